@@ -33,8 +33,7 @@ def main() -> None:
     train, valid = data.by_role("train"), data.by_role("valid")
     wall, cpu = time.perf_counter(), time.process_time()
     fit = fit_prior(scenario.prior, train, valid, dt=scenario.data.dt)
-    for part in (train, valid, data.by_role("test")):
-        smoothed(scenario.prior, fit, part, scenario.data.dt)
+    smoothed(scenario.prior, fit, [*train, *valid, *data.by_role("test")], scenario.data.dt)
     row = {
         "scenario": scenario.name,
         "wall_s": time.perf_counter() - wall,

@@ -37,11 +37,12 @@ if TYPE_CHECKING:
     from hybrid_mpc.control.best_of import BestOf
     from hybrid_mpc.control.nlp import IpoptController
     from hybrid_mpc.control.ocp import OCP, Limits
-    from hybrid_mpc.control.problem import Status, output_cost
+    from hybrid_mpc.control.problem import Status
     from hybrid_mpc.control.rti import CondensedController
     from hybrid_mpc.control.safeguard import SafeController
     from hybrid_mpc.control.soft import SoftBound
     from hybrid_mpc.control.sqp import SQPController
+    from hybrid_mpc.control.targets import Steady, Targets
     from hybrid_mpc.data.differentiate import (
         CausalPolynomial,
         LocalPolynomial,
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.errors import InputError, SafeInputError
     from hybrid_mpc.estimate.delay import DelayCompensation
     from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, TrueState
+    from hybrid_mpc.estimate.offset_free import OffsetFree, offset_free
     from hybrid_mpc.estimate.parameters import (
         parameter_factors,
         parameter_filter,
@@ -74,7 +76,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.files import write_arrays
     from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
     from hybrid_mpc.identify.export import check_parity, trace_model
-    from hybrid_mpc.identify.fit import fit_prior
+    from hybrid_mpc.identify.fit import FirstStates, fit_prior
     from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
     from hybrid_mpc.identify.networks import GRUNetwork
     from hybrid_mpc.identify.prior_model import model_info
@@ -121,7 +123,8 @@ if TYPE_CHECKING:
     from hybrid_mpc.machine.torch_prior import TorchPrior
     from hybrid_mpc.model.buffered import BufferedFunction
     from hybrid_mpc.model.delay import with_input_delay
-    from hybrid_mpc.model.model import HybridModel, longer_period
+    from hybrid_mpc.model.disturbance import Disturbance
+    from hybrid_mpc.model.model import HybridModel, kinematics, longer_period
     from hybrid_mpc.model.riccati import dare, lqr
     from hybrid_mpc.monitor.calibrate import Calibration, count_alarms
     from hybrid_mpc.monitor.detector import Detector
@@ -158,11 +161,13 @@ __all__ = [
     "DelayCompensation",
     "Detector",
     "Diagnoser",
+    "Disturbance",
     "EnergyMonitor",
     "Estimate",
     "ExtendedKalmanFilter",
     "Fault",
     "FaultKind",
+    "FirstStates",
     "GRUNetwork",
     "Guard",
     "HybridModel",
@@ -182,6 +187,7 @@ __all__ = [
     "Mode",
     "ModelInfo",
     "OCP",
+    "OffsetFree",
     "OperatingPoint",
     "Parameter",
     "Prior",
@@ -202,10 +208,12 @@ __all__ = [
     "SmoothingSpline",
     "SoftBound",
     "Status",
+    "Steady",
     "Stribeck",
     "Study",
     "StudyResults",
     "SwitchingFilter",
+    "Targets",
     "Task",
     "TorchPrior",
     "TrainingSettings",
@@ -243,6 +251,7 @@ __all__ = [
     "guard_monitor",
     "holding_input",
     "jacobians",
+    "kinematics",
     "learn_from",
     "linearize",
     "linearize_along",
@@ -266,7 +275,7 @@ __all__ = [
     "multisine",
     "multisine_response",
     "n_features",
-    "output_cost",
+    "offset_free",
     "parameter_factors",
     "parameter_filter",
     "parameter_sensitivities",
@@ -315,11 +324,12 @@ _ROOMS = {
     "control.best_of": ("BestOf",),
     "control.nlp": ("IpoptController",),
     "control.ocp": ("Limits", "OCP"),
-    "control.problem": ("Status", "output_cost"),
+    "control.problem": ("Status",),
     "control.rti": ("CondensedController",),
     "control.safeguard": ("SafeController",),
     "control.soft": ("SoftBound",),
     "control.sqp": ("SQPController",),
+    "control.targets": ("Steady", "Targets"),
     "data.differentiate": (
         "CausalPolynomial", "LocalPolynomial", "SmoothingSpline", "ZeroPhaseFilter", "differentiate",
     ),
@@ -331,6 +341,7 @@ _ROOMS = {
     "errors": ("InputError", "SafeInputError"),
     "estimate.delay": ("DelayCompensation",),
     "estimate.kalman": ("Estimate", "ExtendedKalmanFilter", "TrueState"),
+    "estimate.offset_free": ("OffsetFree", "offset_free"),
     "estimate.parameters": (
         "parameter_factors", "parameter_filter", "parameter_states", "with_parameter_states",
     ),
@@ -339,7 +350,7 @@ _ROOMS = {
     "files": ("write_arrays",),
     "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),
     "identify.export": ("check_parity", "trace_model"),
-    "identify.fit": ("fit_prior",),
+    "identify.fit": ("FirstStates", "fit_prior"),
     "identify.linear": ("LinearModel", "fit_arx", "fit_subspace"),
     "identify.networks": ("GRUNetwork",),
     "identify.prior_model": ("model_info",),
@@ -376,7 +387,8 @@ _ROOMS = {
     "machine.torch_prior": ("TorchPrior",),
     "model.buffered": ("BufferedFunction",),
     "model.delay": ("with_input_delay",),
-    "model.model": ("HybridModel", "longer_period"),
+    "model.disturbance": ("Disturbance",),
+    "model.model": ("HybridModel", "kinematics", "longer_period"),
     "model.riccati": ("dare", "lqr"),
     "monitor.calibrate": ("Calibration", "count_alarms"),
     "monitor.detector": ("Detector",),

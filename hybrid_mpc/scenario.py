@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.loop.plant import Plant
     from hybrid_mpc.loop.simulate import ClosedLoopResult
     from hybrid_mpc.machine.prior import Prior
+    from hybrid_mpc.model.disturbance import Disturbance
     from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -54,13 +55,16 @@ class Task:
         title: One line for plots and the report.
         duration: Length [s].
         x0: Initial state ``(n_x,)`` [SI], at rest.
-        reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI]; the controller previews it.
+        reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI], or ``y_ref (n, n_y)`` where the control problem weighs
+            outputs; the controller previews it if the problem says so.
         weight: ``t (n,) [s] -> (n, n_x)``, factors on the control problem's ``q``, not negative, previewed like
             the reference: zero where a state does not matter, large where it must be met. Instants lie on the grid of
             model periods. Default: 1 throughout.
         control: The task's own control problem, e.g. with other limits. Default: the scenario's.
         faults: What disturbs the machine in this task; no controller knows it. Default: nothing.
         figures: ``result -> {name with unit: number}``, figures of the task's own beside the cost. Default: none.
+        w: ``t (n,) [s] -> (n, n_w)``, measured disturbances of the machine in this task: they act on the plant and are
+            measured, and known ahead where the control problem previews them. Default: those of the operating point.
 
     Example:
         >>> def meet(t):  # at t = 1 s only, and from then on ordinarily
@@ -79,6 +83,7 @@ class Task:
     control: OCP | None = None
     faults: tuple[Fault, ...] = ()
     figures: Callable[[ClosedLoopResult], dict[str, float]] | None = None
+    w: Callable[[Array], Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -136,11 +141,11 @@ class Scenario:
         control: The control problem that all controllers share; default: none.
         sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them. Needed
             where there is a control problem.
-        first_sigma: Standard deviations of the states that are not measured ``(n_x - n_y,)`` [state units] at the
-            estimator's start. Default: ``sqrt(2) sensor_sigma / dt``, what the first two samples tell of speeds.
-        safe_input: Input ``(n_u,)`` [input units] that the machine is left with before the first plan, when a sensor is
-            lost, and at the end of a run. Default: zero, or the limit next to it; a machine that would fall or run
-            away needs its own.
+        first_sigma: Standard deviations of the states that no output shows alone [state units] at the estimator's
+            start. Default: of the speeds of measured states ``sqrt(2) sensor_sigma / dt``, of others by their range.
+        safe_input: Input ``(n_u,)`` [input units] that the machine may be left with: when a sensor is lost, when
+            nothing is finite, at the end of a run. It is never guessed: a guard that rests and a run on the real
+            machine need it. Default: none is declared; a loop in simulation then holds its last input.
         tasks: Closed-loop tasks.
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
@@ -151,6 +156,9 @@ class Scenario:
         benchmark: How ``hybrid-mpc benchmark`` evaluates the machine's models on recordings; default: not at all.
         beyond_recordings: Whether tasks go where no recording was. The filters on the hybrid then assume no less
             process noise than those on the prior; see also ``Budget.prior_replay``. Default: no.
+        disturbance_model: What unmeasured disturbances are added to, as estimators and controllers assume them. As many
+            as there are outputs leave no offset (:func:`~hybrid_mpc.estimate.offset_free.offset_free`). Default: one at
+            each input.
 
     Example:
         >>> spec = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
@@ -177,6 +185,7 @@ class Scenario:
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     benchmark: BenchmarkSpec | None = None
     beyond_recordings: bool = False
+    disturbance_model: tuple[Disturbance, ...] | None = None
 
 
 def registered_scenarios() -> dict[str, str]:

@@ -31,7 +31,7 @@ def make_ekf(model, sigma_d=2e-2):
 def make_safe(model, *, horizon=20, bound=6.0, du_max=None, q=(300.0, 1.0), r=0.05):
     limit = None if du_max is None else [du_max]
     ocp = OCP(horizon, q, [r], [0.05], [-bound], [bound], limit, working_point=POINT)
-    return SafeController(CondensedController(model, ocp), pendulum_model())
+    return SafeController(CondensedController(model, ocp), pendulum_model(), safe_input=[0.0])
 
 
 def loop_row(task="a", controller="prior", seed=0, cost=1.0, **fields):

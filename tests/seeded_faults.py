@@ -186,7 +186,7 @@ FAULTS = (
     ),
     fault(
         "estimate", "a late measurement is matched with the newest input, not the one of its time",
-        "self.estimator.update(base, y, inputs[0])", "self.estimator.update(base, y, inputs[-1])",
+        "self.estimator.update(base, y, inputs[0], ", "self.estimator.update(base, y, inputs[-1], ",
         "delays",
     ),
     fault(

@@ -66,10 +66,10 @@ def test_a_whole_loop_with_its_figures(limits):
     span = span if np.isfinite(span) else TOLERATED
     assert control.input_range == pytest.approx(span)
     model, prior = pendulum_model(z=2), pendulum_model()
-    rest = np.clip(0.0, *limits)
+    rest = np.clip([0.0], *limits)
     estimator = make_estimator(model, machine, np.array([1e-3, 1e-2]))
-    controller = make_controller(model, prior, control)
-    assert controller.controller.ocp.rest_input == rest
+    controller = make_controller(model, prior, control, safe_input=rest)
+    assert controller.controller.problem.u_rest == rest
     result = simulate(
         PendulumPlant(), estimator, controller, lambda t: np.tile([0.3, 0.0], (len(t), 1)), dt=0.02,
         duration=1.0, x0=[0.0, 0.0], seed=0, guard=make_resting_guard(model),

@@ -79,7 +79,8 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     assert kit.monitor().detector == DETECTOR
     assert kit.guard(adapt=True).on_model is Mode.BACKUP
     assert (kit.name, kit.causes) == ("", GOLF.causes)
-    assert kit.safe_input is None
+    assert kit.safe_input == (0.0,)
+    assert kit.on(replace(GOLF, safe_input=None)).controller().safe_input is None
     np.testing.assert_array_equal(kit.controller().safe_input, [0.0])
     limited = next(task for task in GOLF.tasks if task.control is not None)
     assert kit.problem(limited.name) == limited.control

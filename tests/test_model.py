@@ -94,7 +94,8 @@ def test_what_has_no_disturbance_of_its_own_takes_the_usual_one():
         known = TrueState(m).start([1.0, 2.0, 0.0])
         for solver in (CondensedController(m, ocp), IpoptController(m, ocp)):
             plans.append(solver.solve(solver.initial(known), known, np.zeros((1, 2))).u)
-        runs += [Stages(m, 5).run(z[0], inputs), *Stages(m, 5).at(z, inputs)]
+        acting = m.acting(inputs, np.zeros(1), m.w)
+        runs += [Stages(m, 5).run(z[0], acting), *Stages(m, 5).at(z, acting)]
     np.testing.assert_allclose(estimates[0].x, estimates[1].x, rtol=1e-12)
     np.testing.assert_allclose(plans[0], plans[2], atol=1e-9)
     np.testing.assert_allclose(plans[1], plans[3], atol=1e-6)
@@ -111,7 +112,8 @@ def test_what_has_no_disturbance_of_its_own_takes_the_usual_one():
 
         return evaluate
 
-    many = VectorisedStages(replace(model, side_by_side=beside), 5).at(z, inputs)
+    acting = model.acting(inputs, np.zeros(1), model.w)
+    many = VectorisedStages(replace(model, side_by_side=beside), 5).at(z, acting)
     assert asked == [[(5, 2), (5, 1), (5, 1), (5, 1), (5, 1), 0.5, 2.0]]
     np.testing.assert_allclose(many[0], runs[1], rtol=1e-12)
 

@@ -91,9 +91,9 @@ def mpc_gain(
         raise InputError(
             f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move"
         )
-    if ocp.economic is not None:
+    if ocp.economic is not None or ocp.n_y:
         raise InputError(
-            "MPC gain: the problem has an economic stage cost; its gain depends on the whole plan"
+            "MPC gain: the problem has an economic stage cost, or weights on outputs; its gain depends on its plan"
         )
     z0 = np.concatenate([x0, h0])
     plan, z = np.tile(u0, (n, 1)), np.tile(z0, (n + 1, 1))

@@ -68,27 +68,28 @@ class BestOf(Controller):
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None,
+        *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
         """The cheapest plan of all guesses; see :meth:`Controller.solve`.
 
         Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is returned.
         """
         begin = perf_counter()
-        target, u_prev = self.problem.target(reference, weight), previous.u[0]
-        z0 = np.concatenate([estimate.x, estimate.h])
+        target = self.problem.target(reference, weight, estimate, w, previous.steady)
+        u_prev, z0 = previous.u[0], np.concatenate([estimate.x, estimate.h])
 
         def cost_of(u: Array) -> float:
-            cost = self.problem.cost(self.problem.run(z0, u + estimate.d), u, u_prev, target)
+            acting = self.model.acting(u, estimate.d, target.w)
+            cost = self.problem.cost(self.problem.run(z0, acting), u, u_prev, target)
             return cost if np.isfinite(cost) else np.inf
 
         given = estimate, reference, weight
-        first = self._controller.solve(previous, *given, limits=limits)
+        first = self._controller.solve(previous, *given, limits=limits, w=w)
         solutions = [first]
-        guesses = self._guesses(previous, *given, limits) if estimate.finite else []
+        guesses = self._guesses(previous, *given, limits, w) if estimate.finite else []
         for guess in sorted(guesses, key=cost_of)[: self._most]:
             start = self._controller.initial(estimate, guess).delayed(previous.u[0])  # its shift is the guess
-            solutions.append(self._controller.solve(start, *given, limits=limits))
+            solutions.append(self._controller.solve(start, *given, limits=limits, w=w))
         best, least = first, np.inf
         for s in solutions:
             cost = cost_of(s.u)
@@ -98,16 +99,17 @@ class BestOf(Controller):
 
     def _guesses(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None,
-        limits: Limits | None,
+        limits: Limits | None, w: Array | None,
     ) -> list[Array]:  # fmt: skip
         guesses = [
             input_plan(s(estimate) if callable(s) else s, self.ocp.horizon, self.ocp.n_u, "start")
             for s in self._starts
         ]
         for rival in self._rivals:
-            h = hidden_fixed_point(rival.model, estimate.x, previous.u[0], limit=START_LIMIT)
+            known = estimate.w if estimate.w.size == rival.model.n_w else None
+            h = hidden_fixed_point(rival.model, estimate.x, previous.u[0], w=known, limit=START_LIMIT)
             own = replace(estimate, h=h)
-            plan = rival.solve(rival.initial(own, previous.u), own, reference, weight, limits=limits)
+            plan = rival.solve(rival.initial(own, previous.u), own, reference, weight, limits=limits, w=w)
             if plan.status.ok:
                 guesses.append(plan.u)
         return guesses

@@ -29,14 +29,15 @@ class StageCurvature:
 
     They are differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and inputs,
     in which friction curves sharply, and ``n_h`` for the blocks by the hidden state. Those of soft bounds, weighted
-    with their multipliers, are added. The problem's weights and limits give the length of the differences.
+    with their multipliers, are added. The lengths of the differences go by the states' sizes and the inputs' limits.
     """
 
-    def __init__(self, stages: Linearization, ocp: OCP, n_h: int = 0, soft: SoftRows | None = None) -> None:
+    def __init__(
+        self, stages: Linearization, ocp: OCP, sizes: Array, n_h: int = 0, soft: SoftRows | None = None
+    ) -> None:
         self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, n_h
-        self._soft = soft if ocp.soft else None
-        tolerated = 1 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))
-        self._shift = SHIFT * np.concatenate([tolerated, ocp.input_scale])
+        self._soft = soft if soft is not None and soft.functions else None
+        self._shift = SHIFT * np.concatenate([sizes, ocp.input_scale])
         self._by_few = stages.slopes(self._shift.size)
         self._group = min(n_h, max(1, AT_ONCE // ocp.horizon))
         self._by_hidden = stages.slopes(self._group, hidden=True) if n_h else None
@@ -51,20 +52,21 @@ class StageCurvature:
         return curvature.shape in [(horizon, size, size) for size in (self._shift.size, self.size)]
 
     def of(
-        self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array, soft: Array, old: Array | None = None
-    ) -> Array:
+        self, z: Array, u: tuple[Array, Array], a_t: Array, b: Array, adjoint: Array, soft: Array,
+        old: Array | None = None, *, e: Array | None = None,
+    ) -> Array:  # fmt: skip
         """Curvature ``(N, n, n)`` of every stage by ``(x, u, h)``, or by ``(x, u)`` alone where ``old`` has no more.
 
-        ``u`` ``(2, N, n_u)`` are the inputs, and what the model runs on; the Jacobians ``a_t`` (transposed) and ``b``
-        were taken at ``z``. ``adjoint`` and ``soft`` are the multipliers of the stages' results and of the soft bounds.
-        The hidden part of ``old`` is kept.
+        ``u`` are the inputs ``(N, n_u)``, and all that the model runs on ``(N, n_v)``; the Jacobians ``a_t``
+        (transposed) and ``b`` were taken at ``z``. ``adjoint`` and ``soft`` are the multipliers of the stages' results
+        and of the soft bounds, ``e`` the disturbances that those know of. The hidden part of ``old`` is kept.
         """
         few = self._shift.size
         size = self.size if old is None else old.shape[1]
         curvature = np.empty((len(b), size, size)) if old is None else old.copy()
         curvature[:, :few, :few] = self._few(z[:-1], u[1], a_t, b, adjoint)
         if self._soft is not None and np.any(soft):
-            curvature[:, :few, :few] += self._of_soft(self._soft, z, u[0], soft)
+            curvature[:, :few, :few] += self._of_soft(self._soft, z, u[0], soft, e)
         if old is None and self._n_h:
             rows = self._hidden(z[:-1], u[1], a_t, b, adjoint)
             curvature[:, few:] = rows
@@ -72,15 +74,16 @@ class StageCurvature:
             curvature[:, few:, few:] = 0.5 * (rows[:, :, few:] + rows[:, :, few:].transpose(0, 2, 1))
         return curvature
 
-    def _few(self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array) -> Array:
+    def _few(self, z: Array, v: Array, a_t: Array, b: Array, adjoint: Array) -> Array:
         n, n_x, m = len(b), self._n_x, self._shift.size
-        here = np.hstack([z[:, :n_x], u])
+        here, more = np.hstack([z[:, :n_x], v[:, : self._n_u]]), v[:, self._n_u :]
         moved = np.repeat(here[None], m, axis=0)
         each = np.arange(m)
         moved[each, :, each] += self._shift[:, None]
         taken = moved[each, :, each] - here.T  # as rounded
         flat = moved.reshape(m * n, m)
-        slopes = self._by_few(np.hstack([flat[:, :n_x], np.tile(z[:, n_x:], (m, 1))]), flat[:, n_x:])
+        acting = np.hstack([flat[:, n_x:], np.tile(more, (m, 1))])
+        slopes = self._by_few(np.hstack([flat[:, :n_x], np.tile(z[:, n_x:], (m, 1))]), acting)
         change = slopes.reshape(m, n, -1, m)
         change -= np.concatenate([a_t[:, :n_x].transpose(0, 2, 1), b], axis=2)
         weighted = (adjoint[:, None, :] @ change)[:, :, 0]
@@ -104,12 +107,12 @@ class StageCurvature:
             rows[chosen] = (slopes - here) / taken[:, :, None]
         return rows.transpose(1, 0, 2)
 
-    def _of_soft(self, soft: SoftRows, z: Array, u: Array, multipliers: Array) -> Array:
+    def _of_soft(self, soft: SoftRows, z: Array, u: Array, multipliers: Array, e: Array | None) -> Array:
         """Second derivatives of the soft bounds' expressions, which know the states and inputs before the last."""
         n, n_x, m = len(u), self._n_x, self._shift.size
 
         def slopes(points: Array) -> Array:
-            _, by_x, by_u = soft.linearize(np.vstack([points[:, :n_x], z[-1:, :n_x]]), points[:, n_x:])
+            _, by_x, by_u = soft.linearize(np.vstack([points[:, :n_x], z[-1:, :n_x]]), points[:, n_x:], e)
             total = np.zeros((n + 1, m))
             np.add.at(total, soft.stage, multipliers[:, None] * np.hstack([by_x, by_u]))
             return total[:-1]  # bounds on states do not curve

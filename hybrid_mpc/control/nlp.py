@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Controller, Problem, Solution, Status
+from hybrid_mpc.control.problem import Controller, Problem, Solution, Status, Target
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
-from hybrid_mpc.model.model import HybridModel, step_symbols
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.stages import stage_step
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -34,6 +35,7 @@ class Rows(NamedTuple):
 class IpoptController(Controller):
     """Nonlinear MPC by IPOPT on the sparse multiple-shooting problem: the reference, slower than real time.
 
+    Inputs count in :attr:`OCP.input_scale`, states in :attr:`Problem.state_sizes`, soft bounds in half their range.
     Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound. Second
     derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps model and limits; it
     is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
@@ -88,45 +90,45 @@ class IpoptController(Controller):
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None,
+        *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
         """The plan from now on; see :meth:`Controller.solve`. The previous plan, shifted, is the first guess."""
         start = perf_counter()
         problem, u_prev = self.problem, previous.u[0]
-        target = problem.target(reference, weight)
+        target = problem.target(reference, weight, estimate, w, previous.steady)
         u = previous.following
         z = np.hstack([previous.x, previous.h])
         z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
-        given = np.concatenate(
-            [z[0], estimate.d, u_prev, target.x.ravel(), target.weight.ravel(), target.p.ravel()]
-        )
+        added = self.model.acting(np.zeros_like(u), estimate.d, target.w)
+        rows = (added, target.x, target.weight, target.u)
         bounds = self._limited(self.ocp.bounds(u_prev, limits))
-        failed = self._plan(u, z, estimate.d, NAN, Status.NOT_FINITE, NAN, start, 0)
-        if not (
-            target.ok and np.all(np.isfinite(given)) and np.all(np.isfinite(u)) and np.all(np.isfinite(z))
-        ):
+        failed = self._plan(u, z, target, NAN, Status.NOT_FINITE, NAN, start, 0)
+        if not (target.ok and all(np.all(np.isfinite(v)) for v in (*rows, z, u, u_prev))):
             return failed
-        slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u))
-        guess = np.concatenate([u.ravel(), z.ravel(), slack])
+        given = np.concatenate([z[0], u_prev, *(v.ravel() for v in rows), target.e.ravel(), target.p.ravel()])
+        slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u, target.e))
+        guess = np.concatenate([u.ravel(), z.ravel(), slack]) / self._scale
         answer = self._solver(x0=guess, p=given, **bounds)
         stats = self._solver.stats()
-        w, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
-        if not (np.all(np.isfinite(w)) and np.all(np.isfinite(lam_g)) and np.all(np.isfinite(lam_x))):
+        found, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
+        if not all(np.all(np.isfinite(v)) for v in (found, lam_g, lam_x)):
             return failed
-        violated, kkt = self._check(w, given, lam_g, lam_x, bounds)
+        violated, kkt = self._check(found, given, lam_g, lam_x, bounds)
         count = stats["iter_count"]
         if not violated <= FEASIBLE:
-            return self._plan(u, z, estimate.d, NAN, Status.NLP_FAILED, kkt, start, count)
+            return self._plan(u, z, target, NAN, Status.NLP_FAILED, kkt, start, count)
         status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
-        u = np.clip(w[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))
-        z = w[u.size : u.size + z.size].reshape(z.shape)
+        found = found * self._scale
+        u = np.clip(found[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))
+        z = found[u.size : u.size + z.size].reshape(z.shape)
         cost = problem.cost(z, u, u_prev, target)
-        return self._plan(u, z, estimate.d, cost, status, kkt, start, count)
+        return self._plan(u, z, target, cost, status, kkt, start, count)
 
     def _limited(self, of_inputs: tuple[Array, Array]) -> dict[str, Array]:
         """Bounds of unknowns and rows with those of the inputs put in."""
         lower, upper = self._bounds["lbx"].copy(), self._bounds["ubx"].copy()
-        lower[: of_inputs[0].size], upper[: of_inputs[1].size] = (bound.ravel() for bound in of_inputs)
+        n = of_inputs[0].size
+        lower[:n], upper[:n] = (bound.ravel() / self._scale[:n] for bound in of_inputs)
         return {**self._bounds, "lbx": lower, "ubx": upper}
 
     def _check(
@@ -135,22 +137,43 @@ class IpoptController(Controller):
         """Largest violation as a share of its range, and the KKT residual relative to the objective's slope."""
         slope, objective, g = (m.full().ravel() for m in self._slope(w, given, lam_g))
         kkt = float(np.max(np.abs(slope + lam_x)) / max(1.0, np.max(np.abs(objective))))
-        beyond = np.maximum(bounds["lbg"] - g, g - bounds["ubg"]) / self._g_scale
+        beyond = np.maximum(bounds["lbg"] - g, g - bounds["ubg"])
         n = self.ocp.horizon * self.ocp.n_u
         outside = np.maximum(bounds["lbx"][:n] - w[:n], w[:n] - bounds["ubx"][:n])
-        outside = outside.reshape(self.ocp.horizon, -1) / self._u_scale
         return max(float(np.max(beyond, initial=0.0)), float(np.max(outside))), kkt
 
     def _plan(
-        self, u: Array, z: Array, d: Array, cost: float, status: Status, kkt: float, start: float, i: int
+        self,
+        u: Array,
+        z: Array,
+        target: Target,
+        cost: float,
+        status: Status,
+        kkt: float,
+        start: float,
+        i: int,
     ) -> Solution:
-        n_x, soft = self.ocp.n_x, self.problem.soft
-        excess = soft.excess(soft.values(z[:, :n_x], u)) if len(soft) else np.zeros(0)
-        x, h = self._step(z[:-1, :n_x].T, z[:-1, n_x:].T, (u + d).T)
-        defect = float(np.max(np.abs(np.vstack([x.full(), h.full()]).T - z[1:])))
+        n_x, soft, d = self.ocp.n_x, self.problem.soft, target.d
+        excess = soft.excess(soft.values(z[:, :n_x], u, target.e)) if len(soft) else np.zeros(0)
+        after = self._step(z[:-1].T, self.model.acting(u, d, target.w).T).full().T
+        defect = float(np.max(np.abs(after - z[1:])))
         spent = {"solve": (perf_counter() - start) * 1e3}
         largest = float(np.max(excess, initial=0.0))
-        return Solution(u, z[:, :n_x], z[:, n_x:], d, cost, status, kkt, defect, spent, largest, i)
+        return Solution(
+            u,
+            z[:, :n_x],
+            z[:, n_x:],
+            d,
+            cost,
+            status,
+            kkt,
+            defect,
+            spent,
+            largest,
+            i,
+            w=target.w,
+            steady=target.steady,
+        )
 
     def _formulate(self) -> dict[str, ca.MX]:
         """Problem of ``nlpsol`` over ``(u, z, slacks)``; keeps the bounds of its unknowns and rows."""
@@ -158,35 +181,38 @@ class IpoptController(Controller):
         n, n_x, n_u = ocp.horizon, ocp.n_x, ocp.n_u
         n_z = n_x + model.n_h
         u, z, s = ca.MX.sym("u", n_u, n), ca.MX.sym("z", n_z, n + 1), ca.MX.sym("s", len(soft))
-        z0, d, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("d", n_u), ca.MX.sym("u_prev", n_u)
+        z0, added, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("added", model.n_v, n), ca.MX.sym("u_prev", n_u)
         x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
-        p = ca.MX.sym("p", ocp.n_p, n + 1)
-        point = step_symbols(model)[:3]
-        self._step = ca.Function("step", point, list(model.step(*point, model.w, model.p))).map(n)
-        z_next = ca.vertcat(*self._step(z[:n_x, :-1], z[n_x:, :-1], u + ca.repmat(d, 1, n)))
+        u_ref, e = ca.MX.sym("u_ref", n_u, n), ca.MX.sym("e", model.n_d + model.n_w, n)
+        p = ca.MX.sym("p", self.problem.economic.n_p, n + 1)
+        self._step = stage_step(model).map(n)
+        z_next = self._step(z[:, :-1], ca.vertcat(u + added[:n_u, :], added[n_u:, :]))
         du = u - ca.horzcat(u_prev, u[:, :-1])
-        self._u_scale = ocp.input_scale
-        rows = [Rows(z[:, 0] - z0, 0.0, 0.0, 1.0), Rows(z[:, 1:] - z_next, 0.0, 0.0, 1.0)]
+        u_scale, z_scale = ocp.input_scale, np.concatenate([self.problem.state_sizes, np.ones(model.n_h)])
+        rows = [Rows(z[:, 0] - z0, 0.0, 0.0, z_scale), Rows(z[:, 1:] - z_next, 0.0, 0.0, np.tile(z_scale, n))]
         if ocp.du_max is not None:
             limit = np.tile(ocp.du_max, n)
-            rows.append(Rows(du, -limit, limit, np.tile(self._u_scale, n)))
+            rows.append(Rows(du, -limit, limit, np.tile(u_scale, n)))
         inside = [int(k) for k in np.setdiff1d(np.arange(n), ocp.block_starts)]
         if inside:  # move blocks
-            rows.append(Rows(du[:, inside], 0.0, 0.0, np.tile(self._u_scale, len(inside))))
-        rows += self._soft_rows(u, z, s)
-        free = np.full(n_z * (n + 1), np.inf)
+            rows.append(Rows(du[:, inside], 0.0, 0.0, np.tile(u_scale, len(inside))))
+        rows += self._soft_rows(u, z, s, e)
+        free, g_scale = np.full(n_z * (n + 1), np.inf), _filled(rows, 3)
+        self._scale = np.concatenate([np.tile(u_scale, n), np.tile(z_scale, n + 1), soft.scale])
         self._bounds = {
-            "lbx": np.concatenate([np.tile(ocp.u_min, n), -free, np.zeros(len(soft))]),
-            "ubx": np.concatenate([np.tile(ocp.u_max, n), free, np.full(len(soft), np.inf)]),
-            "lbg": _filled(rows, 1), "ubg": _filled(rows, 2),
+            "lbx": np.concatenate([np.tile(ocp.u_min, n), -free, np.zeros(len(soft))]) / self._scale,
+            "ubx": np.concatenate([np.tile(ocp.u_max, n), free, np.full(len(soft), np.inf)]) / self._scale,
+            "lbg": _filled(rows, 1) / g_scale, "ubg": _filled(rows, 2) / g_scale,
         }  # fmt: skip
-        self._g_scale = _filled(rows, 3)
-        return {
-            "x": ca.vertcat(ca.vec(u), ca.vec(z), s),
-            "p": ca.vertcat(z0, d, u_prev, ca.vec(x_ref), ca.vec(weight), ca.vec(p)),
-            "f": self._objective(u, du, z[:n_x, :] - x_ref, weight, s) + self._economic(z[:n_x, :-1], u, p),
-            "g": ca.vertcat(*(ca.vec(row.value) for row in rows)),
-        }
+        unknowns = ca.vertcat(ca.vec(u), ca.vec(z), s)
+        given = ca.vertcat(z0, u_prev, *(ca.vec(v) for v in (added, x_ref, weight, u_ref, e, p)))
+        cost = self._objective(u - u_ref, du, z[:n_x, :] - x_ref, weight, s)
+        cost += self._economic(z[:n_x, :-1], u, p)
+        constraints = ca.vertcat(*(ca.vec(row.value) for row in rows)) / g_scale
+        problem = ca.Function("problem", [unknowns, given], [cost, constraints])
+        scaled = ca.MX.sym("scaled", unknowns.numel())
+        f, g = problem.call([self._scale * scaled, given], True, False)
+        return {"x": scaled, "p": given, "f": f, "g": g}
 
     def _objective(self, u: ca.MX, du: ca.MX, error: ca.MX, weight: ca.MX, s: ca.MX) -> ca.MX:
         ocp, soft = self.ocp, self.problem.soft
@@ -197,19 +223,19 @@ class IpoptController(Controller):
         return self.model.dt * (stage + penalty) + last.T @ self.problem.terminal @ last
 
     def _economic(self, x: ca.MX, u: ca.MX, p: ca.MX) -> ca.MX:
-        f = self.ocp.economic
+        f = self.problem.economic.function
         if f is None:
             return ca.MX(0)
         given = (x, u, p[:, :-1]) if f.n_in() > 2 else (x, u)
         (stages,) = f.map(self.ocp.horizon).call(list(given))
         return self.model.dt * ca.sum2(stages)
 
-    def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX) -> list[Rows]:
+    def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX, e: ca.MX) -> list[Rows]:
         """Constraints of the bounded values, in the order of the problem's rows."""
         ocp, soft, rows = self.ocp, self.problem.soft, []
         states = [int(i) for i in np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))]
         values = [ca.vec(z[states, 1:])] if states else []
-        values += [ca.vec(b.expression.map(ocp.horizon)(z[: ocp.n_x, :-1], u)) for b in ocp.soft]
+        values += [ca.vec(f.map(ocp.horizon)(z[: ocp.n_x, :-1], u, e)) for f in soft.functions]
         value = ca.vertcat(*values)
         for bound, sign in ((soft.upper, 1.0), (soft.lower, -1.0)):
             pick = np.flatnonzero(np.isfinite(bound)).tolist()

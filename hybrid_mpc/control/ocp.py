@@ -11,9 +11,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.control.soft import SoftBound, fixed, number_content, same_expression, state_bounds
+from hybrid_mpc.control.soft import (
+    SoftBound,
+    fixed,
+    number_content,
+    output_bounds,
+    same_expression,
+    state_bounds,
+)
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.limits import at_rest, input_limits, numbers
+from hybrid_mpc.model.limits import input_limits, numbers
+from hybrid_mpc.model.model import output_with_jacobian
 from hybrid_mpc.model.riccati import dare, linearization, vector
 from hybrid_mpc.records import known
 
@@ -55,11 +63,17 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class OCP:
-    """A quadratic tracking problem with bounded inputs and softly bounded states.
+    """A quadratic tracking problem with bounded inputs and softly bounded states and outputs.
 
     The cost of a plan is ``sum_k stage_k dt + (x_N - x_ref_N)' P (x_N - x_ref_N)`` with
-    ``stage_k = (x_k - x_ref_k)' diag(q) (x_k - x_ref_k) + u_k' diag(r) u_k + du_k' diag(r_delta) du_k``,
-    ``du_k = u_k - u_{k-1}`` and ``k = 0 .. N-1``. Only the stages are multiplied by ``dt``.
+    ``stage_k = (x_k - x_ref_k)' diag(q) (x_k - x_ref_k) + (y_k - y_ref_k)' diag(q_y) (y_k - y_ref_k) +
+    (u_k - u_ref_k)' diag(r) (u_k - u_ref_k) + du_k' diag(r_delta) du_k``, ``du_k = u_k - u_{k-1}``, ``k = 0 .. N-1``.
+    Only the stages are multiplied by ``dt``.
+
+    What the reference is depends on ``q_y``. Without it references are those of the states, ``x_ref``, and ``u_ref`` is
+    the model's operating point. With it they are those of the outputs, ``y_ref``, and a target calculator finds
+    ``x_ref`` and ``u_ref`` for them, given the estimated disturbances (:class:`~hybrid_mpc.control.targets.Targets`);
+    where a set-point cannot be reached ``y_ref`` is the nearest that can.
 
     References and weights may vary over time. With weight factors ``w_k`` ``(n_x,)`` in a solve, ``q`` becomes
     ``w_k q`` at stage k and ``P`` becomes ``S P S`` with ``S = diag(sqrt(w_N))``. "Be at x* at the time t*, no matter
@@ -85,22 +99,29 @@ class OCP:
         du_max: Largest change per period ``(n_u,)``, positive. Default: none.
         terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
         working_point: ``(x, u)`` at which ``"riccati"`` and a fallback linearize the model. With a steep friction law
-            take a moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default: zero, the input within its limits.
+            take a moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default: the model's operating point.
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
         slack_quadratic: Penalties ``(n_x,)`` [cost/s/unit^2], positive. Default: ``1000 q``. Where ``q`` is
             zero, 1 stands for it in both.
-        soft: Soft bounds on expressions of ``(x, u)``. Default: none.
+        soft: Soft bounds on expressions of ``(x, u)``, or of ``(x, u, w)``. Default: none.
         blocks: Move blocking: numbers of periods over which the input is held, one block after the other,
             e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now. Default: none.
         economic: A further stage cost per second, ``(x, u) -> scalar``, twice differentiable, of ``(x_0, u_0) ..
             (x_{N-1}, u_{N-1})``; it may be negative and need not be convex. Where it curves down ``rti`` takes it
             as flat; ``sqp`` and ``ipopt`` know its curvature. With ``(x, u, p) -> scalar`` references have
-            ``n_p`` more columns, the values of ``p``: prices, or the outputs' reference
-            (:func:`~hybrid_mpc.control.problem.output_cost`). Default: none.
+            ``n_p`` more columns, the values of ``p``, e.g. prices. Default: none.
         starts: Input plans ``(horizon, n_u)`` from which the first plan of a loop is sought, too, for a task with
             several ways (a swing-up); the cheapest plan is taken. Default: none.
+        q_y: Weights of the outputs ``(n_y,)``, not negative. As many can be held without offset as there are inputs.
+            Default: none; references are then those of the states.
+        y_min: Soft lower bounds of the outputs ``y_0 .. y_{N-1}`` ``(n_y,)``; ``-inf`` for none. A violation costs what
+            it does of a state, by ``q_y``. Default: none.
+        y_max: Soft upper bounds of the outputs ``(n_y,)``; ``inf`` for none. Default: none.
+        preview: Whether a loop knows references and weights ahead, or holds those of the instant. Default: ahead.
+        preview_w: Whether a loop knows the measured disturbances ahead, where it is given a forecast, or holds those
+            measured last. Default: it holds them.
 
     Raises:
         InputError: If shapes do not fit, bounds cross, a weight is negative or not finite, or the blocks'
@@ -109,8 +130,8 @@ class OCP:
     Example:
         >>> from hybrid_mpc.records import plain, record
         >>> heater = OCP(20, (1.0, 0.1), (0.1,), (0.0,), u_min=(0.0,), u_max=(5.0,))
-        >>> heater.q, heater.rest_input
-        (array([1. , 0.1]), array([0.]))
+        >>> heater.q, heater.input_range
+        (array([1. , 0.1]), array([5.]))
         >>> record(OCP, plain(heater), "ocp.json") == heater
         True
     """
@@ -132,6 +153,11 @@ class OCP:
     blocks: tuple[int, ...] | None = None
     economic: ca.Function | None = None
     starts: tuple[Array, ...] = ()
+    q_y: Array = field(default_factory=lambda: np.zeros(0))
+    y_min: Array = field(default_factory=lambda: np.zeros(0))
+    y_max: Array = field(default_factory=lambda: np.zeros(0))
+    preview: bool = True
+    preview_w: bool = False
 
     def __init__(
         self,
@@ -152,6 +178,11 @@ class OCP:
         blocks: Sequence[int] | None = None,
         economic: ca.Function | None = None,
         starts: Sequence[ArrayLike] = (),
+        q_y: ArrayLike = (),
+        y_min: ArrayLike = (),
+        y_max: ArrayLike = (),
+        preview: bool = True,
+        preview_w: bool = False,
     ) -> None:
         if not _whole(horizon) or horizon < 1:
             raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
@@ -166,6 +197,10 @@ class OCP:
                 raise InputError(f"du_max must be positive, got {du_max}; leave it out for no limit")
         if not (isinstance(terminal, str) and terminal == "riccati"):
             terminal = _terminal_matrix(terminal, n_x)
+        outputs = numbers(q_y, "q_y")
+        if not np.all(np.isfinite(outputs) & (outputs >= 0)):
+            raise InputError(f"q_y: weights must be finite and not negative, got {outputs}")
+        y_low, y_up = output_bounds(outputs, y_min, y_max)[:2]
         low, up, linear, quadratic = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
         if wrong := [bound for bound in soft if not isinstance(bound, SoftBound)]:
             raise InputError(f"soft: {wrong[0]!r} given; needed: SoftBound(expression, lower, upper, ...)")
@@ -180,6 +215,7 @@ class OCP:
             "soft": tuple(soft), "blocks": None if blocks is None else _block_lengths(blocks, int(horizon)),
             "economic": economic,
             "starts": tuple(input_plan(s, int(horizon), n_u, f"starts[{i}]") for i, s in enumerate(starts)),
+            "q_y": outputs, "y_min": y_low, "y_max": y_up, "preview": bool(preview), "preview_w": bool(preview_w),
         }  # fmt: skip
         for name, value in fields.items():
             for array in value if isinstance(value, tuple) else (value,):
@@ -219,14 +255,19 @@ class OCP:
         return int(self.r.size)
 
     @property
-    def n_p(self) -> int:
-        """Number of parameters of the economic stage cost; references have ``n_x + n_p`` columns."""
-        return int(self.economic.numel_in(2)) if self.economic is not None and self.economic.n_in() > 2 else 0
+    def n_y(self) -> int:
+        """Number of outputs where references are the outputs', else 0."""
+        return int(self.q_y.size)
 
     @property
-    def rest_input(self) -> Array:
-        """Zero, or the limit next to it ``(n_u,)``: what is held where nothing else is known."""
-        return at_rest(self.u_min, self.u_max)
+    def columns(self) -> int:
+        """Columns of a reference: those of the states, or of the outputs where ``q_y`` weighs them, and ``n_p``."""
+        return (self.n_y or self.n_x) + self.n_p
+
+    @property
+    def n_p(self) -> int:
+        """Number of parameters of the economic stage cost: the last columns of a reference."""
+        return int(self.economic.numel_in(2)) if self.economic is not None and self.economic.n_in() > 2 else 0
 
     @property
     def penalties(self) -> tuple[Array, Array]:
@@ -254,13 +295,19 @@ class OCP:
         """Inputs ``(N, n_u)`` held over the move blocks, each at its first value."""
         return u if self.blocks is None else np.repeat(u[self.block_starts], self.blocks, axis=0)
 
-    def stage_cost(self, x: Array, u: Array, x_ref: Array, du: Array, weight: Array | float = 1.0) -> Array:
+    def stage_cost(
+        self, x: Array, u: Array, x_ref: Array, du: Array, weight: Array | float = 1.0,
+        *, u_ref: Array | float = 0.0, y_error: Array | None = None,
+    ) -> Array:  # fmt: skip
         """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``.
 
-        ``weight`` ``(..., n_x)`` are factors on ``q``. Penalties of soft bounds are not in it.
+        ``weight`` ``(..., n_x)`` are factors on ``q``, ``u_ref`` ``(..., n_u)`` is the target input, ``y_error``
+        ``(..., n_y)`` are the outputs' deviations. Penalties of soft bounds are not in it.
         """
         error = weight * (np.asarray(x) - np.asarray(x_ref)) ** 2
-        return np.asarray(error @ self.q + np.asarray(u) ** 2 @ self.r + np.asarray(du) ** 2 @ self.r_delta)
+        inputs = np.asarray(np.asarray(u) - u_ref)
+        total = np.asarray(error @ self.q + inputs**2 @ self.r + np.asarray(du) ** 2 @ self.r_delta)
+        return total if y_error is None or not self.n_y else total + y_error**2 @ self.q_y
 
     def bounds(self, u_prev: Array, limits: Limits | None = None) -> tuple[Array, Array]:
         """Lower and upper bounds of a plan's inputs, ``(N, n_u)`` each.
@@ -298,6 +345,7 @@ class OCP:
 
         ``"riccati"``: the cost-to-go of the LQR at the working point, minimised over the hidden states (Schur
         complement), so that they need no target. Change weights count as input weights: exact for ``r_delta = 0``.
+        Weights on outputs count as weights on the states that they show there.
 
         Raises:
             InputError: If the linearized model is not stabilisable.
@@ -305,10 +353,7 @@ class OCP:
         if not isinstance(self.terminal, str):
             return self.terminal
         n_x = self.n_x
-        x, u = self.working_point if self.working_point is not None else (np.zeros(n_x), self.rest_input)
-        a, b, _ = linearization(model, x, u)
-        q = np.diag(np.concatenate([self.q, np.zeros(model.n_h)]) * model.dt)
-        p, _ = dare(a, b, q, np.diag(self.r + self.r_delta) * model.dt)
+        p, _ = dare(*self.linear_quadratic(model))
         if not model.n_h:
             return p
         reduced = (
@@ -316,6 +361,27 @@ class OCP:
         )
         values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+    def point(self, model: HybridModel) -> tuple[Array, Array]:
+        """State and input at which terminal weight and fallback are linearized: the working point, else the model's
+        operating point with its input within the limits.
+        """
+        if self.working_point is not None:
+            return self.working_point
+        return model.x0, np.clip(model.u0, self.u_min, self.u_max)
+
+    def linear_quadratic(self, model: HybridModel) -> tuple[Array, Array, Array, Array]:
+        """``A``, ``B``, ``Q`` ``(n_z, n_z)`` and ``R`` of the linear-quadratic problem at :meth:`point`, per period.
+
+        With weights on outputs ``Q`` has ``C' diag(q_y) C``. What outputs depend on inputs directly is left out.
+        """
+        x, u = self.point(model)
+        a, b, _ = linearization(model, x, u)
+        q = np.diag(np.concatenate([self.q, np.zeros(model.n_h)]) * model.dt)
+        if self.n_y:
+            c = output_with_jacobian(model)(x, u, model.w)[1].full()
+            q[: self.n_x, : self.n_x] += (c.T * self.q_y) @ c * model.dt
+        return a, b, q, np.diag(self.r + self.r_delta) * model.dt
 
 
 def _whole(value: object) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Protocol
 
@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
-from hybrid_mpc.control.soft import SoftBound
+from hybrid_mpc.control.soft import SoftBound, output_bounds
+from hybrid_mpc.control.targets import Steady, Targets, state_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
@@ -20,6 +21,9 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import free_run
 
 Array = NDArray[np.float64]
+KNOTS = 8
+"""Most set-points of one preview that get a steady state of their own. Of a reference that moves all the time so many
+rows are taken, and between them steady states are interpolated."""
 
 
 class Status(Enum):
@@ -48,7 +52,7 @@ class Solution:
         u: Inputs ``(N, n_u)``; ``u[0]`` is the one to hold now.
         x: Predicted states ``(N + 1, n_x)``.
         h: Predicted hidden states ``(N + 1, n_h)``.
-        d: Input disturbance ``(n_u,)`` that the prediction assumes: the model runs on ``u + d``.
+        d: Unmeasured disturbances ``(n_d,)`` that the prediction assumes.
         cost: Cost of the plan (see :class:`~hybrid_mpc.control.ocp.OCP`); NaN if it was not solved.
         status: How the solve ended.
         kkt: KKT residual in the QP's scaling, relative to its gradient [-]; of ``ipopt`` that of the NLP.
@@ -58,6 +62,8 @@ class Solution:
         iterations: Linearizations (or iterations of the nonlinear solver) of this solve.
         curvature: Second derivatives of the stages by ``(x, u, h)`` ``(N, n, n)``, or by ``(x, u)`` where the
             hidden state's hardly matter, that ``sqp`` starts its next solve with; None from other solvers.
+        w: Measured disturbances ``(N, n_w)`` that the prediction assumes.
+        steady: The steady state for the first row of an outputs' reference; None where references are the states'.
     """
 
     u: Array
@@ -72,6 +78,8 @@ class Solution:
     excess: float = 0.0
     iterations: int = 1
     curvature: Array | None = None
+    w: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    steady: Steady | None = None
 
     @property
     def following(self) -> Array:
@@ -87,34 +95,45 @@ class Solution:
 
         It loses its last period, which the shift appends anew.
         """
-        x, h = (np.vstack([v[:1], v[:-1]]) for v in (self.x, self.h))
+        x, h, w = (np.vstack([v[:1], v[:-1]]) for v in (self.x, self.h, self.w))
         c = self.curvature
         c = None if c is None else np.concatenate([c[:1], c[:-1]])
-        return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, curvature=c)
+        return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c)
 
 
 class SoftRows:
     """The M soft bounds of a problem along a trajectory, one row a bound and period.
 
-    Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), expressions for ``(x_0, u_0) .. (x_{N-1}, u_{N-1})``.
+    Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), those on outputs and expressions for ``(x_0, u_0) ..
+    (x_{N-1}, u_{N-1})``. Outputs and expressions of ``w`` depend on more, ``e`` ``(N, n_d + n_w)``: the unmeasured and
+    the measured disturbances of each period; without it they are zero. ``model`` is needed for them alone.
     """
 
     stage: NDArray[np.int64]
     """State ``(M,)`` of the trajectory that a row looks at."""
+    parametric: bool
+    """Whether a bounded value depends on ``e``."""
 
-    def __init__(self, ocp: OCP) -> None:
+    def __init__(self, ocp: OCP, model: HybridModel | None = None) -> None:
         n = ocp.horizon
         self._n_x, self._n_u, self._horizon = ocp.n_x, ocp.n_u, n
+        self._n_e = 0 if model is None else model.n_d + model.n_w
+        bounds = [(_of_point(b, ocp, model), b.lower, b.upper, b.linear, b.quadratic) for b in ocp.soft]
+        if ocp.y_min.size and model is not None:
+            bounds.append((_outputs(model), *output_bounds(ocp.q_y, ocp.y_min, ocp.y_max)))
+        self.parametric = bool(ocp.y_min.size) or any(b.expression.n_in() > 2 for b in ocp.soft)
+        self.functions: tuple[ca.Function, ...] = tuple(b[0] for b in bounds)
+        """The bounded expressions ``(x, u, e) -> column``, as the rows of :attr:`lower` after the states'."""
         self._states = np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))
         chosen = self._states
-        self._expressions = [BufferedFunction(_with_slopes(b, ocp.n_x, ocp.n_u).map(n)) for b in ocp.soft]
+        self._expressions = [BufferedFunction(_with_slopes(f).map(n)) for f in self.functions]
         columns = [[np.tile(v[chosen], n) for v in (ocp.x_min, ocp.x_max, *ocp.penalties)]]
-        columns += [[np.tile(v, n) for v in (b.lower, b.upper, b.linear, b.quadratic)] for b in ocp.soft]
+        columns += [[np.tile(v, n) for v in b[1:]] for b in bounds]
         self.lower, self.upper, self.linear, self.quadratic = (
             np.concatenate([c[i] for c in columns]) for i in range(4)
         )
         stages = [np.repeat(np.arange(1, n + 1), chosen.size)]
-        stages += [np.repeat(np.arange(n), b.lower.size) for b in ocp.soft]
+        stages += [np.repeat(np.arange(n), b[1].size) for b in bounds]
         self.stage = np.concatenate(stages)
         half = 0.5 * (self.upper - self.lower)
         # One-sided bounds have no range: the violation that costs as much quadratically as linearly, or 1.
@@ -124,37 +143,40 @@ class SoftRows:
     def __len__(self) -> int:
         return int(self.stage.size)
 
-    def values(self, x: Array, u: Array) -> Array:
+    def values(self, x: Array, u: Array, e: Array | None = None) -> Array:
         """Bounded values ``(M,)`` along states ``(N + 1, n_x)`` and inputs ``(N, n_u)``."""
-        return self.linearize(x, u)[0]
+        return self.linearize(x, u, e)[0]
 
-    def linearize(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    def linearize(self, x: Array, u: Array, e: Array | None = None) -> tuple[Array, Array, Array]:
         """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and input ``(M, n_u)``."""
         n = self._horizon
         by_x = np.tile(np.eye(self._n_x)[self._states], (n, 1))
         rows = [(x[1:, self._states].ravel(), by_x, np.zeros((by_x.shape[0], self._n_u)))]
         for f in self._expressions:
             f.inputs[0][:], f.inputs[1][:] = x[:-1].ravel(), u.ravel()
+            f.inputs[2][:] = 0.0 if e is None else e.ravel()
             f()
-            e, e_x, e_u = (out.copy() for out in f.outputs)
-            each = e.size // n
-            e_x = e_x.reshape(n, self._n_x, each).transpose(0, 2, 1).reshape(e.size, self._n_x)
-            e_u = e_u.reshape(n, self._n_u, each).transpose(0, 2, 1).reshape(e.size, self._n_u)
-            rows.append((e, e_x, e_u))
+            value, by_x, by_u = (out.copy() for out in f.outputs)
+            each = value.size // n
+            by_x = by_x.reshape(n, self._n_x, each).transpose(0, 2, 1).reshape(value.size, self._n_x)
+            by_u = by_u.reshape(n, self._n_u, each).transpose(0, 2, 1).reshape(value.size, self._n_u)
+            rows.append((value, by_x, by_u))
         return (
             np.concatenate([r[0] for r in rows]),
             np.vstack([r[1] for r in rows]),
             np.vstack([r[2] for r in rows]),
         )
 
-    def condensed(self, x: Array, u: Array, from_u: Array) -> tuple[Array, Array, Array]:
+    def condensed(
+        self, x: Array, u: Array, from_u: Array, e: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and by all inputs ``(M, N n_u)``.
 
         ``from_u`` ``((N + 1) n_x, N n_u)`` are the derivatives of the states by the inputs.
         """
         if not len(self):
             return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
-        value, by_x, by_u = self.linearize(x, u)
+        value, by_x, by_u = self.linearize(x, u, e)
         states = from_u.reshape(len(x), self._n_x, u.size)[self.stage]
         slope = (by_x[:, None, :] @ states)[:, 0, :]
         direct = np.flatnonzero(np.any(by_u != 0, axis=1))
@@ -171,33 +193,85 @@ class SoftRows:
         return float(self.linear @ excess + self.quadratic @ excess**2)
 
 
-def _with_slopes(bound: SoftBound, n_x: int, n_u: int) -> ca.Function:
-    """``(x, u)`` to the expression and its derivatives by ``x`` and by ``u``."""
-    f = bound.expression
-    if (f.size_in(0), f.size_in(1)) != ((n_x, 1), (n_u, 1)):
-        raise InputError(f"soft bound: expression {f} does not take (x, u) of {n_x} states and {n_u} inputs")
+def _of_point(bound: SoftBound, ocp: OCP, model: HybridModel | None) -> ca.Function:
+    """A bound's expression as a function of ``(x, u, e)``."""
+    f, n_w = bound.expression, 0 if model is None else model.n_w
+    n_e = 0 if model is None else model.n_d + n_w
+    wanted = [(ocp.n_x, 1), (ocp.n_u, 1), (n_w, 1)][: f.n_in()]
+    if [f.size_in(i) for i in range(f.n_in())] != wanted:
+        raise InputError(
+            f"soft bound: expression {f} does not take (x, u) of {ocp.n_x} states and {ocp.n_u} inputs, nor these "
+            f"and w of {n_w} measured disturbances"
+        )
+    # in scalar code where the expression is some
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    x, u, e = kind.sym("x", ocp.n_x), kind.sym("u", ocp.n_u), kind.sym("e", n_e)
+    given = (x, u) if f.n_in() == 2 else (x, u, e[n_e - n_w :])
+    return ca.Function("bounded", [x, u, e], [f(*given)])
+
+
+def _outputs(model: HybridModel) -> ca.Function:
+    """Outputs of a model as a function of ``(x, u, e)``, with what unmeasured disturbances add."""
+    on_u, _, on_y = (ca.DM(m) for m in model.disturbed)
+    x, u, e = (
+        ca.MX.sym(k, n) for k, n in zip("xue", (model.n_x, model.n_u, model.n_d + model.n_w), strict=True)
+    )
+    d, w = e[: model.n_d], e[model.n_d :]
+    y = model.output(x, u + on_u @ d, w, ca.DM(model.p)) + on_y @ d
+    return ca.Function("outputs", [x, u, e], [ca.densify(y)])
+
+
+def _with_slopes(f: ca.Function) -> ca.Function:
+    """``(x, u, e)`` to the expression and its derivatives by ``x`` and by ``u``."""
+    n_x, n_u, n_e = (f.size1_in(i) for i in range(3))
     # One Jacobian by both, in scalar code where the expression is some: two would run through its calls twice.
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
-    z, x, u = kind.sym("z", n_x + n_u), ca.MX.sym("x", n_x), ca.MX.sym("u", n_u)
-    e = f(z[:n_x], z[n_x:])
-    both = ca.Function("both", [z], [ca.densify(e), ca.densify(ca.jacobian(e, z))], {"cse": True})
-    value, slope = both(ca.vertcat(x, u))
-    return ca.Function("soft", [x, u], [value, slope[:, :n_x], slope[:, n_x:]])
+    z, inner = kind.sym("z", n_x + n_u), kind.sym("e", n_e)
+    x, u, e = ca.MX.sym("x", n_x), ca.MX.sym("u", n_u), ca.MX.sym("e", n_e)
+    value = f(z[:n_x], z[n_x:], inner)
+    outs = [ca.densify(value), ca.densify(ca.jacobian(value, z))]
+    both = ca.Function("both", [z, inner], outs, {"cse": True})
+    found, slope = both(ca.vertcat(x, u), e)
+    return ca.Function("soft", [x, u, e], [found, slope[:, :n_x], slope[:, n_x:]])
+
+
+def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None:
+    """The stage cost that is no square of states or inputs, ``(x, u, p) -> scalar``: the economic one and the outputs'.
+
+    ``p`` are the economic cost's own parameters, then, where outputs are weighed, ``y_ref``, ``d`` and ``w``. None
+    where there is no such cost.
+    """
+    f = ocp.economic
+    n_x, n_u = ocp.n_x, ocp.n_u
+    if f is not None and (
+        (f.size_in(0), f.size_in(1)) != ((n_x, 1), (n_u, 1)) or (f.n_in() > 2 and f.size2_in(2) != 1)
+    ):
+        raise InputError(
+            f"economic: {f} does not take (x, u) of {n_x} states and {n_u} inputs, nor these and a column p"
+        )
+    if not ocp.n_y or model is None:
+        return f
+    n_p, n_y = ocp.n_p, ocp.n_y
+    x, u = ca.MX.sym("x", n_x), ca.MX.sym("u", n_u)
+    p = ca.MX.sym("p", n_p + n_y + model.n_d + model.n_w)
+    error = _outputs(model)(x, u, p[n_p + n_y :]) - p[n_p : n_p + n_y]
+    total = ca.dot(ca.DM(ocp.q_y), error**2)
+    if f is not None:
+        total += f(x, u, p[:n_p]) if f.n_in() > 2 else f(x, u)
+    return ca.Function("stage_cost", [x, u, p], [total])
 
 
 class EconomicCost:
-    """The economic stage cost along a trajectory, with first and second derivatives; zero where there is none."""
+    """:func:`stage_cost` along a trajectory, with first and second derivatives; zero where there is none."""
 
-    def __init__(self, ocp: OCP, dt: float) -> None:
-        self.function, self._dt, self._n = ocp.economic, dt, ocp.horizon
-        f, n_x, n_u = ocp.economic, ocp.n_x, ocp.n_u
+    def __init__(self, ocp: OCP, dt: float, model: HybridModel | None = None) -> None:
+        self.function, self._dt, self._n = stage_cost(ocp, model), dt, ocp.horizon
+        f, n_x, n_u = self.function, ocp.n_x, ocp.n_u
+        self.n_p = int(f.numel_in(2)) if f is not None and f.n_in() > 2 else 0
+        """Number of its parameters."""
         if f is None:
             return
-        if (f.size_in(0), f.size_in(1)) != ((n_x, 1), (n_u, 1)) or (f.n_in() > 2 and f.size2_in(2) != 1):
-            raise InputError(
-                f"economic: {f} does not take (x, u) of {n_x} states and {n_u} inputs, nor these and a column p"
-            )
-        x, u, p = ca.MX.sym("x", n_x), ca.MX.sym("u", n_u), ca.MX.sym("p", ocp.n_p)
+        x, u, p = ca.MX.sym("x", n_x), ca.MX.sym("u", n_u), ca.MX.sym("p", self.n_p)
         value = ca.densify(f(x, u, p) if f.n_in() > 2 else f(x, u))
         slope = ca.horzcat(ca.jacobian(value, x), ca.jacobian(value, u)).T
         curvature = ca.horzcat(ca.jacobian(slope, x), ca.jacobian(slope, u))
@@ -236,51 +310,41 @@ class EconomicCost:
             f.inputs[2][:] = p[: self._n].ravel()
 
 
-def output_cost(output: ca.Function, q_y: ArrayLike) -> ca.Function:
-    """``(x, u, p) -> (y(x, u) - p)' diag(q_y) (y(x, u) - p)``: the economic stage cost that tracks outputs.
-
-    References then have ``n_y`` more columns, the outputs'. It is for outputs that are no states; for states ``q`` says
-    the same and has a terminal weight.
-
-    Args:
-        output: ``(x, u) -> y``, a column; of a model's own outputs ``(x, u, w, p) -> y`` with its ``w`` and ``p``
-            put in.
-        q_y: Weights ``(n_y,)`` [cost/s/unit^2], not negative.
-
-    Raises:
-        InputError: If the function is another, or a weight is negative, not finite or missing.
-
-    Example:
-        >>> x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
-        >>> tip = output_cost(ca.Function("tip", [x, u], [ca.sin(x[0])]), [4.0])
-        >>> float(tip([0.0, 1.0], 0.0, 0.5))
-        1.0
-    """
-    if (output.n_in(), output.n_out()) != (2, 1) or output.size2_out(0) != 1:
-        raise InputError(f"output_cost: {output} given; needed: a function (x, u) -> column")
-    n, weight = output.size1_out(0), np.asarray(q_y, dtype=float).ravel()
-    if weight.shape != (n,) or not np.all(np.isfinite(weight) & (weight >= 0)):
-        raise InputError(f"output_cost: q_y {weight} given; needed: {n} finite weights, none negative")
-    x, u = (ca.MX.sym(name, output.size1_in(i)) for i, name in enumerate("xu"))
-    p = ca.MX.sym("p", n)
-    return ca.Function("output_cost", [x, u, p], [ca.dot(weight, (output(x, u) - p) ** 2)])
-
-
 @dataclass(frozen=True)
 class Target:
-    """Reference ``(N + 1, n_x)``, weight factors on ``q``, and parameters ``(N + 1, n_p)`` of the economic stage cost.
+    """What a plan is to follow, over the horizon; the last values hold where a preview ends.
 
-    The last values hold where the preview ends.
+    Args:
+        x: Reference of the states ``(N + 1, n_x)``.
+        weight: Weight factors on ``q`` ``(N + 1, n_x)``.
+        p: Parameters of :func:`stage_cost` ``(N + 1, n_p)``.
+        u: Target inputs ``(N, n_u)``.
+        w: Measured disturbances ``(N, n_w)``.
+        d: Unmeasured disturbances ``(n_d,)``.
+        y: Reference of the outputs ``(N + 1, n_y)``, or the nearest that can be reached; no columns where references
+            are the states'.
+        steady: Steady state of the first row of such a reference.
     """
 
     x: Array
     weight: Array
     p: Array
+    u: Array
+    w: Array
+    d: Array
+    y: Array
+    steady: Steady | None = None
+
+    @property
+    def e(self) -> Array:
+        """Unmeasured and measured disturbances of each period ``(N, n_d + n_w)``."""
+        return np.hstack([np.tile(self.d, (len(self.w), 1)), self.w])
 
     @property
     def ok(self) -> bool:
         """True if all is finite and no factor is negative."""
-        return bool(np.all(np.isfinite(self.x)) and np.all(np.isfinite(self.p)) and weights_ok(self.weight))
+        finite = all(np.all(np.isfinite(v)) for v in (self.x, self.p, self.u, self.w, self.d))
+        return bool(finite and weights_ok(self.weight))
 
 
 def weights_ok(weight: Array) -> bool:
@@ -301,32 +365,119 @@ class Problem:
                 f"the problem has {ocp.n_x} states and {ocp.n_u} inputs, model {model.name} has "
                 f"{model.n_x} and {model.n_u}"
             )
+        for name, values in (("q_y", ocp.q_y), ("y_min", ocp.y_min), ("y_max", ocp.y_max)):
+            if values.size not in (0, model.n_y):
+                raise InputError(
+                    f"{name} has {values.size} values, model {model.name} {model.n_y} outputs; give one each"
+                )
         self.model, self.ocp = model, ocp
+        self.targets = Targets(model, ocp) if ocp.n_y else None
+        """Steady states for set-points; None where references are the states'."""
         self.terminal = ocp.terminal_weight(model)
-        self.soft = SoftRows(ocp)
-        self.economic = EconomicCost(ocp, model.dt)
+        self.soft = SoftRows(ocp, model)
+        self.economic = EconomicCost(ocp, model.dt, model)
         self.run = free_run(model, ocp.horizon)
         self._rows = np.arange(ocp.horizon + 1)
+        self.state_sizes = state_sizes(model, ocp)
+        """By what solvers scale the states ``(n_x,)``."""
+        self.u_rest: Array = np.clip(model.u0, ocp.u_min, ocp.u_max)
+        """Input ``(n_u,)`` of the operating point, within the limits."""
 
     def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
         """A first plan, of status INITIAL: the model run freely from the estimate on ``u`` ``(N, n_u)``.
 
-        ``u[0]`` counts as the input held before the next solve; without ``u`` it is zero, or the bound next to it.
-        Where the free run diverges, the state is held at the estimate.
+        ``u[0]`` counts as the input held before the next solve; without ``u`` it is the operating point's. Where the
+        free run diverges, the state is held at the estimate.
         """
         n, ocp = self.ocp.horizon, self.ocp
-        start = np.tile(ocp.rest_input, (n, 1)) if u is None else input_plan(u, n, ocp.n_u, "u")
-        plan = np.clip(start, ocp.u_min, ocp.u_max)
-        z = self.run(np.concatenate([estimate.x, estimate.h]), plan + estimate.d)
+        start = np.tile(self.u_rest, (n, 1)) if u is None else input_plan(u, n, ocp.n_u, "u")
+        plan, w = np.clip(start, ocp.u_min, ocp.u_max), self.forecast(None, estimate)
+        z = self.run(np.concatenate([estimate.x, estimate.h]), self.model.acting(plan, estimate.d, w))
         if not np.all(np.isfinite(z)):
             z = np.tile(z[0], (n + 1, 1))
         x, h = z[:, : ocp.n_x], z[:, ocp.n_x :]
-        return Solution(plan, x, h, estimate.d, float("nan"), Status.INITIAL, float("nan"), float("nan"), {})
+        nan = float("nan")
+        return Solution(plan, x, h, estimate.d, nan, Status.INITIAL, nan, nan, {}, w=w)
 
-    def target(self, reference: ArrayLike, weight: ArrayLike | None = None) -> Target:
-        """Reference and factors over the horizon; the last value holds where the preview is shorter."""
-        rows = self._preview(reference, "reference", self.ocp.n_x + self.ocp.n_p)
-        return Target(rows[:, : self.ocp.n_x], self.weights(weight), rows[:, self.ocp.n_x :])
+    def target(
+        self, reference: ArrayLike, weight: ArrayLike | None = None, estimate: Estimate | None = None,
+        w: ArrayLike | None = None, start: Steady | None = None,
+    ) -> Target:  # fmt: skip
+        """What a plan is to follow; the last value holds where the preview is shorter.
+
+        Args:
+            reference: See :meth:`Controller.solve`.
+            weight: Likewise.
+            estimate: Its disturbances are those that steady states are found for. Default: none, and the usual ``w``.
+            w: See :meth:`Controller.solve`.
+            start: Steady state from which those of an outputs' reference are sought.
+        """
+        n, m, ocp = self.ocp.horizon, self.model, self.ocp
+        rows = self._preview(reference, "reference", ocp.columns)
+        p, weights = rows[:, ocp.columns - ocp.n_p :], self.weights(weight)
+        d = np.zeros(m.n_d) if estimate is None else estimate.d
+        ahead = self.forecast(w, estimate)
+        if self.targets is None:
+            u = np.tile(m.u0, (n, 1))
+            return Target(rows[:, : ocp.n_x], weights, p, u, ahead, d, np.zeros((n + 1, 0)))
+        y_ref = np.where(ocp.q_y > 0, rows[:, : ocp.n_y], 0.0)
+        along = np.vstack([ahead, ahead[-1:]])
+        if not all(np.all(np.isfinite(v)) for v in (y_ref, d, along)):
+            return Target(
+                np.full((n + 1, ocp.n_x), np.nan), weights, p, np.tile(m.u0, (n, 1)), ahead, d, y_ref
+            )
+        x, u, y, steady = self._steady(y_ref, d, along, start)
+        own = np.hstack([p, y, np.tile(d, (n + 1, 1)), along])
+        return Target(x, weights, own, u[:-1], ahead, d, y, steady)
+
+    def standing(self) -> Array:
+        """The reference ``(1, columns)`` that is the operating point; the economic cost's parameters are zero."""
+        m, ocp = self.model, self.ocp
+        goal = m.output(m.x0, m.u0, m.w, m.p).full().ravel() if ocp.n_y else m.x0
+        return np.concatenate([goal, np.zeros(ocp.n_p)])[None]
+
+    def _steady(
+        self, y_ref: Array, d: Array, w: Array, start: Steady | None
+    ) -> tuple[Array, Array, Array, Steady]:
+        """States, inputs and outputs of the steady states for each row; exact ones at no more than :data:`KNOTS`."""
+        assert self.targets is not None
+        rows = np.hstack([y_ref, w])
+        new = np.flatnonzero(np.any(np.diff(rows, axis=0) != 0, axis=1)) + 1
+        knots = (
+            np.concatenate([[0], new])
+            if new.size < KNOTS
+            else np.linspace(0, len(rows) - 1, KNOTS).astype(int)
+        )
+        found: list[Steady] = []
+        for k in knots:
+            start = self.targets.at(y_ref[k], d, w[k], start)
+            found.append(start)
+        weighed = self.ocp.q_y > 0
+        point = self.model.x0, self.u_rest
+        x = np.array([s.x if s.steady else point[0] for s in found])
+        u = np.array([s.u if s.steady else point[1] for s in found])
+        off = np.array(
+            [
+                np.where(weighed, s.y - y_ref[k], 0.0) * (s.steady and not s.reached)
+                for s, k in zip(found, knots, strict=True)
+            ]
+        )
+        if new.size < KNOTS:
+            which = np.searchsorted(knots, self._rows, side="right") - 1
+            return x[which], u[which], y_ref + off[which], found[0]
+        x, u, off = (
+            np.stack([np.interp(self._rows, knots, column) for column in v.T], axis=1) for v in (x, u, off)
+        )
+        return x, u, y_ref + off, found[0]
+
+    def forecast(self, w: ArrayLike | None, estimate: Estimate | None) -> Array:
+        """Measured disturbances ``(N, n_w)`` from ``(m, n_w)``, the last ones held; None: those of the estimate."""
+        n, n_w = self.ocp.horizon, self.model.n_w
+        if w is None:
+            known = estimate is not None and estimate.w.size == n_w
+            held = estimate.w if known and estimate is not None else self.model.w
+            return np.tile(held, (n, 1))
+        return self._preview(w, "w", n_w)[:n]
 
     def weights(self, weight: ArrayLike | None) -> Array:
         """Weight factors ``(N + 1, n_x)`` from ``(m, n_x)``, the last value held. Default: 1."""
@@ -356,10 +507,10 @@ class Problem:
         stages, terminal = self.state_weights(target.weight)
         error = x - target.x
         stage = np.sum(error[:-1] ** 2 * stages)
-        stage += self.model.dt * np.sum(u**2 @ self.ocp.r + du**2 @ self.ocp.r_delta)
+        stage += self.model.dt * np.sum((u - target.u) ** 2 @ self.ocp.r + du**2 @ self.ocp.r_delta)
         total = float(stage + error[-1] @ terminal @ error[-1]) + self.economic.value(x, u, target.p)
         if len(self.soft):
-            excess = self.soft.excess(self.soft.values(x, u)) if excess is None else excess
+            excess = self.soft.excess(self.soft.values(x, u, target.e)) if excess is None else excess
             total += self.model.dt * self.soft.penalty(excess)
         return total
 
@@ -388,17 +539,19 @@ class Controller(Protocol):
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None,
+        *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
         """The plan from now on; ``previous.u[0]`` is the input that is being held.
 
         Args:
             previous: The last plan; shifted by one period it is the first guess.
             estimate: The state now; its ``d`` is assumed constant over the horizon.
-            reference: ``(m, n_x)``, from now on in steps of ``dt``; if ``m < N + 1`` its last value holds.
-                Where the economic stage cost has parameters, ``n_p`` more columns are their values.
+            reference: ``(m, n_x)``, or ``(m, n_y)`` where the problem weighs outputs, from now on in steps of ``dt``;
+                if ``m < N + 1`` its last value holds. Where the economic stage cost has parameters, ``n_p`` more
+                columns are their values.
             weight: Factors on ``q`` ``(m, n_x)``, not negative, as the reference. Default: 1.
             limits: Bounds of the inputs for this solve. Default: the problem's own.
+            w: Measured disturbances ``(m, n_w)`` from now on, as the reference. Default: those of the estimate, held.
         """
         ...
 
@@ -411,7 +564,8 @@ class SplitController(Controller):
         raise NotImplementedError
 
     def finish(
-        self, prepared: Any, estimate: Estimate, reference: Array, limits: Limits | None = None
-    ) -> Solution:
+        self, prepared: Any, estimate: Estimate, reference: Array, limits: Limits | None = None,
+        w: Array | None = None,
+    ) -> Solution:  # fmt: skip
         """The rest of it, given what :meth:`prepare` made."""
         raise NotImplementedError

@@ -13,6 +13,7 @@ from scipy.linalg.blas import dgemv
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP
+from hybrid_mpc.control.targets import Steady
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel
@@ -26,7 +27,7 @@ GROUP = 10
 
 @dataclass(frozen=True)
 class Prepared:
-    """Everything of an iteration that needs neither the estimate nor the reference, linearized at ``u``, ``z``, ``d``.
+    """Everything of an iteration that needs neither the estimate nor the reference, linearized at ``u, z, d, w``.
 
     With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
     defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
@@ -49,6 +50,8 @@ class Prepared:
     soft: tuple[Array, Array, Array]
     economic: tuple[Array, Array] | None
     milliseconds: float
+    w: Array
+    steady: Steady | None = None
 
 
 class Condenser:
@@ -186,6 +189,7 @@ class CondensedController(SplitController):
         self.stages = stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
+        self._on_u, self._on_x, _ = model.disturbed
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
         self.qp = InputQP(ocp, self.problem.soft, model.dt)
         self.condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
@@ -198,48 +202,73 @@ class CondensedController(SplitController):
         ``previous.u[0]`` is the input that is being held; ``weight`` as :meth:`Controller.solve` takes it.
         """
         start = perf_counter()
-        u = self.ocp.held(previous.following)
+        u, d = self.ocp.held(previous.following), previous.d
         z = np.hstack([previous.x[1:], previous.h[1:]])
-        derivatives = self.stages.at(z, u + previous.d)
+        w = (
+            np.vstack([previous.w[1:], previous.w[-1:]])
+            if len(previous.w)
+            else self.problem.forecast(None, None)
+        )
+        derivatives = self.stages.at(z, self.model.acting(u, d, w))
         z = np.vstack([z, derivatives[0][-1:]])  # the appended period starts without a defect
         weight = self.problem.weights(weight)
-        return self.condense(u, z, previous.d, previous.u[0], weight, derivatives, start)
+        return self.condense(u, z, d, previous.u[0], weight, derivatives, start, w=w, steady=previous.steady)
 
     @np.errstate(over="ignore", invalid="ignore")
-    def linearize(self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array) -> Prepared:
-        """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``."""
-        start = perf_counter()
-        return self.condense(u, z, d, u_prev, weight, self.stages.at(z[:-1], u + d), start)
+    def linearize(
+        self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, w: Array | None = None,
+        steady: Steady | None = None,
+    ) -> Prepared:  # fmt: skip
+        """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``, ``w`` ``(N,
+        n_w)``.
+        """
+        start, w = perf_counter(), self.problem.forecast(w, None)
+        derivatives = self.stages.at(z[:-1], self.model.acting(u, d, w))
+        return self.condense(u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(
-        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
-    ) -> Solution:
+        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
+        w: Array | None = None,
+    ) -> Solution:  # fmt: skip
         """Embed the estimate and the reference, solve the QP and check its answer.
 
         Arguments as :meth:`Controller.solve` takes them. If the plan's status is not ``ok`` its inputs are the shifted
-        previous plan.
+        previous plan. Where measured disturbances are others than those that were prepared for, it linearizes anew.
         """
         start = perf_counter()
-        target = replace(self.problem.target(reference), weight=prepared.weight)
+        target = self.problem.target(reference, None, estimate, w, prepared.steady)
+        target = replace(target, weight=prepared.weight)
+        if not np.array_equal(target.w, prepared.w):
+            prepared = self.linearize(
+                prepared.u,
+                prepared.z,
+                prepared.d,
+                prepared.u_prev,
+                prepared.weight,
+                target.w,
+                prepared.steady,
+            )
         hessian, economic = self._at_parameters(prepared, target)
         if not target.ok or not np.all(np.isfinite(hessian)):
             return self._failed(prepared, Status.NOT_FINITE, start)
         n_x = self._n_x
         dz0 = np.concatenate([estimate.x, estimate.h]) - prepared.z[0]
-        drift = prepared.defects + prepared.b @ (estimate.d - prepared.d)
+        drift = prepared.defects + prepared.b @ (self._on_u @ (estimate.d - prepared.d))
+        drift[:, :n_x] += self._on_x @ (estimate.d - prepared.d)
         matrices = list(prepared.a_t.transpose(0, 2, 1))
         free = propagate(matrices, drift, dz0)
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
-        gradient = 2 * error.ravel() @ prepared.weighted + self.input_gradient(u_bar, prepared.u_prev)
+        direct = self.input_gradient(u_bar, prepared.u_prev, target.u)
+        gradient = 2 * error.ravel() @ prepared.weighted + direct
         if economic is not None:
             slope, curvature = economic
             slope = slope + (curvature[:, :, :n_x] @ free[:-1, :n_x, None])[:, :, 0]
             gradient += (
                 slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
             )
-        soft = self._soft_rows(prepared, free)
+        soft = self._soft_rows(prepared, free, target)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
         answer = self.qp.solve(hessian, gradient, prepared.u, prepared.u_prev, soft, limits)
@@ -256,40 +285,45 @@ class CondensedController(SplitController):
         u = np.clip(u, *self.ocp.bounds(prepared.u_prev, limits))  # the QP keeps them to its tolerance only
         return Solution(
             u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
-            self._timing(prepared, start), float(np.max(excess, initial=0.0)),
+            self._timing(prepared, start), float(np.max(excess, initial=0.0)), w=target.w, steady=target.steady,
         )  # fmt: skip
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None,
+        *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
         """:meth:`prepare` and :meth:`finish`."""
-        return self.finish(self.prepare(previous, weight), estimate, reference, limits)
+        return self.finish(self.prepare(previous, weight), estimate, reference, limits, w)
 
     def finish(
-        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None
-    ) -> Solution:
+        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
+        w: Array | None = None,
+    ) -> Solution:  # fmt: skip
         """:meth:`feedback`, then linearized anew until there have been ``iterations``; arguments as there."""
-        solution = self.feedback(prepared, estimate, reference, limits)
+        solution = self.feedback(prepared, estimate, reference, limits, w)
         for i in range(1, self._iterations):
             if not solution.status.ok:
                 break
             spent = solution.timing
             z = np.hstack([solution.x, solution.h])
-            again = self.linearize(solution.u, z, solution.d, prepared.u_prev, prepared.weight)
-            solution = self.feedback(again, estimate, reference, limits)
+            again = self.linearize(
+                solution.u, z, solution.d, prepared.u_prev, prepared.weight, solution.w, solution.steady
+            )
+            solution = self.feedback(again, estimate, reference, limits, w)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)
         return solution
 
     def condense(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
-        derivatives: Derivatives, start: float, p: Array | None = None,
+        derivatives: Derivatives, start: float, p: Array | None = None, *, w: Array | None = None,
+        steady: Steady | None = None,
     ) -> Prepared:  # fmt: skip
         """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began.
 
-        ``p`` ``(N + 1, n_p)`` are the values of the economic cost's parameters. Default: none are known yet; where
-        the cost has some it is left to the feedback.
+        ``p`` ``(N + 1, n_p)`` are the values of the stage cost's parameters. Default: none are known yet; where the
+        cost has some it is left to the feedback. ``w`` ``(N, n_w)`` are the measured disturbances. Default: the usual
+        ones.
         """
         n, n_x = self.ocp.horizon, self._n_x
         z_next, a_t, b = derivatives
@@ -302,48 +336,73 @@ class CondensedController(SplitController):
         else:
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
-        soft = self.problem.soft.condensed(z[:, :n_x], u, from_u)
-        known = self.ocp.economic is not None and (p is not None or not self.ocp.n_p)
+        w = self.problem.forecast(w, None)
+        e = np.hstack([np.tile(d, (n, 1)), w])
+        soft = self.problem.soft.condensed(z[:, :n_x], u, from_u, e)
+        known = self.problem.economic.function is not None and (
+            p is not None or not self.problem.economic.n_p
+        )
         economic = self.problem.economic.convex(z[:, :n_x], u, p) if known else None
         if economic is not None:
             hessian += condense_hessians(economic[1], from_u, n_x)
         spent = (perf_counter() - start) * 1e3
         return Prepared(
-            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent
-        )
+            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent, w,
+            steady,
+        )  # fmt: skip
 
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
         """Hessian and economic derivatives, those that wait for the parameters' values included."""
-        if not self.ocp.n_p:
+        if not self.problem.economic.n_p:
             return prepared.hessian, prepared.economic
+        if not target.ok:
+            return prepared.hessian, None
         economic = self.problem.economic.convex(prepared.z[:, : self._n_x], prepared.u, target.p)
         return prepared.hessian + condense_hessians(economic[1], prepared.from_u, self._n_x), economic
 
-    def _soft_rows(self, prepared: Prepared, free: Array) -> tuple[Array, Array] | None:
+    def _soft_rows(self, prepared: Prepared, free: Array, target: Target) -> tuple[Array, Array] | None:
         """Values of the soft bounds before a step, and their derivatives by it."""
         value, by_x, slope = prepared.soft
+        if self.problem.soft.parametric and not np.array_equal(target.d, prepared.d):
+            x = prepared.z[:, : self._n_x]
+            value, by_x, slope = self.problem.soft.condensed(x, prepared.u, prepared.from_u, target.e)
         if not value.size:
             return None
         moved = np.sum(by_x * free[self.problem.soft.stage, : self._n_x], axis=1)
         return value + moved, slope
 
     def _evaluate_once(self) -> None:
-        """Solve once at zero, so that no later call is the first of a CasADi function, which is slow."""
+        """Solve once at the operating point, so that no later call is the first of a CasADi function, which is slow."""
         m = self.model
-        x, h, d, p = np.zeros(m.n_x), np.zeros(m.n_h), np.zeros(m.n_u), np.zeros((0, 0))
-        zero = Estimate(0.0, x, h, d, p, np.zeros(0), NAN)
-        self.solve(self.initial(zero), zero, np.zeros((1, m.n_x + self.ocp.n_p)))
+        x, h, d, p = m.x0, np.zeros(m.n_h), np.zeros(m.n_d), np.zeros((0, 0))
+        rest = Estimate(0.0, x, h, d, p, np.zeros(0), NAN, w=m.w)
+        self.solve(self.initial(rest), rest, self.problem.standing())
 
-    def input_gradient(self, u: Array, u_prev: Array) -> Array:
-        """Gradient of the input costs at the plan ``u`` ``(N n_u,)``."""
+    def input_gradient(self, u: Array, u_prev: Array, u_ref: Array) -> Array:
+        """Gradient of the input costs at the plan ``u`` ``(N n_u,)`` with the target inputs ``u_ref`` ``(N, n_u)``."""
         gradient: Array = self._input_hessian @ u
+        if np.any(u_ref):
+            gradient -= 2 * self.model.dt * (u_ref * self.ocp.r).ravel()
         gradient[: u_prev.size] -= 2 * self.model.dt * self.ocp.r_delta * u_prev
         return gradient
 
     def _failed(self, prepared: Prepared, status: Status, start: float, kkt: float = NAN) -> Solution:
         x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]
         defect, spent = _largest(prepared.defects), self._timing(prepared, start)
-        return Solution(prepared.u, x, h, prepared.d, NAN, status, kkt, defect, spent, NAN)
+        return Solution(
+            prepared.u,
+            x,
+            h,
+            prepared.d,
+            NAN,
+            status,
+            kkt,
+            defect,
+            spent,
+            NAN,
+            w=prepared.w,
+            steady=prepared.steady,
+        )
 
     def _timing(self, prepared: Prepared, start: float) -> dict[str, float]:
         return {"prepare": prepared.milliseconds, "feedback": (perf_counter() - start) * 1e3}

@@ -15,7 +15,7 @@ from hybrid_mpc.control.problem import Controller, Solution, SplitController, St
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import lqr, vector
+from hybrid_mpc.model.riccati import dare, vector
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,8 @@ class Source(Enum):
     MPC = "the checked solution of the MPC"
     PLAN = "the previous plan, shifted: the solve failed"
     FALLBACK = "the stabilising feedback on the prior: the solve failed and the plan is used up"
-    ZERO = "the safe input, by default zero within the limits: nothing else was finite"
+    SAFE = "the declared safe input: nothing else was finite, or the sensor cannot be believed"
+    HELD = "the last input, held: nothing else was finite, and no safe input is declared; or none was decided yet"
     MANUAL = "the operator"
 
 
@@ -48,19 +49,22 @@ class Decision:
 class SafeController:
     """Guards a controller: checked solution, else the shifted plan, else a fallback, else the safe input.
 
+    What is safe nobody can guess: zero is no safe thrust, and no safe valve. Where no safe input is declared, the last
+    input stays.
+
     Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever the solver, the model or
     the estimate do. The object keeps nothing between calls: the held input, the plan and its age are in the
     :class:`Decision`.
 
     Args:
         controller: The controller to guard.
-        fallback: Model, usually the fitted prior, whose LQR at the problem's working point takes over. Default: none,
-            then the safe input follows.
+        fallback: Model, usually the fitted prior, whose LQR at the problem's working point takes over, around the
+            steady state of the reference. Default: none, then the safe input follows.
         max_age: Periods a plan may be followed without a successful solve.
         first: Controller that makes the first plan, before the loop starts; an
             :class:`~hybrid_mpc.control.sqp.SQPController` converges it. Default: ``controller``.
-        safe_input: Input ``(n_u,)`` within the limits that is applied where nothing is known: before the first plan, on
-            a sensor that is lost, at the end of a run. Default: zero, or the limit next to it.
+        safe_input: Input ``(n_u,)`` within the limits that is applied where nothing is known: nothing is finite, the
+            sensor is lost, a run ends. Default: none is declared.
 
     Raises:
         InputError: If the fallback does not fit the problem or cannot be stabilised, or the safe input is outside the
@@ -93,7 +97,7 @@ class SafeController:
             raise InputError(f"max_age must not be negative, got {max_age}")
         ocp = controller.ocp
         self.controller, self._max_age = controller, max_age
-        self.safe_input = checked_safe_input(safe_input, ocp)
+        self.safe_input = None if safe_input is None else checked_safe_input(safe_input, ocp)
         self._split = controller if isinstance(controller, SplitController) else None
         self._first = controller if first is None else first
         sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (self._first, controller)]
@@ -109,12 +113,11 @@ class SafeController:
                     f"fallback {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
                     f"the problem {ocp.n_x} and {ocp.n_u}"
                 )
-            x, u = ocp.working_point or (np.zeros(ocp.n_x), ocp.rest_input)
-            gain = lqr(fallback, x, u, ocp.q, ocp.r + ocp.r_delta)
+            gain = dare(*ocp.linear_quadratic(fallback))[1]
             self._gain = gain[:, : ocp.n_x]
             self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
-            self._fallback = _equilibrium_input(fallback)
-            self._fallback(np.zeros(ocp.n_x))  # a CasADi function's first call is slow
+            self._fallback = _equilibrium_input(fallback, ocp.q)
+            self._fallback(fallback.x0, fallback.w)  # a CasADi function's first call is slow
 
     def initial(
         self,
@@ -122,6 +125,7 @@ class SafeController:
         u: Array | None = None,
         reference: Array | None = None,
         weight: Array | None = None,
+        w: Array | None = None,
     ) -> Decision:
         """Decision before the first: an input is held, and there is a plan to go on from.
 
@@ -130,37 +134,40 @@ class SafeController:
 
         Args:
             estimate: Where the plan starts.
-            u: Input ``(n_u,)`` that is held. Default: the safe input.
-            reference: ``(m, n_x)``, from the first period on in steps of ``dt``: the plan is optimised for it.
+            u: Input ``(n_u,)`` that is held. Default: that of the model's operating point.
+            reference: As :meth:`Controller.solve` takes it, from the first period on: the plan is optimised for it.
                 Default: none; the plan holds ``u``.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
+            w: Measured disturbances ``(m, n_w)``, as the reference. Default: those of the estimate, held.
         """
-        ocp = self.controller.ocp
-        held = self.safe_input if u is None else np.clip(vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
+        ocp, rest = self.controller.ocp, self.controller.model.u0
+        held = np.clip(rest if u is None else vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
         plan = self.controller.initial(estimate, np.tile(held, (ocp.horizon, 1)))
         if reference is not None:
-            solution = self._first.solve(plan, estimate, reference, weight)
+            solution = self._first.solve(plan, estimate, reference, weight, **_ahead(w))
             plan = solution.delayed(held) if solution.status.ok else plan
-        return Decision(held, Source.ZERO, plan, Status.INITIAL, 0)
+        return Decision(held, Source.HELD, plan, Status.INITIAL, 0)
 
     def decide(
         self, previous: Decision, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None, prepared: Any = None,
+        *, limits: Limits | None = None, prepared: Any = None, w: Array | None = None,
     ) -> Decision:  # fmt: skip
         """The input to hold from now on; ``previous.u`` is being held.
 
         Args:
             previous: The last decision.
             estimate: The state now.
-            reference: ``(m, n_x)`` from now on in steps of ``dt``.
+            reference: As :meth:`Controller.solve` takes it.
             weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
             limits: Bounds of the inputs for this period, as :meth:`OCP.bounds` has them. Default: the problem's own.
             prepared: What :meth:`prepare` made of ``previous`` and ``weight``. Default: it is made now.
+            w: Measured disturbances ``(m, n_w)`` from now on. Default: those of the estimate, held.
         """
         if prepared is not None and self._split is not None:
-            solution = self._split.finish(prepared, estimate, reference, limits)
+            solution = self._split.finish(prepared, estimate, reference, limits, **_ahead(w))
         else:
-            solution = self.controller.solve(previous.solution, estimate, reference, weight, limits=limits)
+            last = previous.solution
+            solution = self.controller.solve(last, estimate, reference, weight, limits=limits, **_ahead(w))
         if solution.status.ok:
             u = self.controller.ocp.saturate(solution.u[0], previous.u, limits)
             return Decision(u, Source.MPC, solution.beginning_with(u), solution.status, 0)
@@ -186,7 +193,7 @@ class SafeController:
     ) -> Decision:  # fmt: skip
         """The decision where no solution may be applied; ``solution`` holds the shifted plan and why."""
         ocp, held = self.controller.ocp, previous.u
-        u, source = self._instead(solution, estimate, np.asarray(reference, dtype=float), previous.age + 1)
+        u, source = self._instead(solution, estimate, reference, previous.age + 1, held)
         u = ocp.saturate(u, held, limits)
         inputs = solution.beginning_with(u).u
         inputs = np.where(np.isfinite(inputs), inputs, u)
@@ -195,37 +202,54 @@ class SafeController:
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def _instead(
-        self, failed: Solution, estimate: Estimate, reference: Array, age: int
+        self, failed: Solution, estimate: Estimate, reference: Array, age: int, held: Array
     ) -> tuple[Array, Source]:
         if age <= self._max_age and np.all(np.isfinite(failed.u[0])):
             return failed.u[0], Source.PLAN
-        if self._fallback is not None:
-            goal = reference[0, : self.controller.ocp.n_x]
-            goal = goal if np.all(np.isfinite(goal)) else np.zeros_like(goal)
-            best = self._fallback(goal).full().ravel()
-            u = best - self._gain @ (estimate.x - goal) - estimate.d
+        if self._fallback is not None and estimate.finite:
+            goal, best = self._goal(estimate, reference, failed)
+            u = best - self._gain @ (estimate.x - goal)
             if self._late.size:  # what is under way to the machine already
                 u = u - self._late @ (
                     estimate.h[: self._late.shape[1]] - np.tile(best, self._late.shape[1] // u.size)
                 )
             if np.all(np.isfinite(u)):
                 return u, Source.FALLBACK
-        return self.safe_input, Source.ZERO
+        return (held, Source.HELD) if self.safe_input is None else (self.safe_input, Source.SAFE)
+
+    def _goal(self, estimate: Estimate, reference: Array, failed: Solution) -> tuple[Array, Array]:
+        """State and input ``(n_x,)``, ``(n_u,)`` that the fallback holds: the reference's, else the operating point."""
+        problem, m = self.controller.problem, self.controller.model
+        assert self._fallback is not None
+        target = problem.target(np.asarray(reference, dtype=float)[:1], None, estimate, None, failed.steady)
+        goal = target.x[0]
+        if problem.targets is not None and np.all(np.isfinite(goal)):
+            return goal, target.u[0]
+        goal = goal if np.all(np.isfinite(goal)) else m.x0
+        best = self._fallback(goal, target.w[0]).full().ravel()
+        return goal, best - m.disturbed[0] @ estimate.d
 
 
-def checked_safe_input(given: ArrayLike | None, ocp: OCP) -> Array:
-    """The safe input ``(n_u,)`` of a problem, within its limits; default: zero, or the limit next to it."""
-    u = vector(ocp.rest_input if given is None else given, ocp.n_u, "safe_input")
+def _ahead(w: Array | None) -> dict[str, Any]:
+    """The forecast as an argument, where there is one."""
+    return {} if w is None else {"w": w}
+
+
+def checked_safe_input(given: ArrayLike, ocp: OCP) -> Array:
+    """The safe input ``(n_u,)`` of a problem, within its limits."""
+    u = vector(given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
     return u
 
 
-def _equilibrium_input(model: HybridModel) -> ca.Function:
-    """``x -> u`` that holds a state best: one least-squares Newton step of ``xdot(x, 0, u)`` from zero."""
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    v_dot = model.xdot(x, ca.DM.zeros(model.n_h, 1), u, model.w, model.p)[model.n_x // 2 :]
-    slope = ca.jacobian(v_dot, u)
+def _equilibrium_input(model: HybridModel, q: Array) -> ca.Function:
+    """``(x, w) -> u`` that holds a state best: one Newton step of least squares of ``xdot(x, 0, u)`` from the operating
+    point's input. Rates count in deviations ``1 / sqrt(q)`` of their states.
+    """
+    x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
+    rates = np.sqrt(np.where(q > 0, q, 1.0)) * model.xdot(x, ca.DM.zeros(model.n_h, 1), u, w, model.p)
+    slope = ca.jacobian(rates, u)
     damping = 1e-12 * ca.DM.eye(model.n_u)
-    best = -ca.solve(slope.T @ slope + damping, slope.T @ v_dot)
-    return ca.Function("equilibrium_input", [x], [ca.substitute(best, u, ca.DM.zeros(model.n_u, 1))])
+    best = u - ca.solve(slope.T @ slope + damping, slope.T @ rates)
+    return ca.Function("equilibrium_input", [x, w], [ca.substitute(best, u, ca.DM(model.u0))])

@@ -20,7 +20,8 @@ PENALTY = 1e3
 
 @dataclass(frozen=True, eq=False)
 class SoftBound:
-    """``lower <= expression(x, u) <= upper`` in every period of the horizon, as a penalty on its violation.
+    """``lower <= expression(x, u) <= upper`` (or of ``(x, u, w)``) in every period of the horizon, as a penalty on its
+    violation.
 
     A violation ``s`` costs ``linear s + quadratic s^2`` per second. With ``linear`` above the largest multiplier of
     the hard bound (cost per second and unit by which the bound is moved) the penalty is exact: where the
@@ -29,7 +30,7 @@ class SoftBound:
     Two bounds are equal if their numbers are and their expressions state the same program.
 
     Args:
-        expression: ``(x, u) -> e``, a column of ``n_e``.
+        expression: ``(x, u) -> e``, a column of ``n_e``; ``(x, u, w) -> e`` where measured disturbances matter.
         lower: ``(n_e,)``; ``-inf`` for none.
         upper: ``(n_e,)``; ``inf`` for none.
         linear: Penalties ``(n_e,)`` [cost/s/unit], not negative.
@@ -63,10 +64,13 @@ class SoftBound:
     ) -> None:
         if (
             not isinstance(expression, ca.Function)
-            or (expression.n_in(), expression.n_out()) != (2, 1)
+            or expression.n_in() not in (2, 3)
+            or expression.n_out() != 1
             or expression.size2_out(0) != 1
         ):
-            raise InputError(f"soft bound: {expression} given; needed: a function (x, u) -> column")
+            raise InputError(
+                f"soft bound: {expression} given; needed: a function (x, u) or (x, u, w) -> column"
+            )
         object.__setattr__(self, "expression", expression)
         n = int(expression.size1_out(0))
         arrays = _checked("soft bound", n, lower, upper, linear, quadratic)
@@ -100,6 +104,19 @@ def state_bounds(
         PENALTY * np.sqrt(weight) if linear is None else linear,
         PENALTY * weight if quadratic is None else quadratic,
     )  # fmt: skip
+
+
+def output_bounds(q_y: Array, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Array, Array]:
+    """Bounds on the outputs and their penalties ``(n_y,)`` each, by the weights ``q_y``; empty where there are none."""
+    given = [numbers(v, name) for v, name in ((lower, "y_min"), (upper, "y_max"))]
+    n = max(v.size for v in given)
+    if not n:
+        return tuple(np.zeros(0) for _ in range(4))  # type: ignore[return-value]
+    if q_y.size not in (0, n):
+        raise InputError(f"output bounds: {n} values given, q_y has {q_y.size}; give one for each output")
+    low, up = (v if v.size else np.full(n, side) for v, side in zip(given, (-np.inf, np.inf), strict=True))
+    weight = np.where(q_y > 0, q_y, 1.0) if q_y.size else np.ones(n)
+    return _checked("output bounds", n, low, up, PENALTY * np.sqrt(weight), PENALTY * weight)
 
 
 def _checked(

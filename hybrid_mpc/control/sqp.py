@@ -59,25 +59,31 @@ class ReducedCost:
 
     def __init__(self, inner: CondensedController) -> None:
         self.inner, self.problem = inner, inner.problem
-        self.stages = StageCurvature(inner.stages, inner.ocp, inner.model.n_h, inner.problem.soft)
+        sizes, n_h = inner.problem.state_sizes, inner.model.n_h
+        self.stages = StageCurvature(inner.stages, inner.ocp, sizes, n_h, inner.problem.soft)
         self.metric: Array = np.tile(inner.ocp.input_scale**-2.0, inner.ocp.horizon)
 
     def run(self, z0: Array, u: Array, case: Case) -> Rollout:
         """The run from ``z0`` on ``u``."""
         problem, n_x = self.problem, self.inner.ocp.n_x
-        z = self.inner.stages.run(z0, u + case.d)
-        soft = problem.soft.linearize(z[:, :n_x], u)
+        z = self.inner.stages.run(z0, self.acting(u, case))
+        soft = problem.soft.linearize(z[:, :n_x], u, case.target.e)
         excess = problem.soft.excess(soft[0])
         return Rollout(u, z, soft, problem.cost(z, u, case.u_prev, case.target, excess))
+
+    def acting(self, u: Array, case: Case) -> Array:
+        """All that acts along a run ``(N, n_v)``."""
+        return self.problem.model.acting(u, case.d, case.target.w)
 
     def at(self, run: Rollout, case: Case) -> Point:
         """What is known along a run."""
         problem, n_x = self.problem, self.inner.ocp.n_x
-        derivatives = self.inner.stages.at(run.z[:-1], run.u + case.d)
+        derivatives = self.inner.stages.at(run.z[:-1], self.acting(run.u, case))
         stages, terminal = problem.state_weights(case.target.weight)
         error = run.z[:, :n_x] - case.target.x
-        slopes, direct = 2 * stages * error[:-1], self.inner.input_gradient(run.u.ravel(), case.u_prev)
-        if self.inner.ocp.economic is not None:
+        slopes = 2 * stages * error[:-1]
+        direct = self.inner.input_gradient(run.u.ravel(), case.u_prev, case.target.u)
+        if problem.economic.function is not None:
             economic = problem.economic.derivatives(run.z[:, :n_x], run.u, case.target.p)[0]
             slopes, direct = slopes + economic[:, :n_x], direct + economic[:, n_x:].ravel()
         multipliers = adjoint(derivatives[1], 2 * terminal @ error[-1], slopes)
@@ -103,14 +109,14 @@ class ReducedCost:
     ) -> Array:
         """Weighted second derivatives of the stages; see :meth:`StageCurvature.of`."""
         _, a_t, b = at.derivatives
-        inputs = np.stack([at.run.u, at.run.u + case.d])
-        return self.stages.of(at.run.z, inputs, a_t, b, multipliers, soft, old)
+        inputs = at.run.u, self.acting(at.run.u, case)
+        return self.stages.of(at.run.z, inputs, a_t, b, multipliers, soft, old, e=case.target.e)
 
     def condensed(self, at: Point, case: Case) -> Prepared:
         """The Gauss-Newton model of the cost at a point."""
         return self.inner.condense(
             at.run.u, at.run.z, case.d, case.u_prev, case.target.weight, at.derivatives, perf_counter(),
-            case.target.p,
+            case.target.p, w=case.target.w,
         )  # fmt: skip
 
     def penalty(self, values: Array) -> float:
@@ -404,14 +410,15 @@ class SQPController(Controller):
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None,
+        *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
         """The plan from now on, converged; see :meth:`Controller.solve`.
 
         Its ``kkt`` is the residual of the nonlinear problem in the QP's scaling, with the last QP's multipliers.
         """
         start = perf_counter()
-        case = Case(estimate.d, previous.u[0], self.problem.target(reference, weight), limits)
+        target = self.problem.target(reference, weight, estimate, w, previous.steady)
+        case = Case(estimate.d, previous.u[0], target, limits)
         u = self._admissible(previous.following, case)
         run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
         at = self._cost.at(run, case)
@@ -420,7 +427,7 @@ class SQPController(Controller):
             descent.status, descent.ended = Status.NOT_FINITE, True
         while descent.count < self._iterations and not descent.ended:
             descent.iterate()
-        return self._plan(descent, estimate.d, start)
+        return self._plan(descent, case, start)
 
     def _shifted(self, previous: Solution) -> Array | None:
         """Second derivatives along the previous plan, a period later; None if it has none that fit."""
@@ -441,11 +448,11 @@ class SQPController(Controller):
             rows[start] = u_prev
         return self.ocp.held(rows)
 
-    def _plan(self, descent: Descent, d: Array, start: float) -> Solution:
+    def _plan(self, descent: Descent, case: Case, start: float) -> Solution:
         at, n_x = descent.at.run, self.ocp.n_x
         excess = self.problem.soft.excess(at.soft[0])
         return Solution(
-            at.u, at.z[:, :n_x], at.z[:, n_x:], d, at.cost, descent.status, descent.kkt, 0.0,
+            at.u, at.z[:, :n_x], at.z[:, n_x:], case.d, at.cost, descent.status, descent.kkt, 0.0,
             {"solve": (perf_counter() - start) * 1e3}, float(np.max(excess, initial=0.0)), descent.count,
-            descent.curvature,
+            descent.curvature, w=case.target.w, steady=case.target.steady,
         )  # fmt: skip

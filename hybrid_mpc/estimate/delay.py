@@ -44,8 +44,9 @@ class DelayCompensation:
     was decided. The wrapped estimator runs on the measurements at their own instants; its model then predicts
     ``sensor_delay + input_delay`` periods ahead with the inputs decided since. No method changes the object.
 
-    Before the start the machine rests under an input of zero: the first measurement counts for the start itself, those
-    that follow until the sensor has caught up are not used.
+    Before the start the machine rests under the input of its operating point: the first measurement counts for the
+    start itself, those that follow until the sensor has caught up are not used. Measured disturbances come with their
+    measurement and are held from then on.
 
     Args:
         estimator: The estimator of the loop without delays.
@@ -71,13 +72,15 @@ class DelayCompensation:
         self._sensor = whole_periods(sensor_delay, "sensor_delay")
         self._input = whole_periods(input_delay, "input_delay")
 
-    def start(self, y: ArrayLike, t: float = 0.0) -> DelayedEstimate:
+    def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> DelayedEstimate:
         """First estimate, of the instant ``t`` plus the input delay, from the first measurement."""
-        resting = (np.zeros(self.model.n_u),) * self._input
-        first = self.estimator.start(np.asarray(y, dtype=float), t)
+        resting = (self.model.u0,) * self._input
+        first = self.estimator.start(np.asarray(y, dtype=float), t, **_given(w))
         return self._ahead(first, resting, self._sensor)
 
-    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> DelayedEstimate:
+    def update(
+        self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
+    ) -> DelayedEstimate:
         """Estimate one period later, from what arrives and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
             raise InputError("DelayCompensation goes on from its own estimates only; begin with start()")
@@ -88,15 +91,19 @@ class DelayCompensation:
             if not missing:  # this one was taken at the start itself
                 base = self.estimator.correct(base, y)
             return self._ahead(base, inputs, missing)
-        return self._ahead(self.estimator.update(base, y, inputs[0]), inputs[1:], 0)
+        return self._ahead(self.estimator.update(base, y, inputs[0], **_given(w)), inputs[1:], 0)
 
     def _ahead(self, base: Estimate, inputs: tuple[Array, ...], missing: int) -> DelayedEstimate:
         now = base
         for u in inputs:
             now = self.estimator.predict(now, u)
         return DelayedEstimate(
-            now.t, now.x, now.h, now.d, now.P, base.innovation, base.nis, base, inputs, missing
+            now.t, now.x, now.h, now.d, now.P, base.innovation, base.nis, base, inputs, missing, w=now.w
         )
+
+
+def _given(w: ArrayLike | None) -> dict[str, Array]:
+    return {} if w is None else {"w": np.asarray(w, dtype=float)}
 
 
 def whole_periods(delay: float, name: str) -> int:

@@ -1,23 +1,24 @@
-"""Extended Kalman filter over state, hidden state and input disturbance; and the estimator that gets the truth."""
+"""Extended Kalman filter over state, hidden state and unmeasured disturbances; the estimator that gets the truth."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.buffered import BufferedFunction
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
 START_LIMIT = 25
 """Most periods at rest that the first estimate runs the hidden state through: as many as training warms it up on.
 Longer makes a loop's first step late. Closed loops with a network depend on it (docs/results/README.md)."""
+FITS = 1e-6
+"""Squared error of the first outputs, in the sensors' deviations, below which a state fits them."""
 LOST = 1e12
 """Growth of a variance that leaves few digits of a covariance: nothing is known any more."""
 
@@ -30,11 +31,13 @@ class Estimate:
         t: Time [s].
         x: State ``(n_x,)`` [SI].
         h: Hidden state ``(n_h,)`` before ``(x, u)`` at ``t``.
-        d: Input disturbance ``(n_u,)`` [input units]: the machine acts as if its input were ``u + d``.
-        P: Covariance of ``(x, h, d)``, ``(n_x + n_h + n_u,) * 2``.
+        d: Unmeasured disturbances ``(n_d,)`` in the order of the model's ``disturbance_model``, by default at the
+            inputs [input units]: the machine acts as if its input were ``u + d``.
+        P: Covariance of ``(x, h, d)``, ``(n_x + n_h + n_d,) * 2``.
         innovation: Measured minus predicted outputs ``(n_y,)``; NaN where nothing was measured.
         nis: Normalised innovation squared [-], chi-square with n_y degrees of freedom if the filter's assumptions hold;
             NaN without a measurement.
+        w: Measured disturbances ``(n_w,)`` from ``t`` on; the last ones where there was no sample. Default: none.
     """
 
     t: float
@@ -44,34 +47,40 @@ class Estimate:
     P: Array
     innovation: Array
     nis: float
+    w: Array = field(default_factory=lambda: np.zeros(0), kw_only=True)
 
     @property
     def finite(self) -> bool:
         """Whether all estimated values are finite."""
-        return bool(np.all(np.isfinite(np.concatenate([self.x, self.h, self.d]))))
+        return bool(np.all(np.isfinite(np.concatenate([self.x, self.h, self.d, self.w]))))
 
 
 class Estimator(Protocol):
-    """What a closed loop needs of an estimator. Both methods are pure."""
+    """What a closed loop needs of an estimator. Both methods are pure.
+
+    ``w`` ``(n_w,)`` are the measured disturbances from the sample's instant on. A loop gives them where the model has
+    some, and only there.
+    """
 
     @property
     def model(self) -> HybridModel:
         """The model whose ``(x, h)`` is estimated."""
 
-    def start(self, y: Array, t: float = 0.0) -> Estimate:
+    def start(self, y: Array, t: float = 0.0, *, w: Array | None = None) -> Estimate:
         """First estimate from the first measurement."""
 
-    def update(self, estimate: Estimate, y: Array, u_prev: Array) -> Estimate:
+    def update(self, estimate: Estimate, y: Array, u_prev: Array, *, w: Array | None = None) -> Estimate:
         """Estimate one period later, from ``y`` and the input held since."""
 
 
 class ExtendedKalmanFilter:
     """Extended Kalman filter over ``(x, h, d)`` with the model's exact Jacobian.
 
-    The input disturbance ``d`` is a random walk. A network's hidden state has no noise of its own, it follows the
-    state; hidden states that are parameters have (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). On a
-    linear model this is the Kalman filter. No method changes what the object gives; not for several threads at once (it
-    reuses its buffers).
+    Unmeasured disturbances ``d`` are random walks; where they act says the model's ``disturbance_model``. Measured ones
+    ``w`` come with each sample and are held over the period. A network's hidden state has no noise of its own, it
+    follows the state; hidden states that are parameters have
+    (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). On a linear model this is the Kalman filter. No
+    method changes what the object gives; not for several threads at once (it reuses its buffers).
 
     A prediction is lost if it is not finite, or a deviation is a million times the largest one given here (an unstable
     model long without measurements, an absurd measurement). The next measurement then starts anew.
@@ -81,8 +90,8 @@ class ExtendedKalmanFilter:
         sigma_y: Standard deviations of the measurement noise ``(n_y,)``, positive [output units].
         sigma_x: Standard deviations of the process noise per period ``(n_x,)`` [state units].
         sigma_x0: Standard deviations of the first state ``(n_x,)``.
-        sigma_d: Standard deviations of the step of ``d`` per period ``(n_u,)`` [input units]. Default: zero.
-        sigma_d0: Standard deviations of the first disturbance ``(n_u,)``. Default: zero. Without both ``d`` stays
+        sigma_d: Standard deviations of the step of ``d`` per period ``(n_d,)`` [their units]. Default: zero.
+        sigma_d0: Standard deviations of the first disturbances ``(n_d,)``. Default: zero. Without both ``d`` stays
             exactly zero.
         sigma_h: Standard deviations of the step of the hidden states per period ``(n_h,)``. Default: zero.
         sigma_h0: Standard deviations of the first hidden states ``(n_h,)``. Default: zero.
@@ -93,6 +102,7 @@ class ExtendedKalmanFilter:
     Source: Simon, *Optimal State Estimation*, 2006, section 13.2; Joseph form of the correction.
 
     Example:
+        >>> import casadi as ca
         >>> from hybrid_mpc.machine.signals import Signal
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
@@ -114,26 +124,27 @@ class ExtendedKalmanFilter:
         sigma_h: ArrayLike | None = None,
         sigma_h0: ArrayLike | None = None,
     ) -> None:
-        n_x, n_h, n_u, n_y = model.n_x, model.n_h, model.n_u, model.n_y
-        sigma_d = np.zeros(n_u) if sigma_d is None else sigma_d
-        sigma_d0 = np.zeros(n_u) if sigma_d0 is None else sigma_d0
+        n_x, n_h, n_d, n_y = model.n_x, model.n_h, model.n_d, model.n_y
+        sigma_d = np.zeros(n_d) if sigma_d is None else sigma_d
+        sigma_d0 = np.zeros(n_d) if sigma_d0 is None else sigma_d0
         hidden = _variance(np.zeros(n_h) if sigma_h is None else sigma_h, n_h, "sigma_h")
         hidden0 = _variance(np.zeros(n_h) if sigma_h0 is None else sigma_h0, n_h, "sigma_h0")
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
             raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
-        self.model, self._sizes = model, (n_x, n_h, n_u, n_y)
+        self.model, self._sizes = model, (n_x, n_h, n_d, n_y)
+        self._on_u, self._on_x, self._on_y = model.disturbed
         self._noise_y = variance_y
         self._noise = np.concatenate(
-            [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_u, "sigma_d")]
+            [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_d, "sigma_d")]
         )
         self._first = np.concatenate(
-            [_variance(sigma_x0, n_x, "sigma_x0"), hidden0, _variance(sigma_d0, n_u, "sigma_d0")]
+            [_variance(sigma_x0, n_x, "sigma_x0"), hidden0, _variance(sigma_d0, n_d, "sigma_d0")]
         )
         self._lost = LOST * max(np.max(v) for v in (self._noise, self._first, self._noise_y))
         assert model.with_jacobian is not None
         self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
-        self._step.inputs[3][:], self._step.inputs[4][:] = model.w, model.p
+        self._step.inputs[4][:] = model.p
 
     @property
     def noise(self) -> tuple[Array, Array]:
@@ -144,42 +155,91 @@ class ExtendedKalmanFilter:
         """Whether an estimate is not finite, or so uncertain that nothing is known any more."""
         return not (estimate.finite and np.max(np.diag(estimate.P)) <= self._lost)
 
-    def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
-        """Estimate at rest: the smallest state with the output ``y`` ``(n_y,)``, ``d`` zero.
+    def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> Estimate:
+        """Estimate at rest: the state nearest to the operating point's with the output ``y`` ``(n_y,)``, ``d`` zero.
 
-        Elements of ``y`` that are not finite count as the output at the state zero.
+        Elements of ``y`` that are not finite tell nothing. Where several states have the output (``l sin q``, a
+        speed's size) or the output does not move at the operating point, Newton's method begins one deviation
+        ``sigma_x0`` beside it too, and the nearest state of those that fit is taken. On which side it lies the
+        operating point says alone: the filter does not find out.
         """
-        model = self.model
-        x, u = np.zeros(model.n_x), np.zeros(model.n_u)
+        model, u = self.model, self.model.u0
+        w = self._known(None, w)
         target = np.asarray(y, dtype=float).ravel()
-        for _ in range(20):  # Newton; one step if the outputs are linear in the state
-            y_hat, c_x, _ = self._measured(x, u)
-            error = np.where(np.isfinite(target), target - y_hat, 0.0)
-            if not np.all(np.isfinite(c_x)) or np.max(np.abs(error)) < 1e-12:
-                break
-            x = x + np.linalg.pinv(c_x) @ error
-        h = hidden_fixed_point(model, x, u, limit=START_LIMIT)
+        x = self._fitting(model.x0, target, u, w)
+        h = hidden_fixed_point(model, x, u, w=w, limit=START_LIMIT)
         empty = np.full(model.n_y, np.nan)
-        return Estimate(float(t), x, h, np.zeros(model.n_u), np.diag(self._first), empty, float("nan"))
+        return Estimate(float(t), x, h, np.zeros(model.n_d), np.diag(self._first), empty, float("nan"), w=w)
+
+    def _fitting(self, x0: Array, y: Array, u: Array, w: Array) -> Array:
+        """The state ``(n_x,)`` nearest to ``x0`` whose output is ``y`` where that is finite."""
+        x, unlike, whole = self._newton(x0, y, u, w)
+        if whole and unlike < FITS:
+            return x
+        spread = np.diag(np.sqrt(self._first[: x0.size]))
+        found = [(unlike, x), *(self._newton(x0 + step, y, u, w)[1::-1] for step in (*spread, *-spread))]
+        least = min(score for score, _ in found)
+        fitting = [x for score, x in found if score <= max(least, FITS)] or [x0]
+        return min(fitting, key=lambda x: float(np.sum((x - x0) ** 2)))
+
+    def _newton(self, x: Array, y: Array, u: Array, w: Array) -> tuple[Array, float, bool]:
+        """A state whose output is ``y`` by Newton's method, the squared error in deviations of the sensors, and whether
+        no step had to be shortened. One step if the outputs are linear in the state.
+        """
+        seen, whole = np.isfinite(y), True
+
+        def lacks(at: Array) -> tuple[Array, Array, float]:
+            y_hat, by_x, _ = self._measured(at, u, w)
+            error = np.where(seen, y - y_hat, 0.0)
+            return error, by_x, float(np.sum(error**2 / self._noise_y))
+
+        error, by_x, size = lacks(x)
+        for _ in range(20):
+            if not np.all(np.isfinite(by_x)) or np.max(np.abs(error)) < 1e-12:
+                break
+            step = np.linalg.pinv(np.where(seen[:, None], by_x, 0.0)) @ error
+            for halving in range(60):
+                moved = x + step * 0.5**halving
+                after = lacks(moved)
+                if after[2] < size:
+                    break
+                if size < FITS:  # what is left is rounding
+                    return x, size, whole
+                whole = False
+            else:
+                break
+            x, (error, by_x, size) = moved, after
+        return x, size if np.isfinite(size) else np.inf, whole
+
+    def _known(self, estimate: Estimate | None, w: ArrayLike | None) -> Array:
+        """Measured disturbances ``(n_w,)``: what was measured, else the last ones, else the operating point's."""
+        n_w = self.model.n_w
+        last = estimate.w if estimate is not None and estimate.w.size == n_w else self.model.w
+        if w is None or not n_w:
+            return last
+        given = np.asarray(w, dtype=float).ravel()
+        return np.where(np.isfinite(given), given, last)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
-        (n_x, n_h, n_u, n_y), step = self._sizes, self._step
-        n_z = n_x + n_h
+        (n_x, n_h, n_d, _), step = self._sizes, self._step
+        n_z, w = n_x + n_h, self._known(estimate, None)
         step.inputs[0][:], step.inputs[1][:] = estimate.x, estimate.h
-        step.inputs[2][:] = np.asarray(u, dtype=float).ravel() + estimate.d
+        step.inputs[2][:], step.inputs[3][:] = np.asarray(u, dtype=float).ravel() + self._on_u @ estimate.d, w
         step()
-        x, h, a, b = step.outputs  # of the next call; what is kept of them is copied
-        f = np.eye(n_z + n_u)
-        f[:n_z, :n_z], f[:n_z, n_z:] = a.reshape(n_z, n_z).T, b.reshape(n_u, n_z).T
+        x, h, a, b = step.outputs  # of the next call
+        f = np.eye(n_z + n_d)
+        f[:n_z, :n_z], f[:n_z, n_z:] = a.reshape(n_z, n_z).T, b.reshape(-1, n_z).T @ self._on_u
+        f[:n_x, n_z:] += self._on_x
         p = f @ estimate.P @ f.T
         p.flat[:: p.shape[0] + 1] += self._noise
-        empty = np.full(n_y, np.nan)
-        return Estimate(estimate.t + self.model.dt, x.copy(), h.copy(), estimate.d, p, empty, float("nan"))
+        empty, t = np.full(self.model.n_y, np.nan), estimate.t + self.model.dt
+        return Estimate(t, x + self._on_x @ estimate.d, h.copy(), estimate.d, p, empty, float("nan"), w=w)
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
-        """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form; ``u`` is the input of the output equation.
+        """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form; ``u`` is the input of the output equation,
+        by default the operating point's.
 
         Elements of ``y`` that are not finite are left out; if all are, the estimate comes back as it is.
         """
@@ -191,14 +251,12 @@ class ExtendedKalmanFilter:
 
         Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
         """
-        n_x, n_h, _, n_y = self._sizes
+        n_x, n_h, _, _ = self._sizes
         y = np.asarray(y, dtype=float).ravel()
         seen = np.isfinite(y)
         if not seen.any():
             return estimate, 0.0
-        held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
-        y_hat, c_x, c_u = self._measured(estimate.x, held)
-        c = np.hstack([c_x, np.zeros((n_y, n_h)), c_u])
+        y_hat, c = self._predicted(estimate, u)
         innovation = np.where(seen, y - y_hat, np.nan)
         p, step, nis, size = estimate.P, np.zeros(c.shape[1]), 0.0, 0.0
         for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
@@ -210,42 +268,57 @@ class ExtendedKalmanFilter:
             step, nis, size = step + gain * error, nis + float(error / s * error), size + float(np.log(s))
         n_z = n_x + n_h
         x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]
-        after = Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis)
+        after = Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis, w=estimate.w)
         return after, -0.5 * (nis + size)
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
         """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``."""
-        held = estimate.d if u is None else np.asarray(u, dtype=float).ravel() + estimate.d
-        _, c_x, c_u = self._measured(estimate.x, held)
-        c = np.hstack([c_x, np.zeros((self.model.n_y, self.model.n_h)), c_u])
+        _, c = self._predicted(estimate, u)
         s: Array = c @ estimate.P @ c.T + np.diag(self._noise_y)
         return 0.5 * (s + s.T)
 
-    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
+    def update(
+        self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
+    ) -> Estimate:
         """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
 
-        A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
+        ``w`` ``(n_w,)`` are the disturbances that were measured along with ``y``; NaN or None: the last ones stay. A
+        lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
         """
-        predicted = self.predict(estimate, u_prev)
+        predicted = self.measuring(self.predict(estimate, u_prev), w)
         if self.lost(predicted) and np.any(np.isfinite(np.asarray(y, dtype=float))):
-            return self.start(y, predicted.t)
+            return self.start(y, predicted.t, w=predicted.w)
         return self.correct(predicted, y, u_prev)
 
-    def _measured(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    def measuring(self, predicted: Estimate, w: ArrayLike | None) -> Estimate:
+        """The prediction with the disturbances ``w`` ``(n_w,)`` that were measured at its instant."""
+        return predicted if w is None else replace(predicted, w=self._known(predicted, w))
+
+    def _predicted(self, estimate: Estimate, u: ArrayLike | None) -> tuple[Array, Array]:
+        """Output ``(n_y,)`` of an estimate and its Jacobian by ``(x, h, d)``."""
+        held = self.model.u0 if u is None else np.asarray(u, dtype=float).ravel()
+        y, c_x, c_u = self._measured(estimate.x, held + self._on_u @ estimate.d, self._known(estimate, None))
+        on_d = c_u @ self._on_u + self._on_y
+        return y + self._on_y @ estimate.d, np.hstack([c_x, np.zeros((y.size, self._sizes[1])), on_d])
+
+    def _measured(self, x: Array, u: Array, w: Array) -> tuple[Array, Array, Array]:
         """Output ``(n_y,)`` and its Jacobians by state and input, to be used before the next call."""
-        (n_x, _, n_u, n_y), output = self._sizes, self._output
-        output.inputs[0][:], output.inputs[1][:] = x, u
+        (n_x, _, _, n_y), output = self._sizes, self._output
+        output.inputs[0][:], output.inputs[1][:], output.inputs[2][:] = x, u, w
         output()
         y, c_x, c_u = output.outputs
-        return y, c_x.reshape(n_x, n_y).T, c_u.reshape(n_u, n_y).T
+        return y, c_x.reshape(n_x, n_y).T, c_u.reshape(-1, n_y).T
 
-    def run(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> list[Estimate]:
+    def run(
+        self, y: ArrayLike, u: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None
+    ) -> list[Estimate]:
         """Estimates along a measured past, e.g. to warm up.
 
         Args:
             y: Outputs ``(n, n_y)`` on the model's grid.
             u: Inputs ``(n, n_u)``; ``u[k]`` is held from sample k to k + 1 (the last is not used).
             t: Time of the first sample [s].
+            w: Measured disturbances ``(n, n_w)``. Default: those of the operating point.
 
         Returns:
             ``n`` estimates; number k has seen ``y[:k + 1]``.
@@ -260,9 +333,12 @@ class ExtendedKalmanFilter:
                 f"y {ys.shape} and u {us.shape} given; "
                 f"needed: (n, {self.model.n_y}) and (n, {self.model.n_u}) with n > 0"
             )
-        estimates = [self.start(ys[0], t)]
-        for y_k, u_k in zip(ys[1:], us[:-1], strict=True):
-            estimates.append(self.update(estimates[-1], y_k, u_k))
+        ws = np.tile(self.model.w, (n, 1)) if w is None else np.asarray(w, dtype=float)
+        if ws.shape != (n, self.model.n_w):
+            raise InputError(f"w {ws.shape} given; needed: {(n, self.model.n_w)}")
+        estimates = [self.start(ys[0], t, w=ws[0])]
+        for y_k, u_k, w_k in zip(ys[1:], us[:-1], ws[1:], strict=True):
+            estimates.append(self.update(estimates[-1], y_k, u_k, w=w_k))
         return estimates
 
 
@@ -271,15 +347,6 @@ def _variance(sigma: ArrayLike, size: int, name: str) -> Array:
     if np.any(values < 0):
         raise InputError(f"{name} must not be negative, got {values}")
     return values**2
-
-
-def output_with_jacobian(model: HybridModel) -> ca.Function:
-    """Output ``(n_y,)`` of a model at ``(x, u)`` and its dense Jacobians by ``x`` and by ``u``."""
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    y = model.output(x, u, model.w, model.p)
-    return ca.Function(
-        "output_with_jacobian", [x, u], [y, ca.densify(ca.jacobian(y, x)), ca.densify(ca.jacobian(y, u))]
-    )
 
 
 class TrueState:
@@ -292,34 +359,41 @@ class TrueState:
 
     Example:
         >>> from types import SimpleNamespace
-        >>> TrueState(SimpleNamespace(n_x=2, n_h=0, n_u=1, n_y=1)).start(np.array([0.1, 0.2])).x
+        >>> machine = SimpleNamespace(n_x=2, n_h=0, n_d=1, n_y=1, w=np.zeros(0))
+        >>> TrueState(machine).start(np.array([0.1, 0.2])).x
         array([0.1, 0.2])
     """
 
     def __init__(self, model: HybridModel) -> None:
         self.model = model
 
-    def start(self, y: ArrayLike, t: float = 0.0) -> Estimate:
+    def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> Estimate:
         """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero."""
         m, z = self.model, np.asarray(y, dtype=float).ravel()
         n_z = m.n_x + m.n_h
         if z.size < n_z:
             raise InputError(f"true state: the plant gives {z.size} states, the oracle model needs {n_z}")
-        p, empty = np.zeros((n_z + m.n_u, n_z + m.n_u)), np.full(m.n_y, np.nan)
-        return Estimate(float(t), z[: m.n_x], z[m.n_x : n_z], np.zeros(m.n_u), p, empty, float("nan"))
+        p, empty = np.zeros((n_z + m.n_d, n_z + m.n_d)), np.full(m.n_y, np.nan)
+        known = m.w if w is None else np.asarray(w, dtype=float)
+        return Estimate(
+            float(t), z[: m.n_x], z[m.n_x : n_z], np.zeros(m.n_d), p, empty, float("nan"), w=known
+        )
 
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """The model's own step with ``u`` ``(n_u,)`` held."""
         m = self.model
         x, h = (
-            v.full().ravel() for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float), m.w, m.p)
+            v.full().ravel()
+            for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float), estimate.w, m.p)
         )
-        return self.start(np.concatenate([x, h]), estimate.t + m.dt)
+        return self.start(np.concatenate([x, h]), estimate.t + m.dt, w=estimate.w)
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
         """The truth ``y`` at the estimate's own instant."""
-        return self.start(y, estimate.t)
+        return self.start(y, estimate.t, w=estimate.w)
 
-    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> Estimate:
+    def update(
+        self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
+    ) -> Estimate:
         """The truth one period later; ``u_prev`` is not used."""
-        return self.start(y, estimate.t + self.model.dt)
+        return self.start(y, estimate.t + self.model.dt, w=estimate.w if w is None else w)

@@ -74,10 +74,10 @@ class SwitchingFilter:
         self.model, self.filters, self.transition = filters[0].model, tuple(filters), p
         self._first = _stationary(p)
 
-    def start(self, y: ArrayLike, t: float = 0.0) -> SwitchingEstimate:
+    def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> SwitchingEstimate:
         """Estimate at rest at ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.start`."""
         empty = np.full(self.model.n_y, np.nan)
-        return _together([f.start(y, t) for f in self.filters], self._first, empty, float("nan"))
+        return _together([f.start(y, t, w=w) for f in self.filters], self._first, empty, float("nan"))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> SwitchingEstimate:
@@ -133,16 +133,20 @@ class SwitchingFilter:
         """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation; that of the mixture."""
         return self.filters[0].innovation_covariance(estimate, u)
 
-    def update(self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike) -> SwitchingEstimate:
-        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``.
+    def update(
+        self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
+    ) -> SwitchingEstimate:
+        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``; ``w`` as
+        :meth:`ExtendedKalmanFilter.update` takes it.
 
         A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
         """
         modes, probability = self._predicted(self._own(estimate), u_prev)
+        modes = [f.measuring(e, w) for f, e in zip(self.filters, modes, strict=True)]
         if not np.any(np.isfinite(np.asarray(y, dtype=float))):
             return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
         if any(f.lost(e) for f, e in zip(self.filters, modes, strict=True)):
-            return self.start(y, modes[0].t)
+            return self.start(y, modes[0].t, w=modes[0].w)
         return self._assessed(modes, probability, y, u_prev)[0]
 
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
@@ -167,14 +171,14 @@ def _mixed(modes: Sequence[Estimate], share: Array) -> Estimate:
     ).T @ off
     n_x, n_z = first.x.size, first.x.size + first.h.size
     empty = np.full(first.innovation.size, np.nan)
-    return Estimate(first.t, mean[:n_x], mean[n_x:n_z], mean[n_z:], p, empty, float("nan"))
+    return Estimate(first.t, mean[:n_x], mean[n_x:n_z], mean[n_z:], p, empty, float("nan"), w=first.w)
 
 
 def _together(
     modes: Sequence[Estimate], probability: Array, innovation: Array, nis: float
 ) -> SwitchingEstimate:
     m = _mixed(modes, probability)
-    return SwitchingEstimate(m.t, m.x, m.h, m.d, m.P, innovation, nis, tuple(modes), probability)
+    return SwitchingEstimate(m.t, m.x, m.h, m.d, m.P, innovation, nis, tuple(modes), probability, w=m.w)
 
 
 def _stationary(transition: Array) -> Array:

@@ -47,7 +47,8 @@ def trace_model(step: Step) -> dict[str, nn_export.Program]:
     Args:
         step: The model.
     """
-    programs, examples = prior_programs(step.prior, step.dt), _examples(step)
+    substeps = step.substeps if isinstance(step, PriorStep) else 0
+    programs, examples = prior_programs(step.prior, step.dt, substeps), _examples(step)
     if isinstance(step, PriorStep):
         return programs
     for name, method in (("step", "forward"), ("xdot", "xdot")):

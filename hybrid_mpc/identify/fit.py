@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Literal, TypeAlias
 
@@ -22,12 +22,12 @@ from scipy.stats import qmc
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.scales import evenly, robust_spread, within
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.simulation import Simulation, flow_slope, required_substeps, rest_of
+from hybrid_mpc.identify.simulation import Points, Simulation, flow_slope, required_substeps, rest_of, visited
 from hybrid_mpc.identify.smooth import SAMPLE, Smoother, fit_smoother, rough_smoother, unseen_states
-from hybrid_mpc.machine.prior import Equations, Prior
+from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
@@ -58,6 +58,12 @@ FAR = 3.0
 """Errors beyond this many spreads of the data are as bad as this one where candidates are compared."""
 LARGEST = 1e3
 """Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
+COMPARED = 10
+"""Steps at most of the first states alone, where candidates are compared."""
+ALIKE = 1e-3
+"""They end when none takes off more than this share of a candidate's cost."""
+DAMPING, WORST = 1e-3, 1e9
+"""First damping of a step, and the one with which steps are given up."""
 CONVERGED = 0.01
 """A step that takes off less than this share of a window's mean cost is the last of a fit: what would come after it is
 far less than a standard error."""
@@ -81,10 +87,87 @@ Slopes: TypeAlias = Literal["", "x", "all"]
 
 
 @dataclass(frozen=True)
+class FirstStates:
+    """What is known of the first states of a fit's free runs.
+
+    Args:
+        kind: ``"free"``: nothing, they are found with the parameters. ``"known"``: ``values`` are those of a
+            trajectory's own first sample, for example of a machine that rests before it is started; the others are
+            free. ``"measured"``: outputs that are states, by their names, are exact wherever a run starts; the others
+            are free.
+            ``"shared"``: all trajectories start from one state, which is free. ``"warm_up"``: a run's first ``seconds``
+            alone tell its first state, and what follows alone counts, as where models are judged.
+        values: Values [their units] of the states that are known, by name.
+        seconds: Length [s] of the warm-up.
+
+    Raises:
+        InputError: If ``values`` or ``seconds`` do not belong to the kind, or are missing.
+
+    Example:
+        >>> FirstStates("known", {"phi_dot": 0.0}).values
+        {'phi_dot': 0.0}
+    """
+
+    kind: Literal["free", "known", "measured", "shared", "warm_up"] = "free"
+    values: Mapping[str, float] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.kind not in (kinds := ("free", "known", "measured", "shared", "warm_up")):
+            problems.append(f"first states: kind must be one of {', '.join(kinds)}, got {self.kind!r}")
+        if (self.kind == "known") != bool(self.values):
+            problems.append(
+                f"first states: values by name belong to kind 'known' and to it alone, got {self.values}"
+            )
+        if not all(math.isfinite(value) for value in self.values.values()):
+            problems.append(f"first states: values must be finite, got {self.values}")
+        if (self.kind == "warm_up") != (0 < self.seconds < math.inf):
+            problems.append(
+                f"first states: a positive length [s] belongs to kind 'warm_up' and to it alone, got {self.seconds}"
+            )
+        refuse(problems)
+
+    def samples(self, dt: float) -> int:
+        """Samples of the warm-up, none without."""
+        return scales.periods(self.seconds, dt, 2) if self.kind == "warm_up" else 0
+
+    def check(self, prior: Prior, largest_delay: float) -> None:
+        """Refuse what does not fit to a prior.
+
+        Raises:
+            InputError: With all that does not.
+        """
+        names, outputs = ([s.name for s in signals] for signals in (prior.states, prior.outputs))
+        problems = [
+            f"first states: {name!r} is no state of {type(prior).__name__} ({', '.join(names)})"
+            for name in self.values
+            if name not in names
+        ]
+        if self.kind == "measured" and not set(names) & set(outputs):
+            problems.append(
+                f"first states: no output of {type(prior).__name__} ({', '.join(outputs)}) is a state "
+                f"({', '.join(names)}); leave them free"
+            )
+        if self.kind in ("known", "shared") and largest_delay:
+            problems.append(
+                f"first states: a delay costs the first samples of a trajectory, whose state is {self.kind}; leave "
+                "largest_delay 0, or the first states free"
+            )
+        refuse(problems)
+
+
+FREE = FirstStates()
+
+
+@dataclass(frozen=True)
 class OutputWindows:
     """Windows of recordings: ``y`` ``(n, T + 1, n_y)`` with NaN where nothing was measured, ``u`` ``(n, lead + T + 1,
     n_u)``, of which the first ``lead`` come before the window, ``w`` ``(n, T + 1, n_w)``, a guess ``x`` ``(n, n_x)`` of
     the first state, and which samples are censored ``(n, T + 1, n_y)``.
+
+    Of the first states ``known`` ``(n, n_x)`` are as guessed. Windows of one group ``(n,)`` begin in the same state. Of
+    a window the first ``warm`` samples alone tell its first state, and the others count; 0: all do both.
     """
 
     y: Array
@@ -93,11 +176,17 @@ class OutputWindows:
     x: Array
     censored: Array
     lead: int
+    known: NDArray[np.bool_]
+    group: NDArray[np.int_]
+    warm: int = 0
 
-    @property
-    def periods(self) -> int:
-        """Periods T of a window."""
-        return self.y.shape[1] - 1
+    def times(self, n: int) -> OutputWindows:
+        """The same windows, ``n`` times one behind the other."""
+        y, u, w, x, censored, known = (
+            np.concatenate([v] * n) for v in (self.y, self.u, self.w, self.x, self.censored, self.known)
+        )
+        group = np.concatenate([self.group + i * (self.group.max() + 1) for i in range(n)])
+        return OutputWindows(y, u, w, x, censored, self.lead, known, group, self.warm)
 
 
 def cut_outputs(
@@ -106,10 +195,13 @@ def cut_outputs(
     lead: int,
     most: int,
     states: Sequence[Signal] = (),
+    outputs: Sequence[Signal] = (),
+    first: FirstStates = FREE,
 ) -> OutputWindows:
     """At most ``most`` windows of ``periods``, one behind the other, evenly chosen.
 
-    First states are guessed within the ranges of ``states``. Default: as the trajectories have them.
+    First states are guessed within the ranges of ``states``. Default: as the trajectories have them. What is known of
+    them by their names, and by those of the ``outputs``, says ``first``; it needs ``states``.
 
     Raises:
         InputError: If no trajectory is long enough.
@@ -122,6 +214,10 @@ def cut_outputs(
             f"{lead} samples before it needs {periods + lead + 1}"
         )
     chosen = [starts[i] for i in evenly(len(starts), most)]
+    if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
+        begins = [one for one in starts if one[1] == 0][:most]
+        others = [one for one in starts if one[1] > 0]
+        chosen = begins + [others[i] for i in evenly(len(others), most - len(begins))]
 
     def cut(key: str, before: int) -> Array:
         return np.stack([getattr(t, key)[k - before : k + periods + 1] for t, k in chosen])
@@ -130,9 +226,24 @@ def cut_outputs(
     guesses = np.stack([t.x[k] for t, k in chosen])
     if states:
         guesses = np.clip(guesses, [s.lower for s in states], [s.upper for s in states])
+    y, n = cut("y", 0), len(chosen)
+    known, group = np.zeros(guesses.shape, dtype=bool), np.arange(n)
+    begin = np.array([k == 0 for _, k in chosen])
+    if first.kind == "shared" and begin.any():
+        group[begin] = int(np.flatnonzero(begin)[0])
+        guesses[begin] = guesses[begin].mean(axis=0)
+        group = np.unique(group, return_inverse=True)[1]
+    for j, state in enumerate(states):
+        if first.kind == "known" and state.name in first.values:
+            known[begin, j], guesses[begin, j] = True, first.values[state.name]
+        for i, output in enumerate(outputs):
+            if first.kind == "measured" and output.name == state.name:
+                there = np.isfinite(y[:, 0, i])
+                known[there, j], guesses[there, j] = True, y[there, 0, i]
     return OutputWindows(
-        cut("y", 0), cut("u", lead), cut("w", 0), guesses,
-        np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead,
+        y, cut("u", lead), cut("w", 0), guesses,
+        np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead, known, group,
+        min(first.samples(trajectories[0].dt), periods - 1),
     )  # fmt: skip
 
 
@@ -152,6 +263,8 @@ class OutputFit:
         own = [abs(p.value) if p.value else (p.upper - p.lower) for p in self.free]
         self.unit = np.array([*own, *late])
         self._simulations: dict[tuple[int, ...], Simulation] = {}
+        self.points: Points | None = None
+        """Where the recordings go, once their states are known."""
         self.nominal = (
             np.array([*(p.value for p in self.free), *(0.5 * largest_delay for _ in late)]) / self.unit
         )
@@ -184,35 +297,30 @@ class OutputFit:
         return found if found >= NONE * self.dt else 0.0
 
     def substeps(self, theta: Array) -> int:
-        """Sub-steps a period that the stiffness at ``theta`` asks for."""
-        return required_substeps(self.make(self.values(theta)), self.dt)
+        """Sub-steps a period that the stiffness at ``theta`` asks for, at rest and where the recordings go."""
+        return required_substeps(self.make(self.values(theta)), self.dt, self.points)
 
     def outputs(
         self, theta: Array, x: Array, windows: OutputWindows, substeps: int, slopes: Slopes
-    ) -> tuple[Array, Array, Array]:
-        """Outputs ``(n, T + 1, n_y)`` of free runs from ``x``, and their derivatives by ``theta`` and ``x``.
+    ) -> tuple[Array, Array]:
+        """Outputs ``(n, T + 1, n_y)`` of free runs from ``x``, and their derivatives ``(n, T + 1, n_y, columns)``.
 
-        Derivatives by ``theta`` have no columns if only those by ``x`` are asked for; there are none without slopes.
+        Columns are those by ``theta`` and, behind these, by ``x``; by ``x`` alone; or none (``slopes``). Several
+        ``theta`` ``(m, k)`` share the windows evenly, the first ones to the first.
         """
-        n, periods = len(x), windows.periods
-        p = np.append(self._parameters(theta), 0.0)  # the last is a small change of the delay
-        u, w = self._acting(theta, windows), windows.w
-        free = self._free if slopes == "all" else []
-        simulation = self._simulation(tuple(free))
-        given = x, u[:, :periods], w[:, :periods], p, substeps
-        states, by_p, by_x = simulation.by_all(*given) if slopes else (simulation.states(*given), None, None)
-        held = (v.reshape(n * (periods + 1), -1).T for v in (states, u, w))
-        count = n * (periods + 1)
-        y, c, d = (
-            v.full().reshape(v.shape[0], count, -1).swapaxes(0, 1)
-            for v in _outputs(self.prior.equations, count)(*held, p[:-1])
-        )
-        y = y.reshape(n, periods + 1, -1)
-        if by_p is None or by_x is None:
-            return y, np.zeros(0), np.zeros(0)
-        c, d = (v.reshape(n, periods + 1, y.shape[-1], -1) for v in (c, d))
-        d = d[..., free]
-        return y, (c @ by_p + d) * self.unit[: len(free)], c @ by_x
+        thetas, n = np.atleast_2d(theta), len(x)
+        each = n // len(thetas)
+        # the last parameter is a small change of the delay
+        p = np.repeat([[*self.values(one).values(), 0.0] for one in thetas], each, axis=0)
+        acting = [self._acting(one, windows.u[i * each :][:each], windows) for i, one in enumerate(thetas)]
+        simulation = self._simulation(tuple(self._free) if slopes == "all" else ())
+        given = x, np.concatenate(acting), windows.w, p, substeps
+        if not slopes:
+            return simulation.values(*given), np.zeros(0)
+        y, by = simulation.by_all(*given)
+        if slopes == "all":
+            by[..., : len(self.unit)] *= self.unit
+        return y, by
 
     @cached_property
     def _free(self) -> list[int]:
@@ -222,34 +330,21 @@ class OutputFit:
 
     def _simulation(self, free: tuple[int, ...]) -> Simulation:
         if free not in self._simulations:
-            self._simulations[free] = Simulation(_delayed(self.prior.equations.xdot), self.dt, free)
+            xdot, output = (_delayed(f) for f in (self.prior.equations.xdot, self.prior.equations.output))
+            self._simulations[free] = Simulation(xdot, self.dt, free, output)
         return self._simulations[free]
 
-    def _parameters(self, theta: Array) -> Array:
-        return np.array(list(self.values(theta).values()))
-
-    def _acting(self, theta: Array, windows: OutputWindows) -> Array:
+    def _acting(self, theta: Array, commanded: Array, windows: OutputWindows) -> Array:
         """Inputs ``(n, T + 1, 2 n_u)`` that act, means over each period, and their derivative by the delay."""
         n, first = windows.y.shape[1], windows.lead
         if not self.largest:
-            u = windows.u[:, first : first + n]
+            u = commanded[:, first : first + n]
             return np.concatenate([u, np.zeros_like(u)], axis=-1)
         delay = float(theta[-1] * self.unit[-1]) / self.dt
         whole = min(math.floor(delay), first - 1)
-        younger, older = (windows.u[:, first - whole - k : first - whole - k + n] for k in (0, 1))
+        younger, older = (commanded[:, first - whole - k : first - whole - k + n] for k in (0, 1))
         share = delay - whole
         return np.concatenate([(1 - share) * younger + share * older, (older - younger) / self.dt], axis=-1)
-
-    def fit(
-        self, theta: Array, windows: OutputWindows, sizes: Array, iterations: int, *, fixed: bool = False
-    ) -> Fitted:
-        """Fit ``theta`` and the first states to windows, by Levenberg-Marquardt with the states eliminated.
-
-        ``sizes`` ``(n_x,)`` are the states' natural ones: the first states keep to their guess as if it were known to
-        that. ``fixed`` fits the first states alone.
-        """
-        problem = _Shooting(self, windows, sizes, self.substeps(np.clip(theta, self.lower, self.upper)))
-        return problem.solve(np.clip(theta, self.lower, self.upper), iterations, fixed)
 
 
 def fit_by_prediction(
@@ -348,144 +443,265 @@ def _without_jumps(values: Array) -> Array:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit to windows found: ``theta`` with its covariance, and names of what the windows do not identify.
-
-    ``error`` is the root mean square of the outputs' errors, each over its spread and at most ``FAR``.
-    """
+    """What a fit to windows found: ``theta`` with its covariance, and names of what the windows do not identify."""
 
     theta: Array
     covariance: Array
     unidentified: tuple[str, ...]
-    error: float = math.nan
 
 
-class _Shooting:
-    """Windows of outputs as a least-squares problem over ``theta`` and the first states."""
+@dataclass(frozen=True)
+class _Point:
+    """Errors of the outputs at ``theta`` and first states ``x`` ``(n, n_x)``, and their slopes.
 
-    def __init__(self, fit: OutputFit, windows: OutputWindows, sizes: Array, substeps: int) -> None:
-        self.own, self.windows, self.sizes, self.substeps = fit, windows, sizes, substeps
+    ``error`` ``(n, (T + 1) n_y)`` is zero where nothing counts, ``slopes`` ``(n, (T + 1) n_y, columns)`` are by
+    ``theta`` (or not) and by ``x`` in its sizes. ``scale`` ``(n_y,)`` is what an error of each output is counted in.
+    """
+
+    theta: Array
+    x: Array
+    substeps: int
+    scale: Array
+    error: Array
+    slopes: Array
+
+    @property
+    def scales(self) -> Array:
+        """Scale of each error of a window."""
+        return np.tile(self.scale, self.error.shape[1] // len(self.scale))
+
+    def where(self, better: NDArray[np.bool_], other: _Point) -> _Point:
+        """Windows of the other one where it is better."""
+        own, new = ((p.x, p.error, p.slopes) for p in (self, other))
+        x, error, slopes = (
+            np.where(better.reshape(-1, *(1 for _ in v.shape[1:])), n, v)
+            for v, n in zip(own, new, strict=True)
+        )
+        return replace(self, x=x, error=error, slopes=slopes)
+
+
+class Shooting:
+    """Windows of outputs as a least-squares problem over ``theta`` and the first states.
+
+    ``sizes`` ``(n_x,)`` are the states' natural ones: first states keep to their guess as if it were known to that.
+    """
+
+    def __init__(
+        self, fit: OutputFit, windows: OutputWindows, sizes: Array, spread: Array | None = None
+    ) -> None:
+        self.own, self.windows, self.sizes = fit, windows, sizes
         y = windows.y
         self.seen = np.isfinite(y)
-        self.spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
-        self.scale = self.spread
+        own = [robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T]
+        self.spread = np.array(own) if spread is None else spread
+        warm = np.repeat(np.arange(y.shape[1]) < windows.warm, y.shape[2]).astype(float)
+        self.tell: Array = warm if windows.warm else 1.0 - warm
+        self.count: Array = 1.0 - warm
+        members = np.bincount(windows.group)
+        self.members, self.alone = members[windows.group].astype(float), bool((members == 1).all())
+        self._known: dict[bytes, tuple[float, Array]] = {}
 
-    def residual(self, theta: Array, x: Array, slopes: Slopes) -> tuple[Array, Array, Array]:
-        """Errors ``(n, (T + 1) n_y)`` over their scale, zero where nothing was measured; their derivatives."""
-        windows, n = self.windows, len(x)
-        y, by_theta, by_x = self.own.outputs(theta, x, windows, self.substeps, slopes)
-        error = np.nan_to_num(y, nan=np.inf) - np.where(self.seen, windows.y, 0.0)
-        beyond = (windows.censored != 0) & (windows.censored * error > 0)
-        error, counts = error / self.scale, self.seen & ~beyond
-        inside = counts & (np.abs(error) < LARGEST * self.spread / self.scale)
-        limit = LARGEST * self.spread / self.scale
+    def explained(self, thetas: Sequence[Array]) -> list[float]:
+        """How far each ``theta`` explains the windows from the first states that are best for it.
+
+        That is the root mean square of the errors over the outputs' spreads, each at most ``FAR``; infinite where the
+        prior is too stiff for the period.
+        """
+        unknown: dict[int, list[Array]] = {}
+        for theta in {one.tobytes(): one for one in thetas if one.tobytes() not in self._known}.values():
+            try:
+                unknown.setdefault(self.own.substeps(theta), []).append(theta)
+            except InputError:
+                self._known[theta.tobytes()] = math.inf, self.windows.x
+        n = len(self.windows.x)
+        share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
+        for some in unknown.values():  # all at once: windows do not know of each other
+            problem = Shooting(self.own, self.windows.times(len(some)), self.sizes, self.spread)
+            point = problem._states(problem.start(np.stack(some), problem.windows.x, "x"))
+            over = (
+                np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
+                * self.count
+            )
+            for i, theta in enumerate(some):
+                part = slice(i * n, (i + 1) * n)
+                error = float(np.sqrt(np.square(over[part]).sum() / share))
+                self._known[theta.tobytes()] = error, point.x[part]
+        return [self._known[theta.tobytes()][0] for theta in thetas]
+
+    def first_states(self, theta: Array) -> Array:
+        """First states ``(n, n_x)`` that are best for ``theta``."""
+        self.explained([theta])
+        return self._known[theta.tobytes()][1]
+
+    def solve(self, theta: Array, iterations: int = ITERATIONS) -> Fitted:
+        """Fit ``theta`` with the first states, from the best of these on: by the spreads, then by what is left."""
+        theta = np.clip(theta, self.own.lower, self.own.upper)
+        point = self.start(theta, self.first_states(theta), "all")
+        if len(theta):
+            point = self._descend(point, min(iterations, FIRST))
+            for k in range(SCALINGS):
+                rescaled = replace(point, scale=self._left(point.error))
+                if k and (rescaled.scale > SETTLED * point.scale).all():
+                    break
+                point = self._descend(rescaled, iterations)
+        return Fitted(point.theta, *self._covariance(point))
+
+    def start(self, theta: Array, x: Array, slopes: Slopes) -> _Point:
+        """Errors at ``theta`` from ``x``, each output's over its spread."""
+        nothing = np.zeros(0)
+        substeps = max(self.own.substeps(one) for one in np.atleast_2d(theta))
+        empty = _Point(theta, x, substeps, self.spread, nothing, nothing)
+        return self._at(empty, theta, x, slopes)
+
+    def _at(self, before: _Point, theta: Array, x: Array, slopes: Slopes) -> _Point:
+        """Another point."""
+        windows, seen, n, limit = self.windows, self.seen, len(x), LARGEST * self.spread
+        y, by = self.own.outputs(theta, x, windows, before.substeps, slopes)
+        error = np.nan_to_num(y, nan=np.inf) - np.where(seen, windows.y, 0.0)
+        counts = seen & ~((windows.censored != 0) & (windows.censored * error > 0))
+        inside = counts & (np.abs(error) < limit)
         error = np.where(counts, np.clip(error, -limit, limit), 0.0).reshape(n, -1)
-        if not slopes:
-            return error, by_theta, by_x
-        by_theta, by_x = (
-            np.where(inside[..., None], v / self.scale[:, None], 0.0).reshape(n, error.shape[1], -1)
-            for v in (by_theta, by_x)
-        )
-        return error, np.nan_to_num(by_theta), np.nan_to_num(by_x * self.sizes)
+        by[~inside] = 0.0
+        by[..., -x.shape[1] :] *= np.where(self.windows.known, 0.0, self.sizes)[:, None, None]
+        by = np.nan_to_num(by, copy=False).reshape(n, error.shape[1], by.shape[-1])
+        return replace(before, theta=theta, x=x, error=error, slopes=by)
 
-    def cost(self, error: Array, moved: Array) -> float:
-        """Robust sum of squares, and what the first states moved from their guess, in their sizes."""
+    def _costs(self, point: _Point) -> Array:
+        """Robust sum of squares of each group of windows that counts for its first state, with what this moved."""
+        c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
+        own = 2 * c2 * (np.sqrt(1 + np.square(point.error / point.scales) / c2) - 1)
+        return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
+
+    def _cost(self, point: _Point) -> float:
+        """What ``theta`` is fitted by: the same sum, or of a warm-up what comes behind it."""
+        if not self.windows.warm:
+            return float(self._costs(point).sum())
         c2 = OUTLIERS**2
-        own = 2 * c2 * (np.sqrt(1 + np.square(error) / c2) - 1)
-        return float(own.sum() + np.square(moved).sum())
+        own = 2 * c2 * (np.sqrt(1 + np.square(point.error / point.scales) / c2) - 1)
+        return float((own * self.count).sum())
 
-    def rescaled(self, error: Array) -> None:
-        """Scale each output by what is left of it: outputs of any unit count alike, outliers little."""
-        shape = self.windows.y.shape
-        own = error.reshape(shape) * self.scale
-        left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(shape[-1])]
+    def _moved(self, point: _Point) -> Array:
+        """What first states moved from their guess, in their sizes."""
+        return np.asarray((point.x - self.windows.x) / self.sizes)
+
+    def _grouped(self, values: Array) -> Array:
+        """Sums over the windows of each group."""
+        if self.alone:
+            return values
+        total = np.zeros((int(self.windows.group.max()) + 1, *values.shape[1:]))
+        np.add.at(total, self.windows.group, values)
+        return total
+
+    def _left(self, error: Array) -> Array:
+        """Size of what is left of each output: outputs of any unit count alike, outliers little."""
+        own = error.reshape(self.windows.y.shape)
+        left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
         whole = np.array([float(np.sqrt(np.mean(within(v) ** 2))) if len(v) else 0.0 for v in left])
         robust = np.maximum(robust, 0.1 * whole)  # where most samples are met exactly, the rest is no outlier
-        self.scale = np.maximum(robust, 1e-9 * self.spread)
+        return np.maximum(robust, 1e-9 * self.spread)
 
-    def solve(self, theta: Array, iterations: int, fixed: bool) -> Fitted:
-        """Fit the first states alone, then ``theta`` with them: by the spreads, then by what is left."""
-        n_theta = 0 if fixed else len(theta)
-        theta, x = self._descend(theta, self.windows.x, 0, iterations if fixed else FIRST)
-        if n_theta:
-            theta, x = self._descend(theta, x, n_theta, min(iterations, FIRST))
-            for k in range(SCALINGS):
-                before = self.scale
-                self.rescaled(self.residual(theta, x, "")[0])
-                if k and (self.scale > SETTLED * before).all():
-                    break
-                theta, x = self._descend(theta, x, n_theta, iterations)
-        error, by_theta, by_x = self.residual(theta, x, "all" if n_theta else "x")
-        covariance, unidentified = self._covariance(error, by_theta[..., :n_theta], by_x)
-        count = max(1, int(self.seen.sum()))
-        over = np.clip(error.reshape(self.windows.y.shape) * self.scale / self.spread, -FAR, FAR)
-        return Fitted(theta, covariance, unidentified, float(np.sqrt(np.square(over).sum() / count)))
+    def _states(self, point: _Point) -> _Point:
+        """First states at a ``theta``, each window by itself: with a damping of its own, until all have settled."""
+        cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
+        damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
+        for _ in range(COMPARED):
+            xx, _, _, gx, _ = self._normal(point)
+            moved = -np.linalg.solve(xx * (1 + damping * eye), gx[..., None])[..., 0]
+            trial = self._at(point, point.theta, point.x + moved[group] * self.sizes, "x")
+            new = self._costs(trial)
+            better, promised = new < cost, -2.0 * np.sum(gx * moved, axis=1)
+            gain = np.where(better, cost - new, np.where(damping[:, 0, 0] < WORST, promised, 0.0))
+            point = point.where(better[group], trial)
+            cost = np.minimum(cost, new)
+            damping = damping * np.where(better, 0.2, 5.0)[:, None, None]
+            gains, costs = (v.reshape(candidates, -1).sum(axis=1) for v in (gain, cost))
+            if (gains <= ALIKE * costs).all():
+                break
+        return point
 
-    def _descend(self, theta: Array, x: Array, n_theta: int, iterations: int) -> tuple[Array, Array]:
-        """Steps of Levenberg and Marquardt, of the first states and of ``theta`` where ``n_theta`` is not 0."""
-        slopes: Slopes = "all" if n_theta else "x"
-        guess, damping = self.windows.x, 1e-3
-        error, by_theta, by_x = self.residual(theta, x, slopes)
-        cost = self.cost(error, (x - guess) / self.sizes)
+    def _descend(self, point: _Point, iterations: int) -> _Point:
+        """Steps of Levenberg and Marquardt, of ``theta`` with the first states."""
+        damping, cost, n = DAMPING, self._cost(point), len(point.x)
         for _ in range(iterations):
-            normal = self._normal(error, by_theta[..., :n_theta], by_x, (x - guess) / self.sizes)
-            better, last = False, False
-            for _ in range(6):
-                step, moved = self._step(normal, damping, theta, n_theta)
-                last = self._promised(normal, step[:n_theta], moved) < CONVERGED * cost / len(x)
-                trial = np.clip(theta + step, self.own.lower, self.own.upper)
-                x_trial = x + moved * self.sizes
-                tried, _, _ = self.residual(trial, x_trial, "")
-                new = self.cost(tried, (x_trial - guess) / self.sizes)
-                if new < cost:
-                    better = True
-                    damping = max(damping / 5, 1e-9)
-                    break
+            better = False
+            normal = self._behind(point) if self.windows.warm else self._normal(point)
+            while not better and damping < WORST:
+                step, moved, promised = self._step(normal, damping, point.theta)
+                last = promised < CONVERGED * cost / n
+                theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
+                x = point.x + moved[self.windows.group] * self.sizes
+                if self.windows.warm:  # the warm-up tells the first states of every theta
+                    x = self._states(self._at(point, theta, x, "x")).x
+                trial = self._at(point, theta, x, "all")
+                new = self._cost(trial)
+                better = new < cost
+                damping *= 0.2 if better else 5.0
                 if last:
                     break
-                damping = min(damping * 5, 1e9)
             if not better:
                 break
-            gain, theta, x, cost = cost - new, trial, x_trial, new
-            if last or gain < CONVERGED * cost / len(x):
+            gain, point, cost = cost - new, trial, new
+            if last or gain < CONVERGED * cost / n:
                 break
-            error, by_theta, by_x = self.residual(theta, x, slopes)
-        return theta, x
+        return point
 
-    def _weighted(self, error: Array, *slopes: Array) -> tuple[Array, ...]:
+    def _weighted(self, point: _Point) -> Array:
+        """Slopes and, behind them, errors, over their scale and by the root of their robust weight."""
+        error = point.error / point.scales
         root = (1 + np.square(error / OUTLIERS)) ** -0.25
-        return root * error, *(root[..., None] * s for s in slopes)
+        slopes = point.slopes * (root / point.scales)[..., None]
+        return np.concatenate([slopes, (root * error)[..., None]], axis=-1)
 
-    def _normal(self, error: Array, by_theta: Array, by_x: Array, moved: Array) -> tuple[Array, ...]:
-        """Blocks of the normal equations, window by window."""
-        error, b, a = self._weighted(error, by_theta, by_x)
-        at, bt = a.swapaxes(1, 2), b.swapaxes(1, 2)
-        eye = np.eye(a.shape[-1])
+    def _normal(self, point: _Point) -> tuple[Array, ...]:
+        """Blocks of the normal equations: of ``x`` and of both by groups, of ``theta``, and the gradients."""
+        rows, n_x = self._weighted(point) * np.sqrt(self.tell)[:, None], point.x.shape[1]
+        every = rows.swapaxes(1, 2) @ rows
+        t, x = slice(0, -1 - n_x), slice(-1 - n_x, -1)
+        moved = self._moved(point) / self.members[:, None]
         return (
-            at @ a + eye, at @ b, bt @ b,
-            (at @ error[..., None])[..., 0] + moved, (bt @ error[..., None])[..., 0],
+            self._grouped(every[:, x, x]) + np.eye(n_x), self._grouped(every[:, x, t]), every[:, t, t].sum(axis=0),
+            self._grouped(every[:, x, -1] + moved), every[:, t, -1].sum(axis=0),
         )  # fmt: skip
 
-    @staticmethod
-    def _promised(normal: tuple[Array, ...], step: Array, moved: Array) -> float:
-        """How far a step takes the cost down to first order."""
-        _, _, _, gx, gt = normal
-        return -2.0 * float(gt.sum(0) @ step + np.sum(gx * moved))
+    def _eliminated(self, point: _Point) -> tuple[Array, Array, Array]:
+        """Slopes by ``theta`` and errors of what counts, with first states that follow, by how much these do."""
+        rows, n_x = self._weighted(point), point.x.shape[1]
+        b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
+        at = (a * self.tell[:, None]).swapaxes(1, 2)
+        xx = self._grouped(at @ a) + np.eye(n_x)
+        follow = np.linalg.solve(xx, self._grouped(at @ np.concatenate([b, error], axis=-1)))
+        left = np.concatenate([b, error], axis=-1) - a @ follow[self.windows.group]
+        left *= self.count[:, None]
+        return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64)
 
-    def _step(
-        self, normal: tuple[Array, ...], damping: float, theta: Array, n_theta: int
-    ) -> tuple[Array, Array]:
-        """Step of ``theta``, of which those at a bound that would leave it rest, and of the first states."""
+    def _behind(self, point: _Point) -> tuple[Array, ...]:
+        """As :meth:`_normal`, of what comes behind the warm-up; first states follow from the warm-up alone."""
+        b, error, follow = self._eliminated(point)
+        n_x = point.x.shape[1]
+        return (
+            np.broadcast_to(np.eye(n_x), (len(follow), n_x, n_x)), follow[..., :-1],
+            (b.swapaxes(1, 2) @ b).sum(axis=0), follow[..., -1],
+            (b.swapaxes(1, 2) @ error[..., None])[..., 0].sum(axis=0),
+        )  # fmt: skip
+
+    def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
+        """Step of ``theta``, of which those at a bound that would leave it rest, and of the first states by groups; and
+        how far it takes the cost down to first order.
+        """
         xx, xt, tt, gx, gt = normal
-        xx = xx * (1 + damping * np.eye(xx.shape[-1]))
+        reduced, slope = tt, gt
+        if not self.windows.warm:
+            xx = xx * (1 + damping * np.eye(xx.shape[-1]))
         solved = np.linalg.solve(xx, np.concatenate([xt, gx[..., None]], axis=-1))
         by_theta, own = solved[..., :-1], solved[..., -1]
-        reduced = (tt - xt.swapaxes(1, 2) @ by_theta).sum(0)
-        slope = (gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0]).sum(0)
-        step, free = np.zeros(len(theta)), np.arange(n_theta)
-        reduced = reduced + damping * np.diag(np.maximum(np.diag(tt.sum(0)), 1e-30))
-        for _ in range(n_theta + 1):
-            step[:n_theta] = 0.0
+        if not self.windows.warm:
+            reduced = tt - (xt.swapaxes(1, 2) @ by_theta).sum(axis=0)
+            slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
+        step, free = np.zeros(len(theta)), np.arange(len(theta))
+        reduced = reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30))
+        for _ in range(len(theta) + 1):
+            step[:] = 0.0
             if len(free):
                 step[free] = -np.linalg.lstsq(reduced[np.ix_(free, free)], slope[free], rcond=1e-14)[0]
             low = (theta[free] <= self.own.lower[free]) & (step[free] < 0)
@@ -493,20 +709,17 @@ class _Shooting:
             if not (low | high).any():
                 break
             free = free[~(low | high)]
-        return step, -own - (by_theta @ step[:n_theta, None])[..., 0]
+        moved = -own - (by_theta @ step[:, None])[..., 0]
+        of_states = 0.0 if self.windows.warm else float(np.sum(gx * moved))
+        return step, moved, -2.0 * (float(gt @ step) + of_states)
 
-    def _covariance(self, error: Array, by_theta: Array, by_x: Array) -> tuple[Array, tuple[str, ...]]:
+    def _covariance(self, point: _Point) -> tuple[Array, tuple[str, ...]]:
         """Covariance of ``theta``, from the scatter of the windows' slopes: errors within one are no white noise.
 
         Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters.
         """
-        root = (1 + np.square(error / OUTLIERS)) ** -0.25
-        error, b, a = self._weighted(error, by_theta, by_x)
-        at = a.swapaxes(1, 2)
-        known = np.linalg.solve(
-            at @ a + np.eye(a.shape[-1]), at @ np.concatenate([b, error[..., None]], axis=-1)
-        )
-        b, error = b - a @ known[..., :-1], error - (a @ known[..., -1:])[..., 0]
+        b, error, _ = self._eliminated(point)
+        root = (1 + np.square(point.error / point.scales / OUTLIERS)) ** -0.25
         information = (b.swapaxes(1, 2) @ b).sum(0)
         told = np.flatnonzero(np.diag(information) > 0)  # of the others the outputs say nothing at all
         unknown = set(range(len(information))) - set(told.tolist())
@@ -540,6 +753,7 @@ def fit_prior(
     largest_delay: float = 0.0,
     start: Mapping[str, float] | None = None,
     time_unit: float | None = None,
+    first_states: FirstStates = FREE,
     on_progress: Progress = lambda done, total, text: None,
 ) -> PriorFit:
     """Fit parameters and delay to the measured outputs over longer and longer windows, and find what smooths states.
@@ -563,6 +777,7 @@ def fit_prior(
         start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
             fixed parameters are left out. Default: none.
         time_unit: The machine's second [s]. Default: that of the training trajectories.
+        first_states: What is known of the states that free runs start from. Default: nothing, they are free.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
@@ -582,6 +797,7 @@ def fit_prior(
     fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
     check_observable(fit.prior, dt, unit)
+    first_states.check(fit.prior, largest_delay)
     if _longest(train) < fit.lead + 3:
         raise InputError(
             f"no recording is long enough to fit {type(fit.prior).__name__} to: the longest has {_longest(train)} "
@@ -594,30 +810,39 @@ def fit_prior(
     on_progress(0, total, "smoothing by the nominal prior")
     smoother = rough_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
     sizes = np.array(smoother.sizes.x)
-    guesses = [with_states(part, smoother, fit.delay(fit.nominal)) for part in (train, valid)]
+    every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
+    fit.points = visited(every)
+    if fit.substeps(fit.nominal) > smoother.substeps:  # stiff where the recordings go
+        smoother = replace(smoother, substeps=fit.substeps(fit.nominal))
+        every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
+        fit.points = visited(every)
+    guesses = every[: len(train)], every[len(train) :]
     found: list[tuple[str, Fitted]] = []
-    theta, states = fit.nominal, fit.prior.states
+    theta = fit.nominal
+
+    def problem_of(part: Sequence[Trajectory], periods: int, most: int = WINDOWS) -> Shooting:
+        known = fit.prior.states, fit.prior.outputs, first_states
+        return Shooting(fit, cut_outputs(part, periods, fit.lead, most, *known), sizes)
+
+    problems = [problem_of(guesses[0], periods) for periods in lengths]
     if len(theta):
         on_progress(1, total, "several starts")
-        theta = _best_start(fit, guesses[0], lengths, sizes, start)
-        for i, periods in enumerate(lengths):
-            on_progress(2 + i, total, f"free runs of {periods * dt:.3g} s")
-            windows = cut_outputs(guesses[0], periods, fit.lead, WINDOWS, states)
+        short, long = (problem_of(guesses[0], lengths[i], WINDOWS // 2) for i in (0, -1))
+        theta = _best_start(fit, short, long, start)
+        for i, (periods, problem) in enumerate(zip(lengths, problems, strict=True)):
+            name = f"free runs of {periods * dt:.3g} s"
+            on_progress(2 + i, total, name)
             known = [
                 fit.nominal,
                 theta,
                 *(f.theta for _, f in found[-1:]),
             ]  # short windows may have led astray
-            errors = [_error(fit, one, [windows], sizes) for one in known]
-            nearest, name = known[int(np.argmin(errors))], f"free runs of {periods * dt:.3g} s"
-            found.append((name, fit.fit(nearest, windows, sizes, ITERATIONS)))
-    scored = [
-        cut_outputs(part, lengths[-1], fit.lead, WINDOWS, states)
-        for part in guesses
-        if _longest(part) > lengths[-1] + fit.lead
-    ]
+            found.append((name, problem.solve(known[int(np.argmin(problem.explained(known)))])))
+    judges = [problems[-1]] if _longest(guesses[0]) > lengths[-1] + fit.lead else []
+    if _longest(guesses[1]) > lengths[-1] + fit.lead:
+        judges.append(problem_of(guesses[1], lengths[-1]))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
-    scores = [_error(fit, c.theta, scored, sizes) for _, c in candidates]
+    scores = _errors_of([c.theta for _, c in candidates], judges)
     on_progress(total - 1, total, "smoothing by the fitted prior")
 
     def best() -> tuple[Fitted, Smoother]:
@@ -627,7 +852,8 @@ def fit_prior(
             )
         chosen = candidates[int(np.argmin(scores))][1]
         acting = shifted([*train, *valid], fit.delay(chosen.theta))
-        return chosen, fit_smoother(make(fit.values(chosen.theta)), acting, dt, time_unit=unit)
+        fitted, substeps = make(fit.values(chosen.theta)), fit.substeps(chosen.theta)
+        return chosen, fit_smoother(fitted, acting, dt, time_unit=unit, substeps=substeps)
 
     chosen, smoother = best()
     acting = shifted(train, fit.delay(chosen.theta))
@@ -635,7 +861,7 @@ def fit_prior(
     if answered > 1.0 and fit.free:
         on_progress(total - 1, total, "predictions, as inputs answer to the outputs")
         candidates.append(("predictions", fit_by_prediction(fit, chosen.theta, train, smoother)))
-        scores.append(_error(fit, candidates[-1][1].theta, scored, sizes))
+        scores += _errors_of([candidates[-1][1].theta], judges)
         if int(np.argmin(scores)) == len(scores) - 1:
             chosen, smoother = best()
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
@@ -643,7 +869,7 @@ def fit_prior(
     return PriorFit(
         fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen, answered), stages,
         _correlations(fit, chosen), fit.delay(chosen.theta), smoother.sigma, smoother.walk, smoother.sizes,
-        smoother.fading,
+        smoother.fading, smoother.substeps,
     )  # fmt: skip
 
 
@@ -662,15 +888,18 @@ def refit(
     """
     known = smoothed(make, fit, trajectories, dt)
     own, sizes, stages = OutputFit(make, dt), np.array(fit.smoother(make(fit.values), dt).sizes.x), []
+    own.points = visited(known)
     found = Fitted(own.scaled(fit.values), np.zeros((0, 0)), ())
     for length in lengths:
         periods = min(scales.periods(length, dt, 2), _longest(known) - 1)
         windows = cut_outputs(known, periods, 0, WINDOWS)
-        found = own.fit(found.theta, windows, sizes, ITERATIONS)
-        stages.append({"stage": f"free runs of {length:g} s", "validation_error": found.error})
+        problem = Shooting(own, windows, sizes)
+        found = problem.solve(found.theta)
+        (error,) = problem.explained([found.theta])
+        stages.append({"stage": f"free runs of {length:g} s", "validation_error": error})
     return replace(
         fit, values=own.values(found.theta), standard_errors=_errors(own, found), warnings=_warnings(own, found),
-        stages=tuple(stages), correlations=_correlations(own, found),
+        stages=tuple(stages), correlations=_correlations(own, found), substeps=own.substeps(found.theta),
     )  # fmt: skip
 
 
@@ -681,7 +910,9 @@ def smoothed(
     return fit.smoother(make(fit.values), dt).smooth(shifted(trajectories, fit.delay))
 
 
-def parameter_variance(prior: Prior, covariance: Array, x: Array, u: Array, w: Array, dt: float) -> Array:
+def parameter_variance(
+    prior: Prior, covariance: Array, x: Array, u: Array, w: Array, dt: float, substeps: int = 0
+) -> Array:
     """Variance of the outputs of free runs by that of the parameters ``(b, n, n_y)`` [output units^2].
 
     Args:
@@ -691,18 +922,11 @@ def parameter_variance(prior: Prior, covariance: Array, x: Array, u: Array, w: A
         u: Inputs ``(b, n, n_u)``.
         w: Disturbances ``(b, n, n_w)``.
         dt: Period [s].
+        substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
     """
-    b, n = u.shape[:2]
-    simulation = Simulation(prior.equations.xdot, dt, range(len(prior.parameters)))
-    states, by_p = simulation.by_parameters(x, u[:, :-1], w[:, :-1], prior.p, required_substeps(prior, dt))
-    held = (v.reshape(b * n, -1).T for v in (states, np.concatenate([u, np.zeros_like(u)], axis=-1)))
-    flat_w = w.reshape(b * n, w.shape[-1]).T
-    y, c, d = (
-        v.full().reshape(v.shape[0], b * n, -1).swapaxes(0, 1)
-        for v in _outputs(prior.equations, b * n)(*held, flat_w, prior.p)
-    )
-    slope = c @ by_p.reshape(b * n, -1, by_p.shape[-1]) + d[..., : len(prior.parameters)]
-    variance = np.einsum("kip,pq,kiq->ki", slope, covariance, slope).reshape(b, n, y.shape[1])
+    simulation = Simulation(prior.equations.xdot, dt, range(len(prior.parameters)), prior.equations.output)
+    _, slope = simulation.by_parameters(x, u, w, prior.p, substeps or required_substeps(prior, dt))
+    variance = np.einsum("bkip,pq,bkiq->bki", slope, covariance, slope)
     return np.asarray(np.nan_to_num(np.maximum(variance, 0.0), nan=np.inf))
 
 
@@ -722,9 +946,9 @@ def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
 
 
 def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: float) -> list[Trajectory]:
-    """Trajectories with smoothed states but the inputs as they were commanded, without the samples a delay costs."""
+    """Trajectories with states smoothed roughly, inputs as commanded, and without the samples that a delay costs."""
     made = []
-    for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay)), strict=True):
+    for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay), sweeps=1), strict=True):
         made.append(replace(t.part(slice(len(t.t) - len(s.t), None)), x=s.x, xdot=s.xdot))
     return made
 
@@ -752,17 +976,8 @@ def _lengths(train: Sequence[Trajectory], dt: float, unit: float, length: float,
     return sorted(dict.fromkeys(fitting)) or [max(2, longest // 2)]
 
 
-def _best_start(
-    fit: OutputFit,
-    train: Sequence[Trajectory],
-    lengths: Sequence[int],
-    sizes: Array,
-    start: Mapping[str, float] | None,
-) -> Array:
+def _best_start(fit: OutputFit, short: Shooting, long: Shooting, start: Mapping[str, float] | None) -> Array:
     """What a few steps over short windows find from several starts: what explains the longest windows best."""
-    windows, long = (
-        cut_outputs(train, lengths[i], fit.lead, WINDOWS // 2, fit.prior.states) for i in (0, -1)
-    )
     starts = [fit.nominal, *([] if start is None else [fit.scaled(start)])]
     if len(fit.nominal):
         between = qmc.Sobol(len(fit.nominal), seed=0).random_base2(3)[:STARTS]
@@ -770,19 +985,18 @@ def _best_start(
     found = []
     for one in starts:
         try:
-            found.append(fit.fit(one, windows, sizes, START_ITERATIONS))
+            found.append(short.solve(one, START_ITERATIONS).theta)
         except InputError:  # too stiff for the period there
             continue
     if not found:
         return fit.nominal
-    errors = [_error(fit, f.theta, [long], sizes) for f in found]
-    return found[int(np.argmin([e if math.isfinite(e) else math.inf for e in errors]))].theta
+    return found[int(np.argmin(long.explained(found)))]
 
 
-def _error(fit: OutputFit, theta: Array, parts: Sequence[OutputWindows], sizes: Array) -> float:
-    """Root mean square of the outputs' errors over their spread, with the first states free, over several parts."""
-    found = [fit.fit(theta, part, sizes, ITERATIONS, fixed=True).error for part in parts]
-    return float(np.sqrt(np.average(np.square(found), weights=[part.y.size for part in parts])))
+def _errors_of(thetas: Sequence[Array], parts: Sequence[Shooting]) -> list[float]:
+    """Root mean squares of the outputs' errors over their spread, with the first states free, over several parts."""
+    squares = np.square([part.explained(thetas) for part in parts])
+    return np.sqrt(np.average(squares, axis=0, weights=[part.windows.y.size for part in parts])).tolist()
 
 
 def _errors(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
@@ -822,25 +1036,10 @@ def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0) -> tuple[st
     return tuple(warnings)
 
 
-@lru_cache(maxsize=32)
-def _delayed(xdot: ca.Function) -> ca.Function:
-    """``xdot`` of inputs ``[u, slope by the delay]`` and parameters ``[p, change of the delay]``."""
-    x, u, w, p = (ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in range(4))
-    slope, change = ca.SX.sym("slope", u.shape[0]), ca.SX.sym("change")
-    rates = xdot(x, u + change * slope, w, p)
-    names = [xdot.name_in(i) for i in range(4)]
-    return ca.Function("xdot", [x, ca.vertcat(u, slope), w, ca.vertcat(p, change)], [rates], names, ["xdot"])
-
-
 @lru_cache(maxsize=64)
-def _outputs(equations: Equations, n: int) -> ca.Function:
-    """Outputs at ``n`` points and their slopes by state, and by parameters and delay; inputs as :func:`_delayed` has
-    them.
-    """
-    f = equations.output
+def _delayed(f: ca.Function) -> ca.Function:
+    """``f(x, u, w, p)`` of inputs ``[u, slope by the delay]`` and parameters ``[p, change of the delay]``."""
     x, u, w, p = (ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4))
-    slope, y = ca.SX.sym("slope", u.shape[0]), f(x, u, w, p)
-    by_p = ca.horzcat(ca.jacobian(y, p), ca.jacobian(y, u) @ slope)
-    values = [ca.densify(v) for v in (y, ca.jacobian(y, x), by_p)]
-    one = ca.Function("output", [x, ca.vertcat(u, slope), w, p], values)
-    return one.map("outputs", "serial", n, [3], [])
+    slope, change = ca.SX.sym("slope", u.shape[0]), ca.SX.sym("change")
+    given = [x, ca.vertcat(u, slope), w, ca.vertcat(p, change)]
+    return ca.Function("late", given, [f(x, u + change * slope, w, p)])

@@ -13,14 +13,17 @@ from hybrid_mpc.kit.artifact import INPUTS, OUTPUTS, BalanceInfo, ModelInfo
 from hybrid_mpc.machine.prior import POINT, Prior
 
 
-def prior_programs(prior: Prior, dt: float) -> dict[str, nn_export.Program]:
-    """Programs of the prior alone: ``step`` and ``xdot`` with no hidden state, ``output``, and its balances."""
+def prior_programs(prior: Prior, dt: float, substeps: int = 0) -> dict[str, nn_export.Program]:
+    """Programs of the prior alone: ``step`` and ``xdot`` with no hidden state, ``output``, and its balances.
+
+    A period is integrated in ``substeps``. Default 0: as many as the prior needs at rest.
+    """
     equations = prior.equations
     names = dict(zip(POINT, (prior.states, prior.inputs, prior.disturbances, prior.parameters), strict=True))
     x, u, w, p = (ca.SX.sym(key, len(signals)) for key, signals in names.items())
     h = ca.SX.sym("h", 0)
     rates = equations.xdot(x, u, w, p)
-    x_next = stepped(equations.xdot, x, u, w, p, dt, required_substeps(prior, dt))
+    x_next = stepped(equations.xdot, x, u, w, p, dt, substeps or required_substeps(prior, dt))
     given, outputs = (
         {"step": [x, h, u, w, p], "xdot": [x, h, u, w, p]},
         {"step": [x_next, h], "xdot": [rates]},
@@ -58,4 +61,5 @@ def model_info(prior: Prior, dt: float, covariance: Sequence[Sequence[float]] = 
         tuple(replace(spec, value=values[spec.name]) for spec in prior.parameters),
         covariance=tuple(tuple(row) for row in covariance), balances=balances_of(prior),
         disturbances=prior.disturbances, nominal_w=() if point is None else point.w,
+        nominal_x=() if point is None else point.x, nominal_u=() if point is None else point.u,
     )  # fmt: skip

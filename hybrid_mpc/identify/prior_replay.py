@@ -19,6 +19,7 @@ from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.networks import StackedGRU
+from hybrid_mpc.identify.simulation import required_substeps, visited
 from hybrid_mpc.identify.step import PriorStep, RecurrentStep
 from hybrid_mpc.machine.prior import Prior
 
@@ -74,7 +75,9 @@ def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -
     drawn = rng.integers(len(u), size=(-(-length // HELD), RUNS))
     inputs, disturbances = (z[drawn].repeat(HELD, axis=0)[:length] for z in (u, w))
     far = np.where(angles, np.inf, AWAY * (high - low))
-    states = _prior_runs(prior, training[0].dt, start, (inputs, disturbances), (low - far, high + far))
+    dt = training[0].dt
+    step = PriorStep(prior, dt, required_substeps(prior, dt, visited(training)))
+    states = _prior_runs(step, start, (inputs, disturbances), (low - far, high + far))
     places = _Places(angles, np.sqrt(np.mean(x**2, axis=0)).clip(1e-9))
     distance, _ = cKDTree(places(x)).query(places(states.reshape(-1, x.shape[1])))
     weight = 1.0 - np.exp(-((distance.reshape(states.shape[:2]) / NEAR) ** 2))
@@ -92,10 +95,10 @@ def prior_replay_penalty(step: RecurrentStep, prior_replay: PriorReplay) -> Tens
 
 
 def _prior_runs(
-    prior: Prior, dt: float, start: Array, held: tuple[Array, Array], bounds: tuple[Array, Array]
+    step: PriorStep, start: Array, held: tuple[Array, Array], bounds: tuple[Array, Array]
 ) -> Array:
     """States ``(n, RUNS, n_x)`` of the prior alone; a run that would leave the bounds stays where it is."""
-    step, none = PriorStep(prior, dt), torch.zeros(len(start), 0, dtype=torch.float64)
+    none = torch.zeros(len(start), 0, dtype=torch.float64)
     low, high = (torch.tensor(bound) for bound in bounds)
     x, states = torch.tensor(start), []
     with torch.no_grad():

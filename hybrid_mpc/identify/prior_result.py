@@ -37,6 +37,8 @@ class PriorFit:
         walk: Standard deviation of the unexplained rates' change per period that it assumes, by corrected state.
         sizes: Natural sizes of the signals that the smoother assumes.
         fading: What is left of an unexplained rate after a period, where nothing tells of it [-].
+        substeps: Runge-Kutta sub-steps a period that the fitted prior needs where the recordings go. Default 0: as many
+            as it needs at rest.
     """
 
     values: dict[str, float]
@@ -49,12 +51,13 @@ class PriorFit:
     walk: tuple[float, ...] = ()
     sizes: Sizes | None = None
     fading: float = 1.0
+    substeps: int = 0
 
     def smoother(self, prior: Prior, dt: float) -> Smoother:
         """The smoother around the fitted prior."""
         if self.sizes is None:
             raise InputError("this fit has no smoother: it was not made by fit_prior")
-        return Smoother(prior, dt, self.sigma, self.walk, self.sizes, self.fading)
+        return Smoother(prior, dt, self.sigma, self.walk, self.sizes, self.fading, self.substeps)
 
     @property
     def best(self) -> str:

@@ -7,7 +7,7 @@ a product with them and the network's own few operations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybrid_mpc.identify.networks import StackedGRU, gate_matrices, step_back
+from nn_export.vectorised import vectorised
 
 Array = NDArray[np.float64]
 
@@ -43,9 +44,9 @@ class Rollout:
         x_next = flow(x, c, u, w, p)
         after, given = (x_next, u_next, w_next, p), [x, c, u, w, u_next, w_next, p]
         by_all = ca.jacobian(x_next, ca.vertcat(x, c, p))
-        self._first = _Mapped(point, [seen, *slopes(*point)])
-        self._period = _Mapped(given, [x_next, features(*after)])
-        self._period_and_slopes = _Mapped(given, [x_next, features(*after), by_all, *slopes(*after)])
+        self._first = _SideBySide(point, [seen, *slopes(*point)])
+        self._period = _SideBySide(given, [x_next, features(*after)])
+        self._period_and_slopes = _SideBySide(given, [x_next, features(*after), by_all, *slopes(*after)])
 
     def __call__(self, network: StackedGRU, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor) -> Tensor:
         """States ``(T + 1, networks, n, n_x)`` from ``x`` ``(networks, n, n_x)`` and ``h`` ``(networks, n, z)``.
@@ -66,38 +67,38 @@ class Rollout:
         recurrent, direct, w_out, b_out = weights
         (networks, n, z), periods, count = h.shape, len(u), x.shape[0] * x.shape[1]
         run = _Run.empty(self, periods, networks, n, z, p.shape[-1], slopes)
-        run.x[0], run.rows[:, 0, :, :z] = x, h
-        run.rows[..., -1] = 1.0
-        u_at, w_at = (
-            torch.cat([a, a[-1:]]).flatten(1, 2).numpy() for a in (u, w)
-        )  # the last period's goes on
-        p_at, x_at, c_at = p.flatten(0, 1).numpy(), run.x.flatten(1, 2).numpy(), np.empty((count, self.n_c))
-        c = torch.from_numpy(c_at).view(networks, n, self.n_c)
-        seen = torch.empty(networks, n, self.n_in, dtype=x.dtype)
+        run.rows[:, 0, :, :z], run.rows[..., -1] = h, 1.0
+        run.x[0] = x.flatten(0, 1).T
+        # runs are the last axis for CasADi; the last period's inputs go on
+        u_at, w_at = (torch.cat([a, a[-1:]]).flatten(1, 2).mT.contiguous().numpy() for a in (u, w))
+        p_at, x_at, c = p.flatten(0, 1).T.contiguous().numpy(), run.x.numpy(), _new(self.n_c, count)
+        seen = _new(self.n_in, count)
+        c_by_run, seen_by_run = (v.T.view(networks, n, -1) for v in (c, seen))
+        c_at, seen_at = c.numpy(), seen.numpy()
         by_x, seen_by_x, seen_by_p = (a.numpy() for a in (run.flow_slopes, run.seen_by_x, run.seen_by_p))
-        self._first((x_at[0], u_at[0], w_at[0], p_at), (seen.numpy(), seen_by_x[0], seen_by_p[0]))
+        self._first((x_at[0], u_at[0], w_at[0], p_at), (seen_at, seen_by_x[0], seen_by_p[0]))
         for k in range(periods):
             now, g, candidate = run.rows[:, k], run.gates[k], run.candidate[k]
-            now[..., z:-1] = seen
+            now[..., z:-1] = seen_by_run
             torch.bmm(now, recurrent, out=g)
             torch.bmm(now[..., z:], direct, out=candidate)
             g[..., : 2 * z].sigmoid_()
             candidate.addcmul_(g[..., :z], g[..., 2 * z :]).tanh_()
             after = run.rows[:, k + 1, :, :z]
             torch.lerp(candidate, now[..., :z], g[..., z : 2 * z], out=after)
-            torch.baddbmm(b_out, after, w_out, out=c)
+            c_by_run.copy_(torch.baddbmm(b_out, after, w_out))
             given = x_at[k], c_at, u_at[k], w_at[k], u_at[k + 1], w_at[k + 1], p_at
             if slopes:
-                wanted = x_at[k + 1], seen.numpy(), by_x[k], seen_by_x[k + 1], seen_by_p[k + 1]
+                wanted = x_at[k + 1], seen_at, by_x[k], seen_by_x[k + 1], seen_by_p[k + 1]
                 self._period_and_slopes(given, wanted)
             else:
-                self._period(given, (x_at[k + 1], seen.numpy()))
+                self._period(given, (x_at[k + 1], seen_at))
         return run
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What a free run leaves; slopes of all samples of a period, column by column.
+    """What a free run leaves: states ``(T + 1, n_x, runs)``, and slopes of each period ``(columns, rows, runs)``.
 
     A row in ``rows`` ``(networks, T + 1, n, z + n_in + 1)`` is ``[h, s, 1]``; ``gates`` ``(T, networks, n, 3 z)`` are
     r, z and what is inside the reset product.
@@ -116,10 +117,10 @@ class _Run:
         """Memory for a run; slopes of no period but the first where none are wanted."""
         count, kept, new = networks * n, periods if slopes else 0, _new
         return cls(
-            new(periods + 1, networks, n, of.n_x), new(networks, periods + 1, n, z + of.n_in + 1),
+            new(periods + 1, of.n_x, count), new(networks, periods + 1, n, z + of.n_in + 1),
             new(periods, networks, n, 3 * z), new(periods, networks, n, z),
-            new(kept, count, of.n_x + of.n_c + n_p, of.n_x), new(kept + 1, count, of.n_x, of.n_in),
-            new(kept + 1, count, n_p, of.n_in),
+            new(kept, of.n_x + of.n_c + n_p, of.n_x, count), new(kept + 1, of.n_x, of.n_in, count),
+            new(kept + 1, n_p, of.n_in, count),
         )  # fmt: skip
 
 
@@ -136,7 +137,7 @@ class _FreeRun(torch.autograd.Function):
         run = rollout.run(x, h, u, w, p, weights, slopes)
         ctx.rollout, ctx.run = rollout, run
         ctx.save_for_backward(*weights)
-        return run.x
+        return run.x.mT.unflatten(1, h.shape[:2])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -148,47 +149,62 @@ class _FreeRun(torch.autograd.Function):
         gates, candidates = _new(networks, periods, n, 3 * z), _new(networks, periods, n, z)
         outputs = _new(networks, periods, n, n_c)
         dh, carry = torch.zeros(2, networks, n, z, dtype=grad.dtype)
-        by_p = torch.zeros(networks * n, run.seen_by_p.shape[2], dtype=grad.dtype)
-        x_bar = grad[periods].reshape(networks * n, n_x)
+        by_p = torch.zeros(run.seen_by_p.shape[1], networks * n, dtype=grad.dtype)
+        own = grad.flatten(1, 2).mT.contiguous()
+        x_bar = own[periods]
         for k in range(periods - 1, -1, -1):
-            back = (run.flow_slopes[k] * x_bar.unsqueeze(1)).sum(-1)
-            out = back[:, n_x : n_x + n_c].view(networks, n, n_c)
+            back = (run.flow_slopes[k] * x_bar).sum(1)
+            out = back[n_x : n_x + n_c].T.view(networks, n, n_c)
             outputs[:, k] = out
             d, d_n = gates[:, k], candidates[:, k]
             by_out, h = torch.bmm(out, out_back), run.rows[:, k, :, :z]
             step_back(by_out, carry, dh, h, run.gates[k], run.candidate[k], d, d_n)
             carry.baddbmm_(d, by_h)
-            seen = torch.bmm(d, by_seen).baddbmm_(d_n, direct_back)[..., :-1].reshape(networks * n, 1, -1)
-            x_bar = back[:, :n_x] + (run.seen_by_x[k] * seen).sum(-1)
-            x_bar += grad[k].reshape(networks * n, n_x)
-            if by_p.shape[1]:
-                by_p += back[:, n_x + n_c :] + (run.seen_by_p[k] * seen).sum(-1)
+            seen = torch.bmm(d, by_seen).baddbmm_(d_n, direct_back)[..., :-1].flatten(0, 1).T
+            x_bar = back[:n_x] + (run.seen_by_x[k] * seen).sum(1)
+            x_bar += own[k]
+            if len(by_p):
+                by_p += back[n_x + n_c :] + (run.seen_by_p[k] * seen).sum(1)
         rows = run.rows[:, :-1].flatten(1, 2)
         d_recurrent = rows.mT @ gates.flatten(1, 2)
         d_direct = rows[..., z:].mT @ candidates.flatten(1, 2)
         d_out = run.rows[:, 1:, :, :z].flatten(1, 2).mT @ outputs.flatten(1, 2)
-        ways = x_bar.view(networks, n, n_x), carry, None, None, by_p.view(networks, n, -1)
-        return None, None, *ways, d_recurrent, d_direct, d_out, outputs.sum((1, 2)).unsqueeze(1)
-
-
-class _Mapped:
-    """Scalar operations over many samples in one call, on memory that is given."""
-
-    def __init__(self, given: Sequence[ca.SX], wanted: Sequence[ca.SX]) -> None:
-        self._used = [a.numel() > 0 for a in given]
-        self._kept = [a.numel() > 0 for a in wanted]
-        ins = [a for a, used in zip(given, self._used, strict=True) if used]
-        outs = [ca.densify(a) for a, kept in zip(wanted, self._kept, strict=True) if kept]
-        function = ca.Function("period", ins, ca.cse(outs))
-        self._at: Callable[[int], tuple[Any, Any, Any]] = cache(
-            lambda count: (mapped := function.map(count), *mapped.buffer())
+        by_x, by_p = (v.T.unflatten(0, (networks, n)) for v in (x_bar, by_p))
+        return (
+            None,
+            None,
+            by_x,
+            carry,
+            None,
+            None,
+            by_p,
+            d_recurrent,
+            d_direct,
+            d_out,
+            outputs.sum((1, 2)).unsqueeze(1),
         )
 
+
+class _SideBySide:
+    """Scalar operations over many runs, each operation over all of them at once, on memory that is given."""
+
+    def __init__(self, given: Sequence[ca.SX], wanted: Sequence[ca.SX]) -> None:
+        self._used, self._kept = ([i for i, a in enumerate(every) if a.numel()] for every in (given, wanted))
+        outs = [ca.densify(wanted[i]) for i in self._kept]
+        function = ca.Function("period", [given[i] for i in self._used], ca.cse(outs))
+
+        @cache
+        def at(runs: int) -> tuple[Any, Any, Any]:
+            side_by_side = vectorised(function, runs)
+            return side_by_side, *side_by_side.buffer()
+
+        self._at = at
+
     def __call__(self, given: Sequence[Array], wanted: Sequence[Array]) -> None:
-        """Evaluate; all arrays are contiguous, samples first, and a matrix lies column by column."""
-        _, buffer, evaluate = self._at(len(given[0]))
-        for i, array in enumerate(a for a, used in zip(given, self._used, strict=True) if used):
-            buffer.set_arg(i, memoryview(array.reshape(-1).data))
-        for i, array in enumerate(a for a, kept in zip(wanted, self._kept, strict=True) if kept):
-            buffer.set_res(i, memoryview(array.reshape(-1).data))
+        """Evaluate; all arrays are contiguous, the runs last, and a matrix lies column by column."""
+        _, buffer, evaluate = self._at(given[0].shape[-1])
+        for i, k in enumerate(self._used):
+            buffer.set_arg(i, memoryview(given[k].data))
+        for i, k in enumerate(self._kept):
+            buffer.set_res(i, memoryview(wanted[k].data))
         evaluate()

@@ -1,7 +1,7 @@
 """Free runs of a prior over many windows at once, with exact sensitivities: one graph of scalar operations.
 
-The prior is traced once. A period is a Runge-Kutta step beside its derivatives by the state and the parameters; it is
-run over all periods and all windows in one call of CasADi, without Python in between.
+The prior is traced once. A period is a Runge-Kutta step and the outputs at its begin, beside their derivatives by the
+state and the parameters; each of its operations runs over all windows at once.
 """
 
 from __future__ import annotations
@@ -9,19 +9,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
+from nn_export.vectorised import vectorised
 
 Array = NDArray[np.float64]
 MAX_SUBSTEPS = 20
 """A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
+VISITED = 200
+"""Samples of the recordings that are asked how stiff the prior is there, beside the outermost ones."""
+Points: TypeAlias = tuple[Array, Array, Array]
+"""States ``(n, n_x)``, inputs ``(n, n_u)`` and disturbances ``(n, n_w)``."""
 
 
 class Simulation:
@@ -31,65 +38,111 @@ class Simulation:
         xdot: ``(x, u, w, p) -> xdot`` of scalar operations, as :class:`~hybrid_mpc.machine.prior.Equations` has it.
         dt: Period [s].
         free: Places in ``p`` of the parameters by which it is differentiated, in this order.
+        output: ``(x, u, w, p) -> y``, what is asked for at every sample. Default: the states.
     """
 
-    def __init__(self, xdot: ca.Function, dt: float, free: Sequence[int] = ()) -> None:
-        self.dt, self.free, self._xdot = dt, list(free), xdot
-        self.n_x, self.n_u, self.n_w, self.n_p = (xdot.size1_in(i) for i in range(4))
-        self._runs = cache(self._run_function)
+    def __init__(
+        self, xdot: ca.Function, dt: float, free: Sequence[int] = (), output: ca.Function | None = None
+    ) -> None:
+        self.dt, self.free, self._xdot, self._output = dt, list(free), xdot, output
+        self.n_x, self.n_p = xdot.size1_in(0), xdot.size1_in(3)
+        self._period = cache(self._period_function)
 
-    def states(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> Array:
-        """States ``(n, T + 1, n_x)`` of runs from ``x0`` ``(n, n_x)`` under ``u`` ``(n, T, n_u)``, ``w`` ``(n, T,
-        n_w)``.
+    def values(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> Array:
+        """Outputs ``(n, T + 1, n_y)`` of runs from ``x0`` ``(n, n_x)`` under ``u`` ``(n, T + 1, n_u)``, ``w`` ``(n, T +
+        1, n_w)``, of which the last sample is for the outputs.
 
         Parameters ``p`` are those of all runs ``(n_p,)``, or of each ``(n, n_p)``.
         """
         return self._run(x0, u, w, p, substeps, 0)[0]
 
     def by_parameters(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> tuple[Array, Array]:
-        """The same states, and their derivatives ``(n, T + 1, n_x, n_p)`` by the free parameters."""
+        """The same outputs, and their derivatives ``(n, T + 1, n_y, n_p)`` by the free parameters."""
         return self._run(x0, u, w, p, substeps, len(self.free))
 
-    def by_all(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> tuple[Array, Array, Array]:
-        """The same states, and their derivatives by the free parameters and by the first state."""
-        x, s = self._run(x0, u, w, p, substeps, len(self.free) + self.n_x)
-        return x, s[..., : len(self.free)], s[..., len(self.free) :]
+    def by_all(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> tuple[Array, Array]:
+        """The same outputs, and their derivatives by the free parameters and, behind these, by the first state."""
+        return self._run(x0, u, w, p, substeps, len(self.free) + self.n_x)
 
     def _run(
         self, x0: Array, u: Array, w: Array, p: Array, substeps: int, columns: int
     ) -> tuple[Array, Array]:
-        n, periods, _ = u.shape
-        first = np.zeros((n, 1 + columns, self.n_x))
-        first[:, 0] = x0
+        first = np.zeros((1 + columns, self.n_x, len(x0)))
+        first[0] = x0.T
         if columns > len(self.free):
-            first[:, 1 + len(self.free) :] = np.eye(self.n_x)
-        run = self._runs(substeps, columns, periods, n)
-        every_p = np.broadcast_to(p, (n, self.n_p))
-        held = u.reshape(-1, self.n_u).T, w.reshape(n * periods, self.n_w).T
-        found = run(first.reshape(-1, self.n_x).T, *held, every_p.T)
-        later = np.asarray(found.full().T.reshape(n, periods, 1 + columns, self.n_x))
-        every = np.concatenate([first[:, None], later], axis=1)
-        return every[:, :, 0], every[:, :, 1:].swapaxes(2, 3)
+            first[1 + len(self.free) :] = np.eye(self.n_x)[..., None]
+        held = (np.moveaxis(v, 0, -1) for v in (u, w))
+        every_p = np.broadcast_to(p, (len(x0), self.n_p)).T
+        _, (y,) = over_time(self._period(substeps, columns), first, list(held), [every_p])
+        y = np.moveaxis(y.reshape(len(y), 1 + columns, -1, len(x0)), (3, 0), (0, 1))
+        return np.ascontiguousarray(y[:, :, 0]), np.ascontiguousarray(y[:, :, 1:].swapaxes(2, 3))
 
-    def _run_function(self, substeps: int, columns: int, periods: int, n: int) -> ca.Function:
-        """All runs in one call: ``(z0, u, w, p) -> z`` with ``z = [x, columns of derivatives]``."""
-        sizes = {"z": (self.n_x, 1 + columns), "u": (self.n_u, 1), "w": (self.n_w, 1), "p": (self.n_p, 1)}
+    def _period_function(self, substeps: int, columns: int) -> ca.Function:
+        """A period ``(z, u, w, p) -> z, y`` with ``z = [x, columns of derivatives]``, and ``y`` in the same way."""
+        n_u, n_w = self._xdot.size1_in(1), self._xdot.size1_in(2)
+        sizes = {"z": (self.n_x, 1 + columns), "u": (n_u, 1), "w": (n_w, 1), "p": (self.n_p, 1)}
         z, u, w, p = (ca.SX.sym(name, *size) for name, size in sizes.items())
         x = z[:, 0]
-        x_next = stepped(self._xdot, x, u, w, p, self.dt, substeps)
-        after = [x_next]
-        if columns:
-            by_x = ca.jacobian(x_next, x)
-            slopes = by_x @ z[:, 1:]
-            slopes[:, : len(self.free)] += ca.jacobian(x_next, p)[:, self.free]
-            after.append(slopes)
-        step = ca.Function("period", [z, u, w, p], [ca.cse(ca.densify(ca.horzcat(*after)))])
-        held = [
-            ca.MX.sym(name, rows, periods if name in ("u", "w") else columns)
-            for name, (rows, columns) in sizes.items()
-        ]
-        over = step.mapaccum(periods)(*held[:3], ca.repmat(held[3], 1, periods))
-        return ca.Function("run", held, [over]).map(n)
+        found = []
+        y = x if self._output is None else self._output(x, u, w, p)
+        for value in (stepped(self._xdot, x, u, w, p, self.dt, substeps), y):
+            slopes = ca.jacobian(value, x) @ z[:, 1:]
+            if columns:
+                slopes[:, : len(self.free)] += ca.jacobian(value, p)[:, self.free]
+            found.append(ca.densify(ca.horzcat(value, slopes)))
+        return ca.Function("period", [z, u, w, p], ca.cse(found))
+
+
+def over_time(
+    period: ca.Function, first: Array, signals: Sequence[Array], constants: Sequence[Array]
+) -> tuple[Array, list[Array]]:
+    """A recursion ``z_{k+1}, others_k = period(z_k, signals_k, constants)`` of ``n`` runs side by side.
+
+    The runs are the last axis: an operation of the period is one of CasADi's machine for all of them, on numpy's own
+    memory. Elements of an argument or result come column by column.
+
+    Args:
+        period: The function, of scalar operations.
+        first: ``z_0`` ``(..., n)``.
+        signals: Arguments by time ``(T, size, n)``.
+        constants: Arguments that stay ``(..., n)``.
+
+    Returns:
+        ``z`` ``(T + 1, size, n)``, and each of the others ``(T, size, n)``.
+    """
+    steps, n = len(signals[0]), first.shape[-1]
+    buffer: Any
+    buffer, evaluate = _side_by_side(period, len(signals), n).buffer()
+    held = np.concatenate([np.zeros((0, n)), *(v.reshape(-1, n) for v in constants)])
+    moving, fixed = (np.ascontiguousarray(v, np.float64) for v in (np.concatenate(signals, axis=1), held))
+    sizes = [period.numel_out(i) for i in range(1, period.n_out())]
+    z, others = np.empty((steps + 1, period.numel_in(0), n)), np.empty((steps, sum(sizes), n))
+    z[0] = first.reshape(-1, n)
+    given = [(buffer.set_arg, 0, z), (buffer.set_arg, 1, moving), (buffer.set_res, 0, z[1:])]
+    given += [(buffer.set_res, 1, others)] if sizes else []
+    if fixed.size:
+        buffer.set_arg(2, memoryview(fixed.data))
+    for k in range(steps):
+        for place, i, v in given:
+            place(i, memoryview(v[k].data))
+        evaluate()
+    return z, np.split(others, np.cumsum(sizes)[:-1], axis=1) if sizes else []
+
+
+@lru_cache(maxsize=128)
+def _side_by_side(period: ca.Function, signals: int, n: int) -> ca.Function:
+    """``(z, signals, constants) -> z, others`` of ``n`` runs, each of them one matrix."""
+    kinds = [range(1), range(1, 1 + signals), range(1 + signals, period.n_in())]
+    sizes = [[period.numel_in(i) for i in kind] for kind in kinds]
+    given = [ca.SX.sym("v", sum(own)) for own in sizes]
+    parts = [
+        part
+        for value, own in zip(given, sizes, strict=True)
+        for part in (ca.vertsplit(value, [0, *np.cumsum(own).tolist()]) if own else [])
+    ]
+    z, *others = period.call([ca.reshape(v, *period.size_in(i)) for i, v in enumerate(parts)])
+    found = [ca.vec(z), ca.vertcat(*(ca.vec(v) for v in others))]
+    return vectorised(ca.Function(period.name(), given, found), n)
 
 
 def stepped(xdot: ca.Function, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int) -> ca.SX:
@@ -117,15 +170,39 @@ def with_unknown_rates(xdot: ca.Function, corrected: tuple[int, ...]) -> ca.Func
     return ca.Function("xdot", [z, u, w, p], [ca.densify(rate)], ["x", "u", "w", "p"], ["xdot"])
 
 
-def required_substeps(prior: Prior, dt: float) -> int:
-    """Sub-steps a period that keep every eigenvalue of the prior at rest within 1 / sub-step.
+def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> int:
+    """Sub-steps a period that keep every eigenvalue of the prior within 1 / sub-step: at rest, and at points.
 
-    Rest is the operating point, or else the middle of the signals' ranges (:func:`rest_of`).
-    Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents of the fast mode at 1.
+    Rest is the operating point, or else the middle of the signals' ranges (:func:`rest_of`). Points are where the
+    machine was (:func:`visited`). Runge-Kutta of order 4 is stable up to 2.8 and accurate to per cents of the fast mode
+    at 1.
+
+    Raises:
+        InputError: If that is more than ``MAX_SUBSTEPS``.
     """
-    return substeps_for(
-        prior.equations.xdot, *rest_of(prior), prior.p, dt, f"{type(prior).__name__}: the prior"
-    )
+    name = f"{type(prior).__name__}: the prior"
+    substeps = substeps_for(prior.equations.xdot, *rest_of(prior), prior.p, dt, name)
+    if points is None or not len(points[0]):
+        return substeps
+    slopes = _slopes_at(prior.equations.xdot, len(points[0]))(*(v.T for v in points), prior.p).full()
+    every = np.moveaxis(slopes.reshape(len(prior.states), -1, len(prior.states)), 1, 0)
+    every = every[np.isfinite(every).all(axis=(1, 2))]
+    rate = float(np.abs(np.linalg.eigvals(every)).max(initial=0.0))
+    return max(substeps, _substeps(rate, dt, name, "where the recordings go"))
+
+
+def visited(trajectories: Sequence[Trajectory]) -> Points:
+    """States, inputs and disturbances where the machine was: some samples, evenly chosen, and the outermost ones.
+
+    They decide how stiff a prior is that is stiff in a part of its range alone.
+    """
+    columns = [np.concatenate([getattr(t, key) for t in trajectories]) for key in ("x", "u", "w")]
+    every = np.hstack(columns)[np.isfinite(np.hstack(columns)).all(axis=1)]
+    if len(every):
+        outermost = {int(i) for found in (every.argmin(axis=0), every.argmax(axis=0)) for i in found}
+        every = every[sorted({*evenly(len(every), VISITED), *outermost})]
+    x, u, w = np.split(every, np.cumsum([v.shape[1] for v in columns])[:-1], axis=1)
+    return x, u, w
 
 
 def rest_of(prior: Prior) -> tuple[Array, Array, Array]:
@@ -150,14 +227,23 @@ def substeps_for(xdot: ca.Function, x: Any, u: Any, w: Any, p: Any, dt: float, n
     """:func:`required_substeps` of any ``xdot(x, u, w, p)`` at a point; an error says that ``name`` is too stiff."""
     slope = flow_slope(xdot)(x, u, w, p).full()
     rate = float(np.abs(np.linalg.eigvals(slope)).max()) if np.isfinite(slope).all() else math.inf
+    return _substeps(rate, dt, name, "at rest")
+
+
+def _substeps(rate: float, dt: float, name: str, where: str) -> int:
     substeps = max(1, math.ceil(rate * dt)) if math.isfinite(rate) else MAX_SUBSTEPS + 1
     if substeps > MAX_SUBSTEPS:
         raise InputError(
-            f"{name}'s fastest mode at rest is {rate:.3g} 1/s; a period of {dt} s "
+            f"{name}'s fastest mode {where} is {rate:.3g} 1/s; a period of {dt} s "
             f"would need {rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
             f"at zero speed) or take a smaller dt."
         )
     return substeps
+
+
+@lru_cache(maxsize=64)
+def _slopes_at(xdot: ca.Function, n: int) -> ca.Function:
+    return flow_slope(xdot).map("slopes", "serial", n, [3], [])
 
 
 @lru_cache(maxsize=32)

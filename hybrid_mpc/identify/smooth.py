@@ -11,22 +11,35 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.optimize import minimize_scalar
 
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.scales import evenly, robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of, stepped, with_unknown_rates
+from hybrid_mpc.identify.simulation import (
+    flow_slope,
+    over_time,
+    required_substeps,
+    rest_of,
+    stepped,
+    visited,
+    with_unknown_rates,
+)
 from hybrid_mpc.machine.prior import Equations, Prior
 
 Array = NDArray[np.float64]
 SWEEPS = 4
-"""Linearizations along the smoothed trajectory, after the first along the filter's estimates."""
+"""Linearizations along the smoothed trajectory at most, after the first along the filter's estimates."""
+STILL = 0.01
+"""A trajectory whose estimates move by less than this share of their standard deviations is smoothed."""
 MOST_SWEEPS = 20
 """Linearizations at most, where the censored samples that count are not yet the same from one to the next."""
 DECADES = (-6.0, 2.0)
 """Range searched for the walk of the unexplained rates, as a power of ten of their natural size: from a prior that is
 right to one that explains nothing."""
+AT_ONCE, NARROW = 15, 0.1
+"""Walks tried at once, and the distance [powers of ten] to the next ones at which the best is near enough."""
+ALIKE = 0.5
+"""Share of the longest one's length from which on trajectories are run beside it."""
 ROUGH = -0.5
 """Walk, as a power of ten, of a prior that is not fitted yet."""
 IGNORANCE = 10.0
@@ -76,6 +89,7 @@ class Smoother:
         walk: Standard deviation of d's change per period ``(n_d,)`` [units of the corrected rates].
         sizes: Natural sizes of the signals (:func:`sizes_of`).
         fading: What is left of ``d`` after a period [-].
+        substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
 
     Source: Rauch, Tung, Striebel, *Maximum likelihood estimates of linear dynamic systems* (1965); iterated
     linearization: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
@@ -87,14 +101,17 @@ class Smoother:
     walk: tuple[float, ...]
     sizes: Sizes
     fading: float = 1.0
+    substeps: int = 0
 
-    def smooth(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-        """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it."""
+    def smooth(self, trajectories: Sequence[Trajectory], *, sweeps: int = SWEEPS) -> list[Trajectory]:
+        """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it.
+
+        ``sweeps`` is how often the prior is linearized along the smoothed trajectory, at most.
+        """
         smoothed: dict[int, Trajectory] = {}
-        for group in _by_length(trajectories):
-            z = self._estimate(list(group.values()))
-            for i, t, zi in zip(group, group.values(), z, strict=True):
-                smoothed[i] = self._with_states(t, zi)
+        for group in _together(trajectories):
+            for (i, t), z in zip(group.items(), self._estimate(list(group.values()), sweeps), strict=True):
+                smoothed[i] = self._with_states(t, z)
         return [smoothed[i] for i in range(len(trajectories))]
 
     def innovations(self, trajectories: Sequence[Trajectory]) -> tuple[float, float, int]:
@@ -102,15 +119,7 @@ class Smoother:
 
         They are those of a filter that starts in ignorance; the samples that end it do not count.
         """
-        squares, logs, count = 0.0, 0.0, 0
-        for group in _by_length(trajectories):
-            found = self._filtered(list(group.values()))
-            skip = min(math.ceil(self._n_z / max(1, len(self.sigma))), found.y.shape[1] - 1)
-            e, s, counted = (v[:, skip:] for v in (found.e, found.s, found.counted))
-            squares += float(np.sum(e * np.linalg.solve(s, e[..., None])[..., 0]))
-            logs += float(np.linalg.slogdet(s)[1].sum())
-            count += int(counted.sum())
-        return squares, logs, count
+        return _innovations([self], trajectories)[0]
 
     @property
     def _n_z(self) -> int:
@@ -123,7 +132,7 @@ class Smoother:
             self.prior.equations,
             self.prior.corrected,
             self.dt,
-            required_substeps(self.prior, self.dt),
+            self.substeps or required_substeps(self.prior, self.dt),
             self.fading,
         )
 
@@ -135,16 +144,23 @@ class Smoother:
         xdot[:, list(self.prior.corrected)] += d
         return replace(trajectory, x=x, xdot=xdot)
 
-    def _estimate(self, group: Sequence[Trajectory]) -> Array:
-        """Smoothed ``(x, d)`` ``(b, n, n_z)`` of trajectories of one length."""
-        found = self._filtered(group)
-        z = _smoothed(found)
+    def _estimate(self, group: Sequence[Trajectory], sweeps: int) -> list[Array]:
+        """Smoothed ``(x, d)`` ``(n, n_z)`` of trajectories; each is done when it does not change any more."""
+        runs = _Runs.of(self, group)
+        found = self._filtered(runs)
+        z = _smoothed(found, runs.lengths)
+        open_ = np.ones(len(group), dtype=bool)
         for i in range(MOST_SWEEPS):
-            found, before = self._filtered(group, z), found.counted
-            z = _smoothed(found)
-            if i + 1 >= SWEEPS and np.array_equal(before, found.counted):
+            found, before = self._filtered(runs, along=z), found.counted
+            after = _smoothed(found, runs.lengths)
+            same = (before == found.counted).all(axis=(1, 2))
+            deviation = np.sqrt(np.maximum(np.diagonal(found.now[..., 1:], axis1=-2, axis2=-1), 1e-300))
+            moved = np.where(runs.inside[..., None], np.abs(after - z) / deviation, 0.0).max(axis=(1, 2))
+            z = np.where(open_[:, None, None], after, z)
+            open_ &= ~(same & ((moved < STILL) | (i + 1 >= sweeps)))
+            if not open_.any():
                 break
-        return z
+        return [one[:n] for one, n in zip(z, runs.lengths, strict=True)]
 
     def prediction_errors(self, trajectories: Sequence[Trajectory], p: Array) -> tuple[Array, list[Array]]:
         """Prediction errors of the filter for several sets of parameters ``(m, n_p)``.
@@ -154,87 +170,137 @@ class Smoother:
         """
         every: list[Array] = []
         own: dict[int, Array] = {}
-        for group in _by_length(trajectories):
-            listed = list(group.values())
-            runs = [t for _ in p for t in listed]
-            found = self._filtered(runs, p=np.repeat(p, len(listed), axis=0))
-            e = found.e.reshape(len(p), len(listed), *found.e.shape[1:])
-            own |= dict(zip(group, np.where(found.counted[: len(listed)] > 0, e[0], np.nan), strict=True))
-            root = np.linalg.cholesky(found.s[: len(listed)])
-            every.append(np.linalg.solve(root, e[..., None])[..., 0].reshape(len(p), -1))
+        for group in _together(trajectories):
+            runs, m, b = _Runs.of(self, list(group.values())), len(p), len(group)
+            found = self._filtered(runs.times(m), p=np.repeat(p, b, axis=0))
+            e = found.e.reshape(m, b, *found.e.shape[1:])
+            seen = np.where(found.counted[:b], e[0], np.nan)
+            own |= {i: v[:n] for i, v, n in zip(group, seen, runs.lengths, strict=True)}
+            root = np.linalg.cholesky(
+                np.where(runs.inside[..., None, None], found.s[:b], np.eye(e.shape[-1]))
+            )
+            scaled = np.linalg.solve(root, e[..., None])[..., 0]
+            every.append(np.asarray(scaled[:, runs.inside].reshape(m, -1), dtype=np.float64))
         return np.concatenate(every, axis=1), [own[i] for i in range(len(trajectories))]
 
     def _filtered(
-        self, group: Sequence[Trajectory], along: Array | None = None, p: Array | None = None
+        self,
+        runs: _Runs,
+        along: Array | None = None,
+        p: Array | None = None,
+        levels: tuple[Array, Array] | None = None,
     ) -> _Filtered:
         """What the filter finds, linearized along its own estimates or along ``(x, d)`` ``(b, n, n_z)``.
 
-        Parameters are the prior's, or ``p`` ``(b, n_p)``.
+        Parameters are the prior's, or ``p`` ``(b, n_p)``; noise and walk are the smoother's own, or those of each run
+        in ``levels`` ``(b, n_y)``, ``(b, n_d)``.
         """
-        y, u, w = (np.stack([getattr(t, key) for t in group]) for key in ("y", "u", "w"))
-        censored = np.stack([t.censored for t in group])
-        b, n = y.shape[:2]
-        n_z, n_x = self._n_z, len(self.prior.states)
-        seen = np.isfinite(y)
-        first = np.stack([np.concatenate([self._start(t), np.zeros(n_z - n_x)]) for t in group])
-        ranges = np.array([0.5 * (s.upper - s.lower) for s in self.prior.states])
+        b, n_z, n_x = len(runs.y), self._n_z, len(self.prior.states)
+        sigma, walk = (np.broadcast_to(v, (b, np.shape(v)[-1])) for v in levels or (self.sigma, self.walk))
         if self.fading < 1.0:
-            settled = np.array(self.walk) / math.sqrt(1.0 - self.fading**2)  # of d, when it has long walked
+            settled = walk / math.sqrt(1.0 - self.fading**2)  # of d, when it has long walked
         else:
-            settled = IGNORANCE * np.array([self.sizes.rate[i] for i in self.prior.corrected])
-        spread = np.concatenate([np.minimum(IGNORANCE * np.array(self.sizes.x), ranges), settled])
-        ahead = np.concatenate(
-            [first[..., None], np.broadcast_to(np.diag(spread**2), (b, n_z, n_z))], axis=-1
-        )
-        signals = [np.where(seen, y, 0.0), seen.astype(float), censored.astype(float), u, w]
-        noise = np.concatenate([np.zeros(n_x), np.square(self.walk)])
-        constant = [np.square(self.sigma), noise]
+            own = IGNORANCE * np.array([self.sizes.rate[i] for i in self.prior.corrected])
+            settled = np.broadcast_to(own, walk.shape)
+        ranges = np.array([0.5 * (s.upper - s.lower) for s in self.prior.states])
+        known = np.minimum(IGNORANCE * np.array(self.sizes.x), ranges)
+        spread = np.concatenate([np.broadcast_to(known, (b, n_x)), settled], axis=1)
+        first = np.concatenate([runs.first, np.zeros((b, n_z - n_x))], axis=1)
+        ahead = np.concatenate([first[:, None], spread[..., None] ** 2 * np.eye(n_z)], axis=1)
+        signals = [np.where(runs.seen, runs.y, 0.0), runs.seen, runs.censored, runs.u, runs.w]
+        period = self._passes[0 if along is None else 1]
         values = np.broadcast_to(self.prior.p, (b, len(self.prior.parameters))) if p is None else p
-        own, given = self._passes
-        if along is not None:
-            signals.append(along)
-        run = _run(own if along is None else given, n, b)
-        found = run(
-            np.moveaxis(ahead, 1, 0).reshape(n_z, -1),
-            *(v.reshape(b * n, v.shape[-1]).T for v in signals),
-            values.T,
-            *(np.tile(c[:, None], (1, b)) for c in constant),
+        noise = np.concatenate([np.zeros((b, n_x)), np.square(walk)], axis=1)
+        z, others = over_time(
+            period,
+            np.moveaxis(ahead, 0, -1),
+            [np.moveaxis(v, 0, -1) for v in (*signals, *([] if along is None else [along]))],
+            [v.T for v in (values, np.square(sigma), noise)],
         )
-        ahead_, now, slope, e, s, counts = (
-            np.moveaxis(v.full().reshape(v.shape[0], b, n, -1), 0, 2) for v in found
+        expected, now, slope, e, s, counts = (
+            np.moveaxis(v.reshape(len(v), -1, rows, b), (3, 0, 2, 1), (0, 1, 2, 3))
+            for v, rows in zip((z[:-1], *others), (n_z, n_z, n_z, *(3 * [runs.y.shape[2]])), strict=True)
         )
-        return _Filtered(y, counts[..., 0] > 0, first, spread, ahead_, now, slope, e[..., 0], s)
+        return _Filtered(counts[..., 0] > 0, expected, now, slope, e[..., 0], s)
 
-    def _start(self, trajectory: Trajectory) -> Array:
-        """States at the first sample: nearest to rest, in their sizes, of those that explain what is measured."""
-        x, u, w = rest_of(self.prior)
-        u, w = (own[0] if len(own[0]) else near for own, near in ((trajectory.u, u), (trajectory.w, w)))
-        there = np.isfinite(trajectory.y)
-        y = np.array([c[h][0] if h.any() else np.nan for c, h in zip(trajectory.y.T, there.T, strict=True)])
-        output, size, outputs = (
-            _output_slope(self.prior.equations),
-            np.array(self.sizes.x),
-            np.array(self.sizes.y),
-        )
+    def _starts(self, trajectories: Sequence[Trajectory]) -> Array:
+        """States ``(b, n_x)`` at the first samples: nearest to rest, in their sizes, of those that explain what is
+        measured.
+        """
+        n, rest = len(trajectories), rest_of(self.prior)
+        x = np.tile(rest[0], (n, 1))
+        u, w = (
+            np.stack([v[0] if len(v[0]) else near for v in given])
+            for given, near in (
+                ([t.u for t in trajectories], rest[1]), ([t.w for t in trajectories], rest[2])
+            )
+        )  # fmt: skip
+        y = np.stack([_first_seen(t.y) for t in trajectories])
+        output = _output_slope(self.prior.equations).map(n)
+        size, outputs = np.array(self.sizes.x), np.array(self.sizes.y)
         for _ in range(5):
-            found, c = (v.full() for v in output(x, u, w, self.prior.p))
-            e = np.where(np.isfinite(y), y - found[:, 0], 0.0) / outputs
-            scaled = c * size / outputs[:, None]
-            x = x + size * (np.linalg.pinv(scaled, rcond=1e-6) @ e)
+            found, c = (v.full() for v in output(x.T, u.T, w.T, np.tile(self.prior.p[:, None], (1, n))))
+            e = np.where(np.isfinite(y), y - found.T, 0.0) / outputs
+            scaled = np.moveaxis(c.reshape(c.shape[0], n, -1), 1, 0) * size / outputs[:, None]
+            x = x + size * (np.linalg.pinv(scaled, rcond=1e-6) @ e[..., None])[..., 0]
         return x
+
+
+def _first_seen(y: Array) -> Array:
+    """First sample of each output that is there."""
+    there = np.isfinite(y)
+    return np.array([c[h][0] if h.any() else np.nan for c, h in zip(y.T, there.T, strict=True)])
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Trajectories side by side, ``(b, n, ...)``; behind its end one goes on with its last sample, of which nothing is
+    seen.
+    """
+
+    y: Array
+    seen: Array
+    censored: Array
+    u: Array
+    w: Array
+    first: Array
+    lengths: tuple[int, ...]
+
+    @classmethod
+    def of(cls, smoother: Smoother, group: Sequence[Trajectory]) -> _Runs:
+        """Trajectories with the states that the smoother starts from."""
+        lengths = tuple(len(t.t) for t in group)
+        index = np.minimum(np.arange(max(lengths)), np.array(lengths)[:, None] - 1)
+        y, censored, u, w = (
+            np.stack([getattr(t, key)[i] for t, i in zip(group, index, strict=True)])
+            for key in ("y", "censored", "u", "w")
+        )
+        within = np.arange(max(lengths)) < np.array(lengths)[:, None]
+        seen = (np.isfinite(y) & within[..., None]).astype(float)
+        return cls(y, seen, censored.astype(float), u, w, smoother._starts(group), lengths)
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Which samples are a trajectory's own ``(b, n)``."""
+        return np.asarray(np.arange(self.y.shape[1]) < np.array(self.lengths)[:, None])
+
+    def times(self, m: int) -> _Runs:
+        """The same runs, ``m`` times one behind the other."""
+        own = (
+            np.concatenate([v] * m) for v in (self.y, self.seen, self.censored, self.u, self.w, self.first)
+        )
+        y, seen, censored, u, w, first = own
+        return _Runs(y, seen, censored, u, w, first, self.lengths * m)
 
 
 @dataclass(frozen=True)
 class _Filtered:
-    """A filter's results for ``b`` trajectories of ``n`` samples; the last axis is ``[z, P]`` of estimates.
+    """A filter's results for ``b`` runs of ``n`` samples; the last axis of ``ahead`` and ``now`` is ``[z, P]``.
 
     ``counted`` are the samples that are there, without the censored ones that nothing contradicts.
     """
 
-    y: Array
     counted: NDArray[np.bool_]
-    first: Array
-    spread: Array
     ahead: Array
     now: Array
     slope: Array
@@ -242,31 +308,62 @@ class _Filtered:
     s: Array
 
 
-def _smoothed(found: _Filtered) -> Array:
-    """Rauch-Tung-Striebel smoother behind a filter: ``z`` ``(b, n, n_z)``."""
+def _smoothed(found: _Filtered, lengths: Sequence[int]) -> Array:
+    """Rauch-Tung-Striebel smoother behind a filter: ``z`` ``(b, n, n_z)``, for each run up to its own length."""
     b, n, n_z, _ = found.now.shape
-    forward = found.slope[:, :-1] @ found.now[:, :-1, :, 1:]
-    # where data are exact some directions are known to rounding: it is added to the correlations
-    covariance = found.ahead[:, :-1, :, 1:]
-    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 1e-300))[..., None]
-    correlation = covariance / (size * np.swapaxes(size, -1, -2)) + 1e-14 * np.eye(n_z)
-    back = np.swapaxes(np.linalg.solve(correlation, forward / size) / size, -1, -2)
-    own, ahead = found.now[..., 0], found.ahead[:, :-1, :, 0]
-    given = own[:, -2::-1] - np.einsum("bnij,bnj->bni", back, ahead)[:, ::-1], back[:, ::-1]
+    own = found.now[..., 0]
     if n < 2:
         return own
-    run = _backward(n_z, n - 1).map(b)
-    later = run(
-        own[:, -1].T,
-        given[0].reshape(-1, n_z).T,
-        np.moveaxis(given[1].reshape(-1, n_z, n_z), 1, 0).reshape(n_z, -1),
+    forward = found.slope[:, :-1] @ found.now[:, :-1, :, 1:]
+    # where data are exact some directions are known to rounding: it is added to the correlations
+    covariance = found.ahead[:, 1:, :, 1:]
+    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 1e-300))[..., None]
+    correlation = covariance / (size * np.swapaxes(size, -1, -2)) + 1e-14 * np.eye(n_z)
+    last = np.array(lengths)[:, None] - 1
+    over = np.arange(n - 1) >= last
+    correlation[over], forward[over] = np.eye(n_z), 0.0
+    back = np.swapaxes(np.linalg.solve(correlation, forward / size) / size, -1, -2)
+    ahead = np.where(over[..., None], 0.0, found.ahead[:, 1:, :, 0])
+    end = own[np.arange(b), last[:, 0]]
+    offset = np.where(over[..., None], end[:, None], own[:, :-1] - np.einsum("bnij,bnj->bni", back, ahead))
+    later, _ = over_time(
+        _backward(n_z),
+        end.T,
+        [np.moveaxis(v[:, ::-1], 0, -1) for v in (offset, np.swapaxes(back, -1, -2).reshape(b, n - 1, -1))],
+        [],
     )
-    earlier = later.full().T.reshape(b, n - 1, n_z)[:, ::-1]
-    return np.concatenate([earlier, own[:, -1:]], axis=1)
+    return np.ascontiguousarray(np.moveaxis(later[::-1], -1, 0))
+
+
+def _innovations(
+    smoothers: Sequence[Smoother], trajectories: Sequence[Trajectory]
+) -> list[tuple[float, float, int]]:
+    """:meth:`Smoother.innovations` of smoothers that differ in noise and walk alone."""
+    one, m = smoothers[0], len(smoothers)
+    squares, logs, count = np.zeros(m), np.zeros(m), np.zeros(m)
+    for group in _together(trajectories):
+        runs, b = _Runs.of(one, list(group.values())), len(group)
+        levels = (
+            np.repeat([own.sigma for own in smoothers], b, axis=0),
+            np.repeat([own.walk for own in smoothers], b, axis=0),
+        )
+        found = one._filtered(runs.times(m), levels=levels)
+        skip = np.minimum(math.ceil(one._n_z / max(1, len(one.sigma))), np.array(runs.lengths) - 1)
+        counts = runs.inside & (np.arange(runs.y.shape[1]) >= skip[:, None])
+        e, s, counted = (v.reshape(m, b, *v.shape[1:])[:, counts] for v in (found.e, found.s, found.counted))
+        squares += np.sum(e * np.linalg.solve(s, e[..., None])[..., 0], axis=(1, 2))
+        logs += np.linalg.slogdet(s)[1].sum(axis=1)
+        count += counted.sum(axis=(1, 2))
+    return [(float(a), float(b), int(c)) for a, b, c in zip(squares, logs, count, strict=True)]
 
 
 def fit_smoother(
-    prior: Prior, trajectories: Sequence[Trajectory], dt: float, *, time_unit: float | None = None
+    prior: Prior,
+    trajectories: Sequence[Trajectory],
+    dt: float,
+    *,
+    time_unit: float | None = None,
+    substeps: int | None = None,
 ) -> Smoother:
     """Smoother whose noise and walk make the measurements most likely.
 
@@ -278,18 +375,26 @@ def fit_smoother(
         trajectories: Recordings; at most ``SAMPLE`` of them, evenly chosen, are used.
         dt: Period [s].
         time_unit: The machine's second [s]. Default: that of the trajectories.
+        substeps: Runge-Kutta sub-steps a period. Default: as many as the prior needs where the trajectories go, as far
+            as they hold states.
     """
+    if substeps is None:
+        substeps = required_substeps(prior, dt, visited(trajectories))
     unit = scales.time_unit(trajectories, dt) if time_unit is None else time_unit
     sample = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
-    at = _smoothers(prior, trajectories, dt, unit)
+    at = _smoothers(prior, trajectories, dt, unit, substeps)
 
-    def cost(ratio: float) -> float:
-        squares, logs, count = at(ratio).innovations(sample)
-        value = count * math.log(max(squares, 1e-300) / max(count, 1)) + logs
-        return value if math.isfinite(value) else 1e300
+    def costs(ratios: Array) -> Array:
+        found = _innovations([at(ratio) for ratio in ratios], sample)
+        squares, logs, count = (np.array(v, dtype=float) for v in zip(*found, strict=True))
+        values = count * np.log(np.maximum(squares, 1e-300) / np.maximum(count, 1)) + logs
+        return np.where(np.isfinite(values), values, 1e300)
 
-    best = float(minimize_scalar(cost, bounds=DECADES, method="bounded", options={"xatol": 0.1}).x)
-    squares, _, count = at(best).innovations(sample)
+    best, width = 0.5 * (DECADES[0] + DECADES[1]), 0.5 * (DECADES[1] - DECADES[0])
+    while width > NARROW:  # several at once cost little more than one
+        ratios = np.clip(best + width * np.linspace(-1.0, 1.0, AT_ONCE), *DECADES)
+        best, width = float(ratios[np.argmin(costs(ratios))]), 2 * width / (AT_ONCE - 1)
+    ((squares, _, count),) = _innovations([at(best)], sample)
     sizes = at(best).sizes
     least = QUIETEST * float(np.max(np.array(sizes.y) / np.array(sizes.noise)))
     return at(best, max(math.sqrt(squares / max(count, 1)), least))
@@ -302,11 +407,11 @@ def rough_smoother(
 
     Arguments as for :func:`fit_smoother`; nothing is searched.
     """
-    return _smoothers(prior, trajectories, dt, time_unit)(ROUGH, 1.0)
+    return _smoothers(prior, trajectories, dt, time_unit, required_substeps(prior, dt))(ROUGH, 1.0)
 
 
 def _smoothers(
-    prior: Prior, trajectories: Sequence[Trajectory], dt: float, unit: float
+    prior: Prior, trajectories: Sequence[Trajectory], dt: float, unit: float, substeps: int
 ) -> Callable[..., Smoother]:
     """Smoothers by the walk's ratio, as a power of ten, and the scale of noise and walk."""
     sizes = sizes_of(prior, trajectories, dt, unit)
@@ -315,7 +420,7 @@ def _smoothers(
 
     def at(ratio: float, scale: float = 1.0) -> Smoother:
         sigma, walk = scale * np.array(sizes.noise), scale * 10.0**ratio * rates
-        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes, fading)
+        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes, fading, substeps)
 
     return at
 
@@ -397,12 +502,16 @@ def _noise(trajectories: Sequence[Trajectory]) -> Array:
     return np.array(found)
 
 
-def _by_length(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]]:
-    """Trajectories of equal length together, each under its place in the order given."""
-    groups: dict[int, dict[int, Trajectory]] = {}
-    for i, trajectory in enumerate(trajectories):
-        groups.setdefault(len(trajectory.t), {})[i] = trajectory
-    return list(groups.values())
+def _together(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]]:
+    """Trajectories of about the same length together, each under its place in the order given."""
+    groups: list[dict[int, Trajectory]] = []
+    longest = 0
+    for i, t in sorted(enumerate(trajectories), key=lambda pair: -len(pair[1].t)):
+        if not groups or len(t.t) < ALIKE * longest:
+            groups.append({})
+            longest = len(t.t)
+        groups[-1][i] = t
+    return groups
 
 
 @lru_cache(maxsize=32)
@@ -470,20 +579,8 @@ def _filters(
     return made[0], made[1]
 
 
-@lru_cache(maxsize=64)
-def _run(period: ca.Function, n: int, b: int) -> ca.Function:
-    """A filter over ``n`` samples of ``b`` trajectories; the last three inputs are constant."""
-    signals = range(1, period.n_in() - 3)
-    held = [
-        ca.MX.sym(f"a{i}", period.size1_in(i), period.size2_in(i) * (n if i in signals else 1))
-        for i in range(period.n_in())
-    ]
-    over = period.mapaccum(n)(*held[:-3], *(ca.repmat(v, 1, n) for v in held[-3:]))
-    return ca.Function("run", held, list(over)).map(b)
-
-
-@lru_cache(maxsize=64)
-def _backward(n_z: int, n: int) -> ca.Function:
-    """``z_k = offset_k + back_k z_{k+1}`` over ``n`` samples."""
+@lru_cache(maxsize=32)
+def _backward(n_z: int) -> ca.Function:
+    """``z_k = offset_k + back_k z_{k+1}``."""
     z, offset, back = ca.SX.sym("z", n_z), ca.SX.sym("offset", n_z), ca.SX.sym("back", n_z, n_z)
-    return ca.Function("earlier", [z, offset, back], [offset + back @ z]).mapaccum(n)
+    return ca.Function("earlier", [z, offset, back], [offset + back @ z])

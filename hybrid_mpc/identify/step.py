@@ -104,14 +104,16 @@ class PriorStep(Step):
     Args:
         prior: The ODE prior.
         dt: Model period [s].
+        substeps: Runge-Kutta sub-steps a period (:attr:`~hybrid_mpc.identify.prior_result.PriorFit.substeps`). Default
+            0: as many as the prior needs at rest.
 
     Raises:
         InputError: If the prior is too stiff for the period.
     """
 
-    def __init__(self, prior: Prior, dt: float) -> None:
+    def __init__(self, prior: Prior, dt: float, substeps: int = 0) -> None:
         super().__init__(prior, dt)
-        self.substeps = required_substeps(prior, dt)
+        self.substeps = substeps or required_substeps(prior, dt)
 
     def forward(
         self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
@@ -122,9 +124,12 @@ class PriorStep(Step):
     def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """States of its own run, all runs in one call of CasADi; they are not differentiated."""
         runs, periods = x.shape[:-1].numel(), len(u)
-        u_all, w_all = (z.reshape(periods, runs, z.shape[-1]).swapaxes(0, 1).numpy() for z in (u, w))
+        u_all, w_all = (
+            torch.cat([z, z[-1:]]).reshape(periods + 1, runs, z.shape[-1]).swapaxes(0, 1).numpy()
+            for z in (u, w)
+        )  # the last period's goes on
         simulation = Simulation(self.prior.equations.xdot, self.dt)
-        states = simulation.states(x.reshape(runs, -1).numpy(), u_all, w_all, self.p.numpy(), self.substeps)
+        states = simulation.values(x.reshape(runs, -1).numpy(), u_all, w_all, self.p.numpy(), self.substeps)
         return torch.tensor(states).swapaxes(0, 1).reshape(periods + 1, *x.shape)
 
     def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
@@ -147,6 +152,8 @@ class Scaling:
         centre_u: What is taken off each input first. Default: zero.
         centre_w: What is taken off each disturbance first. Default: zero.
         xdot: Size of each state's rate ``(n_x,)``: the unit in which errors of rates are added up. Default: 1.
+        substeps: Runge-Kutta sub-steps a period that the prior needs where the training data go. Default 0: as many as
+            it needs at rest.
     """
 
     x: tuple[float, ...]
@@ -158,6 +165,7 @@ class Scaling:
     centre_u: tuple[float, ...] = ()
     centre_w: tuple[float, ...] = ()
     xdot: tuple[float, ...] = ()
+    substeps: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xdot", tuple(self.xdot or (1.0,) * len(self.x)))
@@ -203,10 +211,13 @@ class RecurrentStep(Step):
         super().__init__(prior, dt)
         self.network, self.use_prior = network, use_prior
         self.trained = shift if isinstance(shift, TrainedParameters) else None
-        self.substeps = required_substeps(prior, dt) if use_prior and self.corrects_prior else 1
+        own_rates = use_prior and self.corrects_prior
+        self.substeps = (scaling.substeps or required_substeps(prior, dt)) if own_rates else 1
         own = shift if isinstance(shift, Tensor) else torch.zeros(len(prior.parameters), dtype=torch.float64)
         self.register_buffer("own_shift", own, persistent=False)
         for name, values in vars(scaling).items():
+            if name == "substeps":
+                continue
             self.register_buffer(f"scale_{name}", torch.tensor(values, dtype=torch.float64))
 
     @classmethod

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from hybrid_mpc.identify.objectives import (
 )
 from hybrid_mpc.identify.prior_replay import BATCH, make_prior_replay, prior_replay_penalty
 from hybrid_mpc.identify.settings import TrainingSettings
+from hybrid_mpc.identify.simulation import required_substeps, visited
 from hybrid_mpc.identify.step import PREFIX, HybridStep, RecurrentStep, Scaling, TrainedParameters, shift_to
 from hybrid_mpc.machine.prior import Prior
 
@@ -212,7 +213,10 @@ class TrainingRun:
             else validation_horizon(validation, s.warm)
         )
         valid = cut_windows(validation, s.warm, horizon, max(1, horizon // 5))
-        self.scaling = form.scaling_of(prior, windows, dt, use_prior=s.use_prior)
+        scaling = form.scaling_of(prior, windows, dt, use_prior=s.use_prior)
+        own_rates = s.use_prior and form.corrects_prior
+        substeps = required_substeps(prior, dt, visited(training)) if own_rates else 0
+        self.scaling = replace(scaling, substeps=substeps)
         self.windows, self.valid = windows.to(self.device), valid.to(self.device)
         self.fixed = self.windows.take(torch.linspace(0, len(windows) - 1, FIXED).round().long().unique())
         self.objectives = objectives_of(prior, s.objectives)

@@ -52,11 +52,11 @@ CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 SHOWN = 20.0
 """Length of a run that is drawn sample by sample [the machine's seconds]."""
 IN_MOTION = 0.1
-"""Least length [s] that is given of a validation piece: it begins in motion, while a recording that gives less (EMPS,
-20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
+"""Least length [the machine's seconds] that is given of a validation piece: it begins in motion, while a recording that
+gives less (EMPS, 20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
 REFIT_LENGTHS = (0.5, 1.0, 3.0)
-"""Free runs [s] of a refit, the short ones first: from parameters that are far off a long one leads nowhere. Short ones
-alone spend what little there is on their first states; 3 s are what a refit is mostly given, whole."""
+"""Free runs [the machine's seconds] of a refit, the short ones first: from parameters that are far off a long one leads
+nowhere. Short ones alone spend what little there is on their first states; 3 are what a refit mostly gets, whole."""
 FEWEST_RUNS = 3
 """Free runs of a refit at least: one alone would be fitted by any parameters."""
 
@@ -247,7 +247,7 @@ def _make(
     linear, no_linear = _baselines(scenario, data)
     progress.finish("")
     errors = partial(candidate_errors, scenario, fit, networks, linear)
-    validation = errors(data.valid, max(warm_up, IN_MOTION))
+    validation = errors(data.valid, max(warm_up, IN_MOTION * time_unit(data.train, dt)))
     long = errors(data.long, warm_up) if data.long else {}
     hybrid = recommended(*({name: e.error for name, e in part.items()} for part in (validation, long)))
     model = BenchmarkModel(
@@ -423,7 +423,8 @@ def refitted(
     Raises:
         InputError: If the recording is no longer than what is to be fitted, or that is too short.
     """
-    n, least = round(seconds / dt), FEWEST_RUNS * REFIT_LENGTHS[0]
+    lengths = [time_unit([trajectory], dt) * own for own in REFIT_LENGTHS]
+    n, least = round(seconds / dt), FEWEST_RUNS * lengths[0]
     if n >= len(trajectory.t) - 1 or seconds < least:
         raise InputError(
             f"{trajectory.name}: {seconds:g} s are to be fitted; that takes at least {least:g} s and a recording that "
@@ -432,7 +433,7 @@ def refitted(
     index = np.arange(len(trajectory.t))
     first = trajectory.part(index < n, trajectory.name, trajectory.role)
     rest = trajectory.part(index >= n, trajectory.name, trajectory.role)
-    return refit(make, fit, [first], dt=dt, lengths=REFIT_LENGTHS), rest
+    return refit(make, fit, [first], dt=dt, lengths=lengths), rest
 
 
 # What is written and printed.

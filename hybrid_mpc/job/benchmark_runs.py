@@ -261,7 +261,7 @@ def run_freely(
         n = warm + round(length / dt) + 1
         starts = [t.part(np.arange(len(t.t)) < n, t.name, t.role) for t in starts]
     after = slice(1, -1)  # after the warm-up: neither the start nor what follows the last input
-    found = {"phy": model_states(PriorStep(prior, dt), starts, warm)[:, after]}
+    found = {"phy": model_states(PriorStep(prior, dt, fit.substeps), starts, warm)[:, after]}
     for kind, trained in networks.items():
         states = model_states(trained.stacked_step(prior, dt), starts, warm)[:, :, after]
         found |= {kind: states[trained.best], f"{kind} mean": states.mean(0)}

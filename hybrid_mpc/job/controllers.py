@@ -21,6 +21,7 @@ from hybrid_mpc.estimate.kalman import Estimator, TrueState
 from hybrid_mpc.estimate.tuning import process_noise
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import make_controller, make_estimator, make_ocp, tuned_noise
+from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Scenario
 
@@ -73,7 +74,7 @@ def build(
         return estimator, make_controller(model, prior, control, solver=solver, safe_input=kit.safe_input)
     if scenario.oracle is None:
         raise InputError(f"scenario {scenario.name} has no oracle")
-    model = scenario.oracle(prior.dt)
+    model = _oracle(scenario, prior)
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(kit.models[m], ocp) for m in ("prior", "hybrid")]
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
@@ -91,7 +92,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     """
     models = dict(artifact.models)
     if scenario.oracle is not None:
-        models["oracle"] = scenario.oracle(artifact.models["prior"].dt)
+        models["oracle"] = _oracle(scenario, artifact.models["prior"])
     errors = {name: process_noise(model, recordings) for name, model in artifact.models.items()}
     # the plant's own equations err by nothing but the smoothing: start from the better model's errors
     errors["oracle"] = errors["hybrid"]
@@ -101,6 +102,15 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
         if c.model in models and not c.truth
     }
     return no_surer_than_prior(scenario, found)
+
+
+def _oracle(scenario: Scenario, prior: HybridModel) -> HybridModel:
+    """The oracle's model, with operating point and disturbance model of the others."""
+    assert scenario.oracle is not None
+    return replace(
+        scenario.oracle(prior.dt), nominal_x=prior.nominal_x, nominal_u=prior.nominal_u,
+        disturbance_model=prior.disturbance_model,
+    )  # fmt: skip
 
 
 def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:

@@ -27,7 +27,7 @@ from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.loop.simulate import ClosedLoopResult, Step, simulate
 from hybrid_mpc.model.limits import share_used
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, kinematics
 from hybrid_mpc.monitor.calibrate import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.records import known, plain, record
@@ -207,7 +207,8 @@ class LoopRow:
         seed: Number of the loop.
         seconds: Length [s].
         cost: Closed-loop cost on the plant's true state.
-        tracking_rmse: Root mean square deviation of the true states from their reference, by signal.
+        tracking_rmse: Root mean square deviation from the reference by signal: of the true states, or of the measured
+            outputs where references are the outputs'.
         largest_x: Largest magnitude of the true states, by signal.
         largest_u: Largest magnitude of the inputs, by signal.
         limits: Largest share of the way from rest to each limit that was used: 1 is the limit, more a violation.
@@ -314,7 +315,8 @@ class Bench:
         kit = self.kit(spec)
         if spec.rounds:
             model = kit.models["prior"]
-            task = repeated(task, model.dt, np.array(spec.rounds), model.time_unit)
+            speeds = {} if self.kit(spec).problem(task.name).n_y else kinematics(model)
+            task = repeated(task, model.dt, np.array(spec.rounds), model.time_unit, speeds)
         return task if spec.duration is None else replace(task, duration=min(task.duration, spec.duration))
 
     def problem(self, spec: LoopSpec) -> OCP:
@@ -396,7 +398,7 @@ class Bench:
         estimator, controller = self.parts(spec)
         late = spec.late
         result = simulate(
-            self.plant(spec), estimator, controller, task.reference, weight=task.weight,
+            self.plant(spec), estimator, controller, task.reference, weight=task.weight, w=task.w,
             dt=self.kit(spec).models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
             seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
             faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=_noting(spec, plans, on_step),
@@ -509,7 +511,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         seed=spec.seed,
         seconds=len(r.t) * r.dt,
         cost=r.cost,
-        tracking_rmse=_by(labels, np.sqrt(np.mean((r.x - r.reference) ** 2, axis=0))),
+        tracking_rmse=_by([s.label for s in model.outputs] if r.tracks_outputs else labels, r.tracking_rmse),
         largest_x=_by(labels, np.abs(r.x).max(axis=0)),
         largest_u=_by(inputs, np.abs(r.u).max(axis=0)),
         limits=limits_used(problem, r, model),
@@ -532,17 +534,24 @@ def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
 def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
     """Largest share of the way from rest to each limit that a loop used [-]: 1 is the limit, more a violation.
 
-    By signal of the model: inputs and, where limited, ``change of`` an input and the plant's true states.
+    By signal of the model: inputs and, where limited, ``change of`` an input, the plant's true states and, as
+    ``output`` of a name, the measured outputs.
     """
-    changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None]))
+    rest = np.clip(model.u0, control.u_min, control.u_max)
+    changes = np.abs(np.diff(r.u, axis=0, prepend=rest[None]))
     used: dict[str, float] = {}
     for i, signal in enumerate(model.inputs):
-        used[signal.name] = share_used(r.u[:, i], control.u_min[i], control.u_max[i])
+        used[signal.name] = share_used(r.u[:, i], control.u_min[i], control.u_max[i], rest[i])
         if control.du_max is not None:
             used[f"change of {signal.name}"] = float(np.max(changes[:, i] / control.du_max[i]))
     for i, signal in enumerate(model.states):
         if np.isfinite(control.x_min[i]) or np.isfinite(control.x_max[i]):
-            used[signal.name] = share_used(r.x[:, i], control.x_min[i], control.x_max[i])
+            used[signal.name] = share_used(r.x[:, i], control.x_min[i], control.x_max[i], model.x0[i])
+    for i, signal in enumerate(model.outputs if control.y_min.size else ()):
+        if np.isfinite(control.y_min[i]) or np.isfinite(control.y_max[i]):
+            seen = r.y[np.isfinite(r.y[:, i]), i]
+            rest_y = model.output(model.x0, model.u0, model.w, model.p).full()[i, 0]
+            used[f"output {signal.name}"] = share_used(seen, control.y_min[i], control.y_max[i], rest_y)
     return used
 
 
@@ -554,7 +563,8 @@ def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, f
         beyond = np.maximum(r.x - control.x_max, control.x_min - r.x)
         over |= {s.label: v for s, v in zip(model.states, beyond.T, strict=True)}
     if control.du_max is not None:
-        changes = np.abs(np.diff(r.u, axis=0, prepend=control.rest_input[None])) - control.du_max
+        rest = np.clip(model.u0, control.u_min, control.u_max)
+        changes = np.abs(np.diff(r.u, axis=0, prepend=rest[None])) - control.du_max
         over |= {f"change of {s.label}": v for s, v in zip(model.inputs, changes.T, strict=True)}
     return {name: max(0.0, float(values.max())) for name, values in over.items()}
 

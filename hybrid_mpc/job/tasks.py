@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -57,7 +57,9 @@ RETURN_S = 1.0
 """Shortest way back to the reference's beginning [the machine's seconds]."""
 
 
-def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Task:
+def repeated(
+    task: Task, dt: float, shares: Array, time_unit: float = 1.0, speeds: Mapping[int, int] | None = None
+) -> Task:
     """The task over and over: to its end, back to its beginning along a quintic, and again.
 
     Args:
@@ -65,26 +67,35 @@ def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Ta
         dt: Period [s]; a round takes whole periods, since weights may be of single instants.
         shares: Factor ``(m,)`` on the distance from the reference's beginning, a round each.
         time_unit: The machine's second [s]: the way back takes one at least. Default 1.
+        speeds: Places of the columns that are rates of others, by the places of those
+            (:func:`~hybrid_mpc.model.model.kinematics`). Default: none are.
 
     Returns:
         The task of ``m`` rounds.
 
     Example:
         >>> ramp = Task("ramp", "", 1.0, (0.0, 0.0), lambda t: np.column_stack([t, np.ones(len(t))]))
-        >>> twice = repeated(ramp, 0.02, np.array([1.0, 0.5]))
+        >>> twice = repeated(ramp, 0.02, np.array([1.0, 0.5]), speeds={0: 1})
         >>> twice.duration, twice.reference(np.array([0.5, 3.5])).round(6).tolist()
         (6.0, [[0.5, 1.0], [0.25, 0.5]])
     """
-    n_q, length = len(task.x0) // 2, round(task.duration / dt)
+    length, pairs = round(task.duration / dt), dict(speeds or {})
     rows = task.reference(np.arange(length + 1, dtype=np.float64) * dt)
     first, last = rows[0], rows[-1]
-    fastest = np.abs(rows[:, n_q : 2 * n_q]).max(axis=0)
-    far = np.abs(last - first)[:n_q] / np.maximum(fastest, 1e-9)  # a quintic's top speed is 15/8 of its mean
+    n = min(len(task.x0), len(first))  # further columns are no reference of states
+    positions, rates = list(pairs), list(pairs.values())
+    fastest = np.abs(rows[:, rates]).max(axis=0)
+    far = np.abs(last - first)[positions] / np.maximum(
+        fastest, 1e-9
+    )  # a quintic's top speed is 15/8 of its mean
     back = max(RETURN_S * time_unit, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
     period = (length + math.ceil(back / dt - 1e-9)) * dt
-    curve = [
-        _quintic(first[i], last[i], first[n_q + i], last[n_q + i], period - length * dt) for i in range(n_q)
-    ]
+    start = first.copy()
+    start[rates] = 0.0
+    curve = {}
+    for i in set(range(n)) - set(rates):
+        v1, v0 = (first[pairs[i]], last[pairs[i]]) if i in pairs else (0.0, 0.0)
+        curve[i] = _quintic(first[i], last[i], v1, v0, period - length * dt)
 
     def place(t: Array) -> tuple[NDArray[np.int_], Array, NDArray[np.bool_]]:
         number = np.clip(np.floor(t / period + 1e-9).astype(int), 0, None)
@@ -97,10 +108,11 @@ def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Ta
         if during.any():
             rows[during] = task.reference(inside[during])
         left = inside[~during] - length * dt
-        for i, polynomial in enumerate(curve):
-            rows[~during, i], rows[~during, n_q + i] = polynomial(left), polynomial.deriv()(left)
-        start = np.concatenate([first[:n_q], np.zeros(len(first) - n_q)])
-        rows[:, : 2 * n_q] = (start + shares[number, None] * (rows - start))[:, : 2 * n_q]
+        for i, polynomial in curve.items():
+            rows[~during, i] = polynomial(left)
+            if i in pairs:
+                rows[~during, pairs[i]] = polynomial.deriv()(left)
+        rows[:, :n] = (start + shares[number, None] * (rows - start))[:, :n]
         return rows
 
     def weight(t: Array) -> Array:
@@ -111,11 +123,17 @@ def repeated(task: Task, dt: float, shares: Array, time_unit: float = 1.0) -> Ta
             rows[during] = task.weight(inside[during])
         return rows
 
+    def measured(t: Array) -> Array:
+        assert task.w is not None
+        inside = np.minimum(place(np.asarray(t, dtype=float))[1], task.duration)
+        return np.asarray(task.w(inside))
+
     return replace(
         task,
         duration=round(period * len(shares), 9),
         reference=reference,
         weight=None if task.weight is None else weight,
+        w=None if task.w is None else measured,
         figures=None,
     )
 

@@ -32,6 +32,7 @@ from hybrid_mpc.kit.assembly import (
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
+from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import numbers
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration
@@ -92,6 +93,8 @@ class ModelInfo:
         nominal_w: What is taken for w where none is given. Default: zeros.
         covariance: Rows of the covariance of the fitted values. Default: unknown.
         balances: Balances that have programs. Default: none.
+        nominal_x: State of the operating point. Default: zeros.
+        nominal_u: Input of the operating point. Default: zeros.
 
     Raises:
         InputError: If a time is not finite, the period or the machine's second not positive, or the delay negative.
@@ -108,6 +111,8 @@ class ModelInfo:
     nominal_w: tuple[float, ...] = ()
     covariance: tuple[tuple[float, ...], ...] = ()
     balances: tuple[BalanceInfo, ...] = ()
+    nominal_x: tuple[float, ...] = ()
+    nominal_u: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name, value in (("dt", self.dt), ("time_unit", self.time_unit)):
@@ -145,12 +150,14 @@ class LoopSettings:
     Args:
         control: Control problems by task; under ``""`` the one of all tasks that have none of their own. Default: none.
         sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them.
-        first_sigma: Those of what is not measured ``(n_x - n_y,)`` at an estimator's start. Default: by the sensors'.
+        first_sigma: Those of the states that no output shows alone, at an estimator's start. Default: by the sensors'
+            and the states' ranges.
         process_noise: Standard deviations per period ``(n_x,)`` [state units] by model, and by model with ``_observer``
             behind it where the estimator follows an unknown load.
         causes: What may break, by name: the parameters that change together then.
-        safe_input: Input ``(n_u,)`` that the machine is left with. Default: zero, or the limit next to it.
+        safe_input: Input ``(n_u,)`` that the machine may be left with. Default: none is declared.
         tasks: Names of the tasks, with or without a control problem of their own. Default: those of ``control``.
+        disturbance_model: What unmeasured disturbances are added to. Default: one at each input.
 
     Raises:
         InputError: If a deviation is negative or not finite, or the safe input is outside a problem's limits.
@@ -163,6 +170,7 @@ class LoopSettings:
     causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     safe_input: tuple[float, ...] | None = None
     tasks: tuple[str, ...] = ()
+    disturbance_model: tuple[Disturbance, ...] | None = None
 
     def __post_init__(self) -> None:
         sigmas = self.sensor_sigma, self.first_sigma or (), *self.process_noise.values()
@@ -197,6 +205,7 @@ def loop_settings(
         dict(scenario.causes),
         None if safe is None else tuple(numbers(safe, "safe_input").tolist()),
         tuple(task.name for task in scenario.tasks),
+        scenario.disturbance_model,
     )
 
 
@@ -338,7 +347,8 @@ def build_model(name: str, programs: Mapping[str, nn_export.Program], info: Mode
         with_jacobian=nn_export.with_jacobian(program, JACOBIANS),
         side_by_side=partial(nn_export.SideBySide, program),
         disturbances=info.disturbances, nominal_w=info.nominal_w, parameters=info.parameters,
-        covariance=info.covariance, balances=balances, time_unit=info.time_unit,
+        covariance=info.covariance, balances=balances, time_unit=info.time_unit, nominal_x=info.nominal_x,
+        nominal_u=info.nominal_u,
     )  # fmt: skip
     return with_input_delay(model, info.input_delay) if info.input_delay else model
 
@@ -363,7 +373,8 @@ def load(folder: str | Path) -> Kit:
         )
     try:
         programs = nn_export.load_programs(folder)
-        models = {name: build_model(name, programs, found.model) for name in found.models}
+        built = {name: build_model(name, programs, found.model) for name in found.models}
+        models = _disturbed(built, found.loop.disturbance_model)
     except KeyError as error:
         raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {FILE} names") from error
     except nn_export.ExportError as error:
@@ -372,6 +383,16 @@ def load(folder: str | Path) -> Kit:
         models, found.calibration, found.provenance, found.model.input_delay, found.loop,
         found.recommended or ("hybrid" if "hybrid" in models else found.models[0]),
     )  # fmt: skip
+
+
+def _disturbed(
+    models: Mapping[str, HybridModel], chosen: tuple[Disturbance, ...] | None
+) -> dict[str, HybridModel]:
+    """The models with a disturbance model; as they are where they have it."""
+    return {
+        name: model if model.disturbance_model == chosen else replace(model, disturbance_model=chosen)
+        for name, model in models.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -411,7 +432,7 @@ class Kit:
 
     @property
     def first_sigma(self) -> tuple[float, ...] | None:
-        """Standard deviations of what is not measured at an estimator's start; None: by the sensors'."""
+        """Standard deviations of states that no sensor shows at an estimator's start; None: by sensors and ranges."""
         return self.loop.first_sigma
 
     @property
@@ -426,7 +447,7 @@ class Kit:
 
     @property
     def safe_input(self) -> tuple[float, ...] | None:
-        """Input ``(n_u,)`` where nothing is known; None: zero, or the limit next to it."""
+        """Input ``(n_u,)`` that the machine may be left with; None: none is declared."""
         return self.loop.safe_input
 
     @property
@@ -439,8 +460,9 @@ class Kit:
         return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
 
     def on(self, scenario: Scenario) -> Kit:
-        """The kit with the control problems, tasks, sensors and causes that a scenario states now."""
-        return replace(self, loop=loop_settings(scenario, self.loop.process_noise))
+        """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now."""
+        models = _disturbed(self.models, scenario.disturbance_model)
+        return replace(self, models=models, loop=loop_settings(scenario, self.loop.process_noise))
 
     def problem(self, task: str = "") -> OCP:
         """The control problem of a task; of one without a problem of its own, and where no task is named, the common

@@ -18,11 +18,12 @@ from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
+from hybrid_mpc.estimate.offset_free import offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import most_likely
 from hybrid_mpc.loop.guard import Guard, Mode
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
@@ -74,7 +75,7 @@ class LoopAssumptions(Protocol):
 
     @property
     def first_sigma(self) -> tuple[float, ...] | None:
-        """Standard deviations of what is not measured at an estimator's start; None: by the sensors'."""
+        """Standard deviations of states that no sensor shows at an estimator's start; None: by sensors and ranges."""
 
     @property
     def control(self) -> OCP | None:
@@ -82,7 +83,7 @@ class LoopAssumptions(Protocol):
 
     @property
     def safe_input(self) -> tuple[float, ...] | None:
-        """Input ``(n_u,)`` where nothing is known; None: zero, or the limit next to it."""
+        """Input ``(n_u,)`` that the machine may be left with; None: none is declared."""
 
     @property
     def causes(self) -> Mapping[str, tuple[str, ...]]:
@@ -119,17 +120,19 @@ def make_estimator(
     """The estimator that all controllers share.
 
     With observer it switches between three filters (:data:`MODES`): one filter that is quick enough for a push lets
-    the encoder's steps through at all times, and one that is quiet takes a push for noise.
+    the encoder's steps through at all times, and one that is quiet takes a push for noise. The unknown loads are those
+    of the model's ``disturbance_model``.
 
     Args:
         model: The model to estimate with.
         scenario: The machine, a scenario or a kit: its sensors' noise.
         sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
         control: The control problem; its ``input_range`` says what a large load is. Default: the scenario's.
-        observer: Whether it estimates an unknown load at the input. Default: yes.
+        observer: Whether it estimates the unmeasured disturbances. Default: yes.
 
     Raises:
-        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, or there is no control problem.
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, there is no control problem, or the
+            outputs cannot tell the disturbances from the states.
 
     Example:
         ``make_estimator(model, scenario, process_noise(model, train))``
@@ -139,7 +142,12 @@ def make_estimator(
         raise InputError(
             f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...)"
         )
-    first, span = first_deviations(model, scenario), control.input_range
+    first, span = first_deviations(model, scenario), disturbance_sizes(model, control)
+    if observer and not (found := offset_free(model)).detectable:
+        raise InputError(
+            f"an observer of model {model.name}: at its operating point {found.why}; declare others: "
+            'Scenario(disturbance_model=(Disturbance("output", ...), ...)), no more than there are outputs'
+        )
 
     def filter_of(scale: float, step: float | None) -> ExtendedKalmanFilter:
         return ExtendedKalmanFilter(
@@ -154,26 +162,67 @@ def make_estimator(
 
 
 def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
-    """Standard deviations ``(n_x,)`` of the state at the estimator's start, at rest where the sensors say.
+    """Standard deviations ``(n_x,)`` of the state at the estimator's start.
+
+    A state that an output shows alone has that of the sensor. The others have ``first_sigma``, in their order, or
+    without it: the speed of such a state what two samples tell of it, ``sqrt(2) sigma / dt``; any other that of an even
+    spread over its signal's range.
 
     Raises:
-        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model.
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, or is needed and missing.
 
     Example:
+        >>> import casadi as ca
         >>> from types import SimpleNamespace
-        >>> machine = SimpleNamespace(sensor_sigma=(5e-4,), first_sigma=None)
-        >>> first_deviations(SimpleNamespace(n_x=2, n_y=1, dt=0.02), machine).round(4).tolist()
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, (q, v) = ca.MX.sym("x", 2), ca.MX.sym("u"), (Signal("q", "m"), Signal("v", "m/s"))
+        >>> cart = HybridModel.of("cart", 0.02, (q, v), (Signal("F", "N"),), (q,), x=x, u=u, y=x[0],
+        ...     x_next=x + 0.02 * ca.vertcat(x[1], u), xdot=ca.vertcat(x[1], u))
+        >>> first_deviations(cart, SimpleNamespace(sensor_sigma=(5e-4,), first_sigma=None)).round(4).tolist()
         [0.0005, 0.0354]
     """
-    n, sigma, others = model.n_x - model.n_y, scenario.sensor_sigma, scenario.first_sigma
+    sigma, others = scenario.sensor_sigma, scenario.first_sigma
     if len(sigma) != model.n_y:
         raise InputError(f"sensor_sigma needs {model.n_y} standard deviations of the outputs, got {sigma}")
-    if others is None:
-        differenced = np.sqrt(2.0) * np.array(sigma) / model.dt
-        others = tuple(differenced if n == model.n_y else np.full(n, differenced.max()))
-    if len(others) != n:
-        raise InputError(f"first_sigma needs {n} standard deviations of what is not measured, got {others}")
-    return np.array([*sigma, *others], dtype=np.float64)
+    found = np.full(model.n_x, np.nan)
+    for row, deviation in zip(
+        output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full(), sigma, strict=True
+    ):
+        shown = np.flatnonzero(row)
+        if shown.size == 1:
+            found[shown[0]] = np.fmin(found[shown[0]], deviation / abs(row[shown[0]]))
+    unseen = [int(i) for i in np.flatnonzero(np.isnan(found))]
+    if others is not None:
+        if len(others) != len(unseen):
+            names = ", ".join(model.states[i].name for i in unseen) or "none"
+            raise InputError(
+                f"first_sigma needs {len(unseen)} standard deviations, of the states that no output shows alone "
+                f"({names}), got {others}"
+            )
+        found[unseen] = others
+        return found
+    speeds = {v: q for q, v in kinematics(model).items()}
+    for i in unseen:
+        low, high = model.states[i].lower, model.states[i].upper
+        if i in speeds and np.isfinite(found[speeds[i]]):
+            found[i] = np.sqrt(2.0) * found[speeds[i]] / model.dt
+        elif np.isfinite(high - low):
+            found[i] = (high - low) / np.sqrt(12.0)
+    if np.any(np.isnan(found)):
+        names = ", ".join(model.states[i].name for i in np.flatnonzero(np.isnan(found)))
+        raise InputError(
+            f"first_sigma: how uncertain {names} may be at the start nobody can tell; give it, {len(unseen)} standard "
+            "deviations of the states that no output shows alone, or give the states' signals a range"
+        )
+    return found
+
+
+def disturbance_sizes(model: HybridModel, control: OCP) -> Array:
+    """Large values ``(n_d,)`` of the model's unmeasured disturbances: their own, or the input's range."""
+    if model.disturbance_model is None:
+        return control.input_range
+    ranges = dict(zip([s.name for s in model.inputs], control.input_range, strict=True))
+    return np.array([d.size or ranges[d.signal] for d in model.disturbance_model])
 
 
 def make_controller(
@@ -195,15 +244,21 @@ def make_controller(
         control: The control problem.
         solver: Name in :data:`SOLVERS`.
         iterations: Linearizations a period of ``rti``. Default: one.
-        safe_input: Input ``(n_u,)`` where nothing is known. Default: zero, or the limit next to it.
+        safe_input: Input ``(n_u,)`` that the machine may be left with. Default: none is declared.
 
     Raises:
-        InputError: If there is no such solver.
+        InputError: If there is no such solver, or the inputs cannot hold the outputs that the problem weighs.
 
     Example:
         ``make_controller(models["hybrid"], models["prior"], scenario.control)``
     """
     ocp = make_ocp(prior, control)
+    if control.n_y == prior.n_y and 0 < np.count_nonzero(control.q_y) <= prior.n_u:
+        found = offset_free(prior, np.flatnonzero(control.q_y).tolist())
+        if found.target_rank < found.target_needed:
+            raise InputError(
+                f"control problem: at the operating point {found.why}; weigh other outputs in q_y"
+            )
     options = {"iterations": iterations} if solver == "rti" else {}
     controller = SOLVERS[known(solver, SOLVERS, "solver")](model, ocp, **options)
     first = None if controller.converges else first_controller(model, ocp)
@@ -232,20 +287,20 @@ def make_ocp(prior: HybridModel, control: OCP) -> OCP:
 
 
 def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
-    """Working point of the problem, ``(x, u)``, else in motion at the position zero: speeds ``1 / sqrt(q)``, no input.
+    """Working point of the problem, ``(x, u)``, else the operating point, with positions in motion: at speeds ``1 /
+    sqrt(q)``.
 
     A speed without weight is the one that crosses the position's acceptable deviation ``1 / sqrt(q)`` within the
     horizon.
     """
+    x, u = control.point(model)
     if control.working_point is not None:
-        return control.working_point
-    x, half = np.zeros(model.n_x), model.n_x // 2
-    far, fast = (
-        np.where(q > 0, 1.0 / np.sqrt(np.where(q > 0, q, 1.0)), 0.0)
-        for q in (control.q[:half], control.q[half:])
-    )
-    x[half:] = np.where(fast > 0, fast, np.resize(far, fast.size) / (control.horizon * model.dt))
-    return x, control.rest_input
+        return x, u
+    tolerated = np.where(control.q > 0, 1.0 / np.sqrt(np.where(control.q > 0, control.q, 1.0)), 0.0)
+    for position, speed in kinematics(model).items():
+        crossing = tolerated[position] / (control.horizon * model.dt)
+        x[speed] += tolerated[speed] if tolerated[speed] > 0 else crossing
+    return x, u
 
 
 def make_monitor(
@@ -336,7 +391,7 @@ def make_adaptive_guard(
     control = scenario.control if control is None else control
     if control is None:
         raise InputError(f"a guard that adapts needs a control problem; scenario {scenario.name} has none")
-    span = control.input_range
+    span = disturbance_sizes(model, control)
     plain = make_ocp(prior, control)
     ocp = plain.changed(terminal=plain.terminal_weight(model))
     backup = SafeController(

@@ -35,7 +35,7 @@ class Mode(IntEnum):
     FALLBACK = 3
     """The stabilising feedback of the safeguards."""
     REST = 4
-    """No input: what is left where the sensor cannot be believed. The machine must come to rest by itself."""
+    """The safe input: what is left where the sensor cannot be believed. The machine must be safe with it."""
 
 
 @dataclass(frozen=True)
@@ -159,26 +159,37 @@ class GuardedController:
 
     def __init__(self, safe: SafeController, guard: Guard | None = None) -> None:
         self.safe, self.guard = safe, guard
+        if guard is not None and Mode.REST in (guard.on_model, guard.on_sensor) and safe.safe_input is None:
+            raise InputError(
+                "guard: mode REST applies the safe input, and none is declared; give Scenario(safe_input=...) or "
+                "SafeController(safe_input=...): the input with which the machine may be left alone"
+            )
         self._backup = safe if guard is None or guard.backup is None else guard.backup
         if guard is not None and guard.backup is not None and guard.backup_estimator is not None:
             _check_alike(safe.controller, guard.backup.controller, guard.backup_estimator)
 
-    def measured(self, state: GuardState, t: float, y: Array, u_prev: Array) -> GuardState:
-        """State with a sample ``y`` ``(n_y,)`` at ``t``, ``u_prev`` held before it; the mode wanted begins now."""
+    def measured(
+        self, state: GuardState, t: float, y: Array, u_prev: Array, w: Array | None = None
+    ) -> GuardState:
+        """State with a sample ``y`` ``(n_y,)`` at ``t``, ``u_prev`` held before it; the mode wanted begins now.
+
+        ``w`` ``(n_w,)`` are the disturbances measured with it; None: there are none.
+        """
         if state.wanted is not state.mode:
             switch = Switch(t, state.mode, state.wanted, state.why)
             state = replace(state, mode=state.wanted, since=t, switches=(*state.switches, switch))
         estimator = None if self.guard is None else self.guard.backup_estimator
         if estimator is None:
             return state
-        known = state.backup
-        return replace(
-            state, backup=estimator.start(y, t) if known is None else estimator.update(known, y, u_prev)
+        known, also = state.backup, {} if w is None else {"w": w}
+        backup = (
+            estimator.start(y, t, **also) if known is None else estimator.update(known, y, u_prev, **also)
         )
+        return replace(state, backup=backup)
 
     def decide(
         self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array,
-        weight: Array | None = None, *, prepared: Any = None, late: bool = False,
+        weight: Array | None = None, *, prepared: Any = None, late: bool = False, w: Array | None = None,
     ) -> tuple[Decision, GuardState]:  # fmt: skip
         """The input to hold from now on, by the mode's controller; see :meth:`SafeController.decide`.
 
@@ -196,7 +207,7 @@ class GuardedController:
         if state.mode is Mode.FALLBACK:
             decision = safe.late(replace(before, age=USED_UP), known, reference, limits=bounds)
             return replace(decision, status=Status.INITIAL, age=0), state
-        return safe.decide(before, known, reference, weight, limits=bounds, prepared=prepared), state
+        return safe.decide(before, known, reference, weight, limits=bounds, prepared=prepared, w=w), state
 
     def prepare(self, state: GuardState, decision: Decision, weight: Array | None) -> Any:
         """What of the next solve can be done now; None where there is no such part, or another's plan is taken over."""
@@ -241,7 +252,7 @@ class GuardedController:
         if planner == state.planner:
             return previous, state
         finite = replace(
-            estimate, **{name: np.nan_to_num(getattr(estimate, name)) for name in ("x", "h", "d")}
+            estimate, **{name: np.nan_to_num(getattr(estimate, name)) for name in ("x", "h", "d", "w")}
         )
         following = safe.controller.initial(finite, previous.solution.following).delayed(previous.u)
         decision = Decision(previous.u, previous.source, following, Status.INITIAL, 0)
@@ -249,10 +260,11 @@ class GuardedController:
 
     def _rest(self, previous: Decision, limits: Limits | None) -> Decision:
         """The safe input, as soon as ``du_max`` lets it be."""
-        ocp = self.safe.controller.ocp
-        u = ocp.saturate(self.safe.safe_input, previous.u, limits)
+        ocp, safe = self.safe.controller.ocp, self.safe.safe_input
+        assert safe is not None  # checked when the guard was made
+        u = ocp.saturate(safe, previous.u, limits)
         plan = replace(previous.solution, u=np.tile(u, (ocp.horizon, 1)))
-        return Decision(u, Source.ZERO, plan, Status.INITIAL, 0)
+        return Decision(u, Source.SAFE, plan, Status.INITIAL, 0)
 
 
 def _check_alike(main: Controller, backup: Controller, estimator: Estimator) -> None:

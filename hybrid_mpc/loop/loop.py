@@ -2,7 +2,7 @@
 
 A period of :class:`Loop` is::
 
-    step(y)   estimate   from the sample, and the input that acted since the one before
+    step(y, w) estimate  from the sample, and the input that acted since the one before
               guard      the mode that the last period asked for begins; its estimator takes the sample too
               decide     the controller of that mode solves; the safeguards make an admissible input of it
     (the driver hands the input over)
@@ -32,7 +32,7 @@ from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
 from hybrid_mpc.loop.plant import fitting
-from hybrid_mpc.loop.preview import Preview, Previews
+from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -127,11 +127,13 @@ class Loop:
         controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
             fallback.
         monitor: Default: none.
-        reference: ``t (n,) [s] -> (n, n_x)``, previewed over the horizon, with ``n_p`` more columns where the economic
-            stage cost has parameters; or a set-point ``(n_x,)``. Default: zero.
+        reference: ``t (n,) [s] -> (n, n_x)``, or ``(n, n_y)`` where the problem weighs outputs, previewed over the
+            horizon if the problem says so, with ``n_p`` more columns where the economic stage cost has parameters; or a
+            set-point ``(n_x,)`` or ``(n_y,)``. Default: the operating point.
         weight: Factors on ``q``, ``t (n,) -> (n, n_x)``. Default: 1.
         guard: What to do on alarms of the monitor, which it needs. Default: nothing.
-        horizon: Periods of preview. Default: the controller's horizon.
+        w: Forecast of the measured disturbances, ``t (n,) [s] -> (n, n_w)``, for a problem that previews them. Default:
+            none; those measured last are held.
         end: Time [s] beyond which previews that are not finite hold their last value. Default: never.
         input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
         sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
@@ -167,7 +169,7 @@ class Loop:
         reference: Preview | ArrayLike | None = None,
         weight: Preview | None = None,
         guard: Guard | None = None,
-        horizon: int | None = None,
+        w: Preview | None = None,
         end: float = math.inf,
         input_delay: int = 0,
         sensor_delay: int = 0,
@@ -183,7 +185,8 @@ class Loop:
         self._control = GuardedController(safe, guard)
         self._delay = whole_periods(input_delay, "input_delay")
         self._n_inputs = self._delay + whole_periods(sensor_delay, "sensor_delay") + 1
-        self._previews = Previews(reference, weight, self.ocp, horizon, self.model.dt, end)
+        self._previews = Previews(reference, weight, self.ocp, self.model.dt, end, self.standing)
+        self._forecast = Forecast(w, self.ocp, self.model.n_w, self.model.dt)
         self._truth, self._now = sees_truth(estimator), now
         self._state: LoopState | None = None
         self._decide_late: Callable[[], tuple[Decision, GuardState]] | None = None
@@ -198,22 +201,27 @@ class Loop:
     def start(
         self,
         y: ArrayLike | None,
+        w: ArrayLike | None = None,
         *,
+        applied: ArrayLike | None = None,
         truth: ArrayLike | None = None,
         reference: ArrayLike | None = None,
         in_time: Callable[[], bool] | None = None,
     ) -> Array:
         """Begin, while the machine rests: the first estimate, the first plan, which may take its time, the first input.
 
-        Arguments are those of :meth:`step`. Returned is the input ``(n_u,)`` to hold from now on.
+        Arguments are those of :meth:`step`; ``applied`` is the input that has acted until now, by default that of the
+        operating point. Returned is the input ``(n_u,)`` to hold from now on.
         """
-        sample = self._sample(y)
+        sample, measured = self._sample(y), self._disturbed(w)
         x_ref, factors = self._preview(0, reference)
-        estimate = self._estimator.start(self._seen(sample, truth), 0.0)
-        first = self._safe.initial(estimate, None, x_ref, factors)
+        estimate = self._estimator.start(self._seen(sample, truth), 0.0, **self._now_measured(measured))
+        until = None if applied is None else fitting(applied, self.ocp.n_u, "applied")
+        ahead = self._w_ahead(0, measured, estimate)
+        first = self._safe.initial(estimate, until, x_ref, factors, ahead)
         self._state = self._first_state(sample, estimate, first)
         self._ahead, self.reading, self.spent = None, None, dict.fromkeys(TIMED, 0.0)
-        return self._decide(first, x_ref, factors, in_time)
+        return self._decide(first, x_ref, factors, in_time, measured)
 
     def step(
         self,
@@ -229,10 +237,11 @@ class Loop:
 
         Args:
             y: Sample ``(n_y,)``; None or NaN: missing, also single ones.
-            w: Measured disturbances. Today's models have none, so it must be empty or None.
+            w: Measured disturbances ``(n_w,)`` from now on; NaN or None: the last ones stay. ``(m, n_w)`` with a row
+                each for now and the periods ahead is a forecast in place of the loop's own.
             applied: Input ``(n_u,)`` that really acted since the last step, where the actuator says so; an operator's,
                 in manual mode. Default: the one that the last step returned.
-            reference: ``(n_x,)`` or ``(m, n_x)`` from now on in steps of ``dt``, in place of the loop's own.
+            reference: A set-point or ``(m, columns)`` from now on in steps of ``dt``, in place of the loop's own.
             truth: The true ``(x, h)``, for an estimator that needs it.
             in_time: Asked before the solve: may it begin? If not, the last plan is followed, as :meth:`late` does.
                 Default: it may.
@@ -244,11 +253,7 @@ class Loop:
             InputError: If a shape does not fit. No number raises.
         """
         self.finish()
-        sample, state = self._sample(y), self.state
-        if w is not None and np.size(w):
-            raise InputError(
-                f"step: {np.size(w)} measured disturbances given, model {self.model.name} has none"
-            )
+        sample, measured, state = self._sample(y), self._disturbed(w), self.state
         previous, inputs = state.decision, state.inputs
         if applied is not None:
             previous = _with_input(previous, fitting(applied, self.ocp.n_u, "applied"))
@@ -256,21 +261,25 @@ class Loop:
         begin, k = self._now(), state.k + 1
         x_ref, factors = self._preview(k, reference)
         seen = self._seen(sample, truth)
+        also = self._now_measured(measured)
         if state.estimate is None:
-            estimate = self._estimator.start(seen, k * self.model.dt)
+            estimate = self._estimator.start(seen, k * self.model.dt, **also)
         else:
-            estimate = self._estimator.update(state.estimate, seen, previous.u)
+            estimate = self._estimator.update(state.estimate, seen, previous.u, **also)
         self._state = replace(state, k=k, y=sample, estimate=estimate, inputs=inputs, finished=False)
         self.spent = {**dict.fromkeys(TIMED, 0.0), "estimate": self._now() - begin}
-        return self._decide(previous, x_ref, factors, in_time)
+        return self._decide(previous, x_ref, factors, in_time, measured)
 
     def _decide(
-        self, previous: Decision, x_ref: Array, factors: Array | None, in_time: Callable[[], bool] | None
-    ) -> Array:
+        self, previous: Decision, x_ref: Array, factors: Array | None, in_time: Callable[[], bool] | None,
+        measured: Array | None = None,
+    ) -> Array:  # fmt: skip
         """The input of this period, by the controller of the guard's mode or by the operator."""
         state, estimate = self.state, self.estimate
         self.previewed = x_ref, factors
-        guard = self._control.measured(state.guard, self.t, state.y, previous.u)
+        w = self._w_ahead(state.k, measured, estimate)
+        now = self._now_measured(measured).get("w")
+        guard = self._control.measured(state.guard, self.t, state.y, previous.u, now)
         self._decide_late = partial(self._control.decide, guard, previous, estimate, x_ref, late=True)
         may_solve = in_time is None or in_time()
         begin = self._now()
@@ -279,7 +288,7 @@ class Loop:
         else:
             prepared = self._prepared(previous, factors)
             decision, guard = self._control.decide(
-                guard, previous, estimate, x_ref, factors, prepared=prepared, late=not may_solve
+                guard, previous, estimate, x_ref, factors, prepared=prepared, late=not may_solve, w=w
             )
         self.spent["solve"] = self._now() - begin
         self._state = replace(state, decision=decision, guard=guard)
@@ -339,8 +348,10 @@ class Loop:
         self._state = replace(state, k=state.k + n, estimate=estimate, guard=guard, inputs=inputs)
 
     def warm_up(self) -> None:
-        """Call every part once, at rest, and forget it: first calls are slow."""
-        trial, y, truth = copy(self), np.zeros(self.model.n_y), np.zeros(self.model.n_x + self.model.n_h)
+        """Call every part once, at the operating point, and forget it: first calls are slow."""
+        m = self.model
+        trial, y = copy(self), m.output(m.x0, m.u0, m.w, m.p).full().ravel()
+        truth = np.concatenate([m.x0, np.zeros(m.n_h)])
         x_ref, factors = self._preview(0, None)
         estimate = self._estimator.start(truth if self._truth else y, 0.0)
         first = self._safe.initial(estimate)
@@ -407,9 +418,14 @@ class Loop:
         return self.state.guard.switches
 
     @property
-    def safe_input(self) -> Array:
-        """Input ``(n_u,)`` that the machine is left with where nothing is known, as the controller has it."""
-        return self._safe.safe_input.copy()
+    def standing(self) -> Array:
+        """The reference ``(columns,)`` that is the operating point: that of a loop to which none is given."""
+        return self._safe.controller.problem.standing()[0]
+
+    @property
+    def safe_input(self) -> Array | None:
+        """Input ``(n_u,)`` that the machine is left with where nothing is known; None: none is declared."""
+        return None if self._safe.safe_input is None else self._safe.safe_input.copy()
 
     def _first_state(self, sample: Array, estimate: Estimate, first: Decision) -> LoopState:
         memory = None if self._monitor is None else self._monitor.initial()
@@ -417,6 +433,37 @@ class Loop:
 
     def _sample(self, y: ArrayLike | None) -> Array:
         return np.full(self.model.n_y, np.nan) if y is None else fitting(y, self.model.n_y, "the measurement")
+
+    def _disturbed(self, w: ArrayLike | None) -> Array | None:
+        """Measured disturbances ``(m, n_w)``, a row for now and each known ahead; None: nothing was measured."""
+        if w is None:
+            return None
+        rows, n_w = np.atleast_2d(np.asarray(w, dtype=np.float64)), self.model.n_w
+        if rows.size and not n_w:
+            raise InputError(f"w: {rows.size} measured disturbances given, model {self.model.name} has none")
+        if rows.ndim != 2 or rows.shape[1] != n_w or not len(rows):
+            raise InputError(
+                f"w: measured disturbances of shape {np.shape(w)} given, model {self.model.name} has {n_w}: ({n_w},), "
+                f"or (m, {n_w}) with a forecast, needed"
+            )
+        return rows
+
+    def _now_measured(self, measured: Array | None) -> dict[str, Array]:
+        """What an estimator is told of them; nothing where the model has none."""
+        if not self.model.n_w:
+            return {}
+        return {"w": np.full(self.model.n_w, np.nan) if measured is None else measured[0]}
+
+    def _w_ahead(self, k: int, measured: Array | None, estimate: Estimate) -> Array | None:
+        """Measured disturbances ``(m, n_w)`` that the solve of period k counts on; None: those of the estimate."""
+        if measured is not None and len(measured) > 1:
+            return held(measured[self._delay :] if len(measured) > self._delay else measured[-1:], estimate.w)
+        ahead = self._forecast((k + self._delay) * self.model.dt)
+        if ahead is None:
+            return None
+        if not self._delay:
+            ahead[0] = estimate.w
+        return held(ahead, estimate.w)
 
     def _seen(self, sample: Array, truth: ArrayLike | None) -> Array:
         """What the estimator takes: the sample, or the truth."""
@@ -496,6 +543,8 @@ def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monito
         ("input", state.decision.u, model.n_u),
         ("plan", plan.u, ocp.horizon * ocp.n_u),
     ]
+    if estimate is not None and model.n_w:
+        sizes += [("measured disturbances", estimate.w, model.n_w)]
     if estimate is not None:
         sizes += [("estimate", estimate.x, model.n_x), ("hidden state", estimate.h, model.n_h)]
     wrong = [

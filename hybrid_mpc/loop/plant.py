@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 class Plant(Protocol):
     """The machine in simulation. Its state is its own affair; ``truth`` gives the model's states.
 
-    It uses numpy, scipy and casadi only, and its own integrator with its own tolerance.
+    It uses numpy, scipy and casadi only, and its own integrator with its own tolerance. A machine with measured
+    disturbances gets them as a fourth argument, ``step(state, u, dt, w)`` with ``w`` ``(n_w,)`` held over the period.
     """
 
     def reset(self, x0: Array, seed: int) -> Any:
@@ -69,9 +70,11 @@ class SimulatedMachine:
         before, self._acting = self._acting, self._commands.pop(0)
         return self._acting, before
 
-    def advance(self, t: float) -> None:
-        """One period on."""
-        self.state = self._plant.step(self.state, corrupt_input(self._faults, t, self._acting), self._dt)
+    def advance(self, t: float, w: Array | None = None) -> None:
+        """One period on, with measured disturbances ``w`` ``(n_w,)`` if there are any."""
+        u, plant = corrupt_input(self._faults, t, self._acting), self._plant
+        step: Any = plant.step
+        self.state = step(self.state, u, self._dt, *(() if w is None else (w,)))
 
     def _sensor(self) -> Array:
         return fitting(self._plant.measure(self.state, self._rng), self._n_y, "the plant's measurement")

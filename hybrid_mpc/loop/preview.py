@@ -1,4 +1,4 @@
-"""What the loop looks ahead at: reference and weight factors over the horizon."""
+"""What the loop looks ahead at: reference, weight factors and measured disturbances over the horizon."""
 
 from __future__ import annotations
 
@@ -18,19 +18,17 @@ Preview = Callable[[Array], Array]
 class Previews:
     """Reference and weight factors over the horizon, in their shapes; arguments are those of a ``Loop``.
 
-    Where values beyond the ``end`` of the run [s] are not finite, the last before them is held.
+    Without ``ocp.preview`` they are those of the instant alone. Where values beyond the ``end`` of the run [s] are not
+    finite, the last before them is held. ``standing`` ``(columns,)`` is the reference where none is given.
     """
 
     def __init__(
-        self, reference: Preview | ArrayLike | None, weight: Preview | None, ocp: OCP, horizon: int | None,
-        dt: float, end: float,
+        self, reference: Preview | ArrayLike | None, weight: Preview | None, ocp: OCP, dt: float, end: float,
+        standing: Array,
     ) -> None:  # fmt: skip
-        steps = ocp.horizon if horizon is None else horizon
-        if steps < 0:
-            raise InputError(f"horizon must not be negative, got {horizon}")
-        self._reference, self._weight, self._end = _function_of(reference, ocp), weight, end
-        self._n_x, self._columns = ocp.n_x, ocp.n_x + ocp.n_p
-        self._ahead: Array = np.arange(steps + 1, dtype=np.float64) * dt
+        self._reference, self._weight, self._end = _function_of(reference, standing), weight, end
+        self._n_x, self._columns = ocp.n_x, ocp.columns
+        self._ahead: Array = np.arange(ocp.horizon + 1 if ocp.preview else 1, dtype=np.float64) * dt
 
     def __call__(self, t: float) -> tuple[Array, Array | None]:
         """Reference and factors (None for 1) from ``t`` on."""
@@ -51,14 +49,51 @@ class Previews:
         return values
 
 
-def _function_of(reference: Preview | ArrayLike | None, ocp: OCP) -> Preview:
+class Forecast:
+    """Measured disturbances ``(N, n_w)`` from an instant on, where the problem previews them and a forecast is given.
+
+    Args:
+        w: ``t (n,) [s] -> (n, n_w)``; None: there is no forecast.
+        ocp: The problem.
+        n_w: Number of measured disturbances.
+        dt: Period [s].
+
+    Raises:
+        InputError: If there is a forecast but nothing to forecast.
+    """
+
+    def __init__(self, w: Preview | None, ocp: OCP, n_w: int, dt: float) -> None:
+        if w is not None and not n_w:
+            raise InputError("w: a forecast of measured disturbances given, the model has none")
+        self._w = w if ocp.preview_w else None
+        self._n_w, self._ahead = n_w, np.arange(ocp.horizon, dtype=np.float64) * dt
+
+    def __call__(self, t: float) -> Array | None:
+        """Disturbances from ``t`` on; None: those measured last are held."""
+        if self._w is None:
+            return None
+        values = np.array(self._w(t + self._ahead), dtype=np.float64)
+        if values.shape != (self._ahead.size, self._n_w):
+            raise InputError(f"w returns {values.shape}, needed: {(self._ahead.size, self._n_w)}")
+        return values
+
+
+def held(values: Array, first: Array) -> Array:
+    """Rows ``(m, n)`` in which what is not finite is the value before it, at the beginning ``first`` ``(n,)``."""
+    rows, last = values.copy(), first
+    for row in rows:
+        last = np.where(np.isfinite(row), row, last)
+        row[:] = last
+    return rows
+
+
+def _function_of(reference: Preview | ArrayLike | None, standing: Array) -> Preview:
     """The reference as a function of time, also where a set-point or nothing was given."""
     if callable(reference):
         return reference
-    columns = ocp.n_x + ocp.n_p
-    goal = np.zeros(columns) if reference is None else np.asarray(reference, dtype=np.float64)
-    if goal.shape != (columns,):
+    goal = standing if reference is None else np.asarray(reference, dtype=np.float64)
+    if goal.shape != standing.shape:
         raise InputError(
-            f"reference: a function of time or a set-point of shape {(columns,)} needed, got shape {goal.shape}"
+            f"reference: a function of time or a set-point of shape {standing.shape} needed, got shape {goal.shape}"
         )
     return lambda t: np.tile(goal, (len(t), 1))

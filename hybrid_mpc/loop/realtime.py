@@ -75,12 +75,16 @@ class Runner:
         estimator: Filter on the controller's model.
         controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
             fallback.
-        reference: ``t (n,) [s] -> x_ref (n, n_x)``, previewed over the horizon; ``t`` counts from the start.
+        reference: ``t (n,) [s] -> x_ref (n, n_x)``, or ``y_ref (n, n_y)`` where the problem weighs outputs; ``t``
+            counts from the start.
         weight: Factors on ``q``, alike. Default: 1.
-        horizon: Periods of preview. Default: the controller's horizon.
+        measure_w: ``() -> w (n_w,)``, measured disturbances, or None where no sample has come. Default: nobody measures
+            them, and they are those of the operating point.
+        w: Forecast of them, as in :class:`~hybrid_mpc.loop.loop.Loop`.
         monitor: Default: none.
         deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
-        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's.
+        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's; one of the two
+            must be declared.
         input_delay: As in :class:`~hybrid_mpc.loop.loop.Loop`.
         sensor_delay: As there.
         clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
@@ -89,7 +93,8 @@ class Runner:
         keep: Periods whose rows the report keeps, the last ones. Default 100 000.
 
     Raises:
-        InputError: If models, deadline, safe input, delays or ``keep`` do not fit, or the estimator wants the truth.
+        InputError: If models, deadline, safe input, delays or ``keep`` do not fit, no safe input is declared, or the
+            estimator wants the truth.
 
     Example: see ``docs/control.md``; in short::
 
@@ -106,7 +111,8 @@ class Runner:
         reference: Preview,
         *,
         weight: Preview | None = None,
-        horizon: int | None = None,
+        measure_w: Callable[[], ArrayLike | None] | None = None,
+        w: Preview | None = None,
         monitor: Monitor | None = None,
         deadline: float | None = None,
         safe_input: ArrayLike | None = None,
@@ -127,12 +133,19 @@ class Runner:
             raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
         self._clock, self._dt, self._deadline, self._keep = clock or RealClock(), dt, due, keep
         self._measure, self._actuate, self._on_step = measure, actuate, on_step
+        self._measure_w = measure_w
         self._loop = partial(
             Loop, estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
-            horizon=horizon, input_delay=input_delay, sensor_delay=sensor_delay,
+            w=w, input_delay=input_delay, sensor_delay=sensor_delay,
         )  # fmt: skip
         loop = self._loop()
-        self._safe_input = loop.safe_input if safe_input is None else checked_safe_input(safe_input, loop.ocp)
+        declared = loop.safe_input if safe_input is None else safe_input
+        if declared is None:
+            raise InputError(
+                "Runner: no safe input is declared; give safe_input=[...], or Scenario(safe_input=...): the input that "
+                "the machine may be left with. Zero is not safe for every machine, so it is never guessed"
+            )
+        self._safe_input = checked_safe_input(declared, loop.ocp)
 
     @property
     def safe_input(self) -> Array:
@@ -196,7 +209,7 @@ class _Run:
 
     def begin(self) -> None:
         """Measure, plan and decide while the machine still rests; the first period is then now."""
-        self._loop.start(self._sample())
+        self._loop.start(self._sample(), self._disturbances())
         self._start = self._clock.now()
 
     def wait(self) -> None:
@@ -250,6 +263,9 @@ class _Run:
         y = self._runner._measure()
         return None if y is None else fitting(y, self._loop.model.n_y, "what measure() returns")
 
+    def _disturbances(self) -> ArrayLike | None:
+        return None if self._runner._measure_w is None else self._runner._measure_w()
+
     def _decide(self, y: Array | None, deadline: float) -> None:
         """A step whose solve is begun where it can be in time, and dropped where it was not."""
         # Half of the time left is always tried: else a slow spell would end all solving.
@@ -261,7 +277,7 @@ class _Run:
             begun = self._clock.now() + needed <= deadline
             return begun
 
-        self._loop.step(y, in_time=in_time)
+        self._loop.step(y, self._disturbances(), in_time=in_time)
         if begun:
             self._solves.append(self._loop.spent["solve"])
             if self._clock.now() > deadline:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.safeguard import Decision, SafeController
+from hybrid_mpc.control.targets import Steady
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.faults import Fault, check_channels, install
@@ -55,7 +56,7 @@ def simulate(
     x0: ArrayLike,
     seed: int,
     weight: Preview | None = None,
-    horizon: int | None = None,
+    w: Preview | ArrayLike | None = None,
     monitor: Monitor | None = None,
     faults: Sequence[Fault] = (),
     stage_cost: OCP | None = None,
@@ -82,14 +83,17 @@ def simulate(
         estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which is handed the truth, undelayed.
         controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
             fallback.
-        reference: ``t (n,) -> x_ref (n, n_x)`` or a set-point; see :class:`~hybrid_mpc.loop.loop.Loop`.
+        reference: ``t (n,) -> x_ref (n, n_x)``, or ``y_ref (n, n_y)`` where the problem weighs outputs, or a set-point;
+            see :class:`~hybrid_mpc.loop.loop.Loop`.
         dt: Period [s]; must be the models' own.
         duration: Length [s], rounded to whole periods.
         x0: Initial state ``(n_x,)``.
         seed: Seed of the plant and of the measurement noise.
         weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, previewed alike; they count in the recorded cost.
             Default: 1.
-        horizon: Periods of preview. Default: the controller's horizon.
+        w: Measured disturbances of the machine, ``t (n,) -> (n, n_w)`` or constant ones ``(n_w,)``: they act on the
+            plant, the loop measures them, and knows them ahead if the problem previews them. Default: those of the
+            model's operating point.
         monitor: Default: none.
         faults: Default: none.
         stage_cost: Problem whose stage cost is recorded. Default: the controller's.
@@ -111,15 +115,18 @@ def simulate(
                           duration=task.duration, x0=task.x0, seed=0)
     """
     loop = Loop(
-        estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard, horizon=horizon,
-        end=_end(dt, duration, estimator.model.dt), input_delay=input_delay, sensor_delay=sensor_delay,
+        estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
+        w=_disturbances(w, estimator.model), end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
+        sensor_delay=sensor_delay,
     )  # fmt: skip
+    surroundings = _disturbances(w, estimator.model)
     ocp, model, periods = loop.ocp, loop.model, round(duration / dt)
     plant, faults = install(plant, faults)
     check_channels(faults, model.n_y, ocp.n_u)
     cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
     # what the loop previews is for the instant at which its input will act; the cost counts now
-    acting = Previews(reference, weight, ocp, horizon, dt, periods * dt) if input_delay else None
+    standing = loop.standing
+    acting = Previews(reference, weight, ocp, dt, periods * dt, standing) if input_delay else None
     rest = vector(x0, ocp.n_x, "x0")
     machine = SimulatedMachine(plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
     rows: list[_Row] = []
@@ -129,23 +136,66 @@ def simulate(
         y = machine.measure(t)
         truth = np.concatenate([x, plant.hidden(machine.state)])
         in_time = None if late is None else partial(_in_time, late, t)
+        now_w = np.zeros(0) if surroundings is None else _row_at(surroundings, t, model.n_w)
         if k == 0:
-            loop.start(y, truth=truth, in_time=in_time)
+            loop.start(y, now_w, truth=truth, in_time=in_time)
             machine.rest(loop.state.inputs[0])
         else:
-            loop.step(y, truth=truth, in_time=in_time)
+            loop.step(y, now_w, truth=truth, in_time=in_time)
         u, u_prev = machine.command(loop.decision.u)
         loop.finish()
-        x_ref, factors = loop.previewed if acting is None else acting(t)
+        reference_now, factors = loop.previewed if acting is None else acting(t)
+        goal = _goal(ocp, model, reference_now[0], loop.decision.solution.steady)
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
             now = 1.0 if factors is None else factors[0]
-            stage = float(cost.stage_cost(x, u, x_ref[0, : x.size], u - u_prev, now))
+            error = model.output(x, u, now_w, model.p).full().ravel() - goal.y if cost.n_y else None
+            stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, now, u_ref=goal.u, y_error=error))
         step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
-        rows.append(_row(step, x_ref[0, : x.size].copy(), stage, loop.spent))
+        rows.append(_row(step, goal, now_w, stage, loop.spent))
         if on_step is not None:
             on_step(step)
-        machine.advance(t)
+        machine.advance(t, now_w if model.n_w else None)
     return _result(rows, dt, loop.switches)
+
+
+def _disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview | None:
+    """Measured disturbances as a function of time; None where the model has none.
+
+    Raises:
+        InputError: If constant ones are of another number, or the model has none.
+    """
+    if not model.n_w and w is not None:
+        raise InputError(f"w: measured disturbances given, model {model.name} has none")
+    if callable(w) or not model.n_w:
+        return w if callable(w) else None
+    constant = model.w if w is None else vector(w, model.n_w, "w")
+    return lambda t: np.tile(constant, (len(t), 1))
+
+
+def _row_at(w: Preview, t: float, n_w: int) -> Array:
+    values = np.asarray(w(np.array([t])), dtype=np.float64)
+    if values.shape != (1, n_w):
+        raise InputError(f"w returns {values.shape} for one instant, needed: {(1, n_w)}")
+    return values[0]
+
+
+class _Goal(NamedTuple):
+    """What a period was to reach: states, inputs and outputs, and whether it can be reached."""
+
+    x: Array
+    u: Array
+    y: Array
+    reached: bool
+
+
+def _goal(ocp: OCP, model: HybridModel, reference: Array, steady: Steady | None) -> _Goal:
+    """What a period's row of the reference asks for; of outputs with its steady state."""
+    if not ocp.n_y:
+        return _Goal(reference[: model.n_x].copy(), model.u0, np.full(model.n_y, np.nan), True)
+    y = np.where(ocp.q_y > 0, reference[: model.n_y], 0.0)
+    if steady is None or not steady.steady:
+        return _Goal(model.x0, model.u0, y, False)
+    return _Goal(steady.x, steady.u, y, steady.reached)
 
 
 def _in_time(late: Callable[[float], bool], t: float) -> bool:
@@ -167,6 +217,9 @@ def _result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> Cl
         valid=np.array([r is not None and not getattr(r, "validity", 0) for r in readings]),
         switches=switches,
         numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
+        w=np.array([row.w for row in rows]),
+        y_ref=np.array([row.y_ref for row in rows]),
+        reached=np.array([row.reached for row in rows]),
     )
 
 
@@ -188,17 +241,20 @@ class _Row(NamedTuple):
     status: str
     reading: Reading | None
     spent: Mapping[str, float]
+    w: Array
+    y_ref: Array
+    reached: bool
 
 
 COLUMNS = _Row._fields[:11]
 """Those that are numbers."""
 
 
-def _row(step: Step, reference: Array, stage: float, spent: Mapping[str, float]) -> _Row:
+def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, float]) -> _Row:
     e, d = step.estimate, step.decision
     return _Row(
-        step.t, step.x, step.y, d.u, e.x, e.h, e.d, reference, stage, e.innovation, e.nis, d.source.name,
-        d.status.name, step.reading, spent,
+        step.t, step.x, step.y, d.u, e.x, e.h, e.d, goal.x, stage, e.innovation, e.nis, d.source.name,
+        d.status.name, step.reading, spent, w, goal.y, goal.reached,
     )  # fmt: skip
 
 
@@ -237,8 +293,9 @@ class ClosedLoopResult:
         u: Commanded inputs ``(n, n_u)``, held from ``t_k`` on (with an input delay: from that much later).
         x_hat: Estimated states ``(n, n_x)``; with an input delay of the instant at which ``u`` will act.
         h: Estimated hidden states ``(n, n_h)``.
-        d: Estimated input disturbance ``(n, n_u)``.
-        reference: Reference ``(n, n_x)`` at ``t_k``.
+        d: Estimated unmeasured disturbances ``(n, n_d)``.
+        reference: Reference of the states ``(n, n_x)`` at ``t_k``; where the problem weighs outputs, the steady state
+            of the set-point.
         source: Name of the :class:`~hybrid_mpc.control.safeguard.Source` of each input.
         status: Name of the :class:`~hybrid_mpc.control.problem.Status` of each solve.
         stage_cost: Stage cost ``(n,)`` per second on the true state and the input that acts on it, with the
@@ -253,6 +310,9 @@ class ClosedLoopResult:
         innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN where it had none. Default: unknown.
         nis: Normalised innovations squared ``(n,)`` [-]; NaN where there was none. Default: unknown.
         numbers: The monitor's readings as numbers ``(n, columns)``, from which detectors are learned. Default: none.
+        w: Measured disturbances ``(n, n_w)`` that acted from ``t_k`` on. Default: none.
+        y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN where references are the states'. Default: unknown.
+        reached: ``(n,)``, False where the set-point cannot be reached. Default: unknown.
 
     Example:
         >>> one = np.ones((2, 1))
@@ -260,7 +320,7 @@ class ClosedLoopResult:
         ...     ("MPC",) * 2, ("SOLVED",) * 2, np.array([2.0, 4.0]), {},
         ...     one[:, 0], one[:, 0], np.zeros(2, bool))
         >>> round(result.cost, 6), result.tracking_rmse
-        (0.6, 1.0)
+        (0.6, array([1.]))
     """
 
     dt: float
@@ -284,6 +344,14 @@ class ClosedLoopResult:
     innovation: Array = field(default_factory=lambda: np.zeros((0, 0)))
     nis: Array = field(default_factory=lambda: np.zeros(0))
     numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    w: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    y_ref: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    reached: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    @property
+    def tracks_outputs(self) -> bool:
+        """Whether references were the outputs'."""
+        return bool(self.y_ref.size) and bool(np.all(np.isfinite(self.y_ref)))
 
     @property
     def mode(self) -> tuple[str, ...]:
@@ -300,9 +368,12 @@ class ClosedLoopResult:
         return float(np.sum(self.stage_cost) * self.dt)
 
     @property
-    def tracking_rmse(self) -> float:
-        """Root mean square of the true first state's deviation from its reference [its unit]."""
-        return float(np.sqrt(np.mean((self.x[:, 0] - self.reference[:, 0]) ** 2)))
+    def tracking_rmse(self) -> Array:
+        """Root mean squares of the deviations from the reference [their units]: of the true states ``(n_x,)``, or of
+        the measured outputs ``(n_y,)`` where references were the outputs'.
+        """
+        error = self.y - self.y_ref if self.tracks_outputs else self.x - self.reference
+        return np.asarray(np.sqrt(np.nanmean(error**2, axis=0)))
 
     def to_pandas(self, model: HybridModel | None = None) -> pd.DataFrame:
         """One row a period. Needs pandas.
@@ -319,8 +390,10 @@ class ClosedLoopResult:
         import pandas as pd
 
         columns: dict[str, object] = {"t" if model is None else "t [s]": self.t}
-        for name in ("x", "y", "u", "x_hat", "h", "d", "reference"):
+        for name in ("x", "y", "u", "x_hat", "h", "d", "w", "reference", "y_ref"):
             values = getattr(self, name)
+            if not values.size or (name == "y_ref" and not self.tracks_outputs):
+                continue
             labels = _labels(name, values.shape[1], model)
             columns.update({label: values[:, i] for i, label in enumerate(labels)})
         for name in ("source", "status", "stage_cost", "violation", "level", "alarm"):
@@ -334,7 +407,16 @@ class ClosedLoopResult:
 def _labels(name: str, n: int, model: HybridModel | None) -> list[str]:
     if model is None or name == "h":
         return [f"{name}_{i}" for i in range(n)]
-    signals = model.outputs if name == "y" else model.inputs if name in ("u", "d") else model.states
+    if name == "d" and model.disturbance_model is not None:
+        return [f"d {d.at} {d.signal}" for d in model.disturbance_model]
+    groups = {
+        "y": model.outputs,
+        "y_ref": model.outputs,
+        "u": model.inputs,
+        "d": model.inputs,
+        "w": model.disturbances,
+    }
+    signals = groups.get(name, model.states)
     if len(signals) != n:
         raise InputError(
             f"to_pandas: the loop has {n} columns of {name}, the model {model.name} {len(signals)}"

@@ -30,18 +30,14 @@ def numbers(values: ArrayLike, name: str) -> Array:
         raise InputError(f"{name}: numbers needed, got {values!r}") from error
 
 
-def at_rest(lower: ArrayLike, upper: ArrayLike) -> Array:
-    """Zero, or where limits ``(n,)`` exclude it the limit next to it: the input where nothing is known."""
-    return np.asarray(np.clip(0.0, lower, upper))
-
-
-def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> float:
+def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike, rest: ArrayLike = 0.0) -> float:
     """Largest share of the way from rest to a limit ``(n,)`` that values ``(m, n)`` use: 1 at the limit, more beyond.
 
-    Where a limit is the rest value itself: 1 plus the violation over the whole range; infinite without a range.
+    ``rest`` ``(n,)`` is the operating point's value; beyond a limit that limit stands for it. Where a limit is the
+    rest value itself: 1 plus the violation over the whole range; infinite without a range.
     """
     value, low, high = (np.asarray(v, dtype=float) for v in (values, lower, upper))
-    rest, span = at_rest(low, high), high - low
+    rest, span = np.clip(rest, low, high), high - low
     shares = []
     with np.errstate(divide="ignore", invalid="ignore"):
         for way, room in ((value - rest, high - rest), (rest - value, rest - low)):

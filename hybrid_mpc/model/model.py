@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import casadi as ca
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import Parameter, Signal
+from hybrid_mpc.model.disturbance import Disturbance, disturbance_matrices
 
 Array = NDArray[np.float64]
 Expression: TypeAlias = Any
@@ -45,13 +47,14 @@ class HybridModel:
 
     ``h`` is the hidden state before ``(x_k, u_k)``; a prior's is empty (``n_h = 0``, 0 x 1). ``w`` are disturbances,
     measured but not commanded; ``p`` are the prior's parameters. Both may be empty; :attr:`w` and :attr:`p` are their
-    usual values. The fitted prior, the hybrid and an oracle share this interface. :meth:`of` makes a model of
-    expressions.
+    usual values. ``d`` are disturbances that nobody measures; they are no argument of the functions:
+    :attr:`disturbance_model` says what they are added to. The fitted prior, the hybrid and an oracle share this
+    interface. :meth:`of` makes a model of expressions.
 
     Args:
         name: e.g. ``"mopgrnn"``.
         dt: Model period [s].
-        states: Signals of ``x``, ``[q, v]``.
+        states: Signals of ``x``.
         inputs: Signals of ``u``.
         outputs: Signals of ``y``.
         step: ``(x, h, u, w, p) -> (x_next, h_next)``, columns n_x, n_h, n_u, n_w, n_p.
@@ -71,6 +74,10 @@ class HybridModel:
             and the balances then take the input that acts. Default 0.
         time_unit: The machine's second [s] (:func:`~hybrid_mpc.data.scales.time_unit`): the unit of the lengths of
             monitor and guard. Default 1.
+        nominal_x: State ``(n_x,)`` of the operating point: an equilibrium with ``nominal_u`` and ``nominal_w``. Where
+            nothing else is known, loops start there. Default: zeros.
+        nominal_u: Input ``(n_u,)`` that holds it there. Default: zeros.
+        disturbance_model: What unmeasured disturbances are added to. Default: one at each input.
 
     Raises:
         InputError: If the functions' shapes do not fit the signals and parameters.
@@ -109,6 +116,9 @@ class HybridModel:
     balances: tuple[Balance, ...] = field(default=(), repr=False)
     delay_states: int = 0
     time_unit: float = 1.0
+    nominal_x: tuple[float, ...] = ()
+    nominal_u: tuple[float, ...] = ()
+    disturbance_model: tuple[Disturbance, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("dt", "time_unit"):
@@ -126,8 +136,10 @@ class HybridModel:
         n_z = self.n_x + self.n_h
         slopes = [(n_z, n_z), (n_z, self.n_u)]
         _check(self.name, "with_jacobian", with_jacobian, [x, h, u, w, p], [x, h, *slopes])
-        object.__setattr__(self, "nominal_w", self.nominal_w or (0.0,) * self.n_w)
+        for name, size in (("nominal_x", self.n_x), ("nominal_u", self.n_u), ("nominal_w", self.n_w)):
+            object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * size)
         _check_numbers(self)
+        _ = self.disturbed  # an unknown signal is refused here
 
     @classmethod
     def of(
@@ -153,6 +165,9 @@ class HybridModel:
         disturbances: Sequence[Signal] = (),
         nominal_w: Sequence[float] = (),
         parameters: Sequence[Parameter] = (),
+        nominal_x: Sequence[float] = (),
+        nominal_u: Sequence[float] = (),
+        disturbance_model: tuple[Disturbance, ...] | None = None,
     ) -> HybridModel:
         """A model of CasADi expressions, of MX or of SX.
 
@@ -177,6 +192,9 @@ class HybridModel:
             disturbances: Signals of ``w``.
             nominal_w: See :class:`HybridModel`.
             parameters: The parameters ``p``.
+            nominal_x: See :class:`HybridModel`.
+            nominal_u: See :class:`HybridModel`.
+            disturbance_model: See :class:`HybridModel`.
 
         Raises:
             InputError: If an expression holds another symbol, or shapes do not fit.
@@ -211,6 +229,7 @@ class HybridModel:
             balances=()
             if energy is None
             else (Balance("energy", "J", "W", function("energy", [x, rates, u, w, p], [energy])),),
+            nominal_x=tuple(nominal_x), nominal_u=tuple(nominal_u), disturbance_model=disturbance_model,
         )  # fmt: skip
 
     @property
@@ -244,14 +263,63 @@ class HybridModel:
         return len(self.parameters)
 
     @property
+    def n_d(self) -> int:
+        """Number of unmeasured disturbances."""
+        return int(self.disturbed[0].shape[1])
+
+    @cached_property
+    def disturbed(self) -> tuple[Array, Array, Array]:
+        """How unmeasured disturbances act: what ``d`` adds to ``u`` ``(n_u, n_d)``, to ``x_next`` ``(n_x, n_d)`` and to
+        ``y`` ``(n_y, n_d)``.
+        """
+        return disturbance_matrices(self.disturbance_model, self.inputs, self.states, self.outputs, self.dt)
+
+    def acting(self, u: Array, d: Array, w: Array) -> Array:
+        """All that acts on the machine ``(N, n_v)``: inputs ``(N, n_u)`` with what ``d`` ``(n_d,)`` adds to them, then
+        ``w`` ``(N, n_w)`` if there are any, then what ``d`` adds to the next states if it does.
+        """
+        on_u, on_x, _ = self.disturbed
+        parts = [u + d if self.disturbance_model is None else u + on_u @ d]
+        if self.n_w:
+            parts.append(np.broadcast_to(w, (len(u), self.n_w)))
+        if np.any(on_x):
+            parts.append(np.broadcast_to(on_x @ d, (len(u), self.n_x)))
+        return parts[0] if len(parts) == 1 else np.hstack(parts)
+
+    @property
+    def n_v(self) -> int:
+        """Number of columns of :meth:`acting`."""
+        return self.n_u + self.n_w + (self.n_x if np.any(self.disturbed[1]) else 0)
+
+    @property
+    def x0(self) -> Array:
+        """State ``(n_x,)`` of the operating point."""
+        return np.array(self.nominal_x, dtype=np.float64)
+
+    @property
+    def u0(self) -> Array:
+        """Input ``(n_u,)`` of the operating point."""
+        return np.array(self.nominal_u, dtype=np.float64)
+
+    @property
     def w(self) -> Array:
-        """Disturbances ``(n_w,)`` that are taken where none are given."""
+        """Measured disturbances ``(n_w,)`` that are taken where none are given: those of the operating point."""
         return np.array(self.nominal_w, dtype=np.float64)
 
     @property
     def p(self) -> Array:
         """Fitted values ``(n_p,)`` of the parameters."""
         return np.array([parameter.value for parameter in self.parameters], dtype=np.float64)
+
+
+def output_with_jacobian(model: HybridModel) -> ca.Function:
+    """Output ``(n_y,)`` of a model at ``(x, u, w)`` and its dense Jacobians by ``x`` and by ``u``."""
+    x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
+    y = model.output(x, u, w, model.p)
+    return ca.Function(
+        "output_with_jacobian", [x, u, w],
+        [ca.densify(y), ca.densify(ca.jacobian(y, x)), ca.densify(ca.jacobian(y, u))],
+    )  # fmt: skip
 
 
 def longer_period(model: HybridModel, periods: int) -> HybridModel:
@@ -320,6 +388,34 @@ def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> 
     return ca.Function("acceleration", [x, u, w, p], [ca.densify(a)])
 
 
+def kinematics(model: HybridModel) -> dict[int, int]:
+    """Places of the states that are the rates of others, by the places of those: speeds by their positions.
+
+    A rate counts as a state's if it is that state exactly, at random points: ``{0: 1}`` for ``x = (q, q_dot)``.
+    """
+    point = step_symbols(model)
+    x, h, u, w, _ = point
+    rates = model.xdot(*point)
+    slopes = ca.Function("slopes", point, [rates, ca.densify(ca.jacobian(rates, ca.vertcat(x, h, u, w)))])
+    rng = np.random.default_rng(0)
+    found: dict[int, int] = {}
+    scale = np.where(model.x0 != 0, np.abs(model.x0), 1.0)
+    for trial in range(3):
+        x_k = model.x0 + 0.3 * scale * rng.uniform(-1, 1, model.n_x)
+        u_k = model.u0 + 0.3 * rng.uniform(-1, 1, model.n_u)
+        h_k = 0.3 * rng.uniform(-1, 1, model.n_h)
+        value, jacobian = (m.full() for m in slopes(x_k, h_k, u_k, model.w, model.p))
+        now = {
+            i: int(np.argmax(row))
+            for i, row in enumerate(jacobian)
+            if np.array_equal(row, np.eye(row.size)[np.argmax(row)])
+            and np.argmax(row) < model.n_x
+            and value[i, 0] == x_k[np.argmax(row)]
+        }
+        found = now if trial == 0 else {i: j for i, j in found.items() if now.get(i) == j}
+    return {i: j for i, j in found.items() if i != j}
+
+
 def changeable(model: HybridModel) -> tuple[str, ...]:
     """What of a prior may change: its parameters, and the gain of each input."""
     return (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
@@ -365,9 +461,11 @@ def _with_jacobian(step: ca.Function) -> ca.Function:
 
 
 def _check_numbers(model: HybridModel) -> None:
-    w, n_p = model.nominal_w, model.n_p
-    if len(w) != model.n_w or not all(map(math.isfinite, w)):
-        raise InputError(f"model {model.name}: nominal_w needs {model.n_w} finite values, got {w}")
+    n_p = model.n_p
+    for name, size in (("nominal_x", model.n_x), ("nominal_u", model.n_u), ("nominal_w", model.n_w)):
+        values = getattr(model, name)
+        if len(values) != size or not all(map(math.isfinite, values)):
+            raise InputError(f"model {model.name}: {name} needs {size} finite values, got {values}")
     if model.covariance and [len(row) for row in model.covariance] != [n_p] * n_p:
         raise InputError(f"model {model.name}: covariance needs {n_p} rows of {n_p} values, one a parameter")
     for what, names in (

@@ -54,15 +54,19 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
     return p, k
 
 
-def hidden_fixed_point(model: HybridModel, x: Array, u: Array, *, limit: int = 2000) -> Array:
-    """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` held.
+def hidden_fixed_point(
+    model: HybridModel, x: Array, u: Array, *, w: Array | None = None, limit: int = 2000
+) -> Array:
+    """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)``, ``u`` ``(n_u,)`` and ``w`` ``(n_w,)`` held.
 
-    The iteration starts at zero. It ends when no element moves by more than 1e-10, or after ``limit`` steps with the
-    last value.
+    The iteration starts at zero, delayed inputs at ``u``. It ends when no element moves by more than 1e-10, or after
+    ``limit`` steps with the last value.
     """
     h = np.zeros(model.n_h)
+    h[: model.delay_states] = np.resize(u, model.delay_states)
+    held = model.w if w is None else w
     for _ in range(limit if model.n_h else 0):
-        h_next = model.step(x, h, u, model.w, model.p)[1].full().ravel()
+        h_next = model.step(x, h, u, held, model.p)[1].full().ravel()
         moved, h = np.max(np.abs(h_next - h)), h_next
         if not moved > SETTLED:
             break

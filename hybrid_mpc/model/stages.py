@@ -20,17 +20,18 @@ Array = NDArray[np.float64]
 Derivatives = tuple[Array, Array, Array]
 """Successors ``(N, n_z)``, transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
 Run = Callable[[Array, Array], Array]
-"""Trajectory ``(N + 1, n_z)`` of a model from ``z0`` ``(n_z,)`` on inputs ``(N, n_u)``."""
+"""Trajectory ``(N + 1, n_z)`` of a model from ``z0`` ``(n_z,)`` on what acts ``(N, n_v)``
+(:meth:`~hybrid_mpc.model.model.HybridModel.acting`); without measured disturbances these are the inputs."""
 Slopes = Callable[[Array, Array], Array]
-"""Jacobians of the successors ``(m, n_z, n_x + n_u)`` by ``(x, u)``, of ``z`` ``(m, n_z)`` and ``u``; with
+"""Jacobians of the successors ``(m, n_z, n_x + n_u)`` by ``(x, u)``, of ``z`` ``(m, n_z)`` and what acts; with
 ``hidden`` by ``(x, u, h)``."""
 
 
 class Linearization(Protocol):
     """A model's periods over a horizon, values and Jacobians in one call."""
 
-    def at(self, z: Array, u: Array) -> Derivatives:
-        """Every period from its own ``z`` ``(N, n_z)`` on ``u`` ``(N, n_u)``."""
+    def at(self, z: Array, v: Array) -> Derivatives:
+        """Every period from its own ``z`` ``(N, n_z)`` on what acts, ``v`` ``(N, n_v)``."""
 
     run: Run
     """The model from one ``z`` on."""
@@ -60,19 +61,19 @@ class Stages:
         self.run = free_run(model, n, compiled=compiled)
         self._shape, self._n_x = (n, model.n_x + model.n_h), model.n_x
 
-    def at(self, z: Array, u: Array) -> Derivatives:
+    def at(self, z: Array, v: Array) -> Derivatives:
         """See :class:`Linearization`."""
-        z_next, a_t, b = self._call(z, u)
+        z_next, a_t, b = self._call(z, v)
         return z_next.copy(), a_t.copy(), b.copy()  # the next call overwrites them
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearization`."""
         n, n_x = self._shape[0], self._n_x
 
-        def evaluate(z: Array, u: Array) -> Array:
+        def evaluate(z: Array, v: Array) -> Array:
             parts = []
             for k in range(0, times * n, n):
-                _, a_t, b = self._call(z[k : k + n], u[k : k + n])
+                _, a_t, b = self._call(z[k : k + n], v[k : k + n])
                 a = a_t.transpose(0, 2, 1)
                 blocks = [a[:, :, :n_x], b, a[:, :, n_x:]] if hidden else [a[:, :, :n_x], b]
                 parts.append(np.concatenate(blocks, axis=2))
@@ -80,9 +81,9 @@ class Stages:
 
         return evaluate
 
-    def _call(self, z: Array, u: Array) -> Derivatives:
+    def _call(self, z: Array, v: Array) -> Derivatives:
         (n, n_z), f = self._shape, self._side_by_side
-        f.inputs[0][:], f.inputs[1][:] = z.ravel(), u.ravel()
+        f.inputs[0][:], f.inputs[1][:] = z.ravel(), v.ravel()
         f()
         z_next, a, b = f.outputs
         return z_next.reshape(n, n_z), a.reshape(n, n_z, n_z), b.reshape(n, -1, n_z).transpose(0, 2, 1)
@@ -94,51 +95,77 @@ class VectorisedStages:
     def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         assert model.side_by_side is not None
         self._many, self._n, self._n_x = model.side_by_side, n, model.n_x
-        self._given = model.w, model.p
+        self._model, self._ends = model, (model.n_u, model.n_u + model.n_w)
         self._at, self._held = self._many(n, {"A": ("x", "h"), "B": ("u",)}), self._tiled(n)
         self.run = free_run(model, n, compiled=compiled)
 
-    def at(self, z: Array, u: Array) -> Derivatives:
+    def at(self, z: Array, v: Array) -> Derivatives:
         """See :class:`Linearization`."""
-        x_next, h_next, a, b = self._at(z[:, : self._n_x], z[:, self._n_x :], u, *self._held)
+        _, more = self._ends
+        x_next, h_next, a, b = self._at(*self._point(z, v, self._held))
+        if v.shape[1] > more:
+            x_next = x_next + v[:, more:]
         return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearization`."""
         by = ("x", "u", "h") if hidden else ("x", "u")
-        points, n_x = times * self._n, self._n_x
+        points = times * self._n
         many, held = self._many(points, {"slopes": by}), self._tiled(points)
-        return lambda z, u: many(z[:, :n_x], z[:, n_x:], u, *held)[2]
+        return lambda z, v: many(*self._point(z, v, held))[2]
 
-    def _tiled(self, n: int) -> list[Array]:
-        """Disturbances and parameters, the same at all points."""
-        return [np.tile(values, (n, 1)) for values in self._given]
+    def _point(self, z: Array, v: Array, held: tuple[Array, Array]) -> tuple[Array, ...]:
+        """What the model's step takes at many points."""
+        n_u, more = self._ends
+        w = v[:, n_u:more] if more > n_u else held[0]
+        u = v if v.shape[1] == n_u else np.ascontiguousarray(v[:, :n_u])
+        return z[:, : self._n_x], z[:, self._n_x :], u, w, held[1]
+
+    def _tiled(self, n: int) -> tuple[Array, Array]:
+        """No disturbances, and parameters, the same at all points."""
+        return np.zeros((n, 0)), np.tile(self._model.p, (n, 1))
 
 
 def free_run(model: HybridModel, n: int, *, compiled: bool = False) -> Run:
     """The model run freely over ``n`` periods."""
-    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
-    step = ca.Function("z_step", [z, u], [ca.vertcat(*inlined(model.step, _point(model, z, u)))])
+    step = stage_step(model)
     f = BufferedFunction((_compiled(step) if compiled else step).mapaccum("run", n))
 
-    def run(z0: Array, u: Array) -> Array:
-        f.inputs[0][:], f.inputs[1][:] = z0, u.ravel()
+    def run(z0: Array, v: Array) -> Array:
+        f.inputs[0][:], f.inputs[1][:] = z0, v.ravel()
         f()
         return np.concatenate([z0[None], f.outputs[0].reshape(n, -1)])
 
     return run
 
 
+def stage_step(model: HybridModel) -> ca.Function:
+    """``(z, v) -> z_next``: a period of the model on all that acts."""
+    z, v = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("v", model.n_v)
+    x_next, h_next = inlined(model.step, _point(model, z, v))
+    return ca.Function("z_step", [z, v], [ca.vertcat(_moved(model, x_next, v), h_next)])
+
+
 def _stage(model: HybridModel) -> ca.Function:
-    z, u = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("u", model.n_u)
+    z, v = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("v", model.n_v)
     assert model.with_jacobian is not None
-    x_next, h_next, a, b = inlined(model.with_jacobian, _point(model, z, u))
-    return ca.Function("stage", [z, u], [ca.vertcat(x_next, h_next), ca.densify(a), ca.densify(b)])
+    x_next, h_next, a, b = inlined(model.with_jacobian, _point(model, z, v))
+    z_next = ca.vertcat(_moved(model, x_next, v), h_next)
+    return ca.Function("stage", [z, v], [z_next, ca.densify(a), ca.densify(b)])
 
 
-def _point(model: HybridModel, z: ca.MX, u: ca.MX) -> list[ca.MX]:
+def _point(model: HybridModel, z: ca.MX, v: ca.MX) -> list[ca.MX]:
     """What the model's step takes."""
-    return [z[: model.n_x], z[model.n_x :], u, ca.MX(ca.DM(model.w)), ca.MX(ca.DM(model.p))]
+    n_u, more = model.n_u, model.n_u + model.n_w
+    u = v if v.numel() == n_u else v[:n_u]
+    w = v[n_u:more] if model.n_w else ca.MX(ca.DM(model.w))
+    return [z[: model.n_x], z[model.n_x :], u, w, ca.MX(ca.DM(model.p))]
+
+
+def _moved(model: HybridModel, x_next: ca.MX, v: ca.MX) -> ca.MX:
+    """The next state with what unmeasured disturbances add to it."""
+    more = model.n_u + model.n_w
+    return x_next + v[more:] if v.numel() > more else x_next
 
 
 def _compiled(stage: ca.Function) -> ca.Function:

@@ -36,6 +36,7 @@ scenario = PaperScenario(
     control=CONTROL,
     sensor_sigma=(0.5e-3,),  # the encoder's quantisation (0.44 mrad) and noise
     first_sigma=(0.1,),
+    safe_input=(0.0,),
     tasks=TASKS,
     draw=draw,
     figures=figures,

@@ -178,7 +178,7 @@ def physics_job(cases: Sequence[tuple[Case, int]], path: Path, report: Progress)
         report(i, len(cases), f"{case.data_set}, {count} sequences")
         make, evaluation = load_scenario(case.scenario).prior, case.evaluation
         for model, values in (("phy_nominal", None), ("phy", case.values)):
-            step = PriorStep(make(values), case.dt)
+            step = PriorStep(make(values), case.dt, case.fit.substeps if case.fit and values else 0)
             runs = free_runs(step, make(evaluation.values), evaluation.test, evaluation.warm)
             rows.append(Row(case.data_set, count, model, (network_figures(runs),)))
             arrays |= {

@@ -39,6 +39,7 @@ scenario = PaperScenario(
     control=CONTROL,
     sensor_sigma=(1e-4,),
     first_sigma=(0.1,),
+    safe_input=(0.0,),
     tasks=TASKS,
     experiment=EXPERIMENT,
     budgets={

@@ -77,6 +77,7 @@ scenario = Scenario(
     # encoder step 0.0029 rad / sqrt(12), doubled for backlash and vibration
     sensor_sigma=(0.0017,),
     first_sigma=(0.1,),
+    safe_input=(0.0,),
     # Eight seconds of training: few steps, much decay. Chosen on sac_0p9Nm and ilqr_0p9Nm, of which nothing
     # is trained on (docs/results): 300, 1500, 3000, 6000 gave 1.2, 0.8, 0.8, 0.7 of the prior's error there.
     budgets={

@@ -62,6 +62,7 @@ scenario = Scenario(
     control=CONTROL,
     sensor_sigma=(0.001,),  # encoder step 0.0031416 rad / sqrt(12), rounded up
     first_sigma=(0.1,),
+    safe_input=(0.0,),
     tasks=TASKS,
     beyond_recordings=True,  # upright
     draw=draw,

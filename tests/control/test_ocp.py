@@ -22,7 +22,6 @@ from hybrid_mpc import (
     TrueState,
     dare,
     load_scenario,
-    output_cost,
 )
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import registered_scenarios
@@ -194,11 +193,13 @@ def test_the_problems_of_the_ready_scenarios_come_back(name):
 
 
 def test_outputs_that_are_tracked_come_back():
-    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
-    tip = output_cost(ca.Function("tip", [x, u], [ca.vertcat(ca.sin(x[0]), -ca.cos(x[0]))]), [4.0, 1.0])
-    ocp = read(full(economic=tip))
-    assert ocp.n_p == 2
-    assert ocp == full(economic=tip)
+    outputs = {"q_y": [4.0, 0.0], "y_max": [1.0, np.inf], "preview": False, "preview_w": True}
+    ocp = read(full(**outputs))
+    assert (ocp.n_y, ocp.columns) == (2, 2 + ocp.n_p)
+    assert ocp.y_min.tolist() == [-np.inf, -np.inf]
+    assert ocp == full(**outputs)
+    assert ocp != full(**{**outputs, "q_y": [4.0, 1.0]})
+    assert read(full()).q_y.size == 0
 
 
 SMALL = {"horizon": 5, "q": [1], "r": [1], "r_delta": [0.5], "u_min": ["-inf"], "u_max": ["inf"]}

@@ -129,8 +129,8 @@ def test_without_a_finite_state_or_a_fallback_zero_follows(parts):
     _, prior, controller, _ = parts
     estimates = [estimate_of([0.4, 0.0])] * 3 + [estimate_of([np.nan, 0.0])] * 6 + [estimate_of([0.2, 0.0])]
     for fallback in (prior, None):
-        decisions = run(SafeController(controller, fallback, max_age=2), estimates)
-        assert [d.source.name for d in decisions] == ["MPC"] * 3 + ["PLAN"] * 2 + ["ZERO"] * 4 + ["MPC"]
+        decisions = run(SafeController(controller, fallback, max_age=2, safe_input=[0.0]), estimates)
+        assert [d.source.name for d in decisions] == ["MPC"] * 3 + ["PLAN"] * 2 + ["SAFE"] * 4 + ["MPC"]
         for before, after in pairwise(decisions[4:-1]):  # to zero as fast as du_max lets it
             step = np.abs(before.u) - np.abs(after.u)
             np.testing.assert_allclose(step, np.minimum(np.abs(before.u), 0.25), atol=1e-15)

@@ -143,7 +143,7 @@ class Machine:
         """Real-time iteration on the hybrid behind its safeguards; the first plan is the frozen one."""
         rti = CondensedController(self.hybrid, self.problem(name))
         first = FrozenFirst(rti, self.arrays[f"first/{name}"])
-        return SafeController(wrap(rti), self.models["prior"], first=first)
+        return SafeController(wrap(rti), self.models["prior"], first=first, safe_input=[0.0])
 
     def sqp(self, name):
         """The converging solver on the hybrid."""
@@ -171,7 +171,8 @@ class Machine:
             limits = Limits(times["u_min"], times["u_max"])
             return Guard(Mode.LIMITED, Mode.REST, limits=limits, dwell=times["dwell"], quiet=times["quiet"])
         adaptive = with_parameter_states(self.hybrid, times["groups"], prior=self.models["prior"])
-        backup = SafeController(CondensedController(adaptive, self.problem(problem)), self.models["prior"])
+        plain = CondensedController(adaptive, self.problem(problem))
+        backup = SafeController(plain, self.models["prior"], safe_input=[0.0])
         noise, quiet = self.data["observer"], self.data["observer"]["modes"][0]
         estimator = parameter_filter(
             adaptive, len(times["groups"]), sigma_y=noise["sigma_y"], sigma_x=quiet["sigma_x"],
@@ -294,6 +295,11 @@ def previews(m, problem):
     return lambda t: (reference(t + ahead), None if weight is None else weight(t + ahead))
 
 
+def first_name(source):
+    """The name that a source of inputs had when all was frozen."""
+    return {"SAFE": "ZERO"}.get(source, source)
+
+
 def decisions(m, replay):
     """What the controller decides on frozen estimates; its plan goes on from its own last one."""
     problem = m.data["replays"][replay]["problem"]
@@ -312,7 +318,7 @@ def decisions(m, replay):
         "cost": np.array([r.solution.cost for r in rows]),
         "excess": np.array([r.solution.excess for r in rows]),
         "age": np.array([r.age for r in rows]),
-        "source": np.array([r.source.name for r in rows]),
+        "source": np.array([first_name(r.source.name) for r in rows]),
         "status": np.array([r.status.name for r in rows]),
         "plan/u": np.array([r.solution.u for r in plans]),
         "plan/x": np.array([r.solution.x for r in plans]),
@@ -402,7 +408,8 @@ def loop_values(result):
     names = ("x", "y", "u", "x_hat", "d", "stage_cost", "violation", "level")
     found = {name: getattr(result, name) for name in names}
     found |= {name: getattr(result, name).astype(int) for name in ("alarm", "valid")}
-    found |= {name: np.array(getattr(result, name)) for name in ("source", "status", "mode")}
+    found |= {name: np.array(getattr(result, name)) for name in ("status", "mode")}
+    found["source"] = np.array([first_name(name) for name in result.source])
     return found
 
 
@@ -512,7 +519,8 @@ def run_real_time(m):
     )  # fmt: skip
     report = runner.run(duration=loop["periods"] * m.dt)
     found = {name: getattr(report, name) for name in ("t", "y", "u", "x_hat", "applied_ms", "lateness_ms")}
-    found |= {name: np.array(getattr(report, name)) for name in ("source", "status")}
+    found["status"] = np.array(report.status)
+    found["source"] = np.array([first_name(name) for name in report.source])
     found["d"] = np.array([s.estimate.d for s in steps])
     found["h"] = np.array([s.estimate.h for s in steps])
     for name in ("violation_w", "level_w"):
@@ -520,7 +528,8 @@ def run_real_time(m):
     for name in SAID:
         found[name] = np.array([int(getattr(s.reading, name)) for s in steps])
     counts = {name: getattr(report, name) for name in ("periods", "missing", "late", "overruns", "skipped")}
-    return found, counts | {"sources": dict(report.sources), "stopped": report.stopped}
+    sources = {first_name(name): count for name, count in report.sources.items()}
+    return found, counts | {"sources": sources, "stopped": report.stopped}
 
 
 # ---- results.json

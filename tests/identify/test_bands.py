@@ -105,7 +105,7 @@ def test_the_variance_by_the_parameters_is_that_of_drawn_ones():
     found = parameter_variance(prior, covariance, *given, DT)[0, :, 0]
     simulation, n = Simulation(prior.equations.xdot, DT), len(run.t)
     drawn = prior.p + rng.multivariate_normal(np.zeros(3), covariance, 400)
-    held = (np.repeat(v, 400, axis=0) for v in (given[0], given[1][:, :-1], given[2][:, :-1]))
-    states = simulation.states(*held, drawn, 2)
+    held = (np.repeat(v, 400, axis=0) for v in given)
+    states = simulation.values(*held, drawn, 2)
     assert found.shape == (n,)
     np.testing.assert_allclose(found[20:], states[:, 20:, 0].var(axis=0), rtol=0.4)

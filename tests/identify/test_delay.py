@@ -20,8 +20,8 @@ def late_recording(seed):
     for k in range(len(run.u) - 1):
         now = x[-1][None]
         for simulation, m in zip(parts, (2, 1), strict=True):  # the older input, then the younger
-            held = run.u[None, [max(k - m, 0)]]
-            now = simulation.states(now, held, np.zeros((1, 1, 0)), prior.p, 2)[:, -1]
+            held = run.u[None, [max(k - m, 0)] * 2]
+            now = simulation.values(now, held, np.zeros((1, 2, 0)), prior.p, 2)[:, -1]
         x.append(now[0])
     states = np.stack(x)
     return replace(run, x=states, y=states[:, :1])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc import fit_prior, fit_smoother
+from hybrid_mpc import InputError, fit_prior, fit_smoother
 from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.job.benchmark import REFIT_LENGTHS, refitted
 
 POWERS = {"J": 2, "mgl": 0, "d": 1}
 """With time k times as long, an inertia of k^2 J and a damping of k d give the same swings."""
@@ -88,3 +89,19 @@ def test_a_recording_shorter_than_any_window_is_one(runs):
     short = [run.part(slice(20)) for run in runs]
     fit = fit_prior(Pendulum, short[:2], short[2:], dt=DT)
     assert [row["stage"] for row in fit.stages] == ["nominal", "free runs of 0.38 s"]  # all of its 19 periods
+
+
+@pytest.mark.parametrize("k", [20.0, 180_000.0])
+def test_a_refit_counts_in_the_machines_seconds(runs, k):
+    """Of a pendulum whose swings take k times as long, 2.5 k seconds are fitted anew as 2.5 s of the other."""
+    prior, (run, *_) = dilated(k), [stretched(run, k) for run in runs]
+    fit = fit_prior(prior, [run], [run], dt=k * DT)
+    off = replace(fit, values={**fit.values, "mgl": 0.8 * fit.values["mgl"]})
+    again, rest = refitted(prior, off, run, seconds=2.5 * k, dt=k * DT)
+    unit = time_unit([run], k * DT)
+    assert [row["stage"] for row in again.stages] == [f"free runs of {unit * s:g} s" for s in REFIT_LENGTHS]
+    assert len(rest.t) == len(run.t) - 125
+    # noise of 0.1 % of the motion over 2.5 s
+    assert again.values["mgl"] == pytest.approx(TRUTH["mgl"], rel=0.05)
+    with pytest.raises(InputError, match=f"at least {1.5 * unit:g} s"):
+        refitted(prior, off, run, seconds=1.2 * unit, dt=k * DT)

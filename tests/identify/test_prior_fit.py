@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from example_priors import TANKS, Swing, Tanks, TorchSwing, TorchTanks
+from example_priors import TANKS, Arm, Swing, Tanks, TorchArm, TorchSwing, TorchTanks
 from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, Parameter, Prior, Signal, Trajectory, fit_prior
-from hybrid_mpc.identify.fit import OutputFit, _Shooting, cut_outputs, refit, smoothed
+from hybrid_mpc.identify.fit import OutputFit, Shooting, cut_outputs, refit, smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.simulation import Simulation
+from hybrid_mpc.identify.simulation import Simulation, rest_of
 
 NOISE = 2e-3
 
@@ -36,7 +36,7 @@ def tanks(seed, noise=0.0, n=200, dt=1.0):
     u, w = (np.repeat(rng.uniform(0.02, top, n // 10 + 1), 10)[:n, None] for top in (0.35, 0.1))
     start = rng.uniform(0.3, 1.0, (1, 2))
     simulation = Simulation(prior.equations.xdot, dt)
-    x = simulation.states(start, u[None, :-1], w[None, :-1], prior.p, 4)[0]
+    x = simulation.values(start, u[None], w[None], prior.p, 4)[0]
     empty = np.zeros_like(x)
     run = Trajectory(f"tanks{seed}", "train", dt, dt * np.arange(n), u, x[:, 1:], x, empty, w)
     return outputs_of(prior, run, noise, 100 + seed)
@@ -119,23 +119,50 @@ def test_a_tank_is_found_whose_level_has_no_sensor(kind):
     run = tanks(5)
     upper = Simulation(Tanks(TANKS).equations.xdot, 1.0)
     level = smoothed(kind, found, [run], 1.0)[0].x
-    again = upper.states(level[20:21], run.u[None, 20:-1], run.w[None, 20:-1], Tanks(TANKS).p, 4)[0]
+    again = upper.values(level[20:21], run.u[None, 20:], run.w[None, 20:], Tanks(TANKS).p, 4)[0]
     np.testing.assert_allclose(level[20:-20, 0], again[:-20, 0], atol=0.05)  # a tenth of how far it moves
+
+
+def reaching(noise=NOISE):
+    """The true arm under random torques, both angles measured."""
+    prior, runs = Arm(), []
+    for seed in range(3):
+        rng, n = np.random.default_rng(seed), 150
+        u = np.repeat(rng.uniform(-1.0, 1.0, (n // 10, len(prior.inputs))), 10, axis=0)
+        simulation = Simulation(prior.equations.xdot, DT)
+        start = np.array([[0.3, -0.2, 0.0, 0.0]])
+        x = simulation.values(start, u[None], np.zeros((1, n, 0)), 1.05 * prior.p, 4)[0]
+        run = Trajectory(f"arm{seed}", "train", DT, DT * np.arange(n), u, x[:, :2], x, np.zeros_like(x))
+        runs.append(outputs_of(prior, run, noise, seed))
+    return runs
 
 
 @pytest.mark.parametrize(("one", "other", "runs"), [
     (Swing, TorchSwing, lambda: swings(noise=NOISE)),
     (Tanks, TorchTanks, lambda: [tanks(seed, noise=1e-3) for seed in range(3)]),
+    (Arm, TorchArm, lambda: reaching()),
 ])  # fmt: skip
 def test_the_same_machine_in_casadi_and_in_torch_has_the_same_fit(one, other, runs):
-    data = runs()
-    ours, theirs = (fitted(kind, data, dt=data[0].dt) for kind in (one, other))
-    # rounding, through some dozen steps of Gauss-Newton that all converge to the same point
-    for name, value in ours.values.items():
-        assert theirs.values[name] == pytest.approx(value, rel=1e-9), name
-    for name, value in ours.standard_errors.items():
-        assert theirs.standard_errors[name] == pytest.approx(value, rel=1e-6), name
-    assert theirs.best == ours.best
+    data, found = runs(), []
+    for kind in (one, other):
+        fit = OutputFit(kind, data[0].dt)
+        guessed = [replace(run, x=np.tile(rest_of(kind())[0] + 0.1, (len(run.t), 1))) for run in data]
+        problem = Shooting(fit, cut_outputs(guessed, 25, 0, 8), np.ones(len(fit.prior.states)))
+        point = problem.start(1.02 * fit.nominal, problem.windows.x, "all")
+        best = problem.solve(fit.nominal)
+        found.append((point, best, problem.explained([best.theta])[0]))
+    (ours, best, cost), (theirs, other_best, other_cost) = found
+    # the same operations in another order
+    np.testing.assert_allclose(theirs.error, ours.error, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(theirs.slopes, ours.slopes, rtol=0, atol=1e-10 * np.abs(ours.slopes).max())
+    assert other_cost == pytest.approx(cost, rel=1e-8)
+    told = np.sqrt(np.diag(best.covariance))
+    assert (np.abs(other_best.theta - best.theta) <= 1e-4 * told).all()
+    whole, again = (fitted(kind, data, dt=data[0].dt) for kind in (one, other))
+    for name, error in whole.standard_errors.items():
+        assert abs(again.values[name] - whole.values[name]) <= 1e-4 * error, name
+        assert again.standard_errors[name] == pytest.approx(error, rel=1e-6), name
+    assert again.best == whole.best
 
 
 # recordings as they are
@@ -427,6 +454,10 @@ def test_windows_lie_one_behind_the_other():
         cut_outputs(runs, 400, 2, 10)
 
 
+def _twice(windows):
+    return np.concatenate([windows.x] * 2), windows.times(2)
+
+
 @pytest.mark.parametrize("delay", [0.0, 2.5 * DT])
 def test_its_derivatives_are_those_of_finite_differences(delay):
     """Outputs by parameters, delay and first states; outputs that ask for input and parameters themselves."""
@@ -434,7 +465,7 @@ def test_its_derivatives_are_those_of_finite_differences(delay):
     own = OutputFit(TwoSensors, DT, largest_delay=delay)
     windows = cut_outputs(runs, 20, own.lead, 3)
     theta = own.nominal * 1.1
-    y, by_theta, by_x = own.outputs(theta, windows.x, windows, 2, "all")
+    y, slopes = own.outputs(theta, windows.x, windows, 2, "all")
     assert y.shape == windows.y.shape
 
     def outputs(z):
@@ -447,9 +478,13 @@ def test_its_derivatives_are_those_of_finite_differences(delay):
     n = len(theta)
     scale = np.abs(numeric).max()
     # three-point differences: rounding^(2/3) of outputs of up to some hundred
-    np.testing.assert_allclose(by_theta.reshape(-1, n), numeric[:, :n], rtol=0, atol=1e-8 * scale)
-    np.testing.assert_allclose(by_x.reshape(-1, 2), numeric[:, n:], rtol=0, atol=1e-8 * scale)
-    np.testing.assert_array_equal(own.outputs(theta, windows.x, windows, 2, "x")[2], by_x)
+    of_states = slopes[..., n:].reshape(-1, 2)
+    np.testing.assert_allclose(slopes[..., :n].reshape(-1, n), numeric[:, :n], rtol=0, atol=1e-8 * scale)
+    np.testing.assert_allclose(of_states, numeric[:, n:], rtol=0, atol=1e-8 * scale)
+    alone = own.outputs(theta, windows.x, windows, 2, "x")[1].reshape(-1, 2)
+    np.testing.assert_allclose(alone, of_states, rtol=0, atol=1e-13 * scale)  # the same, in another order
+    every, _ = own.outputs(np.stack([own.nominal, theta]), *_twice(windows), 2, "")
+    np.testing.assert_array_equal(every[len(y) :], y)  # of several the last
 
 
 def test_a_missing_sample_has_no_error_and_a_censored_one_only_on_the_wrong_side():
@@ -458,7 +493,7 @@ def test_a_missing_sample_has_no_error_and_a_censored_one_only_on_the_wrong_side
     own = OutputFit(Pendulum, DT)
     windows = cut_outputs([replace(run, x=record(0, seconds=3.0).x)], 25, 0, 1)
     theta = own.scaled(TRUTH)
-    y = own.outputs(theta, windows.x, windows, 2, "")[0]
+    y = own.outputs(theta, windows.x, windows, own.substeps(theta), "")[0]
     limit = replace(windows, y=np.where(np.isfinite(windows.y), y, np.nan))
     sign = np.zeros(y.shape)
     sign[:, 10:15], sign[:, 15:20] = 1, -1
@@ -466,7 +501,7 @@ def test_a_missing_sample_has_no_error_and_a_censored_one_only_on_the_wrong_side
         :, None
     ]  # at least this: exceeded where it is lower
     limit.y[:, 15:20] -= np.array([-0.1, 0.1, 0.1, -0.1, 0.1])[:, None]
-    error = _Shooting(own, replace(limit, censored=sign), np.ones(2), 2).residual(theta, windows.x, "")[0]
+    error = Shooting(own, replace(limit, censored=sign), np.ones(2)).start(theta, windows.x, "x").error
     counted = np.flatnonzero(np.abs(error[0]) > 1e-9)
     # at least: the estimate lies below; at most: it lies above
     assert counted.tolist() == [10, 13, 16, 17, 19]
@@ -481,8 +516,8 @@ def test_a_refit_goes_on_from_an_earlier_fit(fit):
     rng = np.random.default_rng(3)
     base = record(40, seconds=3.0)
     prior = Changed(heavier)
-    x = Simulation(prior.equations.xdot, DT).states(
-        base.x[:1], base.u[None, :-1], np.zeros((1, len(base.u) - 1, 0)), prior.p, 2
+    x = Simulation(prior.equations.xdot, DT).values(
+        base.x[:1], base.u[None], np.zeros((1, len(base.u), 0)), prior.p, 2
     )[0]
     run = replace(base, y=x[:, :1] + NOISE * rng.standard_normal((len(x), 1)), x=np.full_like(x, np.nan))
     again = refit(Pendulum, fit, [run], dt=DT, lengths=(0.5, 1.0))

@@ -192,7 +192,7 @@ def test_a_linear_machine_is_smoothed_as_by_least_squares_over_all_samples(missi
     sizes = Sizes((1.0, 1.0), (0.01, 0.02), (2.0, 2.0, 3.0, 3.0), (1.0, 1.0, 2.0, 2.0))
     smoother = Smoother(Masses(), dt, sigma, walk, sizes)
     ours = smoother.smooth([run])[0]
-    first = np.concatenate([smoother._start(run), np.zeros(2)])
+    first = np.concatenate([smoother._starts([run])[0], np.zeros(2)])
     spread = ignorance(smoother)
     exact = batch_solution(run, sigma, walk, first, spread)
     # rounding, times the ratio of what is known at first to the noise: 3e3 squared
@@ -210,7 +210,7 @@ def test_the_likelihood_is_that_of_the_joint_gaussian():
     sizes = Sizes((1.0, 1.0), (0.01, 0.02), (2.0, 2.0, 3.0, 3.0), (1.0, 1.0, 2.0, 2.0))
     smoother = Smoother(Masses(), dt, sigma, walk, sizes)
     a, b, c, e = discrete(dt)
-    first = np.concatenate([smoother._start(run), np.zeros(2)])
+    first = np.concatenate([smoother._starts([run])[0], np.zeros(2)])
     held, spread = np.hstack([run.u, run.w]), ignorance(smoother)
     mean, covariance, means, blocks = first, np.diag(spread**2), [], []
     cross = [covariance]  # of z_k with all before it
@@ -248,7 +248,7 @@ def tank_run(seed=0, n=240, dt=0.5, noise=1e-4):
     rng, prior = np.random.default_rng(seed), Tanks(TANKS)
     u, w = (np.repeat(rng.uniform(0.0, top, n // 20 + 1), 20)[:n, None] for top in (0.3, 0.1))
     simulation = Simulation(prior.equations.xdot, dt)
-    x = simulation.states(np.array([[0.8, 0.4]]), u[None, :-1], w[None, :-1], prior.p, 4)[0]
+    x = simulation.values(np.array([[0.8, 0.4]]), u[None], w[None], prior.p, 4)[0]
     xdot = prior.equations.xdot(x.T, u.T, w.T, prior.p).full().T
     y = x[:, 1:] + noise * rng.standard_normal((n, 1))
     return Trajectory(f"tanks{seed}", "train", dt, dt * np.arange(n), u, y, x, xdot, w)

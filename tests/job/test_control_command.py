@@ -144,7 +144,7 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
     (loop,) = results["loops"]
     assert loop["switches"][0]["after"] == "REST"
     assert 1.5 <= loop["alarms"][0]["start_s"] < 2.0  # in motion: three steps are predicted at once
-    assert loop["sources"]["ZERO"] > 0.5
+    assert loop["sources"]["SAFE"] > 0.5
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ class Bodies(Prior):
     inputs = (Signal("power", "W", 0.0, 50.0),)
     outputs = (Signal("cold", "degC", 0.0, 200.0), Signal("sensor", "mV", 0.0, 5.0))
     parameters = (Parameter("gain", 0.05, "K/s/W", 0.02, 0.2), Parameter("loss", 0.04, "1/s", 0.01, 0.1))
-    operating_point = OperatingPoint(x=(70.0, 45.0), u=(25.0,))
+    operating_point = OperatingPoint(x=(76.25, 51.25), u=(25.0,))
 
     def xdot(self, x, u, w, p):
         across = 0.05 * (x.hot - x.cold)

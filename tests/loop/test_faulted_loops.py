@@ -61,7 +61,7 @@ def excess(u, ocp):
     """Largest violation of a limit of the input or of its change; at most 0 where all are kept."""
     beyond = [np.max(u - ocp.u_max), np.max(ocp.u_min - u)]
     if ocp.du_max is not None:
-        beyond.append(np.max(np.abs(np.diff(u, axis=0, prepend=ocp.rest_input[None])) - ocp.du_max))
+        beyond.append(np.max(np.abs(np.diff(u, axis=0, prepend=np.zeros((1, 1)))) - ocp.du_max))
     return max(beyond)
 
 

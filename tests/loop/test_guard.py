@@ -55,7 +55,7 @@ def test_there_and_back_without_a_bump(mode):
     assert np.max(inside) <= 1.0 + 1e-12
     if mode is Mode.REST:
         assert np.max(inside) == 0.0
-    expected = {Mode.FALLBACK: "FALLBACK", Mode.REST: "ZERO"}.get(mode, "MPC")
+    expected = {Mode.FALLBACK: "FALLBACK", Mode.REST: "SAFE"}.get(mode, "MPC")
     assert set(result.source[first:last]) == {expected}
     assert set(result.source[last:]) == {"MPC"}
     assert np.all(np.isfinite(result.x))

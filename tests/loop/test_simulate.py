@@ -16,6 +16,7 @@ from hybrid_mpc import (
     ExtendedKalmanFilter,
     Fault,
     InputError,
+    SafeController,
     TrueState,
     simulate,
 )
@@ -72,7 +73,7 @@ def test_cost_and_error_are_those_of_the_true_state(model, safe):
     np.testing.assert_allclose(result.stage_cost, stage, rtol=1e-12)
     assert result.cost == pytest.approx(np.sum(stage) * DT, rel=1e-12)
     assert result.tracking_rmse == pytest.approx(
-        np.std(result.x[:, 0] - result.reference[:, 0], mean=0.0), rel=1e-12
+        np.std(result.x - result.reference, axis=0, mean=0.0), rel=1e-12
     )
     other = run(model, safe, stage_cost=replace_weights(safe.controller.ocp))
     np.testing.assert_allclose(
@@ -149,7 +150,8 @@ def test_a_bare_controller_is_guarded(model, safe):
     bare = run(model, safe.controller)
     np.testing.assert_array_equal(bare.u, run(model, safe).u)
     failing = run(model, safe.controller, reference=lambda t: np.full((len(t), 2), np.nan))
-    assert failing.source == ("PLAN",) * 5 + ("ZERO",) * 25
+    assert failing.source == ("PLAN",) * 5 + ("HELD",) * 25  # a bare controller declares no safe input
+    assert np.all(failing.u[5:] == failing.u[4])
     assert set(failing.status) == {"NOT_FINITE"}
 
 
@@ -167,7 +169,8 @@ def test_preview_reaches_the_controller():
     np.testing.assert_allclose([t[-1] - t[0] for t in seen], 0.2, atol=1e-12)
     assert np.max(np.abs(result.u[:5])) < 1e-9  # rounding: the step is out of sight until t_k + 0.2 s = 0.3 s
     assert np.max(np.abs(result.u[6:14])) > 0.1  # it acts before the step
-    blind = run(model, safe, horizon=0, **still)
+    ocp = safe.controller.ocp.changed(preview=False)
+    blind = run(model, SafeController(CondensedController(model, ocp), pendulum_model()), **still)
     assert np.max(np.abs(blind.u[:15])) < 1e-9
     assert np.max(np.abs(blind.u[15])) > 0.1
 

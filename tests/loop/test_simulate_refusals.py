@@ -43,7 +43,7 @@ class Odd(PendulumPlant):
         ({"duration": np.nan}, "duration"),
         ({"x0": [0.0]}, "x0: 1 values given, 2 needed"),
         ({"x0": [0.0, np.nan]}, "x0: values must be finite"),
-        ({"horizon": -2}, "horizon"),
+        ({"w": [1.0]}, "w: measured disturbances given"),
         ({"reference": lambda t: np.zeros(len(t))}, r"reference returns \(11,\)"),
         ({"weight": lambda t: np.ones(len(t))}, r"weight returns \(11,\)"),
         ({"sensor_delay": -1}, "sensor_delay"),

@@ -77,7 +77,7 @@ def analysis_stage(context: Context) -> AnalysisResult:
     arrays: dict[str, Array] = {}
     for i, (name, model) in enumerate(models.items()):
         context.progress.update("models", i, len(models), name)
-        u = np.zeros(model.n_u) if control is None else control.rest_input
+        u = model.u0 if control is None else np.clip(model.u0, control.u_min, control.u_max)
         x, rest, reason = np.zeros(model.n_x), None, ""
         try:
             x, h = fixed_point(model, u, x)

@@ -75,7 +75,7 @@ def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt:
         with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges has a band without end
             networks = np.nan_to_num(outputs.var(axis=0), nan=np.inf)
             parameters = parameter_variance(
-                phy, covariance, own.x_hat[None, 0], own.u[None], own.w[None], dt
+                phy, covariance, own.x_hat[None, 0], own.u[None], own.w[None], dt, fit.substeps
             )[0]
         found.append(
             RunParts(

@@ -277,6 +277,7 @@ def task_content(task: Task, dt: float, loop: LoopSettings) -> dict[str, object]
         "faults": task.faults,
         "reference": np.asarray(task.reference(t)),
         "weight": None if task.weight is None else np.asarray(task.weight(t)),
+        "measured disturbances": None if task.w is None else np.asarray(task.w(t)),
         "control problem": problem,
         "figures": source_of(task.figures),
     }

@@ -52,7 +52,7 @@ def export_stage(context: Context) -> ExportResult:
     phy = context.scenario.prior(prior.fit.values)
     steps: dict[str, RecurrentStep | PriorStep] = {
         "hybrid": trained_models(context, chosen.deployed).step(phy, dt),
-        "prior": PriorStep(phy, dt),
+        "prior": PriorStep(phy, dt, prior.fit.substeps),
     }
     info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
     deployed = replace(info, input_delay=prior.fit.delay, time_unit=context.time_unit)
@@ -116,6 +116,7 @@ def observed(context: Context) -> dict[str, object]:
         "sensors": (scenario.sensor_sigma, scenario.first_sigma),
         "limits of the input": None if control is None else (control.u_min, control.u_max),
         "beyond recordings": scenario.beyond_recordings,
+        "disturbance model": scenario.disturbance_model,
         "oracle": source_of(scenario.oracle),
     }
 

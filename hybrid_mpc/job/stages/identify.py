@@ -195,14 +195,14 @@ def prior_stage(context: Context) -> PriorResult:
         make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay, time_unit=context.time_unit,
         on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
     )  # fmt: skip
-    parts = [smoothed(make, fit, part, spec.dt) for part in (train, valid, test)]
+    every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     return PriorResult(
         fit,
         make().values,
         {p.name: p.unit for p in make().parameters},
-        {f"{t.name}/{key}": getattr(t, key) for part in parts for t in part for key in ("x", "xdot")},
+        {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )
 
 
@@ -312,7 +312,8 @@ def members(context: Context, name: str, phy: Prior) -> Sequence[Step]:
     """Steps of one model, that of the best network by validation first."""
     dt = context.spec.dt
     if name in ("phy_nominal", "phy"):
-        return [PriorStep(phy if name == "phy" else context.scenario.prior(), dt)]
+        fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
+        return [PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)]
     trained = trained_models(context, name)
     return [trained.step(phy, dt, int(i)) for i in np.argsort(trained.validation, kind="stable")]
 

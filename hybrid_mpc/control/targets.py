@@ -1,0 +1,293 @@
+"""Target calculator: the steady state at which the outputs are a set-point, or as near to it as the limits allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.model import HybridModel, output_with_jacobian
+from hybrid_mpc.model.riccati import hidden_fixed_point, vector
+
+Array = NDArray[np.float64]
+ITERATIONS = 60
+STEADY = 1e-9
+"""Largest step, in scales of the unknowns, at which Newton's method has converged."""
+REACHED = 1e-6
+"""Largest deviation of an output that counts as reached, in tolerated deviations ``1 / sqrt(q_y)``."""
+RANK = 1e-9
+"""Singular values below this share of the largest count as zero."""
+FREE = 1e-6
+"""Weight of the inputs' distance from the operating point along directions that the outputs do not see."""
+
+
+@dataclass(frozen=True)
+class Steady:
+    """A steady state.
+
+    Args:
+        x: States ``(n_x,)``.
+        h: Hidden states ``(n_h,)``.
+        u: Inputs ``(n_u,)`` that hold it.
+        y: Outputs ``(n_y,)`` there, with what unmeasured disturbances add.
+        reached: Whether the outputs that the problem weighs are the set-point's.
+        steady: Whether it is a steady state of the model; False: none was found, this is the last iterate.
+    """
+
+    x: Array
+    h: Array
+    u: Array
+    y: Array
+    reached: bool
+    steady: bool
+
+
+class Targets:
+    """Steady states for set-points of outputs: ``y_ref`` to ``(x_ref, u_ref)``.
+
+    It solves ``min |y - y_ref|^2`` in the weights ``q_y`` over steady states ``z = F(z, u, w, d)`` with inputs, states
+    and outputs within the problem's bounds and the signals' ranges. Of several inputs that do equally well the one
+    nearest to the operating point's is taken, in the inputs' scales. A set-point that cannot be reached gives the
+    nearest that can, and ``reached`` is False. Where no steady state keeps the bounds of states and outputs, they are
+    left out.
+
+    It is Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. No method
+    changes the object's answers; not for several threads at once.
+
+    Args:
+        model: The model, with its disturbance model.
+        ocp: A problem with weights on outputs.
+
+    Raises:
+        InputError: If the problem has no weights on outputs, or they are another number than the model's.
+
+    Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2017, section 1.5.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m"),)
+        >>> tank = HybridModel.of("tank", 1.0, level, (Signal("u", "m/s"),), level, x=x, u=u, y=x,
+        ...     x_next=x + 0.1 * (u - x), xdot=0.1 * (u - x))
+        >>> targets = Targets(tank, OCP(10, [0.0], [0.1], [0.0], [0.0], [2.0], q_y=[1.0]))
+        >>> steady = targets.at([1.5])
+        >>> steady.u.round(6), targets.at([3.0]).y.round(6), targets.at([3.0]).reached
+        (array([1.5]), array([2.]), False)
+    """
+
+    def __init__(self, model: HybridModel, ocp: OCP) -> None:
+        if ocp.q_y.size != model.n_y or not ocp.n_y:
+            raise InputError(
+                f"targets: the problem has q_y = {ocp.q_y}, model {model.name} {model.n_y} outputs; give a weight each"
+            )
+        assert model.with_jacobian is not None
+        self.model, self._ocp = model, ocp
+        self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
+        self._step.inputs[4][:] = model.p
+        self._on_u, self._on_x, self._on_y = model.disturbed
+        self._tracked = np.flatnonzero(ocp.q_y > 0)
+        self._root = np.sqrt(ocp.q_y[self._tracked])
+        self._scale = np.concatenate([state_sizes(model, ocp), np.ones(model.n_h), ocp.input_scale])
+        ranges = [np.array([(s.lower, s.upper) for s in group]).T for group in (model.states, model.outputs)]
+        y_min, y_max = (
+            b if b.size else np.full(model.n_y, s) for b, s in ((ocp.y_min, -np.inf), (ocp.y_max, np.inf))
+        )
+        self._x_range = np.maximum(ocp.x_min, ranges[0][0]), np.minimum(ocp.x_max, ranges[0][1])
+        self._y_range = np.maximum(y_min, ranges[1][0]), np.minimum(y_max, ranges[1][1])
+
+    def at(
+        self,
+        y_ref: ArrayLike,
+        d: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+        start: Steady | None = None,
+    ) -> Steady:
+        """The steady state for a set-point.
+
+        Args:
+            y_ref: Outputs ``(n_y,)``; those without a weight do not matter and may be NaN.
+            d: Unmeasured disturbances ``(n_d,)``. Default: zero.
+            w: Measured disturbances ``(n_w,)``. Default: those of the operating point.
+            start: Where to begin, e.g. the last answer. Default: the operating point.
+
+        Raises:
+            InputError: If a size does not fit, or a value that is needed is not finite.
+        """
+        m = self.model
+        goal = np.asarray(y_ref, dtype=float).ravel()
+        if goal.size != m.n_y or not np.all(np.isfinite(goal[self._tracked])):
+            raise InputError(f"y_ref {goal} given; needed: {m.n_y} outputs, finite where q_y weighs them")
+        d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
+        w = m.w if w is None else vector(w, m.n_w, "w")
+        u = np.clip(m.u0, self._ocp.u_min, self._ocp.u_max)
+        best: Steady | None = None
+        starts = [] if start is None else [(start.x, start.h, start.u)]
+        for x0, h0, u0 in (*starts, (m.x0, hidden_fixed_point(m, m.x0, u, w=w), u)):
+            for bounded in (True, False):
+                found = self._descend(np.concatenate([x0, h0, u0]), goal, d, w, bounded)
+                if found.steady:
+                    return found
+                best = best or found
+        assert best is not None
+        return best
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def _descend(self, v: Array, goal: Array, d: Array, w: Array, bounded: bool) -> Steady:
+        """Gauss-Newton from ``v = (x, h, u)``; ``bounded``: within the bounds of states and outputs."""
+        n_z = v.size - self.model.n_u
+        done = False
+        merit = self._merit(v, goal, d, w)
+        for _ in range(ITERATIONS):
+            step = self._newton(v, goal, d, w, bounded)
+            if step is None or not np.all(np.isfinite(step)):
+                break
+            size = float(np.max(np.abs(step / self._scale)))
+            if size <= STEADY:
+                done = True
+                break
+            share = 1.0
+            while True:
+                moved = v + share * step
+                after = self._merit(moved, goal, d, w)
+                if after < merit or share * size < 1e-8:
+                    break
+                share *= 0.5
+            done = not after < merit and size < 1e-5  # rounding is all that is left
+            v, merit = (moved, after) if np.isfinite(after) else (v, merit)
+            if done or not np.isfinite(after):
+                break
+        y = self._outputs(v, d, w)[0]
+        off = np.max(np.abs(self._root * (y - goal)[self._tracked]), initial=0.0)
+        u = np.clip(v[n_z:], self._ocp.u_min, self._ocp.u_max)
+        n_x = self.model.n_x
+        return Steady(v[:n_x], v[n_x:n_z], u, y, bool(done and off <= REACHED), done)
+
+    def _newton(self, v: Array, goal: Array, d: Array, w: Array, bounded: bool) -> Array | None:
+        """The step that the linearization asks for; None where its QP has no answer."""
+        m, scale = self.model, self._scale
+        n_z, n_x = v.size - m.n_u, m.n_x
+        rest, e = self._rest(v, d, w)
+        y, by_v = self._outputs(v, d, w)
+        e, j = e * scale, by_v * scale
+        if not (np.all(np.isfinite(e)) and np.all(np.isfinite(j)) and np.all(np.isfinite(rest))):
+            return None
+        left, sizes, right = np.linalg.svd(e)
+        rank = int(np.sum(sizes > RANK * sizes[0]))
+        onto = right[:rank].T @ ((left[:, :rank].T @ -rest) / sizes[:rank])  # to the steady states
+        along = right[rank:].T  # and along them
+        sees = self._root[:, None] * j[self._tracked] @ along
+        error = self._root * (goal - y - j @ onto)[self._tracked]
+        far = ((m.u0 - v[n_z:]) / scale[n_z:]) - onto[n_z:]
+        _, s, vt = np.linalg.svd(sees)
+        size = max(float(s[0]) if s.size else 0.0, 1e-150)
+        unseen = vt[int(np.sum(s > RANK * size)) :]
+        move = along[n_z:]
+        inward = unseen.T @ unseen
+        h = sees.T @ sees / size**2 + FREE * inward @ (move.T @ move) @ inward
+        g = -(sees.T @ error / size**2 + FREE * inward @ (move.T @ far))
+        h += 1e-12 * np.trace(h) * np.eye(len(h)) + 1e-14 * np.eye(len(h))
+        values = [(v[n_z:], np.arange(n_z, v.size), self._ocp.u_min, self._ocp.u_max)]
+        rows, lower, upper = [], [], []
+        if bounded:
+            values.append((v[:n_x], np.arange(n_x), *self._x_range))
+            low, high = self._y_range
+            k = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
+            rows.append(j[k] @ along)
+            lower.append(low[k] - y[k] - j[k] @ onto)
+            upper.append(high[k] - y[k] - j[k] @ onto)
+        for now, places, low, high in values:
+            k = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
+            rows.append(along[places[k]])
+            lower.append((low - now)[k] / scale[places[k]] - onto[places[k]])
+            upper.append((high - now)[k] / scale[places[k]] - onto[places[k]])
+        eta = bounded_least_squares(h, g, np.vstack(rows), np.concatenate(lower), np.concatenate(upper))
+        return None if eta is None else (onto + along @ eta) * scale
+
+    def _merit(self, v: Array, goal: Array, d: Array, w: Array) -> float:
+        """Size of what a point lacks of a steady state, and of the outputs' weighted error, less."""
+        rest, _ = self._rest(v, d, w)
+        y, _ = self._outputs(v, d, w)
+        n_z = rest.size
+        off = self._root * (y - goal)[self._tracked]
+        lacks = float(np.sum(np.abs(rest / self._scale[:n_z])))
+        found = 100.0 * lacks + float(np.sqrt(np.sum(off**2)))
+        return found if np.isfinite(found) else np.inf
+
+    def _rest(self, v: Array, d: Array, w: Array) -> tuple[Array, Array]:
+        """``F(z, u) - z`` and its Jacobian ``(n_z, n_z + n_u)``."""
+        m, f = self.model, self._step
+        n_x, n_z = m.n_x, v.size - m.n_u
+        f.inputs[0][:], f.inputs[1][:] = v[:n_x], v[n_x:n_z]
+        f.inputs[2][:], f.inputs[3][:] = v[n_z:] + self._on_u @ d, w
+        f()
+        x, h, a, b = f.outputs
+        moved = np.concatenate([x + self._on_x @ d, h]) - v[:n_z]
+        return moved, np.hstack([a.reshape(n_z, n_z).T - np.eye(n_z), b.reshape(m.n_u, n_z).T])
+
+    def _outputs(self, v: Array, d: Array, w: Array) -> tuple[Array, Array]:
+        """Outputs and their Jacobian ``(n_y, n_z + n_u)``."""
+        m, f = self.model, self._output
+        n_z = v.size - m.n_u
+        f.inputs[0][:], f.inputs[1][:], f.inputs[2][:] = v[: m.n_x], v[n_z:] + self._on_u @ d, w
+        f()
+        y, by_x, by_u = f.outputs
+        hidden = np.zeros((m.n_y, m.n_h))
+        return y + self._on_y @ d, np.hstack(
+            [by_x.reshape(m.n_x, m.n_y).T, hidden, by_u.reshape(m.n_u, m.n_y).T]
+        )
+
+
+def bounded_least_squares(h: Array, g: Array, rows: Array, lower: Array, upper: Array) -> Array | None:
+    """``min 1/2 s'hs + g's`` with ``lower <= rows s <= upper``, for a few unknowns; None where there is none.
+
+    The bounds' squared violation is the dual's non-negative least squares: exact, whatever the number of rows.
+    """
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+    from scipy.optimize import nnls
+
+    if not all(np.all(np.isfinite(m)) for m in (h, g, rows)):
+        return None
+    if not len(h):
+        inside = np.all(lower <= 1e-9) and np.all(upper >= -1e-9)
+        return np.zeros(0) if inside else None
+    try:
+        factor = cho_factor(h)
+    except LinAlgError:
+        return None
+    free = -cho_solve(factor, g)
+    sides = np.concatenate([rows[np.isfinite(upper)], -rows[np.isfinite(lower)]])
+    ends = np.concatenate([upper[np.isfinite(upper)], -lower[np.isfinite(lower)]])
+    size = np.maximum(np.linalg.norm(sides, axis=1), 1e-300)
+    sides, ends = sides / size[:, None], ends / size
+    gap = ends - sides @ free
+    if np.all(gap >= -1e-12):
+        return np.asarray(free)
+    # least distance programming: min |t| with G t >= b for t = L' (s - free)
+    root = np.linalg.cholesky(h)
+    over = -np.linalg.solve(root, sides.T).T
+    e = np.vstack([over.T, -gap[None]])
+    f = np.zeros(len(e))
+    f[-1] = 1.0
+    try:
+        multipliers, left = nnls(e, f, maxiter=30 * e.shape[1])
+    except RuntimeError:
+        return None
+    rest = e @ multipliers - f
+    if left <= 1e-10 or abs(rest[-1]) < 1e-300:
+        return None
+    t = -rest[:-1] / rest[-1]
+    return np.asarray(free + np.linalg.solve(root.T, t))
+
+
+def state_sizes(model: HybridModel, ocp: OCP) -> Array:
+    """A size of each state ``(n_x,)``: what its weight tolerates, ``1 / sqrt(q)``; without a weight half its range,
+    else the operating point's value, else 1.
+    """
+    half = np.array([0.5 * (s.upper - s.lower) for s in model.states])
+    point = np.where(model.x0 != 0, np.abs(model.x0), 1.0)
+    other = np.where(np.isfinite(half), half, point)
+    return np.where(ocp.q > 0, 1.0 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0)), other)

@@ -1,0 +1,133 @@
+"""Whether outputs can be held without offset: the rank test of a disturbance model, and that of the targets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.model import HybridModel, output_with_jacobian
+from hybrid_mpc.model.riccati import hidden_fixed_point, vector
+
+Array = NDArray[np.float64]
+RANK = 1e-9
+"""Singular values below this share of the largest count as zero, rows and columns brought to one size."""
+
+
+@dataclass(frozen=True)
+class OffsetFree:
+    """Ranks at one point, with ``z = (x, h)``.
+
+    Args:
+        n_d: Number of unmeasured disturbances.
+        n_y: Number of outputs.
+        rank: Of ``[[A - I, B_d], [C, C_d]]``.
+        needed: ``n_z + n_d``: with less the outputs cannot tell the disturbances from the states.
+        target_rank: Of ``[[A - I, B], [C_c, D_c]]``, ``c`` the controlled outputs.
+        target_needed: ``n_z + n_c``: with less not every set-point has a steady state.
+    """
+
+    n_d: int
+    n_y: int
+    rank: int
+    needed: int
+    target_rank: int
+    target_needed: int
+
+    @property
+    def detectable(self) -> bool:
+        """Whether a filter can find the disturbances."""
+        return self.rank == self.needed
+
+    @property
+    def promised(self) -> bool:
+        """Whether constant disturbances leave no offset in the controlled outputs, where no limit is active."""
+        return not self.why
+
+    @property
+    def why(self) -> str:
+        """What is missing for that; empty: nothing."""
+        found = []
+        if not self.detectable:
+            found.append(
+                f"the outputs cannot tell the disturbances from the states (rank {self.rank}, needed {self.needed})"
+            )
+        if self.n_d != self.n_y:
+            found.append(f"{self.n_d} disturbances for {self.n_y} outputs; as many are needed")
+        if self.target_rank < self.target_needed:
+            found.append(
+                "the inputs cannot hold the controlled outputs anywhere they are asked to be (rank of the targets "
+                f"{self.target_rank}, needed {self.target_needed})"
+            )
+        return "; ".join(found)
+
+
+def offset_free(
+    model: HybridModel,
+    controlled: Sequence[int] | None = None,
+    *,
+    x: ArrayLike | None = None,
+    u: ArrayLike | None = None,
+    w: ArrayLike | None = None,
+) -> OffsetFree:
+    """The rank test of a model's disturbance model at a point: the operating point, or a set-point's steady state.
+
+    Args:
+        model: The model, with its ``disturbance_model``.
+        controlled: Places of the outputs that are to be held. Default: all.
+        x: State ``(n_x,)``. Default: the operating point's.
+        u: Input ``(n_u,)``. Default: likewise.
+        w: Measured disturbances ``(n_w,)``. Default: likewise.
+
+    Raises:
+        InputError: If a size does not fit.
+
+    Source: Pannocchia and Rawlings, *Disturbance models for offset-free model-predictive control*, AIChE J. 49 (2003);
+    Maeder, Borrelli, Morari, *Linear offset-free model predictive control*, Automatica 45 (2009).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> from hybrid_mpc.model.disturbance import Disturbance
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x,
+        ...     disturbance_model=(Disturbance("output", "x", 1.0),))
+        >>> offset_free(model).why  # an offset of the sensor and the level are one
+        'the outputs cannot tell the disturbances from the states (rank 1, needed 2)'
+    """
+    x = model.x0 if x is None else vector(x, model.n_x, "x")
+    u = model.u0 if u is None else vector(u, model.n_u, "u")
+    w = model.w if w is None else vector(w, model.n_w, "w")
+    h = hidden_fixed_point(model, x, u, w=w)
+    assert model.with_jacobian is not None
+    _, _, a, b = (m.full() for m in model.with_jacobian(x, h, u, w, model.p))
+    _, by_x, by_u = (m.full() for m in output_with_jacobian(model)(x, u, w))
+    on_u, on_x, on_y = model.disturbed
+    n_z = model.n_x + model.n_h
+    still, c = a - np.eye(n_z), np.hstack([by_x, np.zeros((model.n_y, model.n_h))])
+    b_d = b @ on_u
+    b_d[: model.n_x] += on_x
+    chosen = list(range(model.n_y)) if controlled is None else list(controlled)
+    if not all(0 <= i < model.n_y for i in chosen):
+        raise InputError(f"controlled: {chosen} given; needed: places of the {model.n_y} outputs")
+    return OffsetFree(
+        model.n_d, model.n_y,
+        _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d,
+        _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen),
+    )  # fmt: skip
+
+
+def _rank(matrix: Array) -> int:
+    """Rank of a matrix whose rows and columns have units of their own."""
+    if not np.all(np.isfinite(matrix)):
+        return 0
+    m = matrix.copy()
+    for _ in range(5):
+        for axis in (0, 1):
+            size = np.sqrt(np.max(np.abs(m), axis=axis, keepdims=True))
+            m = m / np.where(size > 0, size, 1.0)
+    sizes = np.linalg.svd(m, compute_uv=False)
+    return int(np.sum(sizes > RANK * sizes[0])) if sizes.size and sizes[0] > 0 else 0

@@ -1,0 +1,55 @@
+"""Double pendulum: a real chain of two links with a motor at each joint."""
+
+from __future__ import annotations
+
+from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, DataSpec, Scenario
+from scenarios.common import LazyPrior
+
+DESCRIPTION = """\
+Two links of 0.2 and 0.3 m, a quasi-direct drive (gear 6) at either joint; q1 = 0 hangs down, q2 counts from the first
+link. Recordings: DFKI Robotics Innovation Center, double_pendulum, design C.1 (BSD-3-Clause; Wiebe et al. 2023): sines
+of torque at 500 Hz, for identification; swing-ups of acrobot and pendubot at 33 Hz; balancing while torques push. The
+input is the commanded torque; angles and speeds are measured, by the drives. The answer of a motor is stored a row
+late, 2 ms at 500 Hz, 30 ms at 33 Hz. Near upright every error
+grows fast, so runs are 0.5 s."""
+ROW = 0.002
+"""Distance of two rows [s] of the recordings for identification."""
+SLOW_ROW = 0.03
+"""The same of the swing-ups [s]."""
+MEASURED = ("q1_rad", "q2_rad", "dq1_rad_s", "dq2_rad_s")
+SLOW = tuple(f"{robot}_swingup_{k:02d}" for robot in ("acrobot", "pendubot") for k in (1, 2, 3))
+
+
+scenario = Scenario(
+    name="double_pendulum",
+    title="Double pendulum with two torques (real recordings)",
+    description=DESCRIPTION,
+    prior=LazyPrior("scenarios.double_pendulum.prior", "DoublePendulumPrior"),
+    data=DataSpec(
+        time="time_s",
+        inputs=("tau1_command_nm", "tau2_command_nm"),
+        outputs=MEASURED,
+        dt=0.01,
+        max_gap=0.05,
+        smoothing=0.06,
+        warm_up=0.1,
+        fractions=(0.75, 0.25, 0.0),
+        free_run=0.5,
+        delays=dict.fromkeys(MEASURED, ROW),
+        delays_of={stem: dict.fromkeys(MEASURED, SLOW_ROW) for stem in SLOW},
+    ),
+    benchmark=BenchmarkSpec(
+        {
+            "quick": BenchmarkBudget(
+                16, 2, teacher_steps=0, free_run_steps=150, horizon=50, batch=32, decay=1000.0
+            ),
+            "full": BenchmarkBudget(
+                32, 4, teacher_steps=0, free_run_steps=1000, horizon=50, batch=32, decay=1000.0
+            ),
+        },
+        unit="rad",
+        length=0.5,
+        piece=1.0,
+        valid_every=3,
+    ),
+)

@@ -1,0 +1,274 @@
+"""The target calculator, and problems that weigh outputs, on machines whose rest is not zero."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from control_parts import plan_of
+from machines import AMBIENT, HEAT, PUMP, dc_motor, rest_levels, thermal, two_tanks
+
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Disturbance,
+    Estimate,
+    HybridModel,
+    InputError,
+    IpoptController,
+    SafeController,
+    Signal,
+    SoftBound,
+    SQPController,
+    Status,
+    Targets,
+    dare,
+    linearize,
+)
+
+TANKS = {"q": [0.0, 0.0], "r": [1e6], "r_delta": [1e6], "u_min": [5e-5], "u_max": [4e-4], "q_y": [1.0]}
+HEATERS = {"q": [0.0] * 2, "r": [0.1] * 2, "r_delta": [0.1] * 2, "u_min": [0.0] * 2, "u_max": [20.0] * 2}
+SOLVERS = (CondensedController, SQPController, IpoptController)
+
+
+def estimate_at(model, x=None, d=None, w=None):
+    d = np.zeros(model.n_d) if d is None else np.asarray(d, dtype=float)
+    x = model.x0 if x is None else np.asarray(x, dtype=float)
+    size = x.size + d.size
+    w = model.w if w is None else np.asarray(w, dtype=float)
+    return Estimate(0.0, x, np.zeros(0), d, np.eye(size), np.full(model.n_y, np.nan), np.nan, w=w)
+
+
+def solved_by_ipopt(model, ocp, y_ref, d, w):
+    """The steady state nearest to a set-point, by IPOPT on its definition; inputs near the operating point's."""
+    on_u, on_x, on_y = model.disturbed
+    x, scaled = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
+    u = ocp.input_scale * scaled
+    acting = u + on_u @ d
+    x_next = model.step(x, [], acting, w, model.p)[0] + on_x @ d
+    y = model.output(x, acting, w, model.p) + on_y @ d
+    far = (u - model.u0) / ocp.input_scale
+    cost = ca.dot(ocp.q_y, (y - y_ref) ** 2) + 1e-7 * ca.dot(far, far)
+    nlp = {"x": ca.vertcat(x, scaled), "f": cost, "g": x_next - x}
+    options = {"print_level": 0, "sb": "yes", "tol": 1e-12, "bound_relax_factor": 0.0}
+    solver = ca.nlpsol("target", "ipopt", nlp, {"ipopt": options, "print_time": 0})
+    low = [s.lower for s in model.states]
+    high = [s.upper for s in model.states]
+    size = ocp.input_scale
+    answer = solver(
+        x0=np.concatenate([model.x0, model.u0 / size]), lbg=0, ubg=0, lbx=[*low, *(ocp.u_min / size)],
+        ubx=[*high, *(ocp.u_max / size)],
+    )  # fmt: skip
+    x, u = np.split(answer["x"].full().ravel(), [model.n_x])
+    return x, u * size
+
+
+@pytest.mark.parametrize(
+    ("goal", "d", "inflow"),
+    [(0.3, 0.0, 4e-5), (0.6, 2e-5, 4e-5), (0.1, -1e-5, 1e-4), (1.9, 0.0, 4e-5), (0.05, 0.0, 1e-4)],
+)
+def test_targets_are_those_of_a_solver_also_beyond_reach(goal, d, inflow):
+    model, ocp = two_tanks(), OCP(5, **TANKS)
+    found = Targets(model, ocp).at([goal], [d], [inflow])
+    x, u = solved_by_ipopt(model, ocp, [goal], np.array([d]), np.array([inflow]))
+    assert found.steady
+    np.testing.assert_allclose(found.x, x, atol=2e-5)  # IPOPT's barrier holds it off a bound, here the pump's
+    np.testing.assert_allclose(found.u, u, atol=1e-8)
+    assert found.reached == (goal in (0.3, 0.6, 0.1))
+    upper, lower = rest_levels(found.u[0] + d, inflow)
+    np.testing.assert_allclose(found.x, [upper, lower], rtol=1e-6)
+
+
+@pytest.mark.parametrize("goal", [[45.0, 40.0], [100.0, 20.0], [30.0, 55.0], [20.0, 20.0]])
+def test_two_inputs_and_two_outputs(goal):
+    model, ocp = thermal(), OCP(5, **HEATERS, q_y=[1.0, 4.0])
+    found = Targets(model, ocp).at(goal)
+    x, u = solved_by_ipopt(model, ocp, goal, np.zeros(2), np.zeros(0))
+    np.testing.assert_allclose(found.x, x, atol=1e-4)
+    np.testing.assert_allclose(found.u, u, atol=1e-4)
+    assert found.reached == bool(np.max(np.abs(x - goal)) < 1e-3)
+
+
+def test_the_nearest_of_an_output_too_many_is_taken_and_reported():
+    model = dc_motor()
+    ocp = OCP(5, [0.0, 0.0], [0.1], [0.1], [-12.0], [12.0], q_y=[1.0, 1.0])
+    found = Targets(model, ocp).at([0.7, 40.0])  # current and speed by one voltage
+    x, _ = solved_by_ipopt(model, ocp, [0.7, 40.0], np.zeros(1), np.zeros(0))
+    assert found.steady
+    assert not found.reached
+    np.testing.assert_allclose(found.x, x, rtol=1e-5)
+    one = Targets(model, ocp.changed(q_y=[0.0, 1.0])).at([np.nan, 40.0])
+    assert one.reached
+    np.testing.assert_allclose(one.y[1], 40.0)
+
+
+def test_of_several_inputs_the_nearest_to_the_operating_point_is_taken():
+    """Two pumps fill one tank that leaks: any sum of the right size holds the level."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u", 2)
+    level, pumps = (Signal("level", "m"),), (Signal("a", "-"), Signal("b", "-"))
+    model = HybridModel.of(
+        "two pumps", 1.0, level, pumps, level, x=x, u=u, y=x, x_next=0.5 * x + u[0] + u[1], xdot=-x + u[0] + u[1],
+        nominal_x=[2.0], nominal_u=[0.6, 0.4],
+    )  # fmt: skip
+    ocp = OCP(5, [0.0], [1.0, 1.0], [0.0, 0.0], [0.0, 0.0], [2.0, 1.0], q_y=[1.0])
+    free = Targets(model, ocp).at([3.0])
+    # equal shares of what is missing in scales of half the ranges, 1 and 0.5: min (du_a)^2 + (2 du_b)^2, sum 0.5
+    np.testing.assert_allclose(free.u, [0.6 + 0.4, 0.4 + 0.1], rtol=1e-6)
+    full = Targets(model, ocp.changed(u_max=[0.7, 1.0])).at([3.0])
+    assert full.reached
+    np.testing.assert_allclose(full.u, [0.7, 0.8], atol=1e-5)
+
+
+def test_an_integrator_needs_no_input_to_rest():
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    level = (Signal("x", "m"),)
+    model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, y=x, x_next=x + u - 0.3, xdot=u,
+                           nominal_u=[0.3])  # fmt: skip
+    found = Targets(model, OCP(5, [0.0], [1.0], [0.0], [0.0], [1.0], q_y=[1.0])).at([7.0], [0.1])
+    np.testing.assert_allclose([found.x[0], found.u[0]], [7.0, 0.2], rtol=1e-9)
+
+
+def test_bounds_of_outputs_hold_for_targets_too():
+    model = two_tanks()
+    found = Targets(model, OCP(5, **TANKS, y_max=[0.4])).at([0.6])
+    assert found.steady
+    assert not found.reached
+    np.testing.assert_allclose(found.y, 0.4, rtol=1e-6)
+
+
+def test_disturbances_of_rates_and_outputs_are_made_good():
+    model = two_tanks(disturbance_model=(Disturbance("rate", "lower", 1e-3),))
+    found = Targets(model, OCP(5, **TANKS)).at([0.3], [-5e-4])
+    x_next = model.step(found.x, [], found.u, model.w, model.p)[0].full().ravel() + 5.0 * np.array(
+        [0.0, -5e-4]
+    )
+    np.testing.assert_allclose(x_next, found.x, atol=1e-12)
+    assert found.y == pytest.approx(0.3)
+    sensor = two_tanks(disturbance_model=(Disturbance("output", "lower", 0.1),))
+    assert Targets(sensor, OCP(5, **TANKS)).at([0.3], [0.05]).x[1] == pytest.approx(0.25)
+
+
+def test_what_does_not_fit_is_refused():
+    model = two_tanks()
+    with pytest.raises(InputError, match="give a weight each"):
+        Targets(model, OCP(5, **{**TANKS, "q_y": [1.0, 1.0]}))
+    with pytest.raises(InputError, match="finite where q_y weighs them"):
+        Targets(model, OCP(5, **TANKS)).at([np.nan])
+    with pytest.raises(InputError, match="y_min has 2 values"):
+        CondensedController(model, OCP(5, **{**TANKS, "q_y": ()}, y_max=[1.0, 1.0]))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_lq_is_the_lqr_around_the_operating_point(solver):
+    """Weights on outputs, no limit active: the first input is the LQR's around the target, wherever it lies."""
+    model = thermal()
+    ocp = OCP(15, **HEATERS, q_y=[1.0, 2.0]).changed(r_delta=[0.0, 0.0])
+    goal = model.x0 + np.array([1.0, -0.5])
+    steady = Targets(model, ocp).at(goal)
+    x = goal + np.array([0.4, 0.3])
+    system = linearize(model, model.x0, model.u0)
+    gain = dare(system.A, system.B, np.diag([1.0, 2.0]) * model.dt, np.diag(ocp.r) * model.dt)[1]
+    plan = plan_of(solver(model, ocp), estimate_at(model, x), goal[None])
+    assert plan.status is Status.SOLVED
+    np.testing.assert_allclose(plan.u[0], steady.u - gain @ (x - goal), atol=1e-5)
+    np.testing.assert_allclose(ocp.terminal_weight(model), dare(*ocp.linear_quadratic(model))[0])
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_at_the_operating_point_nothing_is_to_do(solver):
+    for model, ocp in ((two_tanks(), OCP(10, **TANKS)), (thermal(), OCP(10, **HEATERS, q_y=[1.0, 1.0]))):
+        controller = solver(model, ocp)
+        plan = plan_of(controller, estimate_at(model), controller.problem.standing())
+        np.testing.assert_allclose(plan.u, np.tile(model.u0, (10, 1)), rtol=1e-4)
+        states = ocp.changed(
+            q_y=(), q=[1.0, 1.0]
+        )  # references of states: the operating point's input is the target
+        controller = solver(model, states)
+        assert controller.problem.standing().tolist() == [model.x0.tolist()]
+        plan = plan_of(controller, estimate_at(model), controller.problem.standing())
+        np.testing.assert_allclose(plan.u, np.tile(model.u0, (10, 1)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [None, "rate"])
+def test_all_solvers_agree_on_outputs_bounds_and_what_comes(kind):
+    """Weights and bounds on outputs, expressions of w, unmeasured and previewed measured disturbances."""
+    chosen = None if kind is None else (Disturbance(kind, "lower", 1e-3),)
+    model = two_tanks(disturbance_model=chosen)
+    x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("w")
+    together = SoftBound(ca.Function("flows", [x, u, w], [1e4 * (u + w)]), [-np.inf], [4.0], [1e-4], [1e-4])
+    ocp = OCP(20, **{**TANKS, "r": [1e4], "r_delta": [1e4]}, y_max=[0.36], soft=[together])
+    inflow = np.where(np.arange(20) < 8, 4e-5, 1.6e-4)[:, None]
+    given = estimate_at(model, [0.16, 0.17], [2e-5 if kind is None else -2e-4], inflow[0]), np.array([[0.34]])
+    sqp, ipopt, rti = (
+        plan_of(s, *given, w=inflow)
+        for s in (
+            SQPController(model, ocp),
+            IpoptController(model, ocp),
+            CondensedController(model, ocp, iterations=30),
+        )
+    )
+    assert sqp.status is ipopt.status is rti.status is Status.SOLVED
+    assert sqp.cost == pytest.approx(ipopt.cost, rel=1e-6)
+    np.testing.assert_allclose(sqp.u, ipopt.u, atol=2e-7)
+    np.testing.assert_allclose(rti.u, ipopt.u, atol=2e-7)
+    np.testing.assert_array_equal(sqp.w, inflow)
+    assert np.max(1e4 * (sqp.u + inflow)) > 3.9  # the bound on both flows acts
+    held = plan_of(SQPController(model, ocp), *given)
+    assert np.max(np.abs(held.u - sqp.u)) > 1e-6
+
+
+def test_limits_hold_whatever_is_asked():
+    rng = np.random.default_rng(0)
+    model, ocp = thermal(), OCP(8, **HEATERS, du_max=[3.0, 3.0], q_y=[1.0, 1.0])
+    safe = SafeController(CondensedController(model, ocp), model, safe_input=[0.0, 0.0])
+    decision = safe.initial(estimate_at(model))
+    np.testing.assert_array_equal(decision.u, HEAT)
+    for _ in range(15):
+        x, d = AMBIENT + rng.normal(size=2) * 60, rng.normal(size=2) * 10
+        goal = rng.choice([rng.uniform(-200, 400), np.nan], p=[0.8, 0.2], size=2)
+        before, decision = decision, safe.decide(decision, estimate_at(model, x, d), goal[None])
+        assert np.all((decision.u >= 0) & (decision.u <= 20))
+        assert np.all(np.abs(decision.u - before.u) <= 3.0 + 1e-12)
+
+
+def test_a_fallback_holds_the_set_point():
+    """The feedback that takes over leads to the target's steady state, given the estimated disturbance."""
+    model, ocp = two_tanks(), OCP(10, **TANKS)
+    safe = SafeController(CondensedController(model, ocp), model, max_age=0, safe_input=[5e-5])
+    goal, load = np.array([[0.36]]), 1e-5
+    x, decision = model.x0, safe.initial(estimate_at(model))
+    for _ in range(400):
+        decision = safe.late(decision, estimate_at(model, x, [load]), goal)
+        assert decision.source.name == "FALLBACK"
+        x = model.step(x, [], decision.u + load, model.w, model.p)[0].full().ravel()
+    assert x[1] == pytest.approx(0.36, abs=1e-9)
+    states = ocp.changed(q_y=(), q=[1.0, 1.0])
+    safe = SafeController(CondensedController(model, states), model, max_age=0)
+    for _ in range(400):
+        decision = safe.late(decision, estimate_at(model, x, [load]), model.x0[None])
+        x = model.step(x, [], decision.u + load, model.w, model.p)[0].full().ravel()
+    np.testing.assert_allclose(x, model.x0, rtol=1e-6)
+
+
+def test_what_is_safe_is_declared_or_the_last_input_stays():
+    model, ocp = two_tanks(), OCP(10, **TANKS)
+    lost = estimate_at(model, [np.nan, np.nan])
+    for safe_input, name, u in ((None, "HELD", PUMP), ([5e-5], "SAFE", 5e-5)):
+        safe = SafeController(CondensedController(model, ocp), model, max_age=0, safe_input=safe_input)
+        decisions = [safe.initial(estimate_at(model))]
+        for _ in range(3):
+            decisions.append(safe.decide(decisions[-1], lost, np.array([[0.3]])))
+        assert [d.source.name for d in decisions[1:]] == [name] * 3
+        assert all(d.u[0] == pytest.approx(u) for d in decisions[1:])
+    with pytest.raises(InputError, match="outside the limits"):
+        SafeController(CondensedController(model, ocp), safe_input=[-1e-5])
+
+
+def test_a_moving_reference_of_outputs_has_targets_between_a_few_steady_states():
+    model, ocp = two_tanks(), OCP(30, **TANKS)
+    problem = CondensedController(model, ocp).problem
+    course = 0.3 + 0.1 * np.sin(0.1 * np.arange(31))[:, None]
+    target = problem.target(course, None, estimate_at(model))
+    exact = [problem.targets.at(row) for row in course]
+    np.testing.assert_allclose(target.y, course)
+    np.testing.assert_allclose(target.x, [s.x for s in exact], atol=0.01)
+    steps = problem.target(np.where(np.arange(31) < 12, 0.2, 0.4)[:, None], None, estimate_at(model))
+    np.testing.assert_allclose(steps.x[:, 1], np.where(np.arange(31) < 12, 0.2, 0.4), rtol=1e-6)

@@ -1,0 +1,118 @@
+"""From a prior's class to a loop by way of the artifact, on a machine that is no pendulum."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from machines import MachinePlant
+
+import hybrid_mpc as hm
+from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.job.loops import LoopSpec, excess, limits_used, row_of
+from hybrid_mpc.job.tasks import repeated
+from hybrid_mpc.kit.artifact import loop_settings
+
+DT = 10.0
+
+
+class Tanks(hm.Prior):
+    """The lower level is measured, and an inflow into the lower tank."""
+
+    states = (hm.Signal("upper", "m", 0.0, 2.0), hm.Signal("lower", "m", 0.0, 2.0))
+    inputs = (hm.Signal("pump", "m^3/s", 0.0, 4e-4),)
+    outputs = (hm.Signal("lower", "m", 0.0, 2.0),)
+    disturbances = (hm.Signal("inflow", "m^3/s"),)
+    parameters = (hm.Parameter("k", 5e-4, "m^2.5/s", 1e-4, 1e-3),)
+    operating_point = hm.OperatingPoint(x=(0.16, 0.25), u=(2e-4,), w=(5e-5,))
+
+    def xdot(self, x, u, w, p):
+        between, out = (p.k * ca.sqrt(ca.fmax(h, 1e-4)) for h in x)
+        return (u.pump - between) / 0.02, (between + w.inflow - out) / 0.02
+
+
+OCP = hm.OCP(12, [0.0, 0.0], [1e4], [1e5], [0.0], [4e-4], q_y=[1.0], y_max=[0.5], preview_w=True)
+SCENARIO = hm.Scenario(
+    "tanks", "", "", prior=Tanks, control=OCP, sensor_sigma=(1e-3,), safe_input=(5e-5,),
+    data=hm.DataSpec("t", ("pump",), ("lower",), dt=DT, max_gap=DT, smoothing=DT, warm_up=DT, disturbances=("inflow",)),
+    disturbance_model=(hm.Disturbance("rate", "lower", 5e-3),),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def kit(tmp_path_factory):
+    folder, prior = tmp_path_factory.mktemp("tanks"), Tanks()
+    noise = dict.fromkeys(("prior", "prior_observer"), (1e-5, 1e-5))
+    hm.save_artifact(
+        folder, {"prior": prior_programs(prior, DT)}, hm.model_info(prior, DT), loop=loop_settings(SCENARIO, noise),
+        recommended="prior",
+    )  # fmt: skip
+    return hm.load(folder)
+
+
+def test_the_artifact_says_all(kit):
+    model = kit.models["prior"]
+    assert (model.nominal_x, model.nominal_u, model.nominal_w) == ((0.16, 0.25), (2e-4,), (5e-5,))
+    assert model.disturbance_model == SCENARIO.disturbance_model
+    assert kit.control == OCP
+    assert kit.safe_input == (5e-5,)
+    np.testing.assert_allclose(
+        model.step(model.x0, [], model.u0, model.w, model.p)[0].full().ravel(), model.x0
+    )
+    other = kit.on(hm.Scenario("tanks", "", "", prior=Tanks, data=SCENARIO.data, control=OCP))
+    assert other.models["prior"].disturbance_model is None
+
+
+def test_a_loop_from_the_kit_is_without_offset(kit):
+    model = kit.models["prior"]
+    w = lambda t: np.where(t < 300.0, 5e-5, 9e-5)[:, None]  # noqa: E731
+    plant = MachinePlant(
+        kit.on(hm.Scenario("tanks", "", "", prior=Tanks, data=SCENARIO.data)).models["prior"], load=1e-5
+    )
+    result = hm.simulate(
+        plant, kit.observer(), kit.controller(), [0.4], dt=DT, duration=1500.0, x0=model.x0, seed=0, w=w
+    )
+    assert result.source == ("MPC",) * 150
+    np.testing.assert_allclose(result.y[-10:], 0.4, atol=1e-4)
+    assert np.max(result.y) < 0.51
+    assert np.all(result.reached)
+    spec = LoopSpec("tanks", "model", "hold", "prior_observer", monitor="none")
+    task = hm.Task("hold", "", 1500.0, (0.16, 0.25), lambda t: np.full((len(t), 1), 0.4), w=w)
+    row = row_of(spec, task, OCP, model, result)
+    assert list(row.tracking_rmse) == ["lower [m]"]
+    used = limits_used(OCP, result, model)
+    assert set(used) == {"pump", "output lower"}
+    assert used["pump"] == pytest.approx(
+        max((result.u.max() - 2e-4) / 2e-4, (2e-4 - result.u.min()) / 2e-4)
+    )  # counted from the operating point's input
+    assert excess(OCP, result, model)["pump [m^3/s]"] == 0.0
+    table = result.to_pandas(model)
+    assert {"d rate lower", "w inflow [m^3/s]", "y_ref lower [m]"} <= set(table)
+
+
+def test_a_problem_whose_outputs_no_input_holds_is_refused(kit):
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    names = (hm.Signal("a", "-"), hm.Signal("b", "-"))
+    apart = hm.HybridModel.of(
+        "apart", 1.0, names, (hm.Signal("u", "-"),), names[1:], x=x, u=u, xdot=-x, y=x[1],
+        x_next=ca.vertcat(0.5 * x[0] + u, 0.5 * x[1]),
+    )  # fmt: skip
+    with pytest.raises(hm.InputError, match="cannot hold the controlled outputs"):
+        hm.make_controller(apart, apart, hm.OCP(5, [0.0, 0.0], [1.0], [0.0], [-1.0], [1.0], q_y=[1.0]))
+
+
+def test_the_working_point_is_the_operating_point_unless_positions_move(kit):
+    ocp = hm.make_ocp(kit.models["prior"], OCP)
+    np.testing.assert_array_equal(ocp.working_point[0], [0.16, 0.25])
+    np.testing.assert_array_equal(ocp.working_point[1], [2e-4])
+
+
+def test_a_task_of_outputs_is_repeated_without_speeds():
+    ramp = hm.Task(
+        "ramp", "", 100.0, (0.16, 0.25), lambda t: 0.2 + 0.001 * t[:, None], w=lambda t: 1e-5 * t[:, None]
+    )
+    twice = repeated(ramp, DT, np.array([1.0, 0.5]), 60.0)
+    np.testing.assert_allclose(
+        twice.reference(np.array([0.0, 50.0, 160.0, 210.0]))[:, 0], [0.2, 0.25, 0.2, 0.225]
+    )
+    way_back = twice.reference(np.linspace(100.0, 160.0, 7))[:, 0]
+    assert np.all(np.diff(way_back) < 0)
+    np.testing.assert_allclose(twice.w(np.array([50.0, 210.0, 140.0]))[:, 0], [5e-4, 5e-4, 1e-3])
