@@ -38,6 +38,10 @@ Predict = Callable[[Runs], list[Array]]
 """Outputs ``(n, n_y)`` of free runs behind the warm-up of each run."""
 GROWTH, LEAST = 1.3, 0.2
 """A method is looked at when its time has grown by this factor and this much [s]."""
+BUDGETS = (2.0, 5.0, 15.0, 60.0)
+"""Processor times [s] that are compared."""
+SOON = tuple(0.95 * b for b in BUDGETS)
+"""Times [s] at which a method is looked at in any case: shortly before each budget."""
 
 
 class Over(Exception):
@@ -102,7 +106,7 @@ class Watch:
             valid, best = min(errors), candidates[int(np.argmin(errors))]
             test = p.error(p.test_runs, best(p.test_runs))
         self.points.append((now, valid, test))
-        self._next = GROWTH * now + LEAST
+        self._next = min(GROWTH * now + LEAST, *(b for b in SOON if b > now), math.inf)
         self._started += self.seconds - now
         if now >= self.limit:
             raise Over
