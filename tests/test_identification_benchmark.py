@@ -71,8 +71,8 @@ def test_the_rivals_simulate_the_same_prior():
     rng = np.random.default_rng(1)
     x, u = rng.normal(size=(3, 2)), rng.uniform(-0.3, 0.3, (3, 30, 1))
     theta = np.array([prior.p[i] for i in box.free]) / box.size
-    exact = Simulation(prior.equations.xdot, 0.02).states(x, u, np.zeros((3, 30, 0)), prior.p, box.substeps)
-    np.testing.assert_allclose(box.run(x, u, theta), exact[:, :-1, :1], rtol=1e-11, atol=1e-12)
+    exact = Simulation(prior.equations.xdot, 0.02).values(x, u, np.zeros((3, 30, 0)), prior.p, box.substeps)
+    np.testing.assert_allclose(box.run(x, u, theta), exact[..., :1], rtol=1e-11, atol=1e-12)
 
 
 def test_a_late_input_lies_between_two_samples_of_the_past():
