@@ -162,7 +162,7 @@ def test_shares_are_of_the_way_from_rest_to_a_limit(values, limits, share):
 def test_a_guard_keeps_to_limits_beside_zero(mode):
     model = pendulum_model()
     ocp = OCP(10, (30.0, 1.0), [0.05], [0.05], [0.5], [2.0])
-    safe = SafeController(CondensedController(model, ocp), model)
+    safe = SafeController(CondensedController(model, ocp), model, safe_input=[0.5])
     guard = Guard(mode, limits=Limits([-INF], [1.0]))
     told = Loop(TrueState(model), safe, monitor=ScriptedMonitor([(0, 99)]), guard=guard)
     truth = [0.5, 0.0]

@@ -176,9 +176,9 @@ def test_of_many_guesses_only_the_cheapest_are_solved_from():
     solved_from = []
 
     class Counting(SQPController):
-        def solve(self, previous, estimate, reference, weight=None, *, limits=None):
+        def solve(self, previous, *given, **options):
             solved_from.append(float(previous.u[1, 0]))  # what the shifted plan begins with
-            return super().solve(previous, estimate, reference, weight)
+            return super().solve(previous, *given, **options)
 
     counting = Counting(model, ocp)
     costs = {u: carried_out(counting, np.full((60, 1), u), *given) for u in (0.5, -0.5, 0.1)}

@@ -53,7 +53,7 @@ def safe_on(model, terminal="riccati"):
     ocp = OCP(
         20, (300.0, 1.0), [0.05], [0.05], [-6.0], [6.0], [DU], terminal, working_point=([0.0, 1.0], [0.0])
     )
-    return SafeController(CondensedController(model, ocp), pendulum())
+    return SafeController(CondensedController(model, ocp), pendulum(), safe_input=[0.0])
 
 
 @pytest.fixture(scope="module")

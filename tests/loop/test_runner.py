@@ -77,7 +77,7 @@ def test_solves_that_come_late_are_shifted_plans(model, seconds):
     clock = FakeClock()
     late = {12: seconds, 13: seconds, 20: seconds}
     controller = Slow(make_safe(model, horizon=10).controller, clock, late)
-    slow = SafeController(controller, pendulum_model())
+    slow = SafeController(controller, pendulum_model(), safe_input=[0.0])
     report = make_runner(model, slow, Rig(), clock, deadline=0.01).run(N * DT)
     want = run(model, make_safe(model, horizon=10), late=lambda t: round(t / DT) in late)
     same(report, want)
@@ -97,7 +97,9 @@ def test_no_solve_is_begun_that_cannot_be_in_time(model):
             clock.t += 0.017  # 3 ms are left for a solve of 4 ms
         return ordinary()
 
-    runner = Runner(measure, rig.actuate, make_ekf(model), SafeController(controller), sine, clock=clock)
+    runner = Runner(
+        measure, rig.actuate, make_ekf(model), SafeController(controller, safe_input=[0.0]), sine, clock=clock
+    )
     report = runner.run(N * DT)
     assert controller.k == N - 2  # one solve fewer than periods
     assert (report.status[15], report.late, report.overruns) == ("LATE", 1, 0)
@@ -107,7 +109,7 @@ def test_no_solve_is_begun_that_cannot_be_in_time(model):
 def test_after_a_long_solve_periods_are_skipped_on_the_grid(model):
     clock = FakeClock()
     controller = Slow(make_safe(model, horizon=10).controller, clock, {10: 3.3 * DT, 15: 1.3 * DT})
-    report = make_runner(model, SafeController(controller), Rig(), clock).run(N * DT)
+    report = make_runner(model, SafeController(controller, safe_input=[0.0]), Rig(), clock).run(N * DT)
     grid = np.round(report.t / DT).astype(int)
     # 3.3 periods: two are lost, the third is begun late; 1.3 periods: none is lost.
     np.testing.assert_array_equal(grid, [*range(11), *range(13, N)])
@@ -127,7 +129,9 @@ def test_after_a_long_solve_periods_are_skipped_on_the_grid(model):
 def test_after_a_very_long_break_the_estimate_starts_anew(model):
     clock = FakeClock()
     controller = Slow(make_safe(model, horizon=10).controller, clock, {4: 3600.0})
-    report = make_runner(model, SafeController(controller), Rig(), clock).run(3600.0 + N * DT)
+    report = make_runner(model, SafeController(controller, safe_input=[0.0]), Rig(), clock).run(
+        3600.0 + N * DT
+    )
     assert report.skipped == round(3600.0 / DT) - 1
     assert report.x_hat[5, 1] == 0.0  # at rest at the first measurement
     assert report.x_hat[5, 0] == pytest.approx(report.y[5, 0], abs=1e-12)  # Newton's tolerance
@@ -136,7 +140,7 @@ def test_after_a_very_long_break_the_estimate_starts_anew(model):
 def test_a_machine_too_slow_for_its_period_keeps_trying(model):
     clock = FakeClock()
     controller = Slow(make_safe(model, horizon=10).controller, clock, dict.fromkeys(range(-2, 999), 0.03))
-    report = make_runner(model, SafeController(controller), Rig(), clock).run(N * DT)
+    report = make_runner(model, SafeController(controller, safe_input=[0.0]), Rig(), clock).run(N * DT)
     assert controller.k > report.periods / 3  # solves go on being begun
     assert report.late == report.periods - 1  # the first input was decided before the clock began
     assert np.all(np.abs(report.u) <= 6.0)
