@@ -75,7 +75,7 @@ def problem_of(machine: str, files: list[Path]) -> Problem:
     scenario: Scenario = load_scenario(machine)
     spec, prior = scenario.data, scenario.prior()
     if scenario.benchmark is None:
-        data = load_trajectories(files, spec, outputs=prior.outputs, inputs=prior.inputs, states=prior.states)
+        data = load_trajectories(files, prior, spec)
         train, valid, test = (data.by_role(role) for role in ("train", "valid", "test"))
     else:
         read = read_training(scenario, files)

@@ -72,7 +72,7 @@ class Verdict:
 
 
 FOLDERS = {
-    "machine": "tests/identify",
+    "machine": "tests/machine",
     "data": "tests/data",
     "identify": "tests/identify",
     "model": "tests",
@@ -98,24 +98,24 @@ def fault(room: str, what: str, old: str, new: str, words: str = "", folder: str
 
 FAULTS = (
     fault(
-        "machine", "the energy balance is a sum of forces, not of powers",
-        "(v_dot - self.acceleration(x, u)) * v).sum(-1)", "(v_dot - self.acceleration(x, u))).sum(-1)",
+        "machine", "the energy balance loses friction's force, not its power",
+        "ca.dot(force, v), ca.dot(friction, v)", "ca.dot(force, v), ca.sum(friction)",
         "friction",
     ),
     fault(
-        "machine", "friction decelerates by its torque, not by torque over inertia",
-        "return free - torques(self, x) / self.inertia(x)", "return free - torques(self, x)",
+        "machine", "a diagonal mass matrix accelerates by the force, not by force over mass",
+        "rate = driving / ca.diag(mass) if diagonal", "rate = driving if diagonal",
         "friction",
     ),
     fault(
         "machine", "a Stribeck curve starts above its static level",
-        "(level + (static - level) * torch.exp(-ratio * ratio))", "(level + static * torch.exp(-ratio * ratio))",
+        "(level + (static - level) * (-ratio * ratio).exp())", "(level + static * (-ratio * ratio).exp())",
         "friction",
     ),
     fault(
         "machine", "the shares of the two inputs that act within one period are swapped",
         "u=(1 - share) * younger + share * older", "u=share * younger + (1 - share) * older",
-        "delay",
+        "delay", "identify",
     ),
     fault(
         "data", "the input of a period is the mean over the period before",
@@ -135,18 +135,18 @@ FAULTS = (
     ),
     fault(
         "data", "a sensor's noise is estimated too large: the factor of first differences on third ones",
-        "float(np.std(third)) / math.sqrt(20.0)", "float(np.std(third)) / math.sqrt(2.0)",
+        "robust_spread(third) / math.sqrt(20.0)", "robust_spread(third) / math.sqrt(2.0)",
         "scales",
     ),
     fault(
         "identify", "the smoother takes a standard deviation for a variance",
-        "np.zeros(2 * n_q), np.square(self.walk)", "np.zeros(2 * n_q), np.abs(self.walk)",
+        "np.square(walk)], axis=1)", "np.abs(walk)], axis=1)",
         "smoothing",
     ),
     fault(
         "identify", "standard errors of parameters ignore that initial states were fitted too",
-        "(own - states @ (states.T @ own)) / noise", "own / noise",
-        "shooting",
+        "axis=-1) - a @ follow[self.windows.group]", "axis=-1)",
+        "prior_fit",
     ),
     fault(
         "identify", "a bound on the objectives is lowered where one of them is met, not all",
@@ -156,7 +156,7 @@ FAULTS = (
     ),
     fault(
         "identify", "a free run starts a period before the end of its warm-up",
-        "x = x_all[..., warm, :]\n", "x = x_all[..., warm - 1, :]\n",
+        "step.free_run(x_all[..., warm, :]", "step.free_run(x_all[..., warm - 1, :]",
         "evaluation",
     ),
     fault(

@@ -31,7 +31,7 @@ ROOMS = {
     "report": "errors files plots",
     "job": "nn_export errors records files machine data model estimate control loop scenario monitor analyze kit "
     "identify plots report",
-    "cli": "errors records files data scenario kit identify job",
+    "cli": "errors records files machine data scenario kit identify job",
     "scenarios.paper": "errors records files machine data scenario identify plots job cli",
     "scenarios.golf_robot.monitor_study": "errors records files loop scenario monitor kit plots report job cli",
     "scenarios": "nn_export",

@@ -39,7 +39,7 @@ class TemperatureLabPrior(Prior):
     )
     corrects: ClassVar[tuple[str, ...]] = ("heater1", "heater2")
     operating_point: ClassVar[OperatingPoint] = OperatingPoint(
-        x=(42.0, 35.0, 42.0, 35.0, 24.0), u=(30.0, 30.0)
+        x=(43.5, 36.0, 43.5, 36.0, 24.0), u=(30.0, 30.0)
     )
 
     def xdot(self, x: Any, u: Any, w: Any, p: Any) -> Any:
