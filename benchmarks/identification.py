@@ -33,14 +33,13 @@ from statistics import median
 from typing import Any
 
 import torch
-from identifiers import DRAWS, METHODS, NEEDS, Problem, watched
+from identifiers import BUDGETS, DRAWS, METHODS, NEEDS, Problem, watched
 from parts import arguments, report
 
 from hybrid_mpc import Scenario, Trajectory, load_scenario, load_trajectories
 from hybrid_mpc.identify.evaluate import STARTS
 from hybrid_mpc.job.benchmark_runs import read_training
 
-BUDGETS = (2.0, 5.0, 15.0, 60.0)
 FILES = {
     "golf_robot": (),
     "unbalanced_disk": ("unbalanced_disk/multisine_2024.npz",),

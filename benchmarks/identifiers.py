@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -37,6 +38,10 @@ Predict = Callable[[Runs], list[Array]]
 """Outputs ``(n, n_y)`` of free runs behind the warm-up of each run."""
 GROWTH, LEAST = 1.3, 0.2
 """A method is looked at when its time has grown by this factor and this much [s]."""
+BUDGETS = (2.0, 5.0, 15.0, 60.0)
+"""Processor times [s] that are compared."""
+SOON = tuple(0.95 * b for b in BUDGETS)
+"""Times [s] at which a method is looked at in any case: shortly before each budget."""
 
 
 class Over(Exception):
@@ -101,7 +106,7 @@ class Watch:
             valid, best = min(errors), candidates[int(np.argmin(errors))]
             test = p.error(p.test_runs, best(p.test_runs))
         self.points.append((now, valid, test))
-        self._next = GROWTH * now + LEAST
+        self._next = min(GROWTH * now + LEAST, *(b for b in SOON if b > now), math.inf)
         self._started += self.seconds - now
         if now >= self.limit:
             raise Over
@@ -159,6 +164,9 @@ def operators(xp: ModuleType) -> dict[int, Callable[..., Any]]:
         ca.OP_POW: xp.power, ca.OP_CONSTPOW: xp.power, ca.OP_FABS: xp.abs, ca.OP_ASIN: xp.arcsin,
         ca.OP_ACOS: xp.arccos, ca.OP_ATAN: xp.arctan, ca.OP_ATAN2: xp.arctan2,
         ca.OP_LT: lambda a, b: 1.0 * (a < b), ca.OP_LE: lambda a, b: 1.0 * (a <= b),
+        ca.OP_EQ: lambda a, b: 1.0 * (a == b), ca.OP_NE: lambda a, b: 1.0 * (a != b),
+        ca.OP_NOT: lambda a: 1.0 * (a == 0),
+        ca.OP_AND: lambda a, b: 1.0 * ((a != 0) & (b != 0)), ca.OP_OR: lambda a, b: 1.0 * ((a != 0) | (b != 0)),
         ca.OP_IF_ELSE_ZERO: lambda a, b: xp.where(a != 0, b, 0.0),
     }  # fmt: skip
 
@@ -662,6 +670,11 @@ NEEDS = {"jax-sysid grey": "jax_sysid", "jax-sysid black": "jax_sysid", "SUBNET"
 def watched(problem: Problem, name: str, seed: int, limit: float, **options: Any) -> Watch:
     """A method's run, from the recordings on."""
     watch = Watch(problem, limit)
-    with contextlib.suppress(Over), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
+    with (
+        open(os.devnull, "w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+        contextlib.suppress(Over),
+    ):
         METHODS[name](problem, watch, seed, **options)
     return watch

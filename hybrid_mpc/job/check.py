@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -161,6 +161,7 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
         substeps = required_substeps(prior, dt)
         programs = {f"prior/{name}": p for name, p in prior_programs(prior, dt).items()}
         model = build_model("prior", programs, model_info(prior, dt))
+        model = replace(model, disturbance_model=scenario.disturbance_model)
     if model is None:
         return None, None
     modes = np.linalg.eigvals(flow_slope(prior.equations.xdot)(x, u, w, prior.p).full()).astype(np.complex128)
@@ -324,14 +325,12 @@ def _structure(control: Any) -> tuple[Any, ...]:
 
 
 def _check_sensors(report: Report, scenario: Scenario, prior: Prior | None) -> None:
-    n_y, n_x = (0, 0) if prior is None else (len(prior.outputs), len(prior.states))
-    for name, needed in (("sensor_sigma", n_y), ("first_sigma", n_x - n_y)):
+    if prior is not None and len(scenario.sensor_sigma) != len(prior.outputs):
+        given = scenario.sensor_sigma
+        report.add(f"sensor_sigma needs {len(prior.outputs)} numbers, got {len(given)}: {given}")
+    for name in ("sensor_sigma", "first_sigma"):
         values = getattr(scenario, name)
-        if values is None:
-            continue
-        if prior is not None and len(values) != needed:
-            report.add(f"{name} needs {needed} numbers, got {len(values)}: {values}")
-        if not all(math.isfinite(s) and s > 0 for s in values):
+        if values is not None and not all(math.isfinite(s) and s > 0 for s in values):
             report.add(f"{name} must be positive and finite, got {values}")
 
 
@@ -405,7 +404,8 @@ def _check_methods(plant: Plant, prior: Prior, dt: float) -> None:
     x, u = (np.zeros(n_x), np.zeros(n_u)) if point is None else (np.array(point.x), np.array(point.u))
     if (len(x), len(u)) != (n_x, n_u):  # told by the prior
         return
-    state = plant.step(plant.reset(x, 0), u, dt)
+    step: Any = plant.step
+    state = step(plant.reset(x, 0), u, dt, *((rest_of(prior)[2],) if prior.disturbances else ()))
     y, x = plant.measure(state, np.random.default_rng(0)), plant.truth(state)
     for name, found, size in (("measure", y, n_y), ("truth", x, n_x)):
         if np.shape(found) != (size,):
@@ -421,11 +421,13 @@ def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) 
     room = np.array([s.upper for s in model.inputs]) - rest.u
     steps = np.where(room >= steps, steps, -steps)
     sizes = _sizes(model.states, rest.x)
+    step: Any = plant.step
+    held = (rest.w,) if len(rest.w) else ()
 
     def after(u: Array) -> tuple[Array, Array]:
         state, x = plant.reset(rest.x, 0), rest.x
         for _ in range(ANSWER):
-            state = plant.step(state, u, model.dt)
+            state = step(state, u, model.dt, *held)
             x = model.step(x, np.zeros(0), u, rest.w, model.p)[0].full().ravel()
         return np.asarray(plant.truth(state), dtype=np.float64), x
 
@@ -455,7 +457,7 @@ def _check_task(
         report.add(f"{what}: x0 needs {n_x} finite numbers, got {task.x0}")
     else:
         with report.part(what):
-            _check_within("x0", np.array([task.x0]), np.zeros(1), prior)
+            _check_within("x0", np.array([task.x0]), np.zeros(1), prior.states)
     if plant is not None:
         with report.part(what):
             check_channels(install(plant, task.faults)[1], len(prior.outputs), len(prior.inputs))
@@ -463,7 +465,10 @@ def _check_task(
         report.add(f"{what}: duration must be at least a period of {dt} s and finite, got {task.duration}")
         return
     t = np.arange(0.0, task.duration, dt)
-    for name, preview, columns in (("reference", task.reference, n_x + n_p), ("weight", task.weight, n_x)):
+    by_output = isinstance(control, OCP) and control.n_y > 0
+    signals = prior.outputs if by_output else prior.states
+    n_r = len(signals) + n_p
+    for name, preview, columns in (("reference", task.reference, n_r), ("weight", task.weight, n_x)):
         if preview is None:
             continue
         with report.part(what):
@@ -471,7 +476,11 @@ def _check_task(
             if values.shape != (len(t), columns):
                 raise InputError(
                     f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
-                    + (f"; the last {n_p} for the economic cost's parameters" if columns > n_x else "")
+                    + (
+                        f"; the last {n_p} for the economic cost's parameters"
+                        if columns > len(signals)
+                        else ""
+                    )
                 )
             if not np.all(np.isfinite(values)):
                 k = int(np.argmax(~np.isfinite(values).all(axis=1)))
@@ -479,14 +488,14 @@ def _check_task(
             if name == "weight" and np.any(values < 0):
                 raise InputError("weight: factors must not be negative")
             if name == "reference":
-                _check_within(name, values[:, :n_x], t, prior)
-                if isinstance(control, OCP) and rest is not None:
+                _check_within(name, values[:, : len(signals)], t, signals)
+                if isinstance(control, OCP) and rest is not None and not by_output:
                     _check_set_point(report, task, values[:, :n_x], control, prior, rest)
 
 
-def _check_within(name: str, values: Array, t: Array, prior: Prior) -> None:
-    """States are within their signals' ranges."""
-    for j, signal in enumerate(prior.states):
+def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal]) -> None:
+    """Values are within their signals' ranges."""
+    for j, signal in enumerate(signals):
         beyond = (values[:, j] < signal.lower) | (values[:, j] > signal.upper)
         if beyond.any():
             k = int(np.argmax(beyond))

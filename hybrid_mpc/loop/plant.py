@@ -25,7 +25,10 @@ class Plant(Protocol):
         """Plant state at rest within itself at the model state ``x0`` ``(n_x,)`` [SI]."""
 
     def step(self, state: Any, u: Array, dt: float) -> Any:
-        """Plant state after ``dt`` [s] with the input ``u`` ``(n_u,)`` held."""
+        """Plant state after ``dt`` [s] with the input ``u`` ``(n_u,)`` held.
+
+        Where the prior has disturbances the plant gets them too: ``step(state, u, dt, w)``, ``w`` ``(n_w,)``.
+        """
 
     def measure(self, state: Any, rng: np.random.Generator) -> Array:
         """Measured outputs ``(n_y,)`` with sensor noise drawn from ``rng``."""

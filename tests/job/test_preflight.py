@@ -7,12 +7,14 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from example_priors import Tanks
 
 from hybrid_mpc import (
     OCP,
     Balance,
     Budget,
     DataSpec,
+    Disturbance,
     Fault,
     InputError,
     MechanicalPrior,
@@ -305,7 +307,7 @@ WRONG = {
     "no sensor_sigma": (field(sensor_sigma=()), ["sensor_sigma needs 1 numbers, got 0"]),
     "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["sensor_sigma must be positive"]),
     "NaN sensor_sigma": (field(sensor_sigma=(math.nan,)), ["sensor_sigma must be positive"]),
-    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["first_sigma needs 1 numbers, got 2"]),
+    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["first_sigma needs 1 standard deviations", "(phi_dot)"]),
     "zero du_max": (control(du_max=(0,)), ["du_max"]),
     "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["state bounds cross"]),
     "working point of one": (control(working_point=((0.0,), (0.0,))), ["working_point x: 1 values given, 2 needed"]),
@@ -462,3 +464,92 @@ def test_the_command_tells_it_before_it_reads_anything(call, tmp_path):
     assert "horizon must be a whole number of periods, at least 1; got 0" in message
     assert "machine.py:3" in message
     assert not (tmp_path / "out").exists()
+
+
+class RainyTanks(Tanks):
+    """Their operating point: both levels rest under inflow and rain."""
+
+    outputs = (Signal("lower", "m", 0.0, 2.0),)
+    operating_point = OperatingPoint((0.64, 0.64), (0.12,), (0.05,))
+    parameters = (
+        Parameter("a_1", 1.0, "m^2", 1.0, 1.0),
+        Parameter("a_2", 1.2, "m^2", 0.3, 3.0),
+        Parameter("k_1", 0.15, "m^2.5/s", 0.05, 0.6),
+        Parameter("k_2", 0.2125, "m^2.5/s", 0.05, 0.6),
+    )
+
+
+class RainyPlant:
+    """The prior itself, by small steps of Euler."""
+
+    def __init__(self):
+        self._prior = RainyTanks()
+
+    def reset(self, x0, seed):
+        return np.array(x0, dtype=float)
+
+    def step(self, state, u, dt, w):
+        p = self._prior.p
+        for _ in range(50):
+            state = state + dt / 50 * self._prior.equations.xdot(state, u, w, p).full().ravel()
+        return state
+
+    def measure(self, state, rng):
+        return state[1:]
+
+    def truth(self, state):
+        return state
+
+    def hidden(self, state):
+        return np.zeros(0)
+
+
+def filled(to):
+    """A step of the lower tank's level, the only output."""
+    return lambda t: np.where(t[:, None] < 20.0, 0.64, to)
+
+
+def rain(t):
+    return np.full((len(t), 1), 0.05)
+
+
+def rainy(**changes):
+    task = Task(
+        "fill",
+        "More in the lower tank",
+        60.0,
+        (0.64, 0.64),
+        filled(0.8),
+        w=lambda t: np.full((len(t), 1), 0.05),
+    )
+    made = Scenario(
+        "tanks", "Two tanks in the rain", "Levels.", RainyTanks,
+        DataSpec("t", ("inflow",), ("lower",), 1.0, 3.0, 4.0, 20.0, disturbances=("rain",)),
+        plant=RainyPlant, control=OCP(20, (0.0, 0.0), (1.0,), (1.0,), (0.0,), (0.4,), q_y=(25.0,)),
+        sensor_sigma=(1e-3,), first_sigma=(0.1,), safe_input=(0.12,), tasks=(task,),
+        disturbance_model=(Disturbance("output", "lower", 0.1),),
+    )  # fmt: skip
+    return dataclasses.replace(made, **changes)
+
+
+def test_set_points_of_outputs_measured_disturbances_and_a_disturbance_model_pass():
+    check_scenario(rainy())
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (lambda t: filled(2.5)(t), ["reference: lower [m] is 2.5 at 20 s, outside its range from 0 to 2"]),
+        (
+            lambda t: np.zeros((len(t), 2)),
+            ["reference must return the shape (60, 1) for 60 times, got (60, 2)"],
+        ),
+    ],
+    ids=["beyond the range", "of the states"],
+)
+def test_a_set_point_of_outputs_that_cannot_be_is_told(changed, words):
+    task = dataclasses.replace(rainy().tasks[0], reference=changed)
+    with pytest.raises(InputError) as told:
+        check_scenario(rainy(tasks=(task,)))
+    for word in words:
+        assert word in str(told.value)
