@@ -135,7 +135,8 @@ FAULTS = (
     ),
     fault(
         "data", "a sensor's noise is estimated too large: the factor of first differences on third ones",
-        "robust_spread(third) / math.sqrt(20.0)", "robust_spread(third) / math.sqrt(2.0)",
+        "return robust_spread(third) / math.sqrt(20.0)",
+        "return robust_spread(third) / math.sqrt(2.0)",
         "scales",
     ),
     fault(
