@@ -121,9 +121,12 @@ def offset_free(
 
 
 def _rank(matrix: Array) -> int:
-    """Rank of a matrix whose rows and columns have units of their own."""
+    """Rank of a matrix whose rows and columns have units of their own.
+
+    A model that gives no finite number there is not refused for it: the monitor says so, and the loop falls back.
+    """
     if not np.all(np.isfinite(matrix)):
-        return 0
+        return min(matrix.shape)
     m = matrix.copy()
     for _ in range(5):
         for axis in (0, 1):
