@@ -13,6 +13,8 @@ from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
+AROUND = 5
+"""Points around the operating point that are asked where the model cannot tell the disturbances there."""
 RANK = 1e-9
 """Singular values below this share of the largest count as zero, rows and columns brought to one size."""
 
@@ -118,6 +120,27 @@ def offset_free(
         _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d,
         _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen),
     )  # fmt: skip
+
+
+def distinguishable(model: HybridModel) -> OffsetFree:
+    """The rank test at the operating point, or in motion around it where that alone tells the disturbances.
+
+    At rest a bristle of friction takes up a load, so there the two are one; in motion they are not.
+    """
+    found = offset_free(model)
+    rng = np.random.default_rng(0)
+    for _ in range(AROUND):
+        if found.detectable:
+            break
+        other = offset_free(model, x=model.x0 + rng.uniform(-1.0, 1.0, model.n_x) * _sizes(model))
+        found = other if other.detectable else found
+    return found
+
+
+def _sizes(model: HybridModel) -> Array:
+    """How far around the operating point: a tenth of a state's range, or else of its own size."""
+    ranges = np.array([s.upper - s.lower for s in model.states])
+    return 0.1 * np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(model.x0), 1.0))
 
 
 def _rank(matrix: Array) -> int:

@@ -18,7 +18,7 @@ from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
-from hybrid_mpc.estimate.offset_free import offset_free
+from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import most_likely
@@ -143,7 +143,7 @@ def make_estimator(
             f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...)"
         )
     first, span = first_deviations(model, scenario), disturbance_sizes(model, control)
-    if observer and not (found := offset_free(model)).detectable:
+    if observer and not (found := distinguishable(model)).detectable:
         raise InputError(
             f"an observer of model {model.name}: at its operating point {found.why}; declare others: "
             'Scenario(disturbance_model=(Disturbance("output", ...), ...)), no more than there are outputs'

@@ -20,6 +20,7 @@ from hybrid_mpc import (
     offset_free,
     with_input_delay,
 )
+from hybrid_mpc.estimate.offset_free import distinguishable
 from hybrid_mpc.kit.assembly import disturbance_sizes, first_deviations
 
 ALL = (two_tanks, dc_motor, thermal)
@@ -210,3 +211,19 @@ def test_the_first_deviations_belong_to_the_states_that_sensors_show():
     assert found.tolist() == [9.0, 0.05]
     with pytest.raises(InputError, match=r"first_sigma needs 1 .*\(x0\)"):
         first_deviations(scaled, SimpleNamespace(sensor_sigma=(0.2,), first_sigma=(9.0, 9.0)))
+
+
+def test_a_load_that_a_bristle_takes_up_at_rest_is_told_in_motion():
+    """LuGre's bristle: at rest the load and its bend are one, in motion the bend fades."""
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u")
+    bend = x[1] - 100.0 * ca.sqrt(x[1] ** 2 + 1e-12) * x[2]
+    rates = ca.vertcat(x[1], u - 50.0 * x[2] - 0.5 * bend - 0.1 * x[1], bend)
+    states = Signal("q", "m", -1.0, 1.0), Signal("v", "m/s", -1.0, 1.0), Signal("bend", "m", -0.02, 0.02)
+    model = HybridModel.of(
+        "bristle", 0.01, states, (Signal("force", "N"),), states[:1], x=x, u=u, x_next=x + 0.01 * rates, xdot=rates,
+        y=x[0],
+    )  # fmt: skip
+    assert not offset_free(model).detectable
+    assert distinguishable(model).detectable
+    twice = replace(model, disturbance_model=(Disturbance("input", "force"), Disturbance("output", "q", 0.1)))
+    assert not distinguishable(twice).detectable  # two loads and one output: nowhere
