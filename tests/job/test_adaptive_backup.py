@@ -60,7 +60,8 @@ def test_gains_are_left_to_the_mass():
 def test_it_switches_once_the_alarm_has_lasted_and_pays():
     model = pendulum()
     guard = make_adaptive_guard(model, model, SCENARIO, SIGMA_X, patience=0.2)
-    safe, estimator = make_controller(model, model, CONTROL), make_estimator(model, SCENARIO, SIGMA_X)
+    safe = make_controller(model, model, CONTROL, safe_input=[0.0])
+    estimator = make_estimator(model, SCENARIO, SIGMA_X)
     plain, guarded = (
         run(
             model,

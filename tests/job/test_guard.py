@@ -67,7 +67,7 @@ def test_the_rate_is_what_the_data_are_long_enough_for():
 @pytest.mark.parametrize("name", ["track_sine", "track_step"])
 def test_a_repeated_task_has_no_jump(name):
     task = next(t for t in GOLF.tasks if t.name == name)
-    many = repeated(task, DT, np.array([1.0, 0.6, 0.8]))
+    many = repeated(task, DT, np.array([1.0, 0.6, 0.8]), speeds={0: 1})
     t = np.arange(0.0, many.duration, 1e-3)
     x = many.reference(t)
     slope = np.gradient(x[:, 0], t)
