@@ -18,7 +18,9 @@ from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
 BLOCKS = 8
-"""Blocks at least that the validation runs are cut into: the scatter between fewer says little."""
+"""Blocks at least that runs of few recordings are cut into: the scatter between fewer says little."""
+RECORDINGS = 4
+"""Recordings from which on each of them is a block: errors within one hang together, and the next may be another."""
 CONFIDENCE = 0.95
 """Probability, one-sided, with which a recommended hybrid is better than the prior."""
 CONFIDENT = 1.0
@@ -60,12 +62,18 @@ class Choice:
 
 
 def recommend(
-    errors: Mapping[str, Sequence[Array]], *, prior: str = "phy", deploy: str = "", samples: int = 1
+    errors: Mapping[str, Sequence[Array]],
+    *,
+    prior: str = "phy",
+    deploy: str = "",
+    samples: int = 1,
+    recordings: Sequence[str] = (),
 ) -> Choice:
-    """Choose among the prior and hybrids, by their squared errors over the same validation runs.
+    """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
 
     The ratio of a hybrid's error to the prior's is that of their root mean squares over all runs. Its scatter is found
-    by leaving out one block after the other (jackknife); blocks are contiguous parts of the runs.
+    by leaving out one block after the other (jackknife). A block is all runs of a recording; where there are fewer than
+    ``RECORDINGS`` of them, a contiguous part of a run.
 
     Args:
         errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
@@ -73,6 +81,7 @@ def recommend(
         prior: Name of the prior among them.
         deploy: Candidate that the user wants whatever the figures say. Default: none.
         samples: Samples of a block at least, within which errors hang together. Default: 1.
+        recordings: Which recording each run is from. Default: all are from one.
 
     Raises:
         InputError: If ``deploy`` is no candidate, or there is no validation run.
@@ -93,6 +102,12 @@ def recommend(
     cuts = _cuts([len(run) for run in errors[prior]], samples)
     sums = {name: _sums(runs, cuts) for name, runs in errors.items()}
     sizes = np.array([b - a for run in cuts for a, b in run])
+    if len(set(recordings)) >= RECORDINGS:
+        _, of = np.unique(
+            [name for name, run in zip(recordings, cuts, strict=True) for _ in run], return_inverse=True
+        )
+        sums = {name: np.bincount(of, own).astype(np.float64) for name, own in sums.items()}
+        sizes = np.bincount(of, sizes)
     figures = {name: _figures(own, sums[prior], sizes) for name, own in sums.items()}
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)

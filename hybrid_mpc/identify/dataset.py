@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -21,7 +22,8 @@ class Windows:
     """Equal windows cut from trajectories [SI]: a warm-up of ``warm`` samples on measurements, then a scored part.
 
     States ``x`` are ``(n, warm + horizon + 1, n_x)``; inputs ``u``, disturbances ``w`` and the states' derivatives
-    ``xdot`` at the periods' starts ``(n, warm + horizon, ...)``.
+    ``xdot`` at the periods' starts ``(n, warm + horizon, ...)``. ``weight`` ``(networks, n)`` says how much a window
+    counts for each network; None: all alike.
     """
 
     x: Tensor
@@ -29,6 +31,7 @@ class Windows:
     w: Tensor
     warm: int
     xdot: Tensor
+    weight: Tensor | None = None
 
     @property
     def horizon(self) -> int:
@@ -41,25 +44,38 @@ class Windows:
     def take(self, index: Tensor) -> Windows:
         """The windows of ``index``."""
         index = index.to(self.x.device)
-        return Windows(self.x[index], self.u[index], self.w[index], self.warm, self.xdot[index])
+        weight = None if self.weight is None else self.weight[:, index]
+        return Windows(self.x[index], self.u[index], self.w[index], self.warm, self.xdot[index], weight)
 
     def to(self, device: torch.device) -> Windows:
         """The same windows on a device."""
+        weight = None if self.weight is None else self.weight.to(device)
         return Windows(
-            self.x.to(device), self.u.to(device), self.w.to(device), self.warm, self.xdot.to(device)
+            self.x.to(device), self.u.to(device), self.w.to(device), self.warm, self.xdot.to(device), weight
         )
 
 
-def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, stride: int) -> Windows:
-    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough."""
+def cut_windows(
+    trajectories: Sequence[Trajectory],
+    warm: int,
+    horizon: int,
+    stride: int,
+    weights: Sequence[Sequence[float]] = (),
+) -> Windows:
+    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough.
+
+    ``weights`` has a row a trajectory: how much its windows count for each network. Default: all alike.
+    """
     x, u, w, xdot, length = [], [], [], [], warm + horizon
-    for trajectory in trajectories:
+    rows: list[Sequence[float]] = []
+    for i, trajectory in enumerate(trajectories):
         _check_finite(trajectory)
         for start in range(0, len(trajectory.t) - length, stride):
             x.append(trajectory.x[start : start + length + 1])
             u.append(trajectory.u[start : start + length])
             w.append(trajectory.w[start : start + length])
             xdot.append(trajectory.xdot[start : start + length])
+            rows += weights[i : i + 1]
     if not x:
         longest = max((len(t.t) for t in trajectories), default=0)
         raise InputError(
@@ -68,7 +84,57 @@ def cut_windows(trajectories: Sequence[Trajectory], warm: int, horizon: int, str
             "warm_up."
         )
     x_all, u_all, w_all, xdot_all = (torch.tensor(np.stack(parts)) for parts in (x, u, w, xdot))
-    return Windows(x_all, u_all, w_all, warm, xdot_all)
+    weight = torch.tensor(np.array(rows, dtype=np.float64).T) if rows else None
+    return Windows(x_all, u_all, w_all, warm, xdot_all, weight)
+
+
+def in_parts(
+    trajectories: Sequence[Trajectory], parts: int, shortest: int
+) -> tuple[list[Trajectory], list[int]]:
+    """Training data in parts of about the same length, of which a network may leave one out.
+
+    A part is whole recordings, where there are as many of them as parts. Else every recording is cut into equal
+    stretches of its time; what is shorter than ``shortest`` after a cut is dropped.
+
+    Args:
+        trajectories: Training trajectories.
+        parts: How many parts; 0 or 1: none.
+        shortest: Samples of a stretch at least: a recording that would give shorter ones is cut less often.
+
+    Returns:
+        The trajectories, and the part of each; -1 where there are no parts.
+
+    Example:
+        >>> z = np.zeros((100, 1))
+        >>> run = Trajectory("run", "train", 0.1, z[:, 0], z, z, z, z)
+        >>> pieces, part = in_parts([run], 4, 20)
+        >>> [len(p.t) for p in pieces], part, in_parts([run], 4, 60)[1]
+        ([25, 25, 25, 25], [0, 1, 2, 3], [-1])
+    """
+    files = list(dict.fromkeys(t.file for t in trajectories))
+    size = {file: sum(len(t.t) for t in trajectories if t.file == file) for file in files}
+    count = {file: min(-(-parts // max(1, len(files))), size[file] // max(1, shortest)) for file in files}
+    if parts < 2 or sum(max(1, c) for c in count.values()) < 2:
+        return list(trajectories), [-1] * len(trajectories)
+    if len(files) >= parts:
+        load, of = np.zeros(parts), {}
+        for file in sorted(files, key=lambda name: -size[name]):
+            of[file] = int(load.argmin())
+            load[of[file]] += size[file]
+        return list(trajectories), [of[t.file] for t in trajectories]
+    pieces, part, first = [], [], 0
+    for file in files:
+        cuts, done = np.linspace(0, size[file], max(1, count[file]) + 1).round().astype(int).tolist(), 0
+        for t in (t for t in trajectories if t.file == file):
+            for k, (a, b) in enumerate(pairwise(cuts)):
+                keep = slice(max(a - done, 0), max(min(b - done, len(t.t)), 0))
+                whole = keep.stop - keep.start == len(t.t)
+                if keep.stop - keep.start >= shortest or whole:
+                    pieces.append(t if whole else t.part(keep))
+                    part.append((first + k) % parts)
+            done += len(t.t)
+        first += max(1, count[file])
+    return pieces, part
 
 
 def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) -> int:

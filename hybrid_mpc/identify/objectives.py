@@ -49,7 +49,7 @@ class Prediction:
     and ``(..., n_w)``.
 
     ``x_hat`` are the measured states under teacher forcing; rates ``xdot`` are as the model's form has them (hybrid:
-    means over the period).
+    means over the period). ``weight`` ``(networks, n)`` says how much a window counts for each network.
     """
 
     x: Tensor
@@ -58,6 +58,7 @@ class Prediction:
     w: Tensor
     xdot: Tensor
     xdot_hat: Tensor
+    weight: Tensor | None = None
 
 
 Objective: TypeAlias = Callable[[RecurrentStep, Prediction], Tensor]
@@ -73,7 +74,8 @@ def teacher_forced(step: RecurrentStep, windows: Windows) -> Prediction:
     x_k, u_k, w_k = (z[windows.warm :].unsqueeze(1) for z in (x, u, w))
     x_next = windows.x[:, windows.warm + 1 :].transpose(0, 1).unsqueeze(1)
     measured = step.measured_rate(x_k, x_next, _scored_xdot(windows))
-    return Prediction(x_k, x_k, u_k, w_k, measured, step.rate(x_k, u_k, w_k, correction))
+    rate = step.rate(x_k, u_k, w_k, correction)
+    return Prediction(x_k, x_k, u_k, w_k, measured, rate, windows.weight)
 
 
 def warm_up(step: RecurrentStep, windows: Windows) -> Tensor:
@@ -94,7 +96,8 @@ def free_run(step: RecurrentStep, windows: Windows) -> Prediction:
     x_hat = step.free_run(x, h, *(z.expand(-1, h.shape[0], -1, -1) for z in (u, w)))
     measured = windows.x[:, windows.warm :].transpose(0, 1).unsqueeze(1)
     rate = step.measured_rate(measured[:-1], measured[1:], _scored_xdot(windows))
-    return Prediction(measured[:-1], x_hat[:-1], u, w, rate, (x_hat[1:] - x_hat[:-1]) / step.dt)
+    own = (x_hat[1:] - x_hat[:-1]) / step.dt
+    return Prediction(measured[:-1], x_hat[:-1], u, w, rate, own, windows.weight)
 
 
 def error_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
@@ -102,7 +105,8 @@ def error_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
 
     The paper adds up rates of other units as they are (MAE, and E_sim on free runs); so do the figures of its results.
     """
-    return _per_network(((prediction.xdot_hat - prediction.xdot).abs() / step.scale_xdot).mean(-1))
+    error = (prediction.xdot_hat - prediction.xdot).abs() / step.scale_xdot
+    return _per_network(error.mean(-1), prediction.weight)
 
 
 def balance_objective(name: str) -> Objective:
@@ -117,7 +121,7 @@ def balance_objective(name: str) -> Objective:
         residual, held = step.equations.residuals[name], (prediction.u, prediction.w, step.p)
         model = residual(prediction.x_hat, prediction.xdot_hat, *held)
         measured = residual(prediction.x, prediction.xdot, *held)
-        return _per_network((model - measured).abs().sum(-1))
+        return _per_network((model - measured).abs().sum(-1), prediction.weight)
 
     return violation
 
@@ -131,7 +135,8 @@ def output_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
     y = step.equations.output(prediction.x + step.dt * prediction.xdot, *held)
     y_hat = step.equations.output(prediction.x_hat + step.dt * prediction.xdot_hat, *held)
     size = y.flatten(0, -2).std(0, correction=0).clamp_min(1e-12)
-    return _per_network(((y_hat - y) / size).square().sum(-1)).clamp_min(1e-24).sqrt()
+    error = ((y_hat - y) / size).square().sum(-1)
+    return _per_network(error, prediction.weight).clamp_min(1e-24).sqrt()
 
 
 OBJECTIVES: dict[str, Objective] = {"error": error_objective, "output": output_objective}
@@ -157,9 +162,12 @@ def objectives_of(prior: Prior, names: Sequence[str]) -> dict[str, Objective]:
     return {name: OBJECTIVES.get(name) or balance_objective(name) for name in wanted}
 
 
-def _per_network(values: Tensor) -> Tensor:
-    """Mean over time and windows of ``(T, networks, n)``."""
-    return values.mean(dim=(0, 2))
+def _per_network(values: Tensor, weight: Tensor | None) -> Tensor:
+    """Mean over time and windows of ``(T, networks, n)``, the windows weighted."""
+    if weight is None:
+        return values.mean(dim=(0, 2))
+    counted = torch.where(weight > 0, values.mean(dim=0), 0.0)
+    return (counted * weight).sum(-1) / weight.sum(-1).clamp_min(1e-300)
 
 
 def _scored_xdot(windows: Windows) -> Tensor:

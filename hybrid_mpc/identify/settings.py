@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -56,10 +57,12 @@ class TrainingSettings:
         prior_replay: Weight of the mean square of the correction (in its own scale) in states that no recording comes
             near (:mod:`~hybrid_mpc.identify.prior_replay`); it is added to the objectives, which are in units of
             their bounds. An rnn ignores it. Default: zero, none.
+        parts: Parts of the training data, of which network ``i`` leaves out part ``i``: it is validated on that too,
+            and the model is chosen by what networks say of data they never saw. Default 0: all are trained on all.
 
     Raises:
         InputError: If a name is not known, there is no objective, an rnn is to train the prior that it does not have,
-            or prior_replay is negative.
+            prior_replay is negative, or there is one part, which would leave nothing to train on.
 
     Example:
         >>> TrainingSettings("mopgrnn", 16, 4, 100, 100, seed=0, warm=10).objectives
@@ -82,6 +85,7 @@ class TrainingSettings:
     objectives: tuple[str, ...] = ("output", "balances")
     prior_parameters: PriorParameters = "fixed"
     prior_replay: float = 0.0
+    parts: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "objectives", tuple(self.objectives))  # a list, where it comes from a file
@@ -92,6 +96,13 @@ class TrainingSettings:
         if self.kind == "rnn" and self.prior_parameters == "trained":
             raise InputError("an rnn has no prior to train along; leave prior_parameters 'fixed'")
         check_prior_replay(self.prior_replay)
+        if self.parts < 0 or self.parts == 1:
+            raise InputError(f"parts must be 0, or 2 and more, got {self.parts}")
+
+    @property
+    def shortest(self) -> int:
+        """Samples of a training trajectory that give windows of the horizon at several starts."""
+        return self.warm + 1 + math.ceil(1.5 * self.horizon)
 
     @property
     def use_prior(self) -> bool:

@@ -1,4 +1,4 @@
-"""Stage choice: which model is recommended, and the bands around free runs, both by validation recordings."""
+"""Stage choice: which model is recommended, and the bands around free runs, both by data that no network saw."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.identify.bands import Bands, RunParts, fit_bands, variance_parts
 from hybrid_mpc.identify.choose import Choice, recommend
+from hybrid_mpc.identify.dataset import in_parts
 from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, free_runs
 from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of, training_settings
 from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
@@ -44,21 +45,43 @@ class ChoiceResult:
 
 
 def choice_stage(context: Context) -> ChoiceResult:
-    """Free runs of all candidates over validation recordings, as long as those on unseen data."""
-    prior, spec = context.prior, context.spec
+    """Free runs of all candidates, as long as those on unseen data, over what no network saw.
+
+    That are the validation recordings, and of the training ones the part that each network left out: it is the one that
+    runs there.
+    """
+    prior, spec, warm = context.prior, context.spec, context.warm
     phy = context.scenario.prior(prior.fit.values)
     smoother = prior.fit.smoother(phy, spec.dt)
-    valid = evaluation_trajectories(context.smoothed("valid"), smoother, context.warm, spec.free_run)
+    candidates = [name for name in models_of(phy) if name in CANDIDATES]
+    unseen = [(-1, context.smoothed("valid"))]
+    if len(candidates) > 1:
+        settings = training_settings(context, candidates[-1])
+        pieces, part = in_parts(context.smoothed("train"), settings.parts, settings.shortest)
+        unseen += [
+            (i, [t for t, own in zip(pieces, part, strict=True) if own == i])
+            for i in range(settings.networks)
+        ]
+    runs = [
+        (own, evaluation_trajectories(them, smoother, warm, spec.free_run)) for own, them in unseen if them
+    ]
     errors: dict[str, list[Array]] = {}
     bands: dict[str, Bands] = {}
-    candidates = [name for name in models_of(phy) if name in CANDIDATES]
     for i, name in enumerate(candidates):
         context.progress.update("candidates", i, len(candidates), name)
-        every = [free_runs(step, phy, valid, context.warm) for step in members(context, name, phy)]
-        errors[name] = [run.squared_errors(smoother.sizes.y) for run in every[0]]
-        bands[name] = fit_bands(run_parts(phy, prior.fit, every, spec.dt))
+        judged = [
+            judge
+            for own, them in runs
+            for judge in zip(
+                *(free_runs(step, phy, them, warm) for step in members(context, name, phy, own)), strict=True
+            )
+        ]
+        errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in judged]
+        bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*judged, strict=True)), spec.dt))
     samples = max(1, round(context.time_unit / spec.dt))
-    return ChoiceResult(recommend(errors, deploy=context.settings.deploy, samples=samples), bands)
+    recordings = [t.file for _, them in runs for t in them]
+    found = recommend(errors, deploy=context.settings.deploy, samples=samples, recordings=recordings)
+    return ChoiceResult(found, bands)
 
 
 def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float) -> list[RunParts]:

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation
@@ -32,6 +31,8 @@ Array = NDArray[Any]
 
 MODELS = ("phy_nominal", "phy", *KINDS)
 """Models that may be evaluated; those of a prior: :func:`models_of`."""
+PARTS = 4
+"""Parts of the training data at least: a network that leaves one out still sees three quarters."""
 ERRORS = {"error": "E_sim", "output": "RMSE over the spread"}
 """What the validation of a training is called, by its first objective."""
 
@@ -308,14 +309,15 @@ def trained_models(context: Context, kind: str) -> Trained:
     return load_trained(context.out / "checkpoints" / "training" / context.read(TRAINING).folder, kind)
 
 
-def members(context: Context, name: str, phy: Prior) -> Sequence[Step]:
-    """Steps of one model, that of the best network by validation first."""
+def members(context: Context, name: str, phy: Prior, first: int = -1) -> Sequence[Step]:
+    """Steps of one model: of its networks, number ``first`` first, by default the best by validation."""
     dt = context.spec.dt
     if name in ("phy_nominal", "phy"):
         fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
         return [PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)]
     trained = trained_models(context, name)
-    return [trained.step(phy, dt, int(i)) for i in np.argsort(trained.validation, kind="stable")]
+    ranking = sorted((int(i) for i in trained.ranking), key=lambda i: i != first)
+    return [trained.step(phy, dt, i) for i in ranking]
 
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:
@@ -331,6 +333,7 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
         warm=context.warm,
         decay=b.decay,
         prior_replay=b.prior_replay,
+        parts=max(PARTS, b.networks),
     )
     return replace(settings, **context.settings.network())
 
