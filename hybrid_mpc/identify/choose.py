@@ -52,6 +52,7 @@ class Choice:
         candidates: Figures by candidate.
         reason: One sentence for the report.
         blocks: Blocks of the validation runs that were compared.
+        sure: The hybrids that surely beat the prior.
     """
 
     recommended: str
@@ -59,6 +60,7 @@ class Choice:
     candidates: Mapping[str, CandidateFigures]
     reason: str
     blocks: int
+    sure: tuple[str, ...] = ()
 
 
 def recommend(
@@ -71,9 +73,10 @@ def recommend(
 ) -> Choice:
     """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
 
-    The ratio of a hybrid's error to the prior's is that of their root mean squares over all runs. Its scatter is found
-    by leaving out one block after the other (jackknife). A block is all runs of a recording; where there are fewer than
-    ``RECORDINGS`` of them, a contiguous part of a run.
+    The ratio of a hybrid's error to the prior's is that of their root mean squares over all runs. With ``RECORDINGS``
+    or more its bound is that of the mean of the logarithms of each recording's ratio: another recording may be like any
+    of these, so a single one in which the prior is far off does not outweigh the others. With fewer the scatter is
+    found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
 
     Args:
         errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
@@ -102,38 +105,35 @@ def recommend(
     cuts = _cuts([len(run) for run in errors[prior]], samples)
     sums = {name: _sums(runs, cuts) for name, runs in errors.items()}
     sizes = np.array([b - a for run in cuts for a, b in run])
-    if len(set(recordings)) >= RECORDINGS:
+    whole = len(set(recordings)) >= RECORDINGS
+    if whole:
         _, of = np.unique(
             [name for name, run in zip(recordings, cuts, strict=True) for _ in run], return_inverse=True
         )
         sums = {name: np.bincount(of, own).astype(np.float64) for name, own in sums.items()}
         sizes = np.bincount(of, sizes)
-    figures = {name: _figures(own, sums[prior], sizes) for name, own in sums.items()}
+    figures = {name: _figures(own, sums[prior], sizes, whole) for name, own in sums.items()}
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)
     safe = [name for name in hybrids if figures[name].upper < CONFIDENT]
     chosen = min(safe, key=lambda name: figures[name].error, default=prior)
-    reason = _reason(figures, best, chosen, prior, len(sizes))
+    reason = _reason(figures, best, chosen, prior, f"{len(sizes)} {'recordings' if whole else 'blocks'}")
     if deploy and deploy != chosen:
         reason = f"{deploy} is deployed as asked for. {reason}"
-    return Choice(deploy or chosen, best if deploy in ("", prior) else deploy, figures, reason, len(sizes))
+    return Choice(
+        deploy or chosen, best if deploy in ("", prior) else deploy, figures, reason, len(sizes), tuple(safe)
+    )
 
 
-def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: int) -> str:
+def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str) -> str:
     if best == prior:
         return "There is no hybrid to compare with the fitted prior."
-    own = figures[best]
-    if not math.isfinite(own.error):
+    if not math.isfinite(figures[best].error):
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
-    said = (
-        f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
-    )
+    own = figures[best if chosen == prior else chosen]
+    said = f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks})"
     if chosen == prior:
         return f"The fitted prior is recommended: {best} does not surely beat it; {said}."
-    own = figures[chosen]
-    said = (
-        f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks} blocks)"
-    )
     return f"{chosen} is recommended: {said}."
 
 
@@ -152,7 +152,8 @@ def _sums(runs: Sequence[Array], cuts: Sequence[Sequence[tuple[int, int]]]) -> A
     return np.array([float(np.sum(run[a:b])) for run, own in zip(runs, cuts, strict=True) for a, b in own])
 
 
-def _figures(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
+def _figures(own: Array, prior: Array, sizes: Array, whole: bool) -> CandidateFigures:
+    """Figures from the sums of squares by block; ``whole``: the blocks are recordings."""
     n = len(sizes)
     error = math.sqrt(float(own.sum()) / float(sizes.sum())) if np.isfinite(own).all() else math.inf
     if not math.isfinite(error):
@@ -164,6 +165,10 @@ def _figures(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
     ratio = float(np.sqrt(own.sum() / max(float(prior.sum()), 1e-300)))
     if n < 2:
         return CandidateFigures(error, ratio, math.inf)
+    if whole:
+        each = 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
+        most = float(each.mean() + student.ppf(CONFIDENCE, n - 1) * each.std(ddof=1) / math.sqrt(n))
+        return CandidateFigures(error, ratio, max(ratio, math.exp(min(most, 700.0))))
     without = 0.5 * np.log(np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300))
     scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
     bound = math.log(max(ratio, 1e-300)) + float(student.ppf(CONFIDENCE, n - 1)) * scatter

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.dataset import in_parts
+from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.step import Step
 from hybrid_mpc.identify.train import Trained
@@ -115,6 +117,33 @@ def evaluation_trajectories(
         replace(t, x=np.vstack([s.x, t.x[warm + 1 :]]), xdot=np.vstack([s.xdot, t.xdot[warm + 1 :]]))
         for t, s in zip(pieces, starts, strict=True)
     ]
+
+
+def unseen_runs(
+    settings: TrainingSettings,
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    smoother: Smoother,
+    length: float | None = None,
+) -> list[tuple[int, list[Trajectory]]]:
+    """Trajectories that judge a training by what its networks did not see: the validation, and the parts left out.
+
+    Args:
+        settings: Of the training.
+        training: Trajectories that it was given to train on, smoothed.
+        validation: Those that it was validated on.
+        smoother: Smoother of the warm-ups; the same for every model.
+        length: As in :func:`evaluation_trajectories`.
+
+    Returns:
+        Pairs of the network that is to run, -1 for the best, and what over. There is no pair without trajectories.
+    """
+    pieces, part = in_parts(training, settings.parts, settings.shortest)
+    unseen = [(-1, list(validation))]
+    unseen += [
+        (i, [t for t, own in zip(pieces, part, strict=True) if own == i]) for i in range(settings.networks)
+    ]
+    return [(own, evaluation_trajectories(t, smoother, settings.warm, length)) for own, t in unseen if t]
 
 
 def free_runs(

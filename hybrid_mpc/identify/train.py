@@ -171,6 +171,10 @@ class Trained:
         own = {name: torch.tensor(w) for name, w in self.weights.items() if not name.startswith(PREFIX)}
         return self._step(prior, dt, own, lambda stack: stack.member(i), shift)
 
+    def steps(self, prior: Prior, dt: float, first: int = -1) -> list[RecurrentStep]:
+        """The steps of all networks, that of number ``first`` first (default: the best), then in their ranking."""
+        return [self.step(prior, dt, i) for i in sorted(self.ranking.tolist(), key=lambda i: i != first)]
+
     def stacked_step(self, prior: Prior, dt: float) -> RecurrentStep:
         """The step of all networks at once, tensors ``(networks, n, ...)``; the prior's parameters must be fixed."""
         own = {name: torch.tensor(w) for name, w in self.weights.items()}

@@ -14,16 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
-from hybrid_mpc.identify.evaluate import OutputErrors
+from hybrid_mpc.identify.choose import Choice, recommend
+from hybrid_mpc.identify.evaluate import OutputErrors, free_runs, unseen_runs
 from hybrid_mpc.identify.fit import fit_prior, refit, smoothed
 from hybrid_mpc.identify.linear import BASELINES, LinearModel
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import TrainingSettings, kinds_of
+from hybrid_mpc.identify.step import PriorStep, Step
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.job.benchmark_runs import (
     BenchmarkRun,
@@ -39,13 +42,14 @@ from hybrid_mpc.job.benchmark_runs import (
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.folder import JobNote, write_note
-from hybrid_mpc.job.stages.identify import load_trained, save_trained, train_kinds
+from hybrid_mpc.job.stages.identify import PARTS, load_trained, save_trained, train_kinds
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
-SCHEMA = 2
+Array = NDArray[np.float64]
+SCHEMA = 3
 MODEL_NOTE = "benchmark_model.json"
 CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 """What may be recommended, where it is trained."""
@@ -94,6 +98,7 @@ class _Description:
     kinds: tuple[str, ...]
     linear: Mapping[str, LinearModel]
     no_linear: Mapping[str, str]
+    choice: Choice
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,8 @@ class BenchmarkModel(_Description):
     """Everything that a free run over another recording needs: prior, recommended model (``hybrid``), networks by kind.
 
     ``validation`` and ``long`` are the errors of every model on validation pieces and on :attr:`Recordings.long`;
-    ``linear`` are the linear baselines by name, ``no_linear`` says why there is none of a name.
+    ``linear`` are the linear baselines by name, ``no_linear`` says why there is none of a name. ``choice`` says which
+    kinds surely beat the prior where they were not trained.
     """
 
     networks: Mapping[str, Trained]
@@ -249,9 +255,12 @@ def _make(
     errors = partial(candidate_errors, scenario, fit, networks, linear)
     validation = errors(data.valid, max(warm_up, IN_MOTION * time_unit(data.train, dt)))
     long = errors(data.long, warm_up) if data.long else {}
-    hybrid = recommended(*({name: e.error for name, e in part.items()} for part in (validation, long)))
+    choice = _choice(scenario, fit, networks, train, valid)
+    hybrid = recommended(
+        *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=choice.sure
+    )
     model = BenchmarkModel(
-        scenario.name, dt, fit, hybrid, validation, long, tuple(networks), linear, no_linear, networks
+        scenario.name, dt, fit, hybrid, validation, long, tuple(networks), linear, no_linear, choice, networks
     )
     save_model(out / "model", model)
     return model
@@ -311,6 +320,7 @@ def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: in
         seed=seed,
         warm=warm,
         objectives=("output", "balances"),
+        parts=max(PARTS, budget.networks),
         **asdict(budget),
     )
 
@@ -329,11 +339,45 @@ def candidate_errors(
     return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
 
 
-def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> str:
+def _choice(
+    scenario: Scenario,
+    fit: PriorFit,
+    networks: Mapping[str, Trained],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+) -> Choice:
+    """Which kinds of networks surely beat the prior where they were not trained; trajectories are smoothed."""
+    prior, dt = scenario.prior(fit.values), scenario.data.dt
+    settings, smoother = networks["pgrnn"].settings, fit.smoother(prior, dt)
+    runs = unseen_runs(settings, training, validation, smoother, benchmark_of(scenario).length)
+
+    def errors(step_of: Callable[[int], Step]) -> list[Array]:
+        return [
+            run.squared_errors(smoother.sizes.y)
+            for own, them in runs
+            for run in free_runs(step_of(own), prior, them, settings.warm)
+        ]
+
+    plain_prior = PriorStep(prior, dt, fit.substeps)
+    found = {"phy": errors(lambda own: plain_prior)}
+    for kind, trained in networks.items():
+        if kind in CANDIDATES:
+            found[kind] = errors(lambda own, trained=trained: trained.steps(prior, dt, own)[0])  # type: ignore[misc]
+    return recommend(
+        found,
+        samples=max(1, round(time_unit(training, dt) / dt)),
+        recordings=[t.file for _, them in runs for t in them],
+    )
+
+
+def recommended(
+    validation: Mapping[str, float], long: Mapping[str, float], *, sure: Sequence[str] = ("pgrnn", "mopgrnn")
+) -> str:
     """The candidate whose larger error, over the prior's, is least: on validation pieces and on runs of full length.
 
     Nothing was trained on validation pieces, but they may be shorter than the runs of the test, and then do not show
-    drift.
+    drift. Of the networks only those kinds count that are ``sure`` to beat the prior on what they were not trained on
+    (:func:`~hybrid_mpc.identify.choose.recommend`), each alone and as the mean of its kind.
     """
 
     def larger(name: str) -> float:
@@ -342,7 +386,8 @@ def recommended(validation: Mapping[str, float], long: Mapping[str, float]) -> s
         ]
         return max(math.inf if math.isnan(v) else v for v in over_prior)  # NaN: both have diverged
 
-    return min((name for name in CANDIDATES if name in validation), key=larger)
+    able = ("phy", *sure)
+    return min((n for n in CANDIDATES if n in validation and n.partition(" ")[0] in able), key=larger)
 
 
 def save_model(folder: Path, model: BenchmarkModel) -> None:
@@ -488,6 +533,7 @@ def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
         "delay_s": fit.delay,
         "smoother": {"sigma": fit.sigma, "walk": fit.walk},
         "hybrid": model.hybrid,
+        "choice": plain(model.choice),
         "validation": plain(model.validation),
         "long": plain(model.long),
         "baselines": {name: {"chosen": own.chosen.text} for name, own in model.linear.items()}

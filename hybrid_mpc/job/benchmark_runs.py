@@ -210,7 +210,7 @@ def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
         >>> z = np.zeros((101, 1))
         >>> run = Trajectory("run", "train", 0.1, 0.1 * np.arange(101), z, z, np.zeros((101, 2)), np.zeros((101, 2)))
         >>> [(p.name, len(p.t)) for p in pieces(run, 5.0)], len(pieces(run, 60.0))
-        ([('run.1', 50), ('run.2', 50)], 1)
+        ([('run#1', 50), ('run#2', 50)], 1)
     """
     count = round(len(trajectory.t) * trajectory.dt / seconds)
     if count < 2:
@@ -218,7 +218,7 @@ def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
     n, index = len(trajectory.t) // count, np.arange(len(trajectory.t))
     return tuple(
         trajectory.part(
-            (index >= i * n) & (index < (i + 1) * n), f"{trajectory.name}.{i + 1}", trajectory.role
+            (index >= i * n) & (index < (i + 1) * n), f"{trajectory.name}#{i + 1}", trajectory.role
         )
         for i in range(count)
     )

@@ -91,3 +91,33 @@ def test_one_block_tells_nothing_of_its_scatter():
     assert choice.blocks == 1
     assert choice.candidates["pgrnn"].upper == np.inf
     assert choice.recommended == "phy"
+
+
+def test_recordings_count_alike_however_far_off_the_prior_is():
+    """The prior is far off in one of six recordings, which the hybrid mends; in the others it does no better."""
+    rng = np.random.default_rng(6)
+    prior = [10.0 * own if i == 0 else own for i, own in enumerate(runs(rng, n=6))]
+    hybrid = [
+        0.01 * prior[0],
+        *(factor * own for factor, own in zip((1.0, 1.1, 0.9, 1.05, 0.95), prior[1:], strict=True)),
+    ]
+    names = [f"file{i}" for i in range(6)]
+    by_block = recommend({"phy": prior, "pgrnn": hybrid})
+    choice = recommend({"phy": prior, "pgrnn": hybrid}, recordings=names)
+    assert choice.candidates["pgrnn"].ratio == pytest.approx(by_block.candidates["pgrnn"].ratio)
+    assert by_block.recommended == "pgrnn"  # blocks of all recordings together are ruled by the first
+    assert choice.recommended == "phy"
+    assert "6 recordings" in choice.reason
+    # the bound by hand: mean and standard deviation of the logarithms, Student's quantile 2.015 of five degrees
+    logs = 0.5 * np.log([0.01, 1.0, 1.1, 0.9, 1.05, 0.95])
+    upper = np.exp(logs.mean() + 2.015 * logs.std(ddof=1) / np.sqrt(6))
+    assert choice.candidates["pgrnn"].upper == pytest.approx(upper, rel=1e-3)
+    better = [0.25 * own for own in prior]
+    assert recommend({"phy": prior, "pgrnn": better}, recordings=names).recommended == "pgrnn"
+
+
+def test_runs_of_few_recordings_are_cut_into_blocks():
+    prior = runs(np.random.default_rng(7), n=3)
+    errors = {"phy": prior, "pgrnn": [0.25 * own for own in prior]}
+    assert recommend(errors, recordings=["a", "b", "c"]).blocks == recommend(errors).blocks == 9
+    assert recommend(errors | {"phy": prior}, recordings=["a", "a", "b"]).blocks == 9

@@ -36,6 +36,10 @@ def test_a_network_that_drifts_or_diverges_is_not_recommended(name):
     # where the prior itself diverges on long runs, what does not is better, and what does too is worse
     assert recommended(short, {**dict.fromkeys(short, float("inf")), name: 1.0}) == name
     assert recommended(short, dict.fromkeys(short, float("inf"))) == "phy"
+    # and one that does not surely beat the prior where it was not trained is not recommended, whatever else it does
+    others = [kind for kind in ("pgrnn", "mopgrnn") if kind != name.partition(" ")[0]]
+    assert recommended(short, {}, sure=others).partition(" ")[0] in others
+    assert recommended(short, {}, sure=()) == "phy"
 
 
 def test_runs_of_full_length_end_where_validation_does(machine):
@@ -57,8 +61,8 @@ def test_every_so_many_th_file_validates_as_a_whole(machine):
     scenario = load_scenario(str(machine[0]))
     scenario = replace(scenario, benchmark=replace(scenario.benchmark, valid_every=2))
     data = read_training(scenario, [machine[1], machine[2]])  # by name: test.csv, train.csv
-    assert {p.name.split(".")[0] for p in data.train} == {"test"}
-    assert {p.name.split(".")[0] for p in data.valid} == {"train"}
+    assert {p.file for p in data.train} == {"test"}
+    assert {p.file for p in data.valid} == {"train"}
     # all of it in pieces; the last sample's input has no end
     assert sum(len(p.t) for p in data.valid) == 5 * 199
     assert (data.held_back, data.long) == ((), ())

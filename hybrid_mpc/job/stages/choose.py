@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.identify.bands import Bands, RunParts, fit_bands, variance_parts
 from hybrid_mpc.identify.choose import Choice, recommend
-from hybrid_mpc.identify.dataset import in_parts
-from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, free_runs
+from hybrid_mpc.identify.evaluate import FreeRun, free_runs, unseen_runs
 from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
@@ -54,17 +53,10 @@ def choice_stage(context: Context) -> ChoiceResult:
     phy = context.scenario.prior(prior.fit.values)
     smoother = prior.fit.smoother(phy, spec.dt)
     candidates = [name for name in models_of(phy) if name in CANDIDATES]
-    unseen = [(-1, context.smoothed("valid"))]
-    if len(candidates) > 1:
-        settings = training_settings(context, candidates[-1])
-        pieces, part = in_parts(context.smoothed("train"), settings.parts, settings.shortest)
-        unseen += [
-            (i, [t for t, own in zip(pieces, part, strict=True) if own == i])
-            for i in range(settings.networks)
-        ]
-    runs = [
-        (own, evaluation_trajectories(them, smoother, warm, spec.free_run)) for own, them in unseen if them
-    ]
+    settings = training_settings(context, "pgrnn")
+    runs = unseen_runs(
+        settings, context.smoothed("train"), context.smoothed("valid"), smoother, spec.free_run
+    )
     errors: dict[str, list[Array]] = {}
     bands: dict[str, Bands] = {}
     for i, name in enumerate(candidates):

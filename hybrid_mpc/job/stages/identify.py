@@ -316,8 +316,7 @@ def members(context: Context, name: str, phy: Prior, first: int = -1) -> Sequenc
         fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
         return [PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)]
     trained = trained_models(context, name)
-    ranking = sorted((int(i) for i in trained.ranking), key=lambda i: i != first)
-    return [trained.step(phy, dt, i) for i in ranking]
+    return trained.steps(phy, dt, first)
 
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:
