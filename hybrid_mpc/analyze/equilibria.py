@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.stats import qmc
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, positions_of
 from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
@@ -202,7 +202,7 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     Example:
         ``gain_schedule(model, [(np.append(q, 0.0), holding_input(model, [q])) for q in angles], weights, costs)``
     """
-    n_q = model.n_x // 2
+    n_q = positions_of(model)
     if model.n_u != n_q:
         raise InputError(
             f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them"

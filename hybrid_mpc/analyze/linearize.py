@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.analyze.equilibria import hidden_equilibrium
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, positions_of
 from hybrid_mpc.model.riccati import vector
 
 Array = NDArray[np.float64]
@@ -145,7 +145,7 @@ def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: A
     Raises:
         InputError: If a size is wrong or the hidden state finds no rest.
     """
-    n_q = model.n_x // 2
+    n_q = positions_of(model)
     x = np.concatenate([vector(q, n_q, "q"), vector(v_work, n_q, "v_work")])
     return linearize(model, x, u)
 
@@ -175,7 +175,7 @@ def linearize_secant(
     Raises:
         InputError: If a size is wrong, a speed is not positive, or the hidden state finds no rest.
     """
-    n_q, n_z = model.n_x // 2, model.n_x + model.n_h
+    n_q, n_z = positions_of(model), model.n_x + model.n_h
     size = _positive(speed, n_q)
     if kind not in ("secant", "harmonic"):
         raise InputError(f"secant: kind must be 'secant' or 'harmonic', got {kind!r}")
@@ -234,7 +234,7 @@ def friction_slopes(
     Source: the describing function: Gelb and Vander Velde, *Multiple-Input Describing Functions and Nonlinear System
     Design*, 1968, section 2.2.
     """
-    n_q = model.n_x // 2
+    n_q = positions_of(model)
     size = _positive(speeds, np.size(speeds))
     if not 0 <= axis < n_q:
         raise InputError(f"friction: axis {axis} given, model {model.name} has axes 0 to {n_q - 1}")

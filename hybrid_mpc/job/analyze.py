@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,6 +60,7 @@ from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.data.excitation import multisine
+from hybrid_mpc.data.scales import COARSEST
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
@@ -68,7 +70,7 @@ from hybrid_mpc.kit.artifact import FILE, Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import MODES, make_ocp
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, positions_of
 from hybrid_mpc.scenario import Scenario, scenario_of
 from nn_export import Program, load_programs
 
@@ -79,13 +81,16 @@ Point = tuple[Array, Array]
 
 POINTS = ("rest", "working", "moving", "driven")
 """Linearizations: the tangent at rest, the describing function of motions of working size around it, the tangent in
-motion at working speed, and the mean along a driven run."""
+motion at working speed, and the mean along a driven run. Only mechanical models have the two in the middle."""
 LARGEST_ZERO = 1e6
 """Zeros beyond this size stand for a delay of the system: rounding, over the fall of its gain."""
 LEVEL = 0.5
 """Amplitude of the multisine over half the input's range."""
 PERIOD, PERIODS, BAND = 20.0, 4, (0.1, 3.0)
-"""The multisine for frequency responses: its period [s], periods that count, and band [Hz]."""
+"""The multisine for frequency responses: its period [the machine's seconds], periods that count, and band [1 over
+these]."""
+DRIVEN, DRIVEN_BAND = 30.0, (0.1, 1.5)
+"""A driven run: its length [the machine's seconds] and band [1 over these]."""
 POSITIONS = 21
 """Positions of the gain schedule."""
 
@@ -111,7 +116,8 @@ class AnalysisInput:
     """What is analyzed: models by name (``"prior"`` and ``"hybrid"`` are compared), and their surroundings.
 
     ``programs`` are by ``"prior/step"``, ``filters`` by model and mode, ``("hybrid", "quiet")``. ``x_range`` and
-    ``u_range`` are working ranges ``(n, 2)``, ``speed`` is ``(n_x / 2,)``. Recordings are inputs ``(n,)``, outputs
+    ``u_range`` are working ranges ``(n, 2)``, ``speed`` is ``(n_x / 2,)``, empty for a machine without speeds.
+    Recordings are inputs ``(n,)``, outputs
     ``(n,)`` and first states. Points of rest are looked for in ``region`` ``(n_x, 2)``, by default ``x_range``.
     """
 
@@ -291,42 +297,55 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
 
 
 def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Array:
-    n_v = model.n_x - model.n_x // 2
+    if given is not None and not (np.isfinite(given) and given > 0):
+        raise InputError(f"--speed must be positive, got {given}")
+    try:
+        n_q = positions_of(model)
+    except InputError as none:
+        if given is not None:
+            raise InputError(f"--speed: {none}") from None
+        return np.zeros(0)
     if given is not None:
-        if not (np.isfinite(given) and given > 0):
-            raise InputError(f"--speed must be positive, got {given}")
-        return np.full(n_v, given)
+        return np.full(n_q, given)
     if control is None:
-        return np.ones(n_v)
-    weights = control.q[model.n_x // 2 :]
+        return np.ones(n_q)
+    weights = control.q[n_q:]
     return 1.0 / np.sqrt(np.where(weights > 0, weights, 1.0))
 
 
 def state_range(model: HybridModel, control: OCP | None = None) -> Array:
-    """Range of the states ``(n_x, 2)``: limits of the control problem, else the signals', else a unit (half a turn)."""
+    """Range of the states ``(n_x, 2)``: limits of the control problem, else the signals', else a unit (half a turn) to
+    either side of the operating point.
+    """
     none = np.full(model.n_x, np.inf)
     lower, upper = (-none, none) if control is None else (control.x_min, control.x_max)
-    sides = zip(model.states, lower.tolist(), upper.tolist(), strict=True)
-    return np.array([_within(s, np.pi if s.periodic else 1.0, low, high) for s, low, high in sides])
+    sides = zip(model.states, lower.tolist(), upper.tolist(), model.x0.tolist(), strict=True)
+    return np.array([_within(s, np.pi if s.periodic else 1.0, low, high, at) for s, low, high, at in sides])
 
 
 def input_range(model: HybridModel, control: OCP | None) -> Array:
     """Range of the inputs ``(n_u, 2)``: limits of the control problem, else the signals', else a unit."""
     if control is None:
-        return np.array([_within(s, 1.0) for s in model.inputs])
-    sides = zip(model.inputs, control.input_scale, control.u_min, control.u_max, strict=True)
-    return np.array([_within(s, size, low, high) for s, size, low, high in sides])
+        return np.array(
+            [_within(s, 1.0, at=at) for s, at in zip(model.inputs, model.u0.tolist(), strict=True)]
+        )
+    sides = zip(
+        model.inputs, control.input_scale, control.u_min, control.u_max, model.u0.tolist(), strict=True
+    )
+    return np.array([_within(s, size, low, high, at) for s, size, low, high, at in sides])
 
 
 def _within(
-    signal: Signal, size: float, lower: float = -np.inf, upper: float = np.inf
+    signal: Signal, size: float, lower: float = -np.inf, upper: float = np.inf, at: float = 0.0
 ) -> tuple[float, float]:
-    """Finite limits of a signal, else its own; an open side ends at ``size``, at least so far from the other side."""
+    """Finite limits of a signal, else its own; an open side ends ``size`` from ``at``, at least so far from the other
+    side.
+    """
     low = lower if np.isfinite(lower) else signal.lower
     high = upper if np.isfinite(upper) else signal.upper
     if not np.isfinite(low):
-        low = min(-size, high - size) if np.isfinite(high) else -size
-    return low, high if np.isfinite(high) else max(size, low + size)
+        low = min(at - size, high - size) if np.isfinite(high) else at - size
+    return low, high if np.isfinite(high) else max(at + size, low + size)
 
 
 def _filters(
@@ -388,15 +407,16 @@ def analyze_models(given: AnalysisInput, report: Report = lambda *text: None) ->
 
 
 def resting_point(given: AnalysisInput, model: HybridModel) -> Point:
-    """The point of rest without input nearest to zero, stable ones first; zero where none is found."""
-    u = np.zeros(model.n_u)
-    found = equilibria(model, u, pairs(given.x_range), starts=16).points
+    """The point of rest under the operating point's input that is nearest to it, stable ones first; the operating point
+    itself where none is found.
+    """
+    size = given.x_range[:, 1] - given.x_range[:, 0]
+    found = equilibria(model, model.u0, pairs(given.x_range), starts=16).points
     stable = [p for p in found if p.stability == "stable"] or list(found)
     if stable:
-        best = min(stable, key=lambda p: float(np.linalg.norm(p.x)))
+        best = min(stable, key=lambda p: float(np.linalg.norm((p.x - model.x0) / size)))
         return best.x, best.h
-    x = np.zeros(model.n_x)
-    return x, hidden_equilibrium(model, x, u)
+    return model.x0, hidden_equilibrium(model, model.x0, model.u0)
 
 
 def pairs(box: Array) -> list[tuple[float, float]]:
@@ -404,26 +424,39 @@ def pairs(box: Array) -> list[tuple[float, float]]:
     return [(float(a), float(b)) for a, b in box]
 
 
+def machine_second(model: HybridModel) -> float:
+    """The machine's second [s], in which all lengths here count: no shorter than ten periods.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> [machine_second(SimpleNamespace(dt=dt, time_unit=1.0)) for dt in (0.02, 5.0)]
+        [1.0, 50.0]
+    """
+    return max(model.time_unit, COARSEST * model.dt)
+
+
 def driving_input(given: AnalysisInput, model: HybridModel, seconds: float) -> Array:
-    """A multisine ``(n, n_u)`` of working size around the middle of each input's range."""
-    t = np.asarray(model.dt * np.arange(round(seconds / model.dt)), dtype=np.float64)
+    """A multisine ``(n, n_u)`` of working size around the middle of each input's range, over so many of the machine's
+    seconds; each input has lines of its own.
+    """
+    unit = machine_second(model)
+    t = np.asarray(model.dt * np.arange(round(seconds * unit / model.dt)), dtype=np.float64)
     sizes = [(LEVEL * 0.5 * (high - low), 0.5 * (low + high)) for low, high in pairs(given.u_range)]
-    return np.column_stack([multisine(t, size, 0.1, 1.5, offset=middle) for size, middle in sizes])
+    low, high = (edge / unit for edge in DRIVEN_BAND)
+    return np.column_stack([multisine(t, size, low, high, offset=middle) for size, middle in sizes])
 
 
 def equilibria_of(given: AnalysisInput) -> dict[str, Equilibria]:
     """Points of rest of each model in the whole range of the states."""
     region = given.x_range if given.region is None else given.region
-    return {
-        name: equilibria(model, np.zeros(model.n_u), pairs(region)) for name, model in given.models.items()
-    }
+    return {name: equilibria(model, model.u0, pairs(region)) for name, model in given.models.items()}
 
 
 def friction_of(given: AnalysisInput, points: Mapping[str, Point]) -> dict[str, FrictionAnalysis]:
     """Damping at rest, of motions of a size, and in motion."""
-    found, work = {}, float(given.speed[0])
+    found = {}
     for name, model in given.models.items():
-        q = points[name][0][: model.n_x // 2]
+        q, work = points[name][0][: positions_of(model)], float(given.speed[0])
         slopes = friction_slopes(model, q, work * np.geomspace(0.01, 10.0, 61))
         found[name] = FrictionAnalysis(slopes, friction_slopes(model, q, [work]))
     return found
@@ -432,13 +465,13 @@ def friction_of(given: AnalysisInput, points: Mapping[str, Point]) -> dict[str, 
 def systems(given: AnalysisInput, name: str, point: Point) -> dict[str, Any]:
     """The linearizations of a model as ``control.StateSpace``, by the names in :data:`POINTS`."""
     model, (x, h) = given.models[name], point
-    u = np.zeros(model.n_u)
-    return {
-        "rest": linearize(model, x, u, h),
-        "working": linearize_secant(model, x, u, given.speed, h),
-        "moving": linearize_at_speed(model, x[: model.n_x // 2], given.speed, u),
-        "driven": linearize_along(model, x, driving_input(given, model, 30.0), h).mean(round(5.0 / model.dt)),
-    }
+    u, settled = model.u0, round(5.0 * machine_second(model) / model.dt)
+    found = {"rest": linearize(model, x, u, h)}
+    if given.speed.size:
+        found["working"] = linearize_secant(model, x, u, given.speed, h)
+        found["moving"] = linearize_at_speed(model, x[: positions_of(model)], given.speed, u)
+    found["driven"] = linearize_along(model, x, driving_input(given, model, DRIVEN), h).mean(settled)
+    return found
 
 
 def linearizations_of(
@@ -455,8 +488,9 @@ def linearizations_of(
 
 
 def _linearization(given: AnalysisInput, model: HybridModel, point: Point, system: Any) -> Linearization:
-    structure, omega = system_structure(system), np.geomspace(0.02, np.pi / model.dt, 400)
-    t = np.asarray(model.dt * np.arange(round(4.0 / model.dt) + 1), dtype=np.float64)
+    unit = machine_second(model)
+    structure, omega = system_structure(system), np.geomspace(0.02 / unit, np.pi / model.dt, 400)
+    t = np.asarray(model.dt * np.arange(round(4.0 * unit / model.dt) + 1), dtype=np.float64)
     step = control_toolbox().step_response(system, t).outputs
     return Linearization(
         structure,
@@ -479,7 +513,7 @@ def _reduced(
     given: AnalysisInput, model: HybridModel, point: Point, system: Any, omega: Array
 ) -> Reduction | Missing:
     half_x, half_u = (0.5 * (box[:, 1] - box[:, 0]) for box in (given.x_range, given.u_range))
-    (x, h), u = point, np.zeros(model.n_u)
+    (x, h), u = point, model.u0
     try:
         small = physical_states(model, x, u, h, x_scale=half_x, u_scale=half_u, system=system)
     except InputError as error:
@@ -497,7 +531,9 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
     if some.n_u != 1:
         raise InputError(f"responses are estimated for one input; this machine has {some.n_u}")
     if given.recordings:
-        length = min(10.0, 0.25 * max(u.size for u, _, _ in given.recordings) * some.dt)
+        length = min(
+            10.0 * machine_second(some), 0.25 * max(u.size for u, _, _ in given.recordings) * some.dt
+        )
         machine = welch_response([(u, y) for u, y, _ in given.recordings], some.dt, length=length)
         responses = {
             name: welch_response(
@@ -509,15 +545,16 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
     elif given.plant is not None:
         low_u, high_u = given.u_range[0].tolist()
         amplitude, bias = LEVEL * 0.5 * (high_u - low_u), 0.5 * (low_u + high_u)
+        low, high = (edge / machine_second(some) for edge in BAND)
         driven: dict[str, Any] = {
-            "amplitude": amplitude, "bias": bias, "band": BAND, "period": PERIOD, "periods": PERIODS
+            "amplitude": amplitude, "bias": bias, "band": (low, high), "period": PERIOD * machine_second(some),
+            "periods": PERIODS,
         }  # fmt: skip
-        zero = np.zeros(some.n_x)
-        machine = multisine_response(run_plant(given.plant, zero, some.dt), some.dt, **driven)
+        machine = multisine_response(run_plant(given.plant, some.x0, some.dt), some.dt, **driven)
         responses = {
-            name: multisine_response(run_model(m, zero), m.dt, **driven) for name, m in models.items()
+            name: multisine_response(run_model(m, some.x0), m.dt, **driven) for name, m in models.items()
         }
-        size, (low, high) = f"{amplitude:g} {some.inputs[0].unit}", BAND
+        size = f"{amplitude:g} {some.inputs[0].unit}"
         around = f" around {bias:g} {some.inputs[0].unit}" if bias else ""
         source = f"odd multisine of {size}{around}, {low:g} to {high:g} Hz, {PERIODS} periods"
     else:
@@ -584,19 +621,19 @@ def loops_of(
     controllers = {n: CondensedController(m, given.ocp) for n, m in given.models.items()}
     made = {n: systems(given, n, points[n]) for n in given.models}
     for (name, mode), ekf in given.filters.items():
-        model, (x, h), zero = given.models[name], points[name], np.zeros(given.models[name].n_u)
-        for point in POINTS:
-            gain = mpc_gain(controllers[name], x, zero, h, system=made[name][point])
-            steady = steady_filter(ekf, x, zero, h, system=made[name][point])
+        model, (x, h), u = given.models[name], points[name], given.models[name].u0
+        for point in made[name]:
+            gain = mpc_gain(controllers[name], x, u, h, system=made[name][point])
+            steady = steady_filter(ekf, x, u, h, system=made[name][point])
             for machine in (plant for own, plant in around if own == name):
                 loop = mpc_loop(gain, steady, made[machine][point])
-                one = _loop(loop, gain.by_state[:, : model.n_x], model.dt)
+                one = _loop(loop, gain.by_state[:, : model.n_x], model.dt, machine_second(model))
                 found.setdefault(f"{name} on {machine}", {}).setdefault(point, {})[mode] = one
     return found
 
 
-def _loop(loop: LinearLoop, gain: Array, dt: float) -> LoopAnalysis:
-    omega = np.geomspace(0.05, np.pi / dt, 500)
+def _loop(loop: LinearLoop, gain: Array, dt: float, unit: float) -> LoopAnalysis:
+    omega = np.geomspace(0.05 / unit, np.pi / dt, 500)
     response = frequency_response(loop.broken(), omega)
     open_loop = response.magnitude[0, 0] * np.exp(1j * response.phase[0, 0])
     functions: dict[str, Complex] = {}
@@ -614,16 +651,23 @@ def _loop(loop: LinearLoop, gain: Array, dt: float) -> LoopAnalysis:
     )
 
 
+def _seen(model: HybridModel) -> NDArray[np.bool_]:
+    """Which states ``(n_x,)`` an output of the operating point depends on."""
+    x = ca.MX.sym("x", model.n_x)
+    slope = ca.Function("C", [x], [ca.jacobian(model.output(x, model.u0, model.w, model.p), x)])
+    return np.asarray(np.any(slope(model.x0).full() != 0, axis=0))
+
+
 def memory_of(given: AnalysisInput) -> dict[str, MemoryAnalysis]:
     """Lyapunov exponents of driven runs, and the certificate over the working range."""
     found = {}
     for name, model in given.models.items():
-        u, zero = driving_input(given, model, 30.0), np.zeros(model.n_x)
-        whole = lyapunov_exponent(model, zero, u, part="all")
+        u = driving_input(given, model, DRIVEN)
+        whole = lyapunov_exponent(model, model.x0, u, part="all")
         if not model.n_h:
             found[name] = MemoryAnalysis(whole, None, None)
             continue
-        hidden = lyapunov_exponent(model, zero, u, part="hidden")
+        hidden = lyapunov_exponent(model, model.x0, u, part="hidden")
         found[name] = MemoryAnalysis(whole, hidden, _certificate(given, given.programs[f"{name}/step"]))
     return found
 
@@ -639,9 +683,8 @@ def sensitivities_of(given: AnalysisInput) -> dict[str, SensitivityAnalysis]:
     """A driven run's derivatives by the prior's parameters."""
     made = {}
     for name, model in given.models.items():
-        found = parameter_sensitivities(model, np.zeros(model.n_x), driving_input(given, model, 10.0))
-        sigma = np.full(model.n_x, np.inf)
-        sigma[: model.n_y] = 1.0  # positions are what is measured
+        found = parameter_sensitivities(model, model.x0, driving_input(given, model, 10.0))
+        sigma = np.where(_seen(model), given.x_range[:, 1] - given.x_range[:, 0], np.inf)
         apart = found.apart(sigma)
         made[name] = SensitivityAnalysis(
             found.names,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,10 @@ from hybrid_mpc.job.analyze import (
     ResponseAnalysis,
     ScheduleAnalysis,
     SensitivityAnalysis,
+    machine_second,
 )
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import HybridModel, positions_of
 from hybrid_mpc.plots import analysis as plots
 from hybrid_mpc.plots.style import ratio_unit, save
 from hybrid_mpc.records import plain
@@ -124,12 +126,12 @@ def _equilibria(some: HybridModel, part: Mapping[str, Equilibria]) -> Table:
     ]
     return Table(
         ("model", *(s.label for s in some.states), "stability", "spectral radius [-]", "residual [SI]", "hits"),
-        rows, "Points of rest without input in the whole range of the states.",
+        rows, "Points of rest under the operating point's input in the whole range of the states.",
     )  # fmt: skip
 
 
 def _friction(some: HybridModel, part: Mapping[str, FrictionAnalysis]) -> Table:
-    speed = some.states[some.n_x // 2]
+    speed = some.states[positions_of(some)]
     rows: list[tuple[Cell, ...]] = []
     for model, friction in part.items():
         slopes = friction.working
@@ -147,7 +149,7 @@ def _modes(some: HybridModel, part: Mapping[str, Mapping[str, Linearization]]) -
     rows = [
         (model, point, m.pole.real, m.pole.imag, _finite(m.frequency), m.damping, m.reach, m.see, _finite(hankel))
         for model, points in part.items()
-        for point in POINTS
+        for point in points
         for m, hankel in zip(points[point].structure.modes, points[point].structure.hankel.tolist(), strict=True)
     ]  # fmt: skip
     return Table(
@@ -207,14 +209,16 @@ def _memory(some: HybridModel, part: Mapping[str, MemoryAnalysis]) -> Table:
 
 
 def _sensitivity(some: HybridModel, part: Mapping[str, SensitivityAnalysis]) -> Table:
-    rows = [
-        (model, name, float(rms), name in found.identifiable)
+    rows: list[tuple[Cell, ...]] = [
+        (model, name, *map(float, rms), name in found.identifiable)
         for model, found in part.items()
-        for name, rms in zip(found.parameters, found.rms[0], strict=True)
+        for name, rms in zip(found.parameters, found.rms.T, strict=True)
     ]
+    heads = [f"{s.name} per 100 % [{s.unit}]" for s in some.states]
     return Table(
-        ("model", "parameter", f"{some.states[0].name} per 100 % [{some.states[0].unit}]", "identifiable"), rows,
-        "Root mean square change of a free run of 10 s. What is not identifiable cannot be told from others by it.",
+        ("model", "parameter", *heads, "identifiable"), rows,
+        f"Root mean square change of a free run of {10 * machine_second(some):.4g} s. What is not identifiable cannot "
+        "be told from others by it.",
     )  # fmt: skip
 
 
@@ -250,34 +254,55 @@ def _draw_friction(given: AnalysisInput, part: Mapping[str, FrictionAnalysis]) -
     curves = {name: vars(part[name].slopes) for name in _names(given)}
     some = _some(given)
     figure = plots.friction_damping(
-        curves, working_speed=float(given.speed[0]), unit=some.states[some.n_x // 2].unit
+        curves, working_speed=float(given.speed[0]), unit=some.states[positions_of(some)].unit
     )
     yield "friction", figure, "Damping at rest and of motions of a size; negative slopes are left out."
 
 
 def _draw_linear(given: AnalysisInput, part: Mapping[str, Mapping[str, Linearization]]) -> Named:
     some, names = _some(given), _names(given)
-    signals = {"input_signal": some.inputs[0], "output_signal": some.outputs[0]}
+    here = [point for point in POINTS if point in part[names[0]]]
     for point, name in (("rest", "poles"), ("driven", "poles_driven")):
         poles, zeros = ({n: getattr(part[n][point], kind) for n in names} for kind in ("poles", "zeros"))
         caption = f"Poles and zeros of the linearizations {TITLES[point]}."
         yield name, plots.pole_map(poles, some.dt, zeros=zeros), caption
-    for point in POINTS:
+    every = list(product(range(some.n_y), range(some.n_u)))
+    for point in here:
         responses = {}
         for name in names:
             reduced = part[name][point].reduced
             responses[name] = part[name][point].response
             if isinstance(reduced, Reduction):
                 responses[f"{name}, reduced to {some.n_x} states"] = reduced.response
-        curves = {label: (r.omega, r.magnitude[0, 0], r.phase[0, 0]) for label, r in responses.items()}
         note = " A phase that rises at the resonance means negative damping." if point == "moving" else ""
-        figure = plots.bode(curves, **signals, nyquist=np.pi / some.dt)
-        yield f"bode_{point}", figure, f"Bode plot of the linearizations {TITLES[point]}.{note}"
-    steps = {
-        point: {name: (part[name][point].t, part[name][point].step[0, 0]) for name in names}
-        for point in POINTS
-    }
-    yield "steps", plots.step_responses(steps, **signals), "Unit step responses of the linearizations."
+        for i, j in every:
+            curves = {label: (r.omega, r.magnitude[i, j], r.phase[i, j]) for label, r in responses.items()}
+            figure = plots.bode(
+                curves, input_signal=some.inputs[j], output_signal=some.outputs[i], nyquist=np.pi / some.dt
+            )
+            named, channel = _channel(some, i, j)
+            yield (
+                f"bode_{point}{named}",
+                figure,
+                f"Bode plot of the linearizations {TITLES[point]}{channel}.{note}",
+            )
+    for i, j in every:
+        steps = {point: {n: (part[n][point].t, part[n][point].step[i, j]) for n in names} for point in here}
+        figure = plots.step_responses(steps, input_signal=some.inputs[j], output_signal=some.outputs[i])
+        named, channel = _channel(some, i, j)
+        yield f"steps{named}", figure, f"Unit step responses of the linearizations{channel}."
+
+
+CHANNEL = "_from_"
+"""Stands in a figure's name before the channel that it shows, where there are several."""
+
+
+def _channel(some: HybridModel, i: int, j: int) -> tuple[str, str]:
+    """What a figure's name and caption say of its channel, output ``i`` and input ``j``; nothing of the only one."""
+    if some.n_y * some.n_u == 1:
+        return "", ""
+    ends = some.inputs[j].name, some.outputs[i].name
+    return f"{CHANNEL}{ends[0]}_to_{ends[1]}", f", from {ends[0]} to {ends[1]}"
 
 
 def _draw_measured(given: AnalysisInput, part: ResponseAnalysis) -> Named:
@@ -361,7 +386,8 @@ def _sections(result: AnalysisResult, tables: Mapping[str, Table], drawn: Drawn)
         found = getattr(result, part)
         notes = [f"Left out: {found.reason}."] if isinstance(found, Missing) else []
         shown = [tables[n] if n != "modes" else _leading(tables[n]) for n in names if n in tables]
-        sections.append(Section(title, texts[part], [drawn[f] for f in figures if f in drawn], shown, notes))
+        pictures = [own for f in figures for name, own in drawn.items() if name.partition(CHANNEL)[0] == f]
+        sections.append(Section(title, texts[part], pictures, shown, notes))
     return sections
 
 

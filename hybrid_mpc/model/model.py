@@ -416,6 +416,30 @@ def kinematics(model: HybridModel) -> dict[int, int]:
     return {i: j for i, j in found.items() if i != j}
 
 
+def positions_of(model: HybridModel) -> int:
+    """Number ``n_q`` of positions of a model whose state is ``[q, v]`` with ``q_dot = v``.
+
+    Raises:
+        InputError: If its states are anything else: it has no speeds, and no friction of a motion.
+
+    Example:
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m"),)
+        >>> tank = HybridModel.of("tank", 0.1, level, (Signal("u", "m/s"),), level,
+        ...     x=x, u=u, x_next=x + 0.1 * (u - x), xdot=u - x, y=x)
+        >>> positions_of(tank)
+        Traceback (most recent call last):
+            ...
+        hybrid_mpc.errors.InputError: model tank: its states (x) are not positions and then their speeds...
+    """
+    n_q = model.n_x // 2
+    if not n_q or kinematics(model) != {i: n_q + i for i in range(n_q)} or model.n_x != 2 * n_q:
+        raise InputError(
+            f"model {model.name}: its states ({', '.join(s.name for s in model.states)}) are not positions and then "
+            "their speeds, so there is no friction of a motion and no working speed"
+        )
+    return n_q
+
+
 def changeable(model: HybridModel) -> tuple[str, ...]:
     """What of a prior may change: its parameters, and the gain of each input."""
     return (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))

@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from machines import dc_motor, thermal, two_tanks
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -22,17 +23,20 @@ from hybrid_mpc import (
     simulate,
     write_csv,
 )
-from hybrid_mpc.analyze.linearize import control_toolbox
+from hybrid_mpc.analyze.linearize import control_toolbox, jacobians
 from hybrid_mpc.cli.analyze import command
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.job.analyze import (
     AnalysisInput,
     AnalysisSettings,
     Missing,
+    _speed,
     analysis_input,
     analyze_models,
+    input_range,
     loops_of,
     responses_of,
+    state_range,
 )
 from hybrid_mpc.job.analyze_page import tables_of, write_analysis
 from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
@@ -196,3 +200,38 @@ def test_the_delay_that_the_margins_allow_is_the_delay_that_the_rig_stands(golf_
         # A loop that stands the delay moves its input as the task asks; one that does not swings between its bounds.
         assert restless[1] < 1.3 * restless[0]
         assert restless[2] > 1.5 * restless[1]
+
+
+@pytest.mark.parametrize("make", [two_tanks, dc_motor, thermal])
+def test_machines_without_positions_are_analyzed_around_their_operating_point(make, tmp_path):
+    """What has no speeds lacks friction and a working speed; all else is there, channel by channel."""
+    model = make()
+    given = AnalysisInput({"prior": model}, {}, state_range(model), input_range(model, None), np.zeros(0))
+    found = analyze_models(given)
+    assert "are not positions and then their speeds" in found.friction.reason
+    (rest,) = (p for p in found.equilibria["prior"].points if np.allclose(p.x, model.x0, rtol=1e-6))
+    assert rest.stability == "stable"
+    linear = found.linear["prior"]
+    assert list(linear) == ["rest", "driven"]
+    # each channel by hand: C (e^(i omega dt) - A)^-1 B + D
+    a, b, c, d = (m.full() for m in jacobians(model)(model.x0, [], model.u0))
+    response = linear["rest"].response
+    for k in (0, 200):
+        z = np.exp(1j * response.omega[k] * model.dt)
+        by_hand = c @ np.linalg.solve(z * np.eye(model.n_x) - a, b) + d
+        found_k = response.magnitude[..., k] * np.exp(1j * response.phase[..., k])
+        np.testing.assert_allclose(found_k, by_hand, rtol=1e-9, atol=1e-9 * np.abs(by_hand).max())
+    files = {p.name for p in write_analysis(tmp_path, given, found, ["a test"], "none")}
+    channels = [f"_from_{u.name}_to_{y.name}" for u in model.inputs for y in model.outputs]
+    for named in channels if len(channels) > 1 else [""]:
+        assert {f"bode_rest{named}.png", f"bode_driven{named}.png", f"steps{named}.png"} <= files
+    page = (tmp_path / "analysis.html").read_text()
+    assert page.count("Bode plot of the linearizations at rest") == 2 * len(channels)  # caption and alt text
+    assert "Left out: model" in page
+
+
+def test_a_working_speed_is_refused_where_nothing_moves():
+    with pytest.raises(
+        InputError, match=r"--speed: model two tanks: its states \(upper, lower\) are not positions"
+    ):
+        _speed(two_tanks(), None, 0.5)

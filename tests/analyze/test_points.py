@@ -1,5 +1,6 @@
 """Linearizations, points of rest, friction and schedules against closed forms and python-control."""
 
+import casadi as ca
 import control
 import numpy as np
 import pytest
@@ -7,7 +8,9 @@ from analyze_parts import central_differences
 from online_models import linear_model, pendulum_model
 
 from hybrid_mpc import (
+    HybridModel,
     InputError,
+    Signal,
     equilibria,
     friction_slopes,
     gain_schedule,
@@ -167,7 +170,12 @@ def test_describing_function_of_coulomb_friction_is_four_over_pi():
 
 
 def test_secant_linearisation_of_a_linear_model_is_its_tangent():
-    model = linear_model([[0.9, 0.1], [-0.2, 0.8]], [[0.0], [1.0]], [[1.0, 0.0]])
+    x, u, q = ca.MX.sym("x", 2), ca.MX.sym("u"), Signal("q", "m")
+    rates = ca.vertcat(x[1], u - 2.0 * x[0] - 0.5 * x[1])
+    model = HybridModel.of(
+        "spring", 0.1, (q, Signal("v", "m/s")), (Signal("F", "N"),), (q,),
+        x=x, u=u, x_next=x + 0.1 * rates, xdot=rates, y=x[0],
+    )  # fmt: skip
     for kind in ("secant", "harmonic"):
         sys = linearize_secant(model, [0.0, 0.0], [0.0], [0.5], kind=kind)
         assert np.abs(sys.A - linearize(model, [0.0, 0.0], [0.0]).A).max() < 1e-12

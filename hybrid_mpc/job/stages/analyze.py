@@ -1,4 +1,4 @@
-"""Stage analysis: prior and hybrid linearized at rest and at working speed."""
+"""Stage analysis: prior and hybrid linearized at the operating point, a mechanical one at working speed too."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.kit.assembly import working_point
+from hybrid_mpc.model.model import kinematics
 from hybrid_mpc.model.riccati import hidden_fixed_point
 
 Array = NDArray[np.float64]
@@ -40,9 +41,10 @@ class LinearPoint:
 
 @dataclass(frozen=True)
 class ModelAnalysis:
-    """A model at rest and, with a control problem, at working speed.
+    """A model at rest and, if it is mechanical and has a control problem, at working speed.
 
-    ``fixed_point`` is the state at rest ``(n_x,)``; None where there is none near zero, and the reason why.
+    ``fixed_point`` is the state at rest ``(n_x,)``; None where there is none near the operating point, and the reason
+    why.
     """
 
     rest: LinearPoint
@@ -58,7 +60,9 @@ class ModelAnalysis:
 
 @dataclass(frozen=True)
 class AnalysisResult:
-    """The models by name, their working speeds, and frequency responses as ``"MODEL/POINT/omega"`` and so on."""
+    """The models by name, their working speeds, and frequency responses: ``"MODEL/POINT/omega"`` ``(n,)``, and
+    ``.../magnitude`` and ``.../phase`` ``(n_y, n_u, n)``.
+    """
 
     models: Mapping[str, ModelAnalysis]
     working_speed: tuple[float, ...] | None = None
@@ -66,7 +70,7 @@ class AnalysisResult:
 
 
 def analysis_stage(context: Context) -> AnalysisResult:
-    """Linearize prior and hybrid at rest and at working speed; poles, PBH tests, frequency responses."""
+    """Linearize prior and hybrid at rest, mechanical ones at working speed too: poles, PBH tests, responses."""
     from hybrid_mpc.analyze.equilibria import fixed_point
     from hybrid_mpc.analyze.linearize import linearize
     from hybrid_mpc.analyze.properties import frequency_response
@@ -78,25 +82,27 @@ def analysis_stage(context: Context) -> AnalysisResult:
     for i, (name, model) in enumerate(models.items()):
         context.progress.update("models", i, len(models), name)
         u = model.u0 if control is None else np.clip(model.u0, control.u_min, control.u_max)
-        x, rest, reason = np.zeros(model.n_x), None, ""
+        x, rest, reason = model.x0, None, ""
         try:
             x, h = fixed_point(model, u, x)
             rest = tuple(x.tolist())
-        except InputError as none:  # a learned correction may leave no point of rest near zero
+        except InputError as none:  # a learned correction may leave no point of rest nearby
             h = hidden_fixed_point(model, x, u)
-            reason = f"linearized at x = 0 instead: {none}"
+            reason = f"linearized at the operating point instead: {none}"
         systems = {"rest": linearize(model, x, u, h)}
-        if control is not None:
-            moving = x + working_point(model, control)[0]
+        speeds = list(kinematics(model).values())
+        if control is not None and speeds:
+            moving = x.copy()
+            moving[speeds] = working_point(model, control)[0][speeds]
             systems["moving"] = linearize(model, moving, u, hidden_fixed_point(model, moving, u))
-            speed = tuple(moving[model.n_x // 2 :].tolist())
+            speed = tuple(moving[speeds].tolist())
         points: dict[str, LinearPoint] = {}
         for point, system in systems.items():
             omega = np.geomspace(0.1 / model.time_unit, np.pi / model.dt, 300)
             response = frequency_response(system, omega)
             arrays[f"{name}/{point}/omega"] = omega
-            arrays[f"{name}/{point}/magnitude"] = response.magnitude[0, 0]
-            arrays[f"{name}/{point}/phase"] = response.phase[0, 0]
+            arrays[f"{name}/{point}/magnitude"] = response.magnitude
+            arrays[f"{name}/{point}/phase"] = response.phase
             points[point] = linear_point(system)
         found[name] = ModelAnalysis(points["rest"], points.get("moving"), rest, reason)
     return AnalysisResult(found, speed, arrays)

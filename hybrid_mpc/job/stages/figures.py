@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -297,14 +298,21 @@ def _analysis(context: Context) -> Any:
     for point in ("rest", "moving"):
         if point not in found.models["prior"].points:
             continue
-        responses = {
-            n: (arrays[f"{n}/{point}/omega"], arrays[f"{n}/{point}/magnitude"], arrays[f"{n}/{point}/phase"])
-            for n in poles
-        }
-        figure = analysis.bode(
-            responses, input_signal=prior.inputs[0], output_signal=prior.outputs[0], nyquist=np.pi / context.spec.dt
-        )  # fmt: skip
-        yield "analysis", f"bode_{point}", figure, f"Bode plot of prior and hybrid {titles[point]}."
+        for (i, output), (j, into) in product(enumerate(prior.outputs), enumerate(prior.inputs)):
+            responses = {
+                n: (
+                    arrays[f"{n}/{point}/omega"],
+                    *(arrays[f"{n}/{point}/{k}"][i, j] for k in ("magnitude", "phase")),
+                )
+                for n in poles
+            }
+            figure = analysis.bode(
+                responses, input_signal=into, output_signal=output, nyquist=np.pi / context.spec.dt
+            )
+            several = len(prior.outputs) * len(prior.inputs) > 1
+            named = f"bode_{point}_from_{into.name}_to_{output.name}" if several else f"bode_{point}"
+            channel = f", from {into.name} to {output.name}" if several else ""
+            yield "analysis", named, figure, f"Bode plot of prior and hybrid {titles[point]}{channel}."
 
 
 def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:

@@ -1,0 +1,104 @@
+"""Parts of the training data: each network leaves out its own, and what it says there judges the model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from simulated_pendulum import TRUTH, Pendulum
+
+from hybrid_mpc import InputError, TrainingSettings, train
+from hybrid_mpc.identify.dataset import in_parts
+from hybrid_mpc.identify.train import TrainingRun
+
+PRIOR = Pendulum(TRUTH)
+SETTINGS = TrainingSettings("pgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10, parts=2)
+
+
+def recordings(run, *lengths):
+    """Recordings of these lengths, each another file."""
+    return [run.part(slice(0, n), f"file{i}") for i, n in enumerate(lengths)]
+
+
+def test_many_recordings_stay_whole_and_parts_are_alike(data):
+    runs = recordings(data[0][0], 100, 90, 50, 40, 30, 20, 10)
+    pieces, part = in_parts(runs, 3, shortest=5)
+    assert pieces == runs
+    sizes = np.bincount(part, [len(t.t) for t in runs])
+    assert sizes.sum() == 340
+    assert np.ptp(sizes) <= 10  # no further apart than the smallest recording
+
+
+def test_few_recordings_are_cut_in_time(data):
+    runs = recordings(data[0][0], 120, 80)
+    pieces, part = in_parts(runs, 4, shortest=30)
+    assert [(p.name, len(p.t), i) for p, i in zip(pieces, part, strict=True)] == [
+        ("file0", 60, 0),
+        ("file0", 60, 1),
+        ("file1", 40, 2),
+        ("file1", 40, 3),
+    ]
+    for run in runs:  # nothing is lost, nothing is there twice
+        np.testing.assert_array_equal(np.concatenate([p.t for p in pieces if p.file == run.file]), run.t)
+
+
+def test_what_is_too_short_is_not_cut(data):
+    (run,) = recordings(data[0][0], 100)
+    assert in_parts([run], 4, shortest=60) == ([run], [-1])
+    pieces, part = in_parts([run], 4, shortest=45)  # two of fifty
+    assert ([len(p.t) for p in pieces], part) == ([50, 50], [0, 1])
+
+
+def test_pieces_of_a_recording_are_cut_where_the_recording_is(data):
+    run = data[0][0]
+    first, second = run.part(slice(0, 70), "file#1"), run.part(slice(80, 110), "file#2")
+    pieces, part = in_parts([first, second], 2, shortest=20)
+    # the cut lies at sample 50 of 100; 20 samples of the first piece follow it
+    assert [(p.name, len(p.t)) for p in pieces] == [("file#1", 50), ("file#1", 20), ("file#2", 30)]
+    assert part == [0, 1, 1]
+
+
+def test_one_part_is_refused():
+    with pytest.raises(InputError, match="parts must be 0, or 2 and more, got 1"):
+        replace(SETTINGS, parts=1)
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_a_network_learns_nothing_from_the_part_that_it_leaves_out(data, free):
+    run = TrainingRun(PRIOR, *data, SETTINGS)
+    run.free = free
+    weight = run.windows.weight
+    assert weight.shape == (2, len(run.windows))
+    assert set(weight.unique().tolist()) == {0.0, 1.0}
+    before = run._losses(run.windows).detach()
+    spoiled = run.windows.x.clone()
+    spoiled[weight[0] == 0] += 1.0
+    after = run._losses(replace(run.windows, x=spoiled)).detach()
+    # the first objective of free runs is over the outputs' spread in all windows, which has changed for both
+    share = after / before
+    assert share[1, 0] > 2.0 * share[0, 0]
+    if not free:
+        assert torch.equal(after[0], before[0])
+
+
+def test_validation_is_what_all_leave_out_and_a_network_s_own_part(data):
+    run = TrainingRun(PRIOR, *data, SETTINGS)
+    weight = run.valid.weight
+    both, first, second = (
+        int(((weight[0] == a) & (weight[1] == b)).sum()) for a, b in ((1, 1), (1, 0), (0, 1))
+    )
+    assert both > 0
+    assert first > 0
+    assert second > 0
+    assert both + first + second == len(run.valid)
+    plain = TrainingRun(PRIOR, *data, replace(SETTINGS, parts=0))
+    assert plain.valid.weight is None
+
+
+def test_networks_with_validations_of_their_own_are_ranked_by_the_prior_s_error_there(data):
+    trained = train(PRIOR, *data, SETTINGS)
+    first = trained.curve["validation"][0]
+    assert trained.ranking.tolist() == np.argsort(trained.validation / first).tolist()
+    harder = replace(trained, curve=trained.curve | {"validation": trained.curve["validation"] * [1.0, 1e3]})
+    assert harder.best == 1
+    assert replace(harder, settings=replace(SETTINGS, parts=0)).best == int(np.argmin(trained.validation))
