@@ -12,8 +12,8 @@ rounds [us]. ``difference`` is the largest one to the first route.
 - ``horizon``: ``inline`` (N steps of the plain graph written out), ``plain`` (calls of the plain step), ``unroll``,
   ``fold`` and ``linearized`` (:func:`nn_export.unroll` of ``with_jacobian``); ``gradient`` is that of the squared last
   state by all inputs, by CasADi;
-- ``torch``: the prior as it was written in torch against :func:`nn_export.from_casadi` of the exported one, forward and
-  with its gradient; ``machine`` and ``operators`` are its two ways of evaluation.
+- ``torch``: rates of a prior as they are written in torch against :func:`nn_export.from_casadi` of the exported one,
+  forward and with its gradient; ``machine`` and ``operators`` are its two ways of evaluation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from parts import arguments, best_times, buffered, hybrid_step, report
 
 import nn_export
 from nn_export.batched import Batched
-from scenarios.golf_robot import scenario
 
 N_X, N_U, ROUNDS = 2, 1, 15
 PARTS = ("step", "horizon", "torch")
@@ -40,10 +39,32 @@ ONNX_UNITS = 128
 """Hidden units up to which CasADi reads ONNX in seconds."""
 
 
+class Undisturbed(torch.nn.Module):
+    """A step over (x, h, u): no disturbance is measured."""
+
+    def __init__(self, step: torch.nn.Module) -> None:
+        super().__init__()
+        self.step = step
+
+    def forward(self, x: torch.Tensor, h: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Next states."""
+        return self.step(x, h, u, u[..., :0])
+
+
+class Rates(torch.nn.Module):
+    """Rates of a pendulum with dry friction, as a prior has them."""
+
+    def forward(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        """Rates of q and v."""
+        q, v = x[..., :1], x[..., 1:]
+        torque = u - 2.0 * torch.sin(q) - 0.05 * v - 0.2 * torch.tanh(v / 0.05)
+        return torch.cat([v, torque / 0.15], -1)
+
+
 def program_of(z: int) -> nn_export.Program:
     """The traced step over (x, h, u)."""
     examples = tuple(torch.zeros(n, dtype=torch.float64) for n in (N_X, z, N_U))
-    return nn_export.trace(hybrid_step(z), examples, output_names=["x_next", "h_next"])
+    return nn_export.trace(Undisturbed(hybrid_step(z)), examples, output_names=["x_next", "h_next"])
 
 
 def by_casadi(step: ca.Function, inline: bool) -> ca.Function:
@@ -160,7 +181,7 @@ def horizon_rows(z: int, n: int) -> list[dict]:
 
 def torch_row(batch: int) -> dict:
     """A batch through the prior."""
-    prior = scenario.prior()
+    prior = Rates()
     function = nn_export.to_casadi(prior, (torch.zeros(N_X), torch.zeros(N_U)))
     module, batched = nn_export.from_casadi(function), Batched(function)
     torch.manual_seed(0)
@@ -172,7 +193,7 @@ def torch_row(batch: int) -> dict:
         "torch_gradient": lambda: torch.autograd.grad(prior(x, u).sum(), (x, u)),
         "from_casadi_gradient": lambda: torch.autograd.grad(module(x, u).sum(), (x, u)),
         "machine": lambda: batched._run(plain, batch),
-        "operators": lambda: batched.walk(plain),
+        "operators": lambda: batched.walk(plain, (batch,)),
     }
     us = {name: 1e6 * seconds for name, seconds in best_times(routes, 7, calls=20).items()}
     ratio = us["from_casadi_gradient"] / us["torch_gradient"]

@@ -22,7 +22,7 @@ from hybrid_mpc import LoopSpec, Study, run_study
 from hybrid_mpc.job import study_run
 from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.engine import DaskEngine, LocalEngine
-from hybrid_mpc.job.study_log import RunLog, compact, rows, segments
+from hybrid_mpc.job.study_log import RunLog, RunRow, compact, rows, segments
 from hybrid_mpc.job.study_run import THREADS, TIMING, execute, load_inputs, run_batch
 
 
@@ -73,9 +73,9 @@ def overhead(runs: int, folder: Path) -> dict:
     memory = Memory()
     wall, parent = timed(LocalEngine(partial(run_batch, nothing), 2, threads=THREADS), runs, folder, memory)
     found, tenth = list(rows(folder))[4:], max(1, runs // 10)
-    of_workers = [row[f"{TIMING}rss_mb"] for row in found]
+    of_workers = [row.columns[f"{TIMING}rss_mb"] for row in found]
     of_parent = [mb for done, mb in memory.at if done >= tenth]
-    in_runs = sum(row[f"{TIMING}cpu_s"] for row in found)
+    in_runs = sum(row.columns[f"{TIMING}cpu_s"] for row in found)
     return {
         "wall_ms_a_run": 1e3 * wall / runs,
         "parent_cpu_ms_a_run": 1e3 * parent / runs,
@@ -137,9 +137,7 @@ def scale(runs: int, folder: Path) -> dict:
         return value
 
     ids = clocked("name", lambda: [run.id for run in study.runs()])
-    lines = [
-        {"id": run.id, **run.columns(), "status": "done", "error": "", **nothing(run)} for run in study.runs()
-    ]
+    lines = [RunRow(run.id, "done", "", {**run.columns(), **nothing(run)}) for run in study.runs()]
 
     def log():
         with RunLog(folder / "runs") as to:
