@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         balanced_truncation,
         frequency_response,
         physical_states,
+        steady_gain,
         system_structure,
     )
     from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
@@ -297,6 +298,7 @@ __all__ = [
     "simulate",
     "sinusoid",
     "steady_filter",
+    "steady_gain",
     "system_structure",
     "trace_model",
     "train",
@@ -318,7 +320,7 @@ _ROOMS = {
     "analyze.measured": ("multisine_response", "run_model", "run_plant"),
     "analyze.memory": ("contraction", "feature_box", "gru_weights", "lyapunov_exponent"),
     "analyze.properties": (
-        "balanced_truncation", "frequency_response", "physical_states", "system_structure",
+        "balanced_truncation", "frequency_response", "physical_states", "steady_gain", "system_structure",
     ),
     "analyze.sensitivity": ("parameter_sensitivities",),
     "control.best_of": ("BestOf",),

@@ -145,6 +145,46 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
 
 
 @dataclass(frozen=True)
+class SteadyGain:
+    """What the outputs come to under inputs that are held.
+
+    Args:
+        gain: ``(n_y, n_u)`` [output unit / input unit].
+        relative: Relative gains ``(n_y, n_u)`` [-] of a square system whose gain is not singular, else None. Near 1 an
+            input may be paired with an output; negative, its sign turns round when the other loops are closed.
+    """
+
+    gain: Array
+    relative: Array | None
+
+
+def steady_gain(sys: Any) -> SteadyGain:
+    """``C (I - A)^-1 B + D`` of a discrete system, and its relative gains.
+
+    Raises:
+        InputError: If the system has no period, or a pole at 1: it integrates, and nothing holds still.
+
+    Example:
+        >>> import control
+        >>> a, b = 0.5 * np.eye(2), np.array([[1.0, 0.5], [0.25, 1.0]])
+        >>> found = steady_gain(control.ss(a, b, np.eye(2), np.zeros((2, 2)), 0.1))
+        >>> found.gain.round(6).tolist(), found.relative.round(4).tolist()
+        ([[2.0, 1.0], [0.5, 2.0]], [[1.1429, -0.1429], [-0.1429, 1.1429]])
+
+    Source: Bristol, *On a new measure of interaction for multivariable process control*, IEEE Transactions on
+    Automatic Control 11 (1966).
+    """
+    period(sys)
+    a, b, c, d = matrices(sys)
+    away = np.eye(a.shape[0]) - a
+    if a.size and np.linalg.cond(away) > 1.0 / EDGE:
+        raise InputError("steady gain: a pole lies at 1, so the outputs do not settle under a held input")
+    gain = np.asarray(c @ np.linalg.solve(away, b) + d)
+    square = gain.shape[0] == gain.shape[1] and np.linalg.cond(gain) < 1.0 / EDGE
+    return SteadyGain(gain, np.asarray(gain * np.linalg.inv(gain).T) if square else None)
+
+
+@dataclass(frozen=True)
 class Reduced:
     """A reduced ``control.StateSpace`` of ``order`` states and what the reduction costs.
 

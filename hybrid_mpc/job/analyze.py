@@ -51,9 +51,11 @@ from hybrid_mpc.analyze.memory import (
 )
 from hybrid_mpc.analyze.properties import (
     FrequencyResponse,
+    SteadyGain,
     Structure,
     frequency_response,
     physical_states,
+    steady_gain,
     system_structure,
 )
 from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
@@ -174,6 +176,7 @@ class Linearization:
     t: Array
     step: Array
     reduced: Reduction | Missing | None
+    gain: SteadyGain | Missing
 
 
 @dataclass(frozen=True)
@@ -500,7 +503,15 @@ def _linearization(given: AnalysisInput, model: HybridModel, point: Point, syste
         t,
         np.reshape(step, (model.n_y, model.n_u, -1)),
         _reduced(given, model, point, system, omega) if model.n_h else None,
+        _gain(system),
     )
+
+
+def _gain(system: Any) -> SteadyGain | Missing:
+    try:
+        return steady_gain(system)
+    except InputError as error:
+        return Missing(str(error))
 
 
 def _zeros(system: Any) -> Complex:

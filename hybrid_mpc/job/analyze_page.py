@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hybrid_mpc.analyze.equilibria import Equilibria
+from hybrid_mpc.analyze.properties import SteadyGain
 from hybrid_mpc.files import write_arrays, write_json, write_text
 from hybrid_mpc.job.analyze import (
     POINTS,
@@ -109,6 +110,7 @@ def tables_of(given: AnalysisInput, result: AnalysisResult) -> dict[str, Table]:
         "equilibria": (result.equilibria, _equilibria),
         "friction": (result.friction, _friction),
         "modes": (result.linear, _modes),
+        "steady_gain": (result.linear, _steady_gain),
         "margins": (result.loops, _margins),
         "gain_schedule": (result.schedule, _schedule),
         "memory": (result.memory, _memory),
@@ -158,6 +160,23 @@ def _modes(some: HybridModel, part: Mapping[str, Mapping[str, Linearization]]) -
          f"Hankel singular value [{ratio_unit(some.outputs[0], some.inputs[0])}]"), rows,
         "Modes of the linearizations. Controllability and observability are distances from losing them; the Hankel "
         "singular values have an order of their own.",
+    )  # fmt: skip
+
+
+def _steady_gain(some: HybridModel, part: Mapping[str, Mapping[str, Linearization]]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for (model, points), (i, y), (j, u) in product(
+        part.items(), enumerate(some.outputs), enumerate(some.inputs)
+    ):
+        for point, own in points.items():
+            gain = own.gain
+            if isinstance(gain, SteadyGain):
+                relative = None if gain.relative is None else float(gain.relative[i, j])
+                rows.append((model, point, f"{y.label} by {u.label}", float(gain.gain[i, j]), relative))
+    return Table(
+        ("model", "point", "channel", "steady gain [output unit / input unit]", "relative gain [-]"), rows,
+        "What an output comes to under a held input. A relative gain near 1 says that this input may be paired with "
+        "this output; a negative one, that its sign turns round when the other loops are closed.",
     )  # fmt: skip
 
 
@@ -367,7 +386,7 @@ SECTIONS: Mapping[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "friction": ("Friction in a linearization", ("friction",), ("friction",)),
     "linear": (
         "Linearized models",
-        ("modes",),
+        ("modes", "steady_gain"),
         ("poles", "bode_rest", "bode_working", "bode_moving", "bode_driven", "steps"),
     ),
     "measured": ("Against the machine", (), ("measured",)),

@@ -97,8 +97,16 @@ def test_every_number_of_the_page_has_a_unit(prior_alone):
         analyze_models(replace(given, plant=None)), loops=Missing("none"), sensitivity=Missing("none")
     )
     tables = tables_of(given, result)
-    assert set(tables) == {"equilibria", "friction", "modes", "gain_schedule", "memory"}
-    words = {"model", "point", "stability", "hits", "contraction certified", "positions that no input holds"}
+    assert set(tables) == {"equilibria", "friction", "modes", "steady_gain", "gain_schedule", "memory"}
+    words = {
+        "model",
+        "channel",
+        "point",
+        "stability",
+        "hits",
+        "contraction certified",
+        "positions that no input holds",
+    }
     for table in tables.values():
         assert all(column.endswith("]") for column in table.columns if column not in words), table.columns
     assert tables["gain_schedule"].columns[2] == "gain of phi, lowest [N m/rad]"
@@ -221,6 +229,11 @@ def test_machines_without_positions_are_analyzed_around_their_operating_point(ma
         by_hand = c @ np.linalg.solve(z * np.eye(model.n_x) - a, b) + d
         found_k = response.magnitude[..., k] * np.exp(1j * response.phase[..., k])
         np.testing.assert_allclose(found_k, by_hand, rtol=1e-9, atol=1e-9 * np.abs(by_hand).max())
+    dc = c @ np.linalg.solve(np.eye(model.n_x) - a, b) + d
+    np.testing.assert_allclose(linear["rest"].gain.gain, dc, rtol=1e-9)
+    assert (linear["rest"].gain.relative is None) == (model.n_y != model.n_u)
+    if make is dc_motor:
+        return  # what is drawn has nothing new
     files = {p.name for p in write_analysis(tmp_path, given, found, ["a test"], "none")}
     channels = [f"_from_{u.name}_to_{y.name}" for u in model.inputs for y in model.outputs]
     for named in channels if len(channels) > 1 else [""]:
