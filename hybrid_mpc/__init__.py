@@ -131,6 +131,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.monitor.detector import Detector
     from hybrid_mpc.monitor.diagnose import Diagnoser
     from hybrid_mpc.monitor.energy import EnergyMonitor
+    from hybrid_mpc.monitor.innovations import ResidualLimits, ResidualMonitor, learn_residuals
     from hybrid_mpc.monitor.learn import guard_monitor, learn_from
     from hybrid_mpc.monitor.lengths import rest_speeds
     from hybrid_mpc.monitor.replay import replay
@@ -195,6 +196,8 @@ __all__ = [
     "PriorStep",
     "Provenance",
     "RandomFaults",
+    "ResidualLimits",
+    "ResidualMonitor",
     "Role",
     "RunSettings",
     "Runner",
@@ -254,6 +257,7 @@ __all__ = [
     "jacobians",
     "kinematics",
     "learn_from",
+    "learn_residuals",
     "linearize",
     "linearize_along",
     "linearize_at_speed",
@@ -396,6 +400,7 @@ _ROOMS = {
     "monitor.detector": ("Detector",),
     "monitor.diagnose": ("Diagnoser",),
     "monitor.energy": ("EnergyMonitor",),
+    "monitor.innovations": ("ResidualLimits", "ResidualMonitor", "learn_residuals"),
     "monitor.learn": ("guard_monitor", "learn_from"),
     "monitor.lengths": ("rest_speeds",),
     "monitor.replay": ("replay",),

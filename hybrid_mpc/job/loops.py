@@ -20,7 +20,13 @@ from hybrid_mpc.files import digest, read_document, read_document_arrays, write_
 from hybrid_mpc.job.controllers import CONTROLLERS, build
 from hybrid_mpc.job.tasks import repeated, tasks_of
 from hybrid_mpc.kit.artifact import WATCHES, Kit
-from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
+from hybrid_mpc.kit.assembly import (
+    SOLVERS,
+    energy_is_watched,
+    make_adaptive_guard,
+    make_backup_guard,
+    make_resting_guard,
+)
 from hybrid_mpc.loop.faults import Fault, check_channels, fault_text, install
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.plant import Plant
@@ -30,6 +36,7 @@ from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel, kinematics
 from hybrid_mpc.monitor.calibrate import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.innovations import ResidualMonitor
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario, Task, load_scenario, registered_scenarios
 
@@ -337,11 +344,17 @@ class Bench:
         self._built.move_to_end(key)
         return self._built[key]
 
-    def monitor(self, spec: LoopSpec) -> EnergyMonitor | None:
-        """What watches the loop of a specification; refused if the model lacks what it needs."""
+    def monitor(self, spec: LoopSpec) -> EnergyMonitor | ResidualMonitor | None:
+        """What watches the loop of a specification; refused if the model lacks what it needs.
+
+        ``"own"``, which only records, is of residuals where the model's energy cannot be watched.
+        """
         if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
             return None
-        return self.kit(spec).monitor(kind=spec.monitor, task=spec.task)
+        kit = self.kit(spec)
+        if spec.monitor == "own" and not energy_is_watched(kit.models["hybrid"]):
+            return ResidualMonitor(kit.models["hybrid"])
+        return kit.monitor("hybrid", kind=spec.monitor, task=spec.task)
 
     def guard(self, spec: LoopSpec) -> Guard | None:
         """What an alarm does in the loop of a specification; None: nothing. Refused if the model lacks its parts."""
@@ -379,7 +392,7 @@ class Bench:
         spec: LoopSpec,
         *,
         task: Task | None = None,
-        monitor: EnergyMonitor | None = None,
+        monitor: EnergyMonitor | ResidualMonitor | None = None,
         on_step: Callable[[Step], None] | None = None,
     ) -> tuple[LoopRow, ClosedLoopResult]:
         """Run one loop.

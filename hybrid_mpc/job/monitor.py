@@ -91,7 +91,7 @@ class MonitorJob:
     @property
     def estimator(self) -> EstimatorLike:
         """The estimator of the closed loops."""
-        return self.kit.observer()
+        return self.kit.observer("hybrid")
 
     @property
     def monitor(self) -> EnergyMonitor:

@@ -23,10 +23,11 @@ from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_stat
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import most_likely
 from hybrid_mpc.loop.guard import Guard, Mode
-from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
+from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian, positions_of
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
+from hybrid_mpc.monitor.residuals import check_model
 from hybrid_mpc.records import known
 
 if TYPE_CHECKING:  # reading recordings takes half a second to import, and no controller does
@@ -303,6 +304,16 @@ def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
     return x, u
 
 
+def energy_is_watched(model: HybridModel) -> bool:
+    """Whether the energy monitor can read a model: a mechanical one whose outputs are its positions."""
+    try:
+        positions_of(model)
+        check_model(model)
+    except InputError:
+        return False
+    return True
+
+
 def make_monitor(
     model: HybridModel, calibration: Calibration | None, *, rest_speed: ArrayLike | None = None
 ) -> EnergyMonitor:
@@ -312,6 +323,9 @@ def make_monitor(
         model: The model that is compared with the machine.
         calibration: Its thresholds; None: its levels raise no alarm.
         rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: the calibration's.
+
+    Raises:
+        InputError: If the model's energy cannot be watched (:func:`energy_is_watched`).
 
     Example:
         ``make_monitor(artifact.models["hybrid"], None)``

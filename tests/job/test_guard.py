@@ -98,6 +98,18 @@ def test_loops_are_nominal_and_age_where_the_plant_can():
         guard_job.nominal_loops(replace(GOLF, tasks=broken), GOLF.budgets["quick"], MODEL)
 
 
+def test_a_hybrid_is_watched_by_its_own_model_where_the_prior_is_recommended(golf_artifact):
+    kit = load(golf_artifact).with_noise(SIGMA)
+    spec = replace(
+        guard_job.nominal_loops(GOLF, GOLF.budgets["quick"], MODEL)[0], monitor="own", duration=1.0
+    )
+    rows = [
+        Bench(GOLF, {"model": replace(kit, recommended=name)}).run(spec)[0] for name in ("hybrid", "prior")
+    ]
+    assert rows[0].cost == rows[1].cost
+    assert rows[0].largest_level == rows[1].largest_level > 0
+
+
 def test_a_nominal_loop_is_what_the_guard_would_read(golf_artifact, monkeypatch):
     monkeypatch.setattr(guard_job, "BLOCKS", 1)
     bench = Bench(GOLF, {"model": load(golf_artifact).with_noise(SIGMA)})

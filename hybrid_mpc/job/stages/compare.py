@@ -31,7 +31,9 @@ from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
+from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.loop import Loop
+from hybrid_mpc.monitor.innovations import ResidualMonitor
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
@@ -154,7 +156,8 @@ def _only_timing(context: Context) -> ControlResult:
     controller, estimator, durations = kit.controller(), kit.observer(), []
     for i, recording in enumerate(whole):
         context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
-        monitor = kit.monitor(kind="own")
+        watched = kit.models[kit.recommended]
+        monitor = kit.monitor(kind="own") if energy_is_watched(watched) else ResidualMonitor(watched)
         durations.append(time_on_recording(controller, estimator, monitor, recording, most))
     reason = f"scenario {context.scenario.name} has no plant to close the loop with"
     return ControlResult((), reason, {"step_ms": np.concatenate(durations)})
@@ -163,7 +166,7 @@ def _only_timing(context: Context) -> ControlResult:
 def time_on_recording(
     controller: SafeController,
     estimator: ExtendedKalmanFilter | SwitchingFilter,
-    monitor: EnergyMonitor,
+    monitor: EnergyMonitor | ResidualMonitor,
     trajectory: Trajectory,
     most: int,
 ) -> Array:

@@ -210,7 +210,7 @@ def faulted(
     dt = kit.models["hybrid"].dt
     task = nominal_tasks(scenario)[0]
     start = dt * round(0.5 * task.duration / dt)
-    monitor = kit.monitor(kind="guard", task=task.name, diagnose=True)
+    monitor = kit.monitor("hybrid", kind="guard", task=task.name, diagnose=True)
     loops: list[FaultedLoop] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
@@ -450,7 +450,7 @@ def _nominal_data(context: Context, kit: Kit, rest: tuple[float, ...]) -> Nomina
     scenario, model = context.scenario, kit.models["hybrid"]
     if scenario.plant is not None and any(not task.faults for task in scenario.tasks):
         return _from_loops(context, model)
-    monitor, estimator = guard_monitor(model, rest_speed=rest), kit.observer()
+    monitor, estimator = guard_monitor(model, rest_speed=rest), kit.observer("hybrid")
     whole = context.dataset.whole
     numbers = [
         replay(monitor, estimator, recording, on_progress=say).numbers
@@ -507,8 +507,8 @@ def _recorded(
     Without either the readings are kept and nothing but a blind monitor alarms.
     """
     model = kit.models["hybrid"]
-    monitor = kit.monitor(kind="energy" if detector is None else "guard", diagnose=True)
-    estimator = kit.observer()
+    monitor = kit.monitor("hybrid", kind="energy" if detector is None else "guard", diagnose=True)
+    estimator = kit.observer("hybrid")
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
     found: list[ExplainedAlarm] = []
     arrays: dict[str, Array] = {}
