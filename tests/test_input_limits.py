@@ -228,7 +228,7 @@ def test_a_scenario_whose_limits_cross_ends_before_anything_is_computed(call, tm
 )
 def test_ranges_that_are_analysed_never_cross(signal, inside):
     one = Signal("T", "K", *signal)
-    model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
+    model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2, x0=np.zeros(2), u0=np.zeros(1))
     np.testing.assert_array_equal(state_range(model), [inside, inside])
     np.testing.assert_array_equal(input_range(model, None), [inside])
     np.testing.assert_array_equal(state_range(model, None), [inside, inside])
@@ -236,7 +236,7 @@ def test_ranges_that_are_analysed_never_cross(signal, inside):
 
 def test_working_ranges_take_each_limit_that_there_is():
     one = Signal("T", "K", -4.0)
-    model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2)
+    model = SimpleNamespace(states=(one, one), inputs=(one,), n_x=2, x0=np.zeros(2), u0=np.zeros(1))
     control = CONTROL.changed(u_min=(0.0,), u_max=(5.0,), x_min=(2.0, -INF), x_max=None)
     np.testing.assert_array_equal(state_range(model, control), [(2.0, 3.0), (-4.0, 1.0)])
     np.testing.assert_array_equal(input_range(model, control), [(0.0, 5.0)])
@@ -246,7 +246,7 @@ def test_working_ranges_take_each_limit_that_there_is():
 
 def test_a_study_drives_inputs_within_their_ranges():
     given = SimpleNamespace(u_range=np.array([(0.0, 5.0), (-4.0, 0.0), (-1.0, 1.0)]))
-    u = driving_input(given, SimpleNamespace(dt=0.02, n_u=3), 30.0)
+    u = driving_input(given, SimpleNamespace(dt=0.02, n_u=3, time_unit=1.0), 30.0)
     np.testing.assert_allclose(u.max(axis=0) - u.min(axis=0), 0.5 * np.array([5.0, 4.0, 2.0]), rtol=0.1)
     np.testing.assert_allclose(u.mean(axis=0), [2.5, -2.0, 0.0], atol=0.05)
     assert np.all((u >= [0.0, -4.0, -1.0]) & (u <= [5.0, 0.0, 1.0]))
