@@ -19,8 +19,9 @@ from hybrid_mpc.errors import InputError
 Array = NDArray[np.float64]
 BLOCKS = 8
 """Blocks at least that runs of few recordings are cut into: the scatter between fewer says little."""
-RECORDINGS = 4
-"""Recordings from which on each of them is a block: errors within one hang together, and the next may be another."""
+RECORDINGS = 2
+"""Recordings from which on each of them is a block: errors within one hang together, and the next may be of another
+day. With two or three the bound is wide, and rightly so."""
 CONFIDENCE = 0.95
 """Probability, one-sided, with which a recommended hybrid is better than the prior."""
 CONFIDENT = 1.0
@@ -75,8 +76,8 @@ def recommend(
 
     The ratio of a hybrid's error to the prior's is that of their root mean squares over all runs. With ``RECORDINGS``
     or more its bound is that of the mean of the logarithms of each recording's ratio: another recording may be like any
-    of these, so a single one in which the prior is far off does not outweigh the others. With fewer the scatter is
-    found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
+    of these, so a single one in which the prior is far off does not outweigh the others. Within a single recording
+    the scatter is found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
 
     Args:
         errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error

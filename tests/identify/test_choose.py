@@ -116,8 +116,17 @@ def test_recordings_count_alike_however_far_off_the_prior_is():
     assert recommend({"phy": prior, "pgrnn": better}, recordings=names).recommended == "pgrnn"
 
 
-def test_runs_of_few_recordings_are_cut_into_blocks():
+def test_runs_of_a_single_recording_are_cut_into_blocks():
     prior = runs(np.random.default_rng(7), n=3)
     errors = {"phy": prior, "pgrnn": [0.25 * own for own in prior]}
-    assert recommend(errors, recordings=["a", "b", "c"]).blocks == recommend(errors).blocks == 9
-    assert recommend(errors | {"phy": prior}, recordings=["a", "a", "b"]).blocks == 9
+    assert recommend(errors, recordings=["a", "a", "a"]).blocks == recommend(errors).blocks == 9
+    assert recommend(errors, recordings=["a", "a", "b"]).blocks == 2
+
+
+def test_many_blocks_of_two_days_are_two_pieces_of_evidence():
+    """Better on one day and hardly better on the other: another day may be either, however long the recordings are."""
+    prior = runs(np.random.default_rng(7), n=8)
+    hybrid = [(0.2 if i < 4 else 0.95) * own for i, own in enumerate(prior)]
+    errors = {"phy": prior, "pgrnn": hybrid}
+    assert recommend(errors).recommended == "pgrnn"
+    assert recommend(errors, recordings=["monday"] * 4 + ["tuesday"] * 4).recommended == "phy"
