@@ -34,7 +34,7 @@ class CandidateFigures:
 
     Args:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
-        ratio: That over the prior's [-].
+        ratio: That over the prior's [-]; of several recordings the geometric mean of each one's.
         upper: Upper bound of the ratio with a probability of ``CONFIDENCE`` [-].
     """
 
@@ -74,10 +74,10 @@ def recommend(
 ) -> Choice:
     """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
 
-    The ratio of a hybrid's error to the prior's is that of their root mean squares over all runs. With ``RECORDINGS``
-    or more its bound is that of the mean of the logarithms of each recording's ratio: another recording may be like any
-    of these, so a single one in which the prior is far off does not outweigh the others. Within a single recording
-    the scatter is found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
+    The ratio of a hybrid's error to the prior's is the geometric mean of each recording's where there are
+    ``RECORDINGS`` or more, and its bound is that of the mean of the logarithms: another recording may be like any of
+    these, so a single one in which the prior is far off does not outweigh the others. Over all runs together the hybrid
+    must be the better one as well. Within a single recording the ratio is that of the root mean squares, and its scatter is found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
 
     Args:
         errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
@@ -116,7 +116,11 @@ def recommend(
     figures = {name: _figures(own, sums[prior], sizes, whole) for name, own in sums.items()}
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)
-    safe = [name for name in hybrids if figures[name].upper < CONFIDENT]
+    safe = [
+        name
+        for name in hybrids
+        if figures[name].upper < CONFIDENT and figures[name].error < figures[prior].error
+    ]
     chosen = min(safe, key=lambda name: figures[name].error, default=prior)
     reason = _reason(figures, best, chosen, prior, f"{len(sizes)} {'recordings' if whole else 'blocks'}")
     if deploy and deploy != chosen:
@@ -169,7 +173,7 @@ def _figures(own: Array, prior: Array, sizes: Array, whole: bool) -> CandidateFi
     if whole:
         each = 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
         most = float(each.mean() + student.ppf(CONFIDENCE, n - 1) * each.std(ddof=1) / math.sqrt(n))
-        return CandidateFigures(error, ratio, max(ratio, math.exp(min(most, 700.0))))
+        return CandidateFigures(error, math.exp(float(each.mean())), math.exp(min(most, 700.0)))
     without = 0.5 * np.log(np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300))
     scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
     bound = math.log(max(ratio, 1e-300)) + float(student.ppf(CONFIDENCE, n - 1)) * scatter

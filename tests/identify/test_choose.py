@@ -104,12 +104,13 @@ def test_recordings_count_alike_however_far_off_the_prior_is():
     names = [f"file{i}" for i in range(6)]
     by_block = recommend({"phy": prior, "pgrnn": hybrid})
     choice = recommend({"phy": prior, "pgrnn": hybrid}, recordings=names)
-    assert choice.candidates["pgrnn"].ratio == pytest.approx(by_block.candidates["pgrnn"].ratio)
+    assert choice.candidates["pgrnn"].error == pytest.approx(by_block.candidates["pgrnn"].error)
     assert by_block.recommended == "pgrnn"  # blocks of all recordings together are ruled by the first
     assert choice.recommended == "phy"
     assert "6 recordings" in choice.reason
     # the bound by hand: mean and standard deviation of the logarithms, Student's quantile 2.015 of five degrees
     logs = 0.5 * np.log([0.01, 1.0, 1.1, 0.9, 1.05, 0.95])
+    assert choice.candidates["pgrnn"].ratio == pytest.approx(np.exp(logs.mean()))
     upper = np.exp(logs.mean() + 2.015 * logs.std(ddof=1) / np.sqrt(6))
     assert choice.candidates["pgrnn"].upper == pytest.approx(upper, rel=1e-3)
     better = [0.25 * own for own in prior]

@@ -432,7 +432,7 @@ def _choice_table(results: Results) -> Table:
         (name_of(name), c.error, c.ratio, c.upper, "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]
-    columns = ("model", "error [spreads]", "over the prior's", "at most", "")
+    columns = ("model", "error [spreads]", "over the prior's", "at most, by 95 %", "")
     return Table(columns, rows, f"Validation recordings. {choice.reason}")
 
 
