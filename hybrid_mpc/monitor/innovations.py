@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -50,6 +50,8 @@ class ResidualLimits:
         false_alarms_per_hour: Wanted rate [1/h] of all alarms together.
         hours: Duration of the recordings [h].
         method: How they were found.
+        rated: Whether the rate was told from the recordings; False where they were too short for any, and thresholds
+            are a margin above the highest nominal level.
 
     Raises:
         InputError: If the sizes differ, or a number is not positive.
@@ -64,6 +66,7 @@ class ResidualLimits:
     false_alarms_per_hour: float
     hours: float
     method: str = ""
+    rated: bool = True
 
     def __post_init__(self) -> None:
         sides = np.array(self.threshold, dtype=float), np.array(self.release, dtype=float)
@@ -172,8 +175,8 @@ class ResidualMonitor:
 
     **Levels** are means over two lengths. An alarm starts where one passes the threshold of its channel, and its
     channel is named. The first of the machine's seconds counts for nothing: estimates settle in it. **Frozen sensor**:
-    an output repeats itself exactly, for longer than it did when nothing was wrong, while the model's own predictions of
-    it add up to more than they did then (limits), and to more than three of the sensor's steps (resolution). A sensor
+    an output repeats itself exactly, for longer than when nothing was wrong, while the model's own predictions of it
+    add up to more than they did then (limits), and to more than three of the sensor's steps (resolution). A sensor
     at an end of its range is not frozen.
 
     For a mechanical model whose positions are measured :class:`~hybrid_mpc.monitor.energy.EnergyMonitor` sees more: it
@@ -210,7 +213,8 @@ class ResidualMonitor:
         self.model, self.limits = model, limits
         outputs, balances, measured = model.outputs, model.balances, model.disturbances
         free = tuple(f"free run of {s.name}" for s in outputs)
-        self.channels = (*(s.name for s in (*outputs, *balances, *measured)), *free)
+        names = *(s.name for s in outputs), *(b.name for b in balances), *(s.name for s in measured)
+        self.channels = (*names, *free)
         """Names of the residuals."""
         units = tuple(s.unit for s in outputs)
         self.units = (*units, *(b.rate_unit for b in balances), *(s.unit for s in measured), *units)
@@ -282,12 +286,11 @@ class ResidualMonitor:
         counted = residual if seen > self.settling else np.full_like(residual, np.nan)
         recent = np.vstack([state.recent[1:], counted])
         level = np.column_stack([_mean(recent[-self.short :]), _mean(recent)])
-        on, share = self._alarms(level, state.on)
+        on, share = self.alarms(level, state.on)
         still = (y == state.y) & np.isfinite(moved) & (seen > self.settling)
         travel = np.where(still, state.travel + moved, 0.0)
         repeats = np.where(still, state.repeats + 1, 0)
-        inside = (y > self._ends[0]) & (y < self._ends[1])
-        frozen = inside & (np.abs(travel) > self._travel) & (repeats > self._repeats)
+        frozen = self.frozen(y, travel, repeats)
         validity = self._validity(residual[: -m.n_y], y, u_prev, seen)
         invalid = state.invalid + 1 if validity else 0
         blind = invalid > 2 * self.short
@@ -316,8 +319,13 @@ class ResidualMonitor:
             following.append(now)
         return ahead, tuple(following), error
 
-    def _alarms(self, level: Array, were_on: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
-        """Which alarms are on, and the largest level over its threshold."""
+    def frozen(self, y: Array, travel: Array, repeats: NDArray[np.int_]) -> NDArray[np.bool_]:
+        """Which sensors are frozen ``(n_y,)``: from the measurement, and how far and long each repeated itself."""
+        inside = (y > self._ends[0]) & (y < self._ends[1])
+        return inside & (np.abs(travel) > self._travel) & (repeats > self._repeats)
+
+    def alarms(self, level: Array, were_on: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
+        """Which alarms are on at levels ``(channels, 2)``, and the largest level over its threshold."""
         if self.limits is None:
             return were_on, math.nan
         size = np.abs(np.nan_to_num(level))
@@ -380,6 +388,16 @@ class ResidualTrace:
         every |= {f"{name} frozen": on for name, on in zip(self.outputs, self.frozen.T, strict=True)}
         return {name: _intervals(on, self.t) for name, on in every.items() if on.any()}
 
+    def named(self, start: float, end: float) -> tuple[str, ...]:
+        """Channels that alarm between two instants [s], in the order in which they do; frozen sensors as
+        ``"NAME frozen"``.
+        """
+        within = (self.t >= start - 1e-9) & (self.t <= end + 1e-9)
+        on = np.hstack([self.on, self.frozen])[within]
+        names = (*self.channels, *(f"{name} frozen" for name in self.outputs))
+        first = [int(np.argmax(column)) if column.any() else len(on) for column in on.T]
+        return tuple(names[i] for i in np.argsort(first, kind="stable") if first[i] < len(on))
+
     def coverage(self, dt: float) -> dict[str, float]:
         """Seconds with a valid reading, and those without, by reason."""
         return {name: float(np.sum(self.validity == why)) * dt for why, name in SECONDS.items()}
@@ -427,18 +445,34 @@ def replay_residuals(
         on_sample(k, estimate)
     on_progress(n, n)
     outputs = tuple(s.name for s in m.outputs)
+    columns = {
+        name: np.array([getattr(r, name) for r in readings])
+        for name in ("residual", "level", "share", "travel", "repeats", "alarm", "validity")
+    }
     return ResidualTrace(
-        np.asarray(recording.t, dtype=np.float64),
-        *(np.array([getattr(r, name) for r in readings]) for name in ("residual", "level", "share")),
-        np.array(on),
-        np.array([[name in r.frozen_outputs for name in outputs] for r in readings]),
-        *(
-            np.array([getattr(r, name) for r in readings])
-            for name in ("travel", "repeats", "alarm", "validity")
-        ),
-        monitor.channels,
-        outputs,
-    )
+        np.asarray(recording.t, dtype=np.float64), on=np.array(on),
+        frozen=np.array([[name in r.frozen_outputs for name in outputs] for r in readings]),
+        channels=monitor.channels, outputs=outputs, **columns,
+    )  # fmt: skip
+
+
+def judged(monitor: ResidualMonitor, trace: ResidualTrace, y: Array) -> ResidualTrace:
+    """A trace with the alarms of ``monitor``'s limits; ``y`` ``(n, n_y)`` are its measurements.
+
+    Residuals do not depend on limits, so nothing is replayed.
+    """
+    rows, frozen = [], []
+    on = np.zeros((len(monitor.channels), 2), dtype=bool)
+    shares = []
+    for level, travel, repeats, measured in zip(trace.level, trace.travel, trace.repeats, y, strict=True):
+        on, share = monitor.alarms(level, on)
+        rows.append(on.any(axis=1))
+        shares.append(share)
+        frozen.append(monitor.frozen(measured, travel, repeats))
+    found, stuck = np.array(rows), np.array(frozen)
+    blind = trace.alarm & ~trace.on.any(axis=1) & ~trace.frozen.any(axis=1)
+    alarm = found.any(axis=1) | stuck.any(axis=1) | blind
+    return replace(trace, share=np.array(shares), on=found, frozen=stuck, alarm=alarm)
 
 
 def learn_residuals(
@@ -471,44 +505,49 @@ def learn_residuals(
     """
     monitor, given = ResidualMonitor(model), list(recordings)
     total, before = sum(len(r.t) for r in given), 0
-    levels, travels, repeated = [], [], []
-    for i, recording in enumerate(given):
+    traces = []
+    for recording in given:
         start = before
 
         def say(done: int, own: int, start: int = start) -> None:
             on_progress(start + done, total)
 
-        trace = replay_residuals(monitor, estimator, recording, on_progress=say)
+        traces.append(replay_residuals(monitor, estimator, recording, on_progress=say))
         before += len(recording.t)
-        counts = np.ones(len(recording.t), dtype=bool) if nominal is None else np.array(nominal[i])
+    return limits_of(monitor, given, traces, false_alarms_per_hour=false_alarms_per_hour, nominal=nominal)
+
+
+def limits_of(
+    monitor: ResidualMonitor,
+    recordings: Sequence[TrajectoryLike],
+    traces: Sequence[ResidualTrace],
+    *,
+    false_alarms_per_hour: float | Sequence[float] = 1.0,
+    nominal: Sequence[NDArray[np.bool_]] | None = None,
+) -> ResidualLimits:
+    """The limits of :func:`learn_residuals` from the ``traces`` of the ``recordings`` by a monitor without limits."""
+    model, levels, travels, repeats = monitor.model, [], [], []
+    for i, trace in enumerate(traces):
+        counts = np.ones(len(trace.t), dtype=bool) if nominal is None else np.array(nominal[i])
         counts[: monitor.settling] = False
         levels.append(np.where(counts[:, None, None], np.abs(trace.level), np.nan))
         travels.append(np.abs(trace.travel[counts]))
-        repeated.append(trace.repeats[counts])
+        repeats.append(trace.repeats[counts])
     seconds = float(sum(np.isfinite(run[:, 0, 0]).sum() for run in levels)) * model.dt
     if not seconds:
         raise InputError(
             f"learn_residuals: no recording is longer than the {monitor.settling * model.dt:g} s that the estimator "
             "settles in"
         )
-    travel, repeats = _freezing(model, given, np.concatenate(travels), np.concatenate(repeated))
-    rates = np.atleast_1d(false_alarms_per_hour).tolist()
-    for rate in rates:
+    far, often = _freezing(model, recordings, np.concatenate(travels), np.concatenate(repeats))
+    for rate in np.atleast_1d(false_alarms_per_hour).tolist():
         threshold, release, short = _thresholds(monitor, levels, rate)
         if not short:
             break
-    method = f"{MARGIN} x the highest nominal level ({short})" if short else "extreme values of blocks"
     return ResidualLimits(
-        monitor.channels,
-        model.dt,
-        _pairs(threshold),
-        _pairs(release),
-        travel,
-        repeats,
-        rate,
-        seconds / 3600,
-        method,
-    )
+        monitor.channels, model.dt, _pairs(threshold), _pairs(release), far, often, rate, seconds / 3600,
+        f"{MARGIN} x the highest nominal level ({short})" if short else "extreme values of blocks", not short,
+    )  # fmt: skip
 
 
 def _thresholds(monitor: ResidualMonitor, levels: Sequence[Array], rate: float) -> tuple[Array, Array, str]:
@@ -543,8 +582,8 @@ def _thresholds(monitor: ResidualMonitor, levels: Sequence[Array], rate: float) 
 def _freezing(
     model: HybridModel, recordings: Sequence[TrajectoryLike], travel: Array, repeats: NDArray[np.int_]
 ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-    """How far outputs may be predicted to move, and for how many samples, while their sensor repeats itself: beyond what
-    nominal data have, and three of the sensor's steps.
+    """How far outputs may be predicted to move, and for how many samples, while their sensor repeats itself: beyond
+    what nominal data have, and three of the sensor's steps.
 
     The step is that of an even error as large as the sensor's noise, and no less than the smallest change recorded.
     Repetitions of what is not predicted to move by a step are those of a machine at rest.
