@@ -381,24 +381,14 @@ def explained_residuals(
     )  # fmt: skip
     model = monitor.model
     diagnoser = None
-    if monitor.limits is not None and trace.on.any():
+    if monitor.limits is not None and trace.alarm.any():
         diagnoser = ResidualDiagnoser(model, monitor.limits, causes or None, prior=prior)
-    n, given = len(trace.t), getattr(recording, "w", None)
-    w = np.tile(model.w, (n, 1)) if given is None or not model.n_w else given
-    x, h = (np.array([getattr(e, name) for e in estimates]) for name in ("x", "h"))
-    d = np.array([e.d if e.d.size == model.n_d else np.zeros(model.n_d) for e in estimates])
     alarms = []
     for start, end in trace.intervals():
-        k = int(np.searchsorted(trace.t, start - 1e-9))
-        channels = trace.named(start, end)
-        if trace.frozen[k].any():
-            text = FROZEN
-        elif not channels:
-            text = BLIND[Validity(int(trace.validity[k]))]
-        elif diagnoser is None or all(name.endswith(" frozen") for name in channels):
-            text = FROZEN if diagnoser is not None else ""
-        else:
-            text = diagnoser.diagnose(diagnoser.window(k, recording.y, recording.u, w, x, h, d)).text
+        k, channels = int(np.searchsorted(trace.t, start - 1e-9)), trace.named(start, end)
+        text = BLIND.get(Validity(int(trace.validity[k])), "") if not channels else ""
+        if diagnoser is not None and channels:
+            text = diagnoser.of_alarm(k, trace, recording, estimates)
         alarms.append(Alarm(start, end, text, channels))
     return trace, tuple(alarms)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,7 +14,8 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, changeable, incidence
 from hybrid_mpc.monitor.diagnose import Change, Diagnosis
-from hybrid_mpc.monitor.innovations import SHORT_S, ResidualLimits, machine_second
+from hybrid_mpc.monitor.innovations import SHORT_S, ResidualLimits, ResidualTrace, machine_second
+from hybrid_mpc.monitor.replay import TrajectoryLike
 
 Array = NDArray[np.float64]
 BEFORE_S, AFTER_S = 1.0, 1.0
@@ -30,9 +33,11 @@ ALIKE = 4.0
 RIDGE = 1e-9
 """Damping of the least squares, as a share of the columns' squared size: for directions that the window does not
 show."""
-ITERATIONS = 3
-SMALLEST = 0.02
-"""A parameter or gain is looked at down to this share of itself: it keeps its sign."""
+REFINED, ITERATIONS = 4, 3
+"""So many of the best linear fits go on by so many steps of Gauss-Newton."""
+RANGE = (-0.98, 4.0)
+"""Changes of a parameter or gain that are looked at, as shares: it keeps its sign, and five times is another
+machine."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +69,8 @@ class ResidualDiagnoser:
     for constant, are free; so is the instant within the averages before the alarm from which on something is different.
     What is tried is a parameter of the prior (or a group that changes by one share), the gain and the offset of each
     input, and the offset and gain of each output. The model's sensitivities to all of them come from one run; each is
-    fitted alone by weighted least squares, the best ones by Gauss-Newton, and a second one is added where two explain
-    much more than one. Nothing is known of friction or of motion.
+    fitted alone by weighted least squares, the best ones by Gauss-Newton, and two together where they explain much more
+    than one. Nothing is known of friction or of motion.
 
     Args:
         model: The model that the monitor compares with the machine.
@@ -119,15 +124,34 @@ class ResidualDiagnoser:
             max(1, round(length * unit / model.dt)) for length in (BEFORE_S, AFTER_S, SHORT_S)
         )
 
-    def window(
-        self, alarm: int, y: Array, u: Array, w: Array, states: Array, hidden: Array, disturbances: Array
-    ) -> Window:
-        """The window around the alarm that began at a sample of a recording, of which all are ``(n, ...)``."""
-        first, end = max(alarm - self.before, 0), min(alarm + self.after + 1, len(y))
-        part = slice(first, end)
-        return Window(
-            y[part], u[part], w[part], states[first], hidden[first], disturbances[first], alarm - first
-        )
+    def of_alarm(
+        self, alarm: int, trace: ResidualTrace, recording: TrajectoryLike, estimates: Sequence[Any]
+    ) -> str:
+        """What explains the alarm that begins at a sample of a replayed recording, in words.
+
+        Args:
+            alarm: Number of the sample.
+            trace: Of the recording.
+            recording: With ``y``, ``u`` and, where the model has measured disturbances, ``w``.
+            estimates: The estimates along it.
+        """
+        model = self.model
+        stuck = [name for name, on in zip(trace.outputs, trace.frozen[alarm], strict=True) if on]
+        if stuck:
+            return f"the sensor of {', '.join(stuck)} repeats itself while motion is predicted"
+        on = [name for name, alarms in zip(trace.channels, trace.on[alarm], strict=True) if alarms]
+        if not on:
+            return "the monitor has no valid reading"
+        if set(on) <= {s.name for s in model.disturbances}:
+            return f"{', '.join(on)} is where it never was when nothing was wrong"
+        first, end = max(alarm - self.before, 0), min(alarm + self.after + 1, len(recording.y))
+        part, begin = slice(first, end), estimates[first]
+        w: Array | None = getattr(recording, "w", None)
+        known = w[part] if model.n_w and w is not None else np.tile(model.w, (end - first, 1))
+        d = begin.d if np.size(begin.d) == model.n_d else np.zeros(model.n_d)
+        return self.diagnose(
+            Window(recording.y[part], recording.u[part], known, begin.x, begin.h, d, alarm - first)
+        ).text
 
     def diagnose(self, window: Window) -> Diagnosis:
         """What explains the alarm of a window."""
@@ -140,46 +164,30 @@ class ResidualDiagnoser:
             np.isfinite(window.u[:-1]).all() and np.isfinite(window.x).all() and np.isfinite(window.h).all()
         ):
             return Diagnosis("inputs or estimates are missing around the alarm", samples)
-        none = np.zeros(len(self.names))
-        fits: list[_Fit] = []
-        for onset in self._onsets(window):
-            errors, slopes = self._linear(window, none, np.zeros(nuisance), onset)
-            for i in range(len(self.names)):
-                fits.append(_fit(errors, slopes, nuisance, (i,), onset))
-        bare = _fit(errors, slopes, nuisance, (), 0).misfit
+        none, still, m = np.zeros(len(self.names)), np.zeros(nuisance), len(self.names)
+        linear = {onset: self._linear(window, none, still, onset) for onset in self._onsets(window)}
+
+        def fitted(tried: Iterable[tuple[int, ...]], refine: int) -> list[_Fit]:
+            """The best onset's fit of each, the best of them refined; the best first."""
+            found = [
+                min(
+                    (self._within(_fit(*at, nuisance, causes, onset)) for onset, at in linear.items()),
+                    key=_misfit,
+                )
+                for causes in tried
+            ]
+            found.sort(key=_misfit)
+            return sorted(
+                [self._refined(window, f, nuisance) for f in found[:refine]] + found[refine:], key=_misfit
+            )
+
+        bare = _fit(*next(iter(linear.values())), nuisance, (), 0).misfit
         if not bare > 0:
             return Diagnosis("nothing to explain", samples)
-        single = [
-            min((f for f in fits if f.causes == (i,)), key=lambda f: f.misfit) for i in range(len(self.names))
-        ]
-        single.sort(key=lambda f: f.misfit)
-        refined = [self._refined(window, f, nuisance) for f in single[:4]] + single[4:]
-        refined.sort(key=lambda f: f.misfit)
-        best = refined[0]
-        pairs = (
-            [
-                self._refined(
-                    window,
-                    min(
-                        (
-                            _fit(
-                                *self._linear(window, none, np.zeros(nuisance), onset),
-                                nuisance,
-                                (best.causes[0], other.causes[0]),
-                                onset,
-                            )
-                            for onset in {best.onset, other.onset}
-                        ),
-                        key=lambda f: f.misfit,
-                    ),
-                    nuisance,
-                )
-                for other in refined[1:]
-            ]
-            if best.misfit > ENOUGH * bare
-            else []
-        )
-        two = min(pairs, key=lambda f: f.misfit, default=None)
+        single = fitted(((i,) for i in range(m)), REFINED)
+        best = single[0]
+        several = best.misfit > ENOUGH * bare and m > 1
+        two = fitted(combinations(range(m), 2), REFINED)[0] if several else None
         independent = max(samples / self.short, 2.0)
         if two is not None and two.misfit < SECOND * best.misfit and two.misfit < LEFT * bare:
             changes = tuple(self._changes(two, independent))
@@ -196,11 +204,17 @@ class ResidualDiagnoser:
             )
         others = tuple(
             self._changes(f, independent)[0]
-            for f in refined[1:]
+            for f in single[1:]
             if f.misfit - best.misfit < ALIKE * best.misfit / independent
         )
         text = " or ".join(str(change) for change in (first, *others))
         return Diagnosis(f"{text}, which leaves {left:.0%} unexplained", samples, (first,), others)
+
+    def _within(self, fit: _Fit) -> _Fit:
+        """The fit, or one that explains nothing where a share is out of range."""
+        shares = fit.change[self._is_share[list(fit.causes)]]
+        inside = bool(np.all((shares >= RANGE[0]) & (shares <= RANGE[1])))
+        return fit if inside else replace(fit, misfit=np.inf)
 
     def _onsets(self, window: Window) -> list[int]:
         """Samples from which on something may be different: some of the averages' length before the alarm."""
@@ -236,7 +250,7 @@ class ResidualDiagnoser:
         for _ in range(ITERATIONS):
             moved = theta.copy()
             moved[list(fit.causes)] += step.change
-            moved = np.where(self._is_share, np.maximum(moved, SMALLEST - 1.0), moved)
+            moved = np.where(self._is_share, np.clip(moved, *RANGE), moved)
             errors, slopes = self._linear(window, moved, start + step.start, fit.onset)
             misfit = float(errors @ errors)
             if not np.isfinite(misfit) or misfit > 1.5 * best.misfit + 1e-12:
@@ -266,6 +280,10 @@ class _Fit:
     start: Array
     misfit: float
     covariance: Array
+
+
+def _misfit(fit: _Fit) -> float:
+    return fit.misfit
 
 
 def _fit(errors: Array, slopes: Array, nuisance: int, causes: tuple[int, ...], onset: int) -> _Fit:
