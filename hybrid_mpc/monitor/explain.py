@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, changeable, incidence
 from hybrid_mpc.monitor.diagnose import Change, Diagnosis
@@ -18,16 +19,18 @@ from hybrid_mpc.monitor.innovations import SHORT_S, ResidualLimits, ResidualTrac
 from hybrid_mpc.monitor.replay import TrajectoryLike
 
 Array = NDArray[np.float64]
-BEFORE_S, AFTER_S = 1.0, 1.0
+BEFORE_S, AFTER_S = 2.0, 1.0
 """How long before the alarm and after it is looked at [the machine's seconds]: the model needs the first to tell where
 the machine was, and a cause needs the second to show."""
 FEWEST = 5
 """Samples of each output that an explanation needs, for each number that it fits."""
 LEFT = 0.5
 """Share of what the model leaves that a known cause may leave; with more, something else broke."""
-ENOUGH, SECOND = 0.15, 0.5
-"""A second cause is looked for where the first one leaves more than the first share, and taken where it leaves less
-than the second one of that."""
+ENOUGH, ORDINARY, SECOND = 0.15, 1 / 3, 0.5
+"""A second cause is looked for where the first one leaves more than the first share, or more than the second one of the
+threshold; it is taken where it leaves less than the third share of what the first one leaves."""
+ONSETS = 14
+"""Instants that are tried, at most."""
 ALIKE = 4.0
 """Causes whose misfits differ by less (2 deviations) cannot be told apart."""
 RIDGE = 1e-9
@@ -186,7 +189,8 @@ class ResidualDiagnoser:
             return Diagnosis("nothing to explain", samples)
         single = fitted(((i,) for i in range(m)), REFINED)
         best = single[0]
-        several = best.misfit > ENOUGH * bare and m > 1
+        ordinary = ORDINARY**2 * float(known.sum()) * self.model.n_y
+        several = best.misfit > min(ENOUGH * bare, ordinary) and m > 1
         two = fitted(combinations(range(m), 2), REFINED)[0] if several else None
         independent = max(samples / self.short, 2.0)
         if two is not None and two.misfit < SECOND * best.misfit and two.misfit < LEFT * bare:
@@ -218,8 +222,9 @@ class ResidualDiagnoser:
 
     def _onsets(self, window: Window) -> list[int]:
         """Samples from which on something may be different: some of the averages' length before the alarm."""
-        back = {0, 1, 2, self.short // 2, self.short, 2 * self.short, self.before // 2}
-        return sorted({max(window.alarm - b, 1) for b in back})
+        back = [*range(self.short + 1), 2 * self.short, self.before // 3, self.before // 2]
+        chosen = [back[i] for i in evenly(len(back), ONSETS)]
+        return sorted({max(window.alarm - b, 1) for b in chosen})
 
     def _linear(self, window: Window, theta: Array, start: Array, onset: int) -> tuple[Array, Array]:
         """Scaled errors ``(m,)`` of a free run and their slopes ``(m, n_x + n_d + causes)``."""

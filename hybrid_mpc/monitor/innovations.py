@@ -174,7 +174,8 @@ class ResidualMonitor:
       turns, and the older one is read.
 
     **Levels** are means over two lengths. An alarm starts where one passes the threshold of its channel, and its
-    channel is named. The first of the machine's seconds counts for nothing: estimates settle in it. **Frozen sensor**:
+    channel is named. The first of the machine's seconds counts for nothing: estimates settle in it; an average counts
+    from when its length has passed since. **Frozen sensor**:
     an output repeats itself exactly, for longer than when nothing was wrong, while the model's own predictions of it
     add up to more than they did then (limits), and to more than three of the sensor's steps (resolution). A sensor
     at an end of its range is not frozen.
@@ -285,7 +286,8 @@ class ResidualMonitor:
         seen = min(state.seen + 1, self.settling + self.long)
         counted = residual if seen > self.settling else np.full_like(residual, np.nan)
         recent = np.vstack([state.recent[1:], counted])
-        level = np.column_stack([_mean(recent[-self.short :]), _mean(recent)])
+        level = np.column_stack([_mean(recent[-length:]) for length in (self.short, self.long)])
+        level[:, [seen < self.settling + length for length in (self.short, self.long)]] = np.nan
         on, share = self.alarms(level, state.on)
         still = (y == state.y) & np.isfinite(moved) & (seen > self.settling)
         travel = np.where(still, state.travel + moved, 0.0)

@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 5,
+    "schema_version": 6,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -97,6 +97,12 @@ RESULTS = {
         "controller_step_ms": {"median": 2.0, "p95": 3.0, "p99": 4.0, "max": 9.0},
         "period_ms": 20.0,
         "misses": 0,
+    },
+    "residuals": {
+        "false_alarms_per_hour": 0.0,
+        "alarms": [{"file": "a", "start_s": 1.0, "end_s": 2.0, "channels": ["phi"]}],
+        "faults_reason": "the energy is watched",
+        "details": {"source": "recordings", "limits": {}, "clean": None},
     },
     "monitor": {"threshold": {"energy [W]": 0.06}, "false_alarms_per_hour": 0.0, "alarms": []},
     "guard": {
