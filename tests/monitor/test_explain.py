@@ -1,4 +1,4 @@
-"""What broke on any machine: parameters, actuators and sensors of tanks and heated bodies, and what is none of these."""
+"""What broke on any machine: parameters, an actuator and sensors of heated bodies, and what is none of these."""
 
 from dataclasses import replace
 
@@ -121,10 +121,17 @@ def test_something_else_is_not_taken_for_a_known_cause(limits):
     run.y[START:, 1] += 1.5 * np.sign(np.sin(np.arange(400 - START) * 1.3))
     estimates = []
     trace = replay_residuals(
-        ResidualMonitor(model, limits=limits), observer(model), run, on_sample=lambda k, e: estimates.append(e)
+        ResidualMonitor(model, limits=limits),
+        observer(model),
+        run,
+        on_sample=lambda k, e: estimates.append(e),
     )
     (k, *_) = np.flatnonzero(trace.alarm)
-    assert ResidualDiagnoser(model, limits).of_alarm(int(k), trace, run, estimates).startswith("none of the known")
+    assert (
+        ResidualDiagnoser(model, limits)
+        .of_alarm(int(k), trace, run, estimates)
+        .startswith("none of the known")
+    )
 
 
 def test_groups_of_parameters_and_strange_ones(limits):

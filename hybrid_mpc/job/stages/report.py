@@ -553,8 +553,8 @@ def _residual_tables(found: Residuals) -> list[Table | None]:
             )
             for row in found.faults
         ]
-        heads = ("fault", "at [s]", "alarm after [s]", "channels", "taken for")
-        tables.append(Table(heads, broken, "Loops in which something breaks."))
+        columns = ("fault", "at [s]", "alarm after [s]", "channels", "taken for")
+        tables.append(Table(columns, broken, "Loops in which something breaks."))
     return tables
 
 
