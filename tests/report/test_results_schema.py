@@ -141,7 +141,7 @@ def leaves(values=RESULTS, prefix=""):
             yield prefix + key
 
 
-DEFAULTS = ("estimation.", "timing.controller_step_ms.", "guard.", "analysis.")
+DEFAULTS = ("estimation.", "timing.controller_step_ms.", "residuals.", "guard.", "analysis.")
 """Groups whose values may be left out."""
 
 
@@ -185,7 +185,7 @@ def test_null_needs_a_reason():
 
 
 def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match="this version reads 5"):
+    with pytest.raises(InputError, match="this version reads 6"):
         read_results(put("schema_version", 4))
     with pytest.raises(InputError, match="no field 'programs'"):
         read_results(put("export.programs", 3))
