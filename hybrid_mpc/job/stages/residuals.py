@@ -113,7 +113,10 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
     context.read(NOISE)
     kit, limits = context.kit, {}
     for name in dict.fromkeys(("hybrid", kit.recommended)):
-        found, recordings, traces, source = _learned(context, kit, name)
+        try:
+            found, recordings, traces, source = _learned(context, kit, name)
+        except InputError as none:
+            return Absent(f"no limits of residuals could be learned: {none}")
         limits[name] = found
     set_residuals(context.out / "model", limits)
     alarms, clean = _on_recordings(
