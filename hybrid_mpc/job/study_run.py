@@ -105,7 +105,7 @@ def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> di
         if "energy" in study.monitors and kit.calibration is None:
             raise InputError(f"study: monitor energy: {folder} holds no calibration; take monitor own")
         for kind in {"guard", "residuals"}.intersection(study.monitors):
-            kit.monitor("hybrid", kind=kind)
+            kit.on(scenario).monitor("hybrid", kind=kind)
         if study.guard == "adapt":
             adaptable(kit.models["hybrid"], scenario.causes)
         if held is None or label not in held:

@@ -156,7 +156,7 @@ def test_what_does_not_fit_is_refused():
     limits = learn_residuals(
         dc_motor(),
         observer(dc_motor(), sigma, step),
-        [recording(make, swing, sigma, 700, 0)],
+        [recording(make, swing, sigma, 1500, 0)],
         false_alarms_per_hour=1.0,
     )
     assert "1.5 x the highest nominal level" in limits.method  # for one an hour 3.5 s are too short
