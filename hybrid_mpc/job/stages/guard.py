@@ -526,7 +526,7 @@ def _recorded(
         trace, alarms = explained(
             monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
         )
-        found += [ExplainedAlarm(recording.name, **vars(alarm)) for alarm in alarms]
+        found += [ExplainedAlarm(recording.name, a.start_s, a.end_s, a.diagnosis) for a in alarms]
         begins, _ = stretches(trace.alarm)
         for window in clean_windows(context, recording, ("test",)):
             inside = _settled(recording.t, *window, model)
