@@ -38,6 +38,14 @@ class Known(Recording, Protocol):
         """States ``(n, n_x)``."""
 
 
+def disturbances_of(recording: Recording, model: HybridModel) -> Array:
+    """Measured disturbances ``(n, n_w)`` of a recording; the operating point's where it has none."""
+    found: Array | None = getattr(recording, "w", None)
+    if model.n_w and found is not None and found.shape[1:] == (model.n_w,):
+        return found
+    return np.tile(model.w, (len(recording.u), 1))
+
+
 def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4000) -> Array:
     """Standard deviations ``(n_x,)`` of the model's one-period errors on recordings [SI].
 
@@ -56,10 +64,10 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
     """
     errors: list[Array] = []
     for recording in recordings:
-        h = np.zeros(model.n_h)
+        h, w = np.zeros(model.n_h), disturbances_of(recording, model)
         for k in range(len(recording.u) - 1):
             x_next, h = (
-                m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], model.w, model.p)
+                m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], w[k], model.p)
             )
             if k >= model.delay_states:  # before, the inputs under way are unknown
                 errors.append(x_next - recording.x[k + 1])
@@ -81,9 +89,10 @@ def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> f
 
     Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
     """
-    estimate, total = estimator.start(recording.y[0]), 0.0
+    w = disturbances_of(recording, estimator.model)
+    estimate, total = estimator.start(recording.y[0], w=w[0]), 0.0
     for k in range(1, len(recording.y)):
-        ahead = estimator.predict(estimate, recording.u[k - 1])
+        ahead = estimator.measuring(estimator.predict(estimate, recording.u[k - 1]), w[k])
         estimate, likelihood = estimator.assess(ahead, recording.y[k], recording.u[k - 1])
         if k >= skip:
             total += likelihood

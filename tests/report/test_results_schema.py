@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 5,
+    "schema_version": 6,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -98,6 +98,12 @@ RESULTS = {
         "period_ms": 20.0,
         "misses": 0,
     },
+    "residuals": {
+        "false_alarms_per_hour": 0.0,
+        "alarms": [{"file": "a", "start_s": 1.0, "end_s": 2.0, "channels": ["phi"]}],
+        "faults_reason": "the energy is watched",
+        "details": {"source": "recordings", "limits": {}, "clean": None},
+    },
     "monitor": {"threshold": {"energy [W]": 0.06}, "false_alarms_per_hour": 0.0, "alarms": []},
     "guard": {
         "false_alarms_per_hour": 2.0,
@@ -135,7 +141,7 @@ def leaves(values=RESULTS, prefix=""):
             yield prefix + key
 
 
-DEFAULTS = ("estimation.", "timing.controller_step_ms.", "guard.", "analysis.")
+DEFAULTS = ("estimation.", "timing.controller_step_ms.", "residuals.", "guard.", "analysis.")
 """Groups whose values may be left out."""
 
 
@@ -179,7 +185,7 @@ def test_null_needs_a_reason():
 
 
 def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match="this version reads 5"):
+    with pytest.raises(InputError, match="this version reads 6"):
         read_results(put("schema_version", 4))
     with pytest.raises(InputError, match="no field 'programs'"):
         read_results(put("export.programs", 3))

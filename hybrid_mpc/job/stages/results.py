@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,15 @@ from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
 from hybrid_mpc.job.stages.identify import DATA, MODELS
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
+from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.innovations import ResidualLimits
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 ENERGY = "energy [W]"
 """The balance that the monitor watches, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
@@ -262,6 +264,29 @@ class Monitor:
 
 
 @dataclass(frozen=True)
+class ResidualsDetails:
+    """What limits were learned from, limits by model, and alarms where nothing disturbs the machine."""
+
+    source: str = ""
+    limits: Mapping[str, ResidualLimits] = field(default_factory=dict)
+    clean: CleanAlarms | None = None
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """The monitor of residuals: false alarms an hour, alarms on the recordings with their channels, and loops in which
+    an actuator weakens or a sensor freezes, for machines whose energy is not watched.
+    """
+
+    false_alarms_per_hour: float | None = None
+    alarms: tuple[ChannelAlarm, ...] | None = None
+    faults: tuple[FaultedChannel, ...] | None = None
+    faults_reason: str = ""
+    details: ResidualsDetails = ResidualsDetails()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class BrokenLoop:
     """A loop in which something breaks: what and when, time to the alarm (None: never), what it is taken for."""
 
@@ -337,6 +362,7 @@ class Results:
     control: Control
     estimation: Estimation
     timing: Timing
+    residuals: Residuals
     monitor: Monitor
     guard: Guard
     analysis: Analysis
@@ -371,7 +397,16 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
         raise InputError(
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
         )
-    for group in ("identification", "control", "estimation", "timing", "monitor", "guard", "analysis"):
+    for group in (
+        "identification",
+        "control",
+        "estimation",
+        "timing",
+        "residuals",
+        "monitor",
+        "guard",
+        "analysis",
+    ):
         _check_values(values[group], group, where)
     return results
 
@@ -408,6 +443,7 @@ def collect(context: Context) -> Results:
         _control(context),
         _estimation(context),
         _timing(context),
+        _residuals(context),
         _monitor(context),
         _guard(context),
         _analysis(context),
@@ -576,6 +612,20 @@ def _timing(context: Context) -> Timing:
         return Timing(StepTimes(reason=reason), period, None, reason)
     median, p95, p99 = (float(np.quantile(ms, q)) for q in (0.5, 0.95, 0.99))
     return Timing(StepTimes(median, p95, p99, float(ms.max())), period, int((ms > period).sum()))
+
+
+def _residuals(context: Context) -> Residuals:
+    found = context.find(RESIDUALS)
+    if isinstance(found, Absent):
+        return Residuals(reason=found.reason)
+    clean = found.clean
+    return Residuals(
+        clean.alarms / (clean.seconds / 3600.0) if clean.seconds else 0.0,
+        found.alarms,
+        found.faults,
+        "" if found.faults is not None else "there is no plant, no calm task, or the energy is watched",
+        ResidualsDetails(found.source, found.limits, clean),
+    )
 
 
 def _monitor(context: Context) -> Monitor:
