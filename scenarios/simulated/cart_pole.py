@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import (
-    OCP, DataSpec, Disturbance, Fault, MechanicalPrior, OperatingPoint, Parameter, Scenario, Signal, Task, multisine,
+    OCP,
+    DataSpec,
+    Disturbance,
+    Fault,
+    MechanicalPrior,
+    OperatingPoint,
+    Parameter,
+    Scenario,
+    Signal,
+    Task,
+    multisine,
     random_steps,
 )  # fmt: skip
 from scenarios.common import moves
@@ -127,8 +137,8 @@ def aside(t: Array) -> Array:
 scenario = Scenario(
     name="cart_pole",
     title="Cart with a hanging pole: one force, two positions, a rail that sticks (simulated)",
-    description="A force moves a cart from which a pole hangs. The prior's rail has viscous friction; the machine's rail "
-    "also sticks. Recordings are held on the rail by a weak spring.",
+    description="A force moves a cart from which a pole hangs. The prior's rail has viscous friction; the machine's "
+    "rail also sticks. Recordings are held on the rail by a weak spring.",
     prior=CartPolePrior,
     data=DataSpec("time_s", ("force_n",), ("position_m", "angle_rad"), dt=DT, max_gap=2 * DT, smoothing=0.14,
                   warm_up=0.5, windows=windows(SECONDS), free_run=3.0),

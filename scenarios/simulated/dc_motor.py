@@ -1,4 +1,4 @@
-"""A DC motor: current and speed are measured, its iron saturates and its brushes rub."""
+"""A DC motor: current and speed are measured, and it rubs the more the slower it turns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import (
-    OCP, Balance, DataSpec, Disturbance, Fault, OperatingPoint, Parameter, Prior, Scenario, Signal, Task, random_steps,
+    OCP,
+    Balance,
+    DataSpec,
+    Disturbance,
+    Fault,
+    OperatingPoint,
+    Parameter,
+    Prior,
+    Scenario,
+    Signal,
+    Task,
+    random_steps,
 )  # fmt: skip
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 
@@ -117,8 +128,8 @@ def steady(t: Array) -> Array:
 scenario = Scenario(
     name="dc_motor",
     title="DC motor with current and speed: Stribeck friction (simulated)",
-    description="A voltage drives a motor against a load. The prior takes the load as steady; the machine's dry friction "
-    "grows below 12 rad/s.",
+    description="A voltage drives a motor against a load. The prior takes the load as steady; the machine's dry "
+    "friction grows below 12 rad/s.",
     prior=DcMotorPrior,
     data=DataSpec("time_s", ("voltage_v",), ("current_a", "speed_rad_s"), dt=DT, max_gap=2 * DT, smoothing=0.04,
                   warm_up=0.2, windows=windows(SECONDS), free_run=2.0),

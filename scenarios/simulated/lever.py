@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import (
-    OCP, DataSpec, Disturbance, Fault, MechanicalPrior, OperatingPoint, Parameter, Scenario, Signal, Task, multisine,
+    OCP,
+    DataSpec,
+    Disturbance,
+    Fault,
+    MechanicalPrior,
+    OperatingPoint,
+    Parameter,
+    Scenario,
+    Signal,
+    Task,
+    multisine,
     random_steps,
 )  # fmt: skip
 from scenarios.common import moves
@@ -139,8 +149,8 @@ def lifted(t: Array) -> Array:
 scenario = Scenario(
     name="lever",
     title="Lever: the sine of its angle and a tachometer, a gear with a gap (simulated)",
-    description="A motor lifts a lever. No sensor shows the angle itself: one shows the height of the end, one the speed. "
-    "The prior's gear is tight; the machine's has a gap of 0.12 rad.",
+    description="A motor lifts a lever. No sensor shows the angle itself: one shows the height of the end, one the "
+    "speed. The prior's gear is tight; the machine's has a gap of 0.12 rad.",
     prior=LeverPrior,
     data=DataSpec("time_s", ("u_nm",), ("height_m", "tacho_rad_s"), dt=DT, max_gap=2 * DT, smoothing=0.14,
                   warm_up=0.5, windows=windows(SECONDS), free_run=3.0),

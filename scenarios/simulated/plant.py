@@ -145,8 +145,8 @@ class Experiment:
         seconds: Length [s] of a recording.
         x0: First state ``(n_x,)``.
         signals: ``(t, rng) -> (u (n, n_u), w (n, n_w))``: what excites the machine, held over each period.
-        feedback: ``y (n_y,) -> (n_u,)``, what a simple controller adds to the inputs, for a machine that would run away.
-            Default: nothing.
+        feedback: ``y (n_y,) -> (n_u,)``, what a simple controller adds to the inputs of a machine that would run
+            away. Default: nothing.
         limits: Smallest and largest inputs ``(n_u,)`` each.
     """
 

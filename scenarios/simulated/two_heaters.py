@@ -10,7 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import (
-    OCP, Balance, DataSpec, Disturbance, Fault, OperatingPoint, Parameter, Prior, Scenario, Signal, Task, random_steps,
+    OCP,
+    Balance,
+    DataSpec,
+    Disturbance,
+    Fault,
+    OperatingPoint,
+    Parameter,
+    Prior,
+    Scenario,
+    Signal,
+    Task,
+    random_steps,
 )  # fmt: skip
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 

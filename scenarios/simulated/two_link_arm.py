@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import (
-    OCP, DataSpec, Disturbance, Fault, MechanicalPrior, OperatingPoint, Parameter, Scenario, Signal, Task, multisine,
+    OCP,
+    DataSpec,
+    Disturbance,
+    Fault,
+    MechanicalPrior,
+    OperatingPoint,
+    Parameter,
+    Scenario,
+    Signal,
+    Task,
+    multisine,
     random_steps,
 )  # fmt: skip
 from scenarios.common import moves
@@ -135,8 +145,8 @@ def lifted(t: Array) -> Array:
 scenario = Scenario(
     name="two_link_arm",
     title="Two-link arm with two torques: joints that stick (simulated)",
-    description="An arm of two links hangs from its shoulder. The prior knows inertia, weight and viscous friction; the "
-    "machine's joints also stick.",
+    description="An arm of two links hangs from its shoulder. The prior knows inertia, weight and viscous friction; "
+    "the machine's joints also stick.",
     prior=TwoLinkArmPrior,
     data=DataSpec("time_s", ("tau1_nm", "tau2_nm"), ("shoulder_rad", "elbow_rad"), dt=DT, max_gap=2 * DT,
                   smoothing=0.14, warm_up=0.5, windows=windows(SECONDS), free_run=3.0),

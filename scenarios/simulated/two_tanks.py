@@ -11,7 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import (
-    OCP, Balance, DataSpec, Disturbance, Fault, OperatingPoint, Parameter, Prior, Scenario, Signal, Task, random_steps,
+    OCP,
+    Balance,
+    DataSpec,
+    Disturbance,
+    Fault,
+    OperatingPoint,
+    Parameter,
+    Prior,
+    Scenario,
+    Signal,
+    Task,
+    random_steps,
 )  # fmt: skip
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 
@@ -118,8 +129,8 @@ def rain(t: Array) -> Array:
 scenario = Scenario(
     name="two_tanks",
     title="Two tanks: the upper level is not measured, and runs over (simulated)",
-    description="A pump fills the upper of two tanks, which drains into the lower one; a measured inflow joins there. The "
-    "prior knows pipes and floors; above 0.36 m the upper tank runs over, which it does not know.",
+    description="A pump fills the upper of two tanks, which drains into the lower one; a measured inflow joins there. "
+    "The prior knows pipes and floors; above 0.36 m the upper tank runs over, which it does not know.",
     prior=TwoTanksPrior,
     data=DataSpec("time_s", ("pump",), ("lower_m",), dt=DT, max_gap=2 * DT, smoothing=40.0, warm_up=150.0,
                   disturbances=("inflow",), windows=windows(SECONDS), free_run=800.0),
