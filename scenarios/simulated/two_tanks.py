@@ -48,7 +48,7 @@ class TwoTanksPrior(Prior):
     disturbances: ClassVar[tuple[Signal, ...]] = (Signal("inflow", "m^3/s", 0.0, 2e-4),)
     outputs: ClassVar[tuple[Signal, ...]] = (Signal("lower", "m", -0.1, 2.0),)
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("area", AREA, "m^2", 0.01, 0.04, "floor of a tank"),
+        Parameter("area", AREA, "m^2", AREA, AREA, "floor of a tank (fixed: by a ruler)"),
         Parameter("pipe_upper", PIPE, "m^2", 6e-5, 2.4e-4, "clear width of the upper tank's pipe"),
         Parameter("pipe_lower", PIPE, "m^2", 6e-5, 2.4e-4, "of the lower tank's"),
     )
@@ -69,7 +69,7 @@ class TwoTanksPrior(Prior):
 class TwoTanks(SimulatedPlant):
     """Another floor, other pipes, and a weir: above its edge the upper tank runs over onto the floor."""
 
-    area: float = 0.0225
+    area: float = 0.0208
     pipe_upper: float = 1.05e-4
     pipe_lower: float = 1.38e-4
     edge: float = 0.36
@@ -90,7 +90,7 @@ class TwoTanks(SimulatedPlant):
 
 def signals(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Pump and inflow in random steps."""
-    pump = random_steps(t, 4e-5, 3.3e-4, hold=(40.0, 250.0), rng=rng)
+    pump = random_steps(t, 4e-5, 3.6e-4, hold=(40.0, 250.0), rng=rng)
     return pump[:, None], random_steps(t, 0.0, 8e-5, hold=(100.0, 500.0), rng=rng)[:, None]
 
 
