@@ -84,32 +84,91 @@ STEP = np.sqrt(12)
 """A sensor whose steps are this many standard deviations has the same noise as one of white noise."""
 
 
-def held(scenario):
-    """The task in which an unknown constant load is held, the controlled outputs, and what error is allowed there."""
-    task = next(t for t in scenario.tasks if t.faults)
-    controlled = np.flatnonzero(scenario.control.q_y)
-    return task, controlled, 2 * STEP * np.array(scenario.sensor_sigma)[controlled]
-
-
 def closed(scenario, kit, task, seed=0, **options):
     return hm.simulate(
-        scenario.plant(), kit.observer(task=task.name), kit.controller(task=task.name), task.reference,
-        dt=scenario.data.dt, duration=task.duration, x0=task.x0, seed=seed, w=task.w,
-        **{"faults": task.faults, **options},
+        scenario.plant(), kit.observer(), kit.controller(), task.reference,
+        dt=scenario.data.dt, x0=task.x0, seed=seed, w=task.w,
+        **{"faults": task.faults, "duration": task.duration, **options},
     )  # fmt: skip
+
+
+def shown(plant, result):
+    """What the sensors would show without noise ``(n, n_y)``."""
+    rows = zip(result.x, result.u, result.w, strict=True)
+    return np.array([[float(v) for v in plant.outputs(list(x), list(u), list(w), plant)] for x, u, w in rows])
 
 
 @each
 def test_a_constant_load_leaves_no_offset(name, fitted):
-    scenario, fit, kit = fitted(name)
-    task, controlled, allowed = held(scenario)
+    """The mean error of the last fifth is below two steps of the sensor."""
+    scenario, _, kit = fitted(name)
+    task = next(t for t in scenario.tasks if t.faults)
+    controlled = np.flatnonzero(scenario.control.q_y)
     assert hm.offset_free(kit.models["prior"], controlled).promised
     result = closed(scenario, kit, task)
-    model, last = kit.models["prior"], len(result.t) * 4 // 5
-    shown = np.array([model.output(x, u, w, model.p).full().ravel() for x, u, w in
-                      zip(result.x[last:], result.u[last:], result.w[last:], strict=True)])  # fmt: skip
-    error = (shown - result.y_ref[last:])[:, controlled].mean(axis=0)
-    print(name, error, allowed, result.sources if hasattr(result, "sources") else set(result.source), result.cost)
-    assert np.all(np.abs(error) < allowed)
+    late = slice(len(result.t) * 4 // 5, None)
+    error = (shown(scenario.plant(), result) - result.y_ref)[late, controlled].mean(axis=0)
+    assert np.all(np.abs(error) < 2 * STEP * np.array(scenario.sensor_sigma)[controlled])
     assert set(result.source) == {"MPC"}
     assert np.all((result.u >= scenario.control.u_min) & (result.u <= scenario.control.u_max))
+
+
+LOOPS, PERIODS = 3, 30
+"""Loops a machine with random faults, and their length; benchmarks/simulated_machines.py runs more."""
+
+
+@each
+def test_faulted_loops_keep_the_limits_and_raise_nothing(name, fitted):
+    scenario, _, kit = fitted(name)
+    control, dt, task = scenario.control, scenario.data.dt, scenario.tasks[0]
+    rng = np.random.default_rng(sorted(MACHINES).index(name))
+    for seed in range(LOOPS):
+        faults = random_faults(scenario, rng, dt)
+        result = closed(scenario, kit, task, seed, faults=faults, duration=PERIODS * dt)
+        assert np.all(np.isfinite(result.u))
+        assert np.all((result.u >= control.u_min) & (result.u <= control.u_max))
+
+
+def random_faults(scenario, rng, dt):
+    """Two to four faults of sensors, actuators and the plant itself, of random sizes, within the loop."""
+    plant, span, faults = scenario.plant(), scenario.control.u_max - scenario.control.u_min, []
+    n_y, n_u = len(scenario.sensor_sigma), len(span)
+    for _ in range(rng.integers(2, 5)):
+        start = dt * float(rng.integers(2, PERIODS // 2))
+        end = np.inf if rng.random() < 0.3 else start + dt * float(rng.integers(1, PERIODS // 2))
+        j, i = int(rng.integers(n_y)), int(rng.integers(n_u))
+        kind = rng.integers(7)
+        target, value, channel = [
+            ("measurement_dropout", 0.0, j),
+            ("measurement_freeze", 0.0, j),
+            ("measurement_scale", rng.uniform(0.5, 2.0), j),
+            ("measurement_offset", 100 * scenario.sensor_sigma[j] * rng.normal(), j),
+            ("input_gain", rng.uniform(0.0, 1.5), i),
+            ("input_offset", 0.5 * span[i] * rng.uniform(-1, 1), i),
+            (f"plant_{rng.choice(plant.parameters_of)}", rng.uniform(0.5, 2.0), 0),
+        ][kind]
+        faults.append(hm.Fault(start, end, target, float(value), channel))
+    return faults
+
+
+def test_a_plant_refuses_faults_and_parameters_that_it_does_not_have():
+    with pytest.raises(hm.InputError, match="plant_edge"):
+        two_tanks.TwoTanks().with_faults([hm.Fault(0.0, 1.0, "plant_hole", 2.0)])
+    wider = hm.varied(two_tanks.TwoTanks(), [("area", 2.0)])
+    assert wider.area == 2 * two_tanks.TwoTanks().area
+
+
+def test_a_fault_of_the_plant_acts_while_it_lasts():
+    plant = two_tanks.TwoTanks().with_faults([hm.Fault(5.0, 10.0, "plant_pipe_lower", 0.0)])
+    state, levels = plant.reset(np.array(two_tanks.LEVELS), 0), []
+    for _ in range(3):
+        levels.append(plant.truth(state)[1])
+        state = plant.step(state, np.array([two_tanks.PUMP]), 5.0, np.array([two_tanks.INFLOW]))
+    levels.append(plant.truth(state)[1])
+    rise = np.diff(levels)
+    closed_pipe = (
+        (two_tanks.outflow(plant.pipe_upper, plant.truth(state)[0]) + two_tanks.INFLOW) * 5 / plant.area
+    )
+    assert rise[1] == pytest.approx(closed_pipe, rel=0.05)  # the upper level moves a little
+    assert rise[0] < 0.5 * rise[1]
+    assert rise[2] < 0.5 * rise[1]
