@@ -88,14 +88,14 @@ class SimulatedPlant:
     def step(self, state: PlantState, u: Array, dt: float, w: Array | None = None) -> PlantState:
         """State after ``dt`` [s] with inputs ``u`` ``(n_u,)`` and disturbances ``w`` ``(n_w,)`` held."""
         w = np.zeros(0) if w is None else w
-        step, _ = equations(type(self), len(state.z), len(u), len(w))
+        step, _ = self._equations(len(state.z), len(u), len(w))
         given = np.concatenate([u, w, self._values(state.t), [dt]])
         z = step(x0=state.z, p=given)["xf"].full().ravel()
         return PlantState(z, state.t + dt, np.asarray(u, dtype=np.float64), np.asarray(w, dtype=np.float64))
 
     def measure(self, state: PlantState, rng: np.random.Generator) -> Array:
         """Measured outputs ``(n_y,)`` with white noise."""
-        _, outputs = equations(type(self), len(state.z), len(state.u), len(state.w))
+        _, outputs = self._equations(len(state.z), len(state.u), len(state.w))
         y: Array = outputs(state.z, state.u, state.w, self._values(state.t)).full().ravel()
         return y + np.array(self.sigma) * rng.standard_normal(len(y))
 
@@ -106,6 +106,10 @@ class SimulatedPlant:
     def hidden(self, state: PlantState) -> Array:
         """Nothing: there is no oracle."""
         return np.zeros(0)
+
+    def _equations(self, n_z: int, n_u: int, n_w: int) -> tuple[ca.Function, ca.Function]:
+        kind: Any = type(self)  # one for all of a class: parameters are arguments
+        return equations(kind, n_z, n_u, n_w)
 
     def _values(self, t: float) -> Array:
         """Parameters at the time ``t`` [s], with the faults that act."""
@@ -124,12 +128,12 @@ def equations(kind: type[SimulatedPlant], n_z: int, n_u: int, n_w: int) -> tuple
     z, u, w = ca.SX.sym("z", n_z), ca.SX.sym("u", n_u), ca.SX.sym("w", n_w)
     p, dt = ca.SX.sym("p", len(names)), ca.SX.sym("dt")
     values = SimpleNamespace(**dict(zip(names, ca.vertsplit(p), strict=True)))
-    given = [ca.vertsplit(v) if v.numel() else [] for v in (z, u, w)]
-    rates = ca.vertcat(*plant.rates(*given, values))
+    zs, us, ws = (ca.vertsplit(v) if v.numel() else [] for v in (z, u, w))
+    rates = ca.vertcat(*plant.rates(zs, us, ws, values))
     ode = {"x": z, "p": ca.vertcat(u, w, p, dt), "ode": dt * rates}
     options = {"abstol": TOLERANCE, "reltol": TOLERANCE, "max_num_steps": 100000}
     step = ca.integrator("step", "cvodes", ode, 0.0, 1.0, options)
-    y = ca.vertcat(*plant.outputs(*given, values))
+    y = ca.vertcat(*plant.outputs(zs, us, ws, values))
     return step, ca.Function("outputs", [z, u, w, p], [y])
 
 

@@ -113,16 +113,17 @@ def test_a_constant_load_leaves_no_offset(name, fitted):
     assert np.all((result.u >= scenario.control.u_min) & (result.u <= scenario.control.u_max))
 
 
-LOOPS, PERIODS = 3, 30
-"""Loops a machine with random faults, and their length; benchmarks/simulated_machines.py runs more."""
+PERIODS = 30
+"""Length of a loop with random faults."""
 
 
+@pytest.mark.parametrize("loops", [3, pytest.param(34, marks=pytest.mark.full)])
 @each
-def test_faulted_loops_keep_the_limits_and_raise_nothing(name, fitted):
+def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, fitted):
     scenario, _, kit = fitted(name)
     control, dt, task = scenario.control, scenario.data.dt, scenario.tasks[0]
     rng = np.random.default_rng(sorted(MACHINES).index(name))
-    for seed in range(LOOPS):
+    for seed in range(loops):
         faults = random_faults(scenario, rng, dt)
         result = closed(scenario, kit, task, seed, faults=faults, duration=PERIODS * dt)
         assert np.all(np.isfinite(result.u))
