@@ -9,7 +9,6 @@ import typer
 
 from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import scenario_of
 
 if TYPE_CHECKING:
     from hybrid_mpc.job.monitor import MonitorJob, MonitorResult, RecordingResult
@@ -63,6 +62,7 @@ def monitor(
     from hybrid_mpc.job.monitor import learn as learn_job
     from hybrid_mpc.job.monitor import prepared, watch
     from hybrid_mpc.kit.artifact import FILE, artifact_folder, read_description
+    from hybrid_mpc.scenario import scenario_of
 
     check_folder(out)
     folder = artifact_folder(model)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -104,12 +104,6 @@ class SwitchingFilter:
         return self.assess(estimate, y, u)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
-    def measuring(self, predicted: Estimate, w: ArrayLike | None) -> SwitchingEstimate:
-        """The prediction with the disturbances ``w`` ``(n_w,)`` that were measured at its instant."""
-        own = self._own(predicted)
-        modes = tuple(f.measuring(e, w) for f, e in zip(self.filters, own.modes, strict=True))
-        return replace(own, modes=modes, w=modes[0].w)
-
     def assess(
         self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None
     ) -> tuple[SwitchingEstimate, float]:

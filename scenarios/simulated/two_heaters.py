@@ -164,6 +164,6 @@ scenario = Scenario(
     tasks=(
         Task("warm", "Warm both places up, then cool one", 2000.0, REST, warm),
         Task("draught", "Keep both temperatures although heater 1 gives less", 1500.0, REST, steady,
-             faults=(Fault(200.0, np.inf, "input_offset", -3.0),)),
+             faults=(Fault(200.0, np.inf, "input_offset", -3.0, "Q1"),)),
     ),
 )  # fmt: skip

@@ -161,6 +161,6 @@ scenario = Scenario(
     tasks=(
         Task("reach", "Go from place to place", 6.0, REST, reach),
         Task("carry", "Hold a place against an unknown torque", 6.0, REST, lifted,
-             faults=(Fault(2.0, np.inf, "input_offset", -1.0),)),
+             faults=(Fault(2.0, np.inf, "input_offset", -1.0, "tau_1"),)),
     ),
 )  # fmt: skip

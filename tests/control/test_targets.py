@@ -135,7 +135,7 @@ def test_bounds_of_outputs_hold_for_targets_too():
     np.testing.assert_allclose(found.y, 0.4, rtol=1e-6)
 
 
-def test_surroundings_rates_and_outputs_are_made_good():
+def test_disturbances_of_rates_and_outputs_are_made_good():
     model = two_tanks(disturbance_model=(Disturbance("rate", "lower", 1e-3),))
     found = Targets(model, OCP(5, **TANKS)).at([0.3], [-5e-4])
     x_next = model.step(found.x, [], found.u, model.w, model.p)[0].full().ravel() + 5.0 * np.array(

@@ -227,7 +227,7 @@ def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_pat
     if stored == "none":
         write_description(short.out / "model", replace(description, calibration=None))
     write_csv(tmp_path / "long.csv", QUICK.recording(5, 900))
-    monkeypatch.setattr("hybrid_mpc.cli.monitor.scenario_of", lambda *given: short.scenario)
+    monkeypatch.setattr("hybrid_mpc.scenario.scenario_of", lambda *given: short.scenario)
     done = CliRunner().invoke(
         app, ["monitor", str(short.out / "model"), str(tmp_path / "long.csv"), "--scenario", "axis",
               "--out", str(tmp_path / "out")],

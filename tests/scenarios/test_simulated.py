@@ -133,20 +133,21 @@ def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, fitted):
 def random_faults(scenario, rng, dt):
     """Two to four faults of sensors, actuators and the plant itself, of random sizes, within the loop."""
     plant, span, faults = scenario.plant(), scenario.control.u_max - scenario.control.u_min, []
-    n_y, n_u = len(scenario.sensor_sigma), len(span)
+    prior = scenario.prior()
+    y, u = [s.name for s in prior.outputs], [s.name for s in prior.inputs]
     for _ in range(rng.integers(2, 5)):
         start = dt * float(rng.integers(2, PERIODS // 2))
         end = np.inf if rng.random() < 0.3 else start + dt * float(rng.integers(1, PERIODS // 2))
-        j, i = int(rng.integers(n_y)), int(rng.integers(n_u))
+        j, i = int(rng.integers(len(y))), int(rng.integers(len(u)))
         kind = rng.integers(7)
         target, value, channel = [
-            ("measurement_dropout", 0.0, j),
-            ("measurement_freeze", 0.0, j),
-            ("measurement_scale", rng.uniform(0.5, 2.0), j),
-            ("measurement_offset", 100 * scenario.sensor_sigma[j] * rng.normal(), j),
-            ("input_gain", rng.uniform(0.0, 1.5), i),
-            ("input_offset", 0.5 * span[i] * rng.uniform(-1, 1), i),
-            (f"plant_{rng.choice(plant.parameters_of)}", rng.uniform(0.5, 2.0), 0),
+            ("measurement_dropout", 0.0, y[j]),
+            ("measurement_freeze", 0.0, y[j]),
+            ("measurement_scale", rng.uniform(0.5, 2.0), y[j]),
+            ("measurement_offset", 100 * scenario.sensor_sigma[j] * rng.normal(), y[j]),
+            ("input_gain", rng.uniform(0.0, 1.5), u[i]),
+            ("input_offset", 0.5 * span[i] * rng.uniform(-1, 1), u[i]),
+            (f"plant_{rng.choice(plant.parameters_of)}", rng.uniform(0.5, 2.0), ""),
         ][kind]
         faults.append(hm.Fault(start, end, target, float(value), channel))
     return faults
