@@ -136,7 +136,7 @@ class LoopSpec:
             if not isinstance(given, tuple) or not all(isinstance(f, Fault) for f in given):
                 raise InputError(
                     f"LoopSpec: {name} is a tuple of Fault, got {given!r}; write (Fault(start, end, target, value),), "
-                    'or parsed_fault("TARGET=VALUE@START:END") for a text'
+                    'or parsed_fault("TARGET:CHANNEL=VALUE@START:END") for a text'
                 )
         seeds = (self.seed, self.run_seed)
         if not all(isinstance(seed, int) and seed >= 0 for seed in seeds):
