@@ -112,8 +112,25 @@ def test_recordings_count_alike_however_far_off_the_prior_is():
     logs = 0.5 * np.log([0.01, 1.0, 1.1, 0.9, 1.05, 0.95])
     upper = np.exp(logs.mean() + 2.015 * logs.std(ddof=1) / np.sqrt(6))
     assert choice.candidates["pgrnn"].upper == pytest.approx(upper, rel=1e-3)
+    assert choice.candidates["pgrnn"].typical == pytest.approx(np.exp(logs.mean()))
+    assert (
+        f"in a typical one of 6 recordings {np.exp(logs.mean()):.2f} (at most {upper:.2f})" in choice.reason
+    )
     better = [0.25 * own for own in prior]
     assert recommend({"phy": prior, "pgrnn": better}, recordings=names).recommended == "pgrnn"
+
+
+def test_the_bound_is_that_of_the_typical_recording_and_may_lie_below_the_ratio_over_all():
+    """Much better in all but the loudest recording, which rules the sum: the bound is not raised to the sum's ratio."""
+    prior = runs(np.random.default_rng(8), n=8)
+    prior[0] = 1000.0 * prior[0]
+    factors = [1.1**2] + [0.2**2 * (1 + 0.01 * i) for i in range(7)]
+    errors = {"phy": prior, "pgrnn": [factor * own for factor, own in zip(factors, prior, strict=True)]}
+    choice = recommend(errors, recordings=[f"file{i}" for i in range(8)])
+    own = choice.candidates["pgrnn"]
+    assert own.typical < own.upper < 1.0 < own.ratio
+    assert not own.sure  # both must be below 1: the rule is no looser
+    assert choice.recommended == "phy"
 
 
 def test_runs_of_a_single_recording_are_cut_into_blocks():

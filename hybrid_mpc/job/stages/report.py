@@ -343,8 +343,9 @@ def _prior_replay_text(weight: float) -> tuple[str, ...]:
 def _monitor_words(found: MonitorResult) -> str:
     assert found.clean is not None
     clean, load = found.clean, found.load
+    there = "was 1 alarm" if clean.alarms == 1 else f"were {clean.alarms} alarms"
     words = (
-        f"In {clean.seconds:.0f} s known to be undisturbed there were {clean.alarms} alarms, "
+        f"In {clean.seconds:.0f} s known to be undisturbed there {there}, "
         f"in the {clean.test_seconds:.0f} s of test data among them {clean.test_alarms}."
     )
     if load is None:
@@ -429,11 +430,24 @@ def _score_tables(context: Context, results: Results) -> list[Table]:
 def _choice_table(results: Results) -> Table:
     choice = results.identification.details.choice
     rows = [
-        (name_of(name), c.error, c.ratio, c.upper, "recommended" if name == choice.recommended else "")
+        (name_of(name), c.error, c.ratio, *(None if name == "phy" else v for v in (c.typical, c.upper)),
+         "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
-    ]
-    columns = ("model", "error [spreads]", "over the prior's", "at most", "")
-    return Table(columns, rows, f"Validation recordings. {choice.reason}")
+    ]  # fmt: skip
+    columns = (
+        "model",
+        "error [spreads]",
+        "over the prior's",
+        "in a typical recording",
+        "that one at most",
+        "",
+    )
+    caption = (
+        f"Validation recordings. {choice.reason} A hybrid is recommended where both, its error over the prior's and the "
+        "bound, are below 1. In a typical recording: the geometric mean of each recording's ratio; with a single "
+        "recording the ratio itself. The bound holds with 95 %."
+    )
+    return Table(columns, rows, caption)
 
 
 def _band_table(context: Context, results: Results) -> Table:

@@ -35,7 +35,7 @@ from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 ENERGY = "energy [W]"
 """The balance that the monitor watches, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
@@ -122,12 +122,13 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class CandidateErrors:
-    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's, and that one's upper
-    bound; None where a run diverged or the bound is not known.
+    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's, the ratio in a typical
+    recording, and that one's upper bound; None where a run diverged or the bound is not known.
     """
 
     error: float | None
     ratio: float | None
+    typical: float | None
     upper: float | None
 
 
@@ -439,7 +440,7 @@ def _identification(context: Context) -> Identification:
             chosen.hybrid,
             chosen.reason,
             {
-                name: CandidateErrors(finite(c.error), finite(c.ratio), finite(c.upper))
+                name: CandidateErrors(*(finite(v) for v in (c.error, c.ratio, c.typical, c.upper)))
                 for name, c in chosen.candidates.items()
             },
         ),
