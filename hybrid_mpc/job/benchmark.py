@@ -49,7 +49,7 @@ from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 Array = NDArray[np.float64]
-SCHEMA = 3
+SCHEMA = 4
 MODEL_NOTE = "benchmark_model.json"
 CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 """What may be recommended, where it is trained."""
@@ -186,6 +186,7 @@ def benchmark(
 
 def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
     budgets = benchmark_of(scenario).budgets
+    scored_signals(scenario.prior().outputs, benchmark_of(scenario))  # refuses units of what is no output
     if settings.budget not in budgets:
         raise InputError(
             f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"

@@ -443,8 +443,8 @@ def _choice_table(results: Results) -> Table:
         "",
     )
     caption = (
-        f"Validation recordings. {choice.reason} A hybrid is recommended where both, its error over the prior's and the "
-        "bound, are below 1. In a typical recording: the geometric mean of each recording's ratio; with a single "
+        f"Validation recordings. {choice.reason} A hybrid is recommended where both, its error over the prior's and "
+        "the bound, are below 1. In a typical recording: the geometric mean of each recording's ratio; with a single "
         "recording the ratio itself. The bound holds with 95 %."
     )
     return Table(columns, rows, caption)
