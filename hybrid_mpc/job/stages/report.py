@@ -45,7 +45,7 @@ from hybrid_mpc.job.stages.results import (
     finite,
 )
 from hybrid_mpc.job.summary import Summary
-from hybrid_mpc.monitor.residuals import force_units
+from hybrid_mpc.monitor.residuals import force_unit
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 
@@ -198,7 +198,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "models": [_prior_table(context)],
         "free_run": [*_score_tables(context, results), _choice_table(results), _band_table(context, results)],
         "export": [_export_table(results.export)],
-        "control": [_control_table(results.control)],
+        "control": [_control_table(results.control), _tracking_table(results.control)],
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
         "monitor": [_alarm_table(context, results.monitor)],
@@ -503,11 +503,38 @@ def _control_table(control: Control) -> Table | None:
         costs = (_cost(cells.get(name)) for name in names)
         rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
     caption = (
-        "Closed-loop cost J on the true state: mean over seeds with its 95 % interval (none for one seed). Gap: "
+        "Closed-loop cost J on the true state: mean over seeds with its 95 % interval (none for one seed); squared "
+        "deviations of all signals, each times its weight in the control problem, which brings them to one scale. Gap: "
         "share of the distance from the better baseline to the measuring oracle that the hybrid with observer "
         "covers; a dash where baseline and oracle do not differ enough to say."
     )
     return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
+
+
+def _tracking_table(control: Control) -> Table | None:
+    """Tracking errors of every signal that has a reference, in its unit."""
+    if control.details is None:
+        return None
+    cells = [
+        (task, name, own[name])
+        for task, own in control.details.tasks.items()
+        for name in CONTROLLERS
+        if name in own
+    ]
+    signals = list(dict.fromkeys(s for *_, cell in cells for s in cell.tracking_rmse))
+    rows = [
+        (
+            task,
+            name.replace("_", ", "),
+            *(cell.tracking_rmse[s].mean if s in cell.tracking_rmse else None for s in signals),
+        )
+        for task, name, cell in cells
+    ]
+    caption = (
+        "Root mean square deviations from the reference, means over seeds: of true states, or of measured outputs "
+        "where references are theirs."
+    )
+    return Table(("task", "controller", *(f"RMSE of {s}" for s in signals)), rows, caption)
 
 
 def _cost(cell: Summary | None) -> str:
@@ -544,7 +571,7 @@ def _alarm_table(context: Context, monitor: Monitor) -> Table | None:
     if monitor.alarms is None or calibration is None:
         return None
     rows = [(a.file, a.start_s, a.end_s) for a in monitor.alarms]
-    unit = force_units(context.kit.models["prior"])[0]
+    unit = force_unit(context.kit.models["prior"])
     caption = (
         f"Alarms over the whole recordings; thresholds {calibration.threshold_w:.3g} W and "
         f"{calibration.residual_threshold:.3g} {unit}."
