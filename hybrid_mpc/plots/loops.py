@@ -146,7 +146,7 @@ def closed_loops(
     for ax, panel in zip(panels, shown, strict=False):
         if panel.reference is not None:
             ax.plot(t, panel.reference, **(line_style("reference") | {"zorder": 4}))
-        _bounds(ax, panel.bounds, f"limits of {'states' if panel.of == 'x' else 'outputs'}")
+        _bounds(ax, panel.bounds, "limits of outputs and states")
         ax.set_ylabel(axis_label(panel.signal))
     for ax, panel in zip(errors, tracked, strict=True):
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
