@@ -131,7 +131,13 @@ if TYPE_CHECKING:
     from hybrid_mpc.monitor.detector import Detector
     from hybrid_mpc.monitor.diagnose import Diagnoser
     from hybrid_mpc.monitor.energy import EnergyMonitor
-    from hybrid_mpc.monitor.innovations import ResidualLimits, ResidualMonitor, learn_residuals
+    from hybrid_mpc.monitor.explain import ResidualDiagnoser
+    from hybrid_mpc.monitor.innovations import (
+        ResidualLimits,
+        ResidualMonitor,
+        learn_residuals,
+        replay_residuals,
+    )
     from hybrid_mpc.monitor.learn import guard_monitor, learn_from
     from hybrid_mpc.monitor.lengths import rest_speeds
     from hybrid_mpc.monitor.replay import replay
@@ -196,6 +202,7 @@ __all__ = [
     "PriorStep",
     "Provenance",
     "RandomFaults",
+    "ResidualDiagnoser",
     "ResidualLimits",
     "ResidualMonitor",
     "Role",
@@ -290,6 +297,7 @@ __all__ = [
     "process_noise",
     "random_steps",
     "replay",
+    "replay_residuals",
     "rest_speeds",
     "run",
     "run_model",
@@ -400,7 +408,8 @@ _ROOMS = {
     "monitor.detector": ("Detector",),
     "monitor.diagnose": ("Diagnoser",),
     "monitor.energy": ("EnergyMonitor",),
-    "monitor.innovations": ("ResidualLimits", "ResidualMonitor", "learn_residuals"),
+    "monitor.explain": ("ResidualDiagnoser",),
+    "monitor.innovations": ("ResidualLimits", "ResidualMonitor", "learn_residuals", "replay_residuals"),
     "monitor.learn": ("guard_monitor", "learn_from"),
     "monitor.lengths": ("rest_speeds",),
     "monitor.replay": ("replay",),

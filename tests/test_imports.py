@@ -253,3 +253,32 @@ def test_closed_loop_runs_where_torch_cannot_be_imported(tmp_path, golf_artifact
     solved, error = done.stdout.split()
     assert int(solved) == 100  # every one of the 2 s / 20 ms steps
     assert float(error) < 0.1  # rad; an untrained network is the prior: it follows, roughly
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_help_and_version_load_nothing_that_computes(option):
+    """They answer at once: a command loads what it works with when it is called."""
+    script = (
+        "import sys; sys.argv = ['hybrid-mpc', sys.argv[1]]\n"
+        "from hybrid_mpc.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        "print('LOADED', *sorted({name.partition('.')[0] for name in sys.modules}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, option], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    told, _, loaded = done.stdout.partition("LOADED ")
+    assert "hybrid-mpc" in told or "reproduce" in told
+    heavy = {
+        "scipy",
+        "casadi",
+        "torch",
+        "pandas",
+        "matplotlib",
+        "control",
+        "dask",
+        "joblib",
+        "optuna",
+        "jinja2",
+    }
+    assert not heavy & set(loaded.split())

@@ -7,9 +7,10 @@ from machines import MachinePlant
 
 import hybrid_mpc as hm
 from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.job import monitor as monitor_job
 from hybrid_mpc.job.loops import LoopSpec, excess, limits_used, row_of
 from hybrid_mpc.job.tasks import repeated
-from hybrid_mpc.kit.artifact import loop_settings
+from hybrid_mpc.kit.artifact import loop_settings, set_residuals
 
 DT = 10.0
 
@@ -116,3 +117,90 @@ def test_a_task_of_outputs_is_repeated_without_speeds():
     way_back = twice.reference(np.linspace(100.0, 160.0, 7))[:, 0]
     assert np.all(np.diff(way_back) < 0)
     np.testing.assert_allclose(twice.w(np.array([50.0, 210.0, 140.0]))[:, 0], [5e-4, 5e-4, 1e-3])
+
+
+LIMITS = hm.ResidualLimits(
+    ("lower", "inflow", "free run of lower"), DT, ((2e-3, 1e-3), (2e-5, 2e-5), (4e-3, 3e-3)),
+    ((1e-3, 5e-4), (1e-5, 1e-5), (2e-3, 1.5e-3)), (5e-3,), (2,), 1.0, 1.0,
+)  # fmt: skip
+
+
+def test_limits_of_residuals_are_kept_and_make_the_monitor(kit, tmp_path):
+    prior = Tanks()
+    hm.save_artifact(
+        tmp_path, {"prior": prior_programs(prior, DT)}, hm.model_info(prior, DT), loop=kit.loop,
+        recommended="prior",
+    )  # fmt: skip
+    with pytest.raises(hm.InputError, match=r"residuals: no model 'hybrid'; there are: prior"):
+        set_residuals(tmp_path, {"hybrid": LIMITS})
+    set_residuals(tmp_path, {"prior": LIMITS})
+    learned = hm.load(tmp_path)
+    assert learned.residuals == {"prior": LIMITS}
+    for kind in ("", "guard", "residuals"):
+        assert learned.monitor(kind=kind).limits == LIMITS
+    assert learned.monitor(kind="own").limits is None
+    assert kit.monitor().limits is None  # nothing was learned
+    with pytest.raises(hm.InputError, match="holds no limits of residuals"):
+        kit.monitor(kind="guard")
+    with pytest.raises(hm.InputError, match="the outputs of model prior must be its positions"):
+        learned.monitor(kind="energy")
+
+
+def test_a_guard_listens_to_residuals_in_a_loop(kit):
+    """A level sensor that is off by 0.1 m from 300 s on: the alarm names it, and the guard goes over to rest."""
+    model = kit.models["prior"]
+    monitor = hm.ResidualMonitor(model, limits=LIMITS)
+    fault = hm.Fault(300.0, np.inf, "measurement_offset", 0.1, "lower")
+    result = hm.simulate(
+        MachinePlant(model), kit.observer(), kit.controller(), [0.3], dt=DT, duration=600.0, x0=model.x0, seed=0,
+        monitor=monitor, guard=hm.Guard(hm.Mode.REST, dwell=50.0, quiet=100.0), faults=(fault,),
+    )  # fmt: skip
+    assert not result.alarm[result.t < 300.0].any()
+    assert result.alarm[30]
+    (first, *_) = result.switches
+    assert (first.t, first.after.name) == (310.0, "REST")
+    assert first.why.startswith("the model does not describe the machine: lower")
+    np.testing.assert_array_equal(result.u[31:40], 5e-5)
+
+
+def test_recordings_are_watched_by_their_channels(kit, tmp_path):
+    """The command's way: learn from one recording, watch another whose sensor is off, read what it says."""
+    model, rng = kit.models["prior"], np.random.default_rng(3)
+    for name, off in (("calm", 0.0), ("off", 0.05)):
+        plant, x, u, rows = MachinePlant(model, sigma=1e-3), model.x0, 2e-4, []
+        for k in range(300):
+            if k % 15 == 0:
+                u = float(rng.uniform(1e-4, 3e-4))
+            y = float(plant.measure(x, rng)[0]) + (off if k >= 200 else 0.0)
+            w = 5e-5 + 1e-6 * rng.normal()
+            rows.append((DT * k, u, y, w))
+            x = plant.step(x, np.array([u]), DT, np.array([w]))
+        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header="t,pump,lower,inflow", comments="")
+    folder = tmp_path / "model"
+    prior = Tanks()
+    hm.save_artifact(
+        folder,
+        {"prior": prior_programs(prior, DT)},
+        hm.model_info(prior, DT),
+        loop=kit.loop,
+        recommended="prior",
+    )
+    job = monitor_job.prepared(SCENARIO, folder, [tmp_path / "calm.csv"])
+    limits = monitor_job.learn(job, 1.0, tmp_path)
+    job = monitor_job.prepared(
+        SCENARIO, folder, [tmp_path / "off.csv"], calibration=tmp_path / "calibration.json"
+    )
+    assert job.limits == limits
+    out = tmp_path / "out"
+    out.mkdir()
+    (row,) = monitor_job.watch(job, out).recordings
+    (first, *_) = row.alarms
+    assert 2000.0 <= first.start_s <= 2000.0 + 3 * DT
+    assert "lower" in first.channels
+    assert "of lower" in first.diagnosis
+    text = (out / "off.csv").read_text().splitlines()
+    assert len(text) == 1 + len(job.data.whole[0].t)
+    assert "free_run_of_lower_short_m" in text[0]
+    assert (out / "off.png").is_file()
+    with pytest.raises(hm.InputError, match="holds no detector"):
+        monitor_job.read_detector(tmp_path / "calibration.json")

@@ -44,7 +44,7 @@ def control(
     seeds: Annotated[int, typer.Option(help="Loops of each task and controller.", min=1)] = 10,
     seed: Annotated[int, typer.Option(help="Seed of the loops.", min=0, max=MOST_SEED)] = 0,
     fault: Annotated[
-        list[str] | None, typer.Option(help="TARGET=VALUE@START:END in every loop; may be repeated.")
+        list[str] | None, typer.Option(help="TARGET:CHANNEL=VALUE@START:END in every loop; may be repeated.")
     ] = None,
     guard: Annotated[
         bool,

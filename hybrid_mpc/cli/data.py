@@ -6,17 +6,17 @@ import csv
 import inspect
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
-from hybrid_mpc.data.differentiate import LocalPolynomial
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import check_folder, write_text
 from hybrid_mpc.records import MOST_SEED
-from hybrid_mpc.scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from hybrid_mpc.scenario import Scenario
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -33,6 +33,8 @@ def data(
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
 ) -> None:
     """Write a simulated machine's recordings as CSV or npz files, with a README on units, sampling and roles."""
+    from hybrid_mpc.scenario import load_scenario
+
     files = write_data(load_scenario(scenario), out, seed, budget, data_set)
     print(f"{len(files)} recordings and README.md in {out.resolve()}")
 
@@ -63,6 +65,8 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
 
 def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
     """What a reader of ``files`` must know, and the ``command`` that wrote them; sampling as it is in the files."""
+    from hybrid_mpc.data.differentiate import LocalPolynomial
+
     spec, prior = scenario.data, scenario.prior()
     signals = [*zip(spec.inputs, prior.inputs, strict=True), *zip(spec.outputs, prior.outputs, strict=True)]
     period, spread = _sampling(files, spec.time)
@@ -105,6 +109,8 @@ def _role(scenario: Scenario, path: Path) -> str:
 
 def _sampling(files: Sequence[Path], column: str | float) -> tuple[float, float]:
     """Median period of the files, and the time stamps' standard deviation around whole periods [s]."""
+    import numpy as np
+
     if not isinstance(column, str):
         return column, 0.0
     times = []

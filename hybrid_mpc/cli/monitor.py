@@ -1,4 +1,4 @@
-"""``hybrid-mpc monitor``: the energy monitor over recordings."""
+"""``hybrid-mpc monitor``: what watches a machine, over recordings of it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import typer
 
 from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.scenario import scenario_of
 
 if TYPE_CHECKING:
     from hybrid_mpc.job.monitor import MonitorJob, MonitorResult, RecordingResult
@@ -32,11 +31,21 @@ def monitor(
     ] = "",
     learn: Annotated[
         float,
-        typer.Option(help="The recordings are nominal: learn a detector for so many false alarms an hour."),
+        typer.Option(
+            help="The recordings are nominal: learn what to alarm by, for so many false alarms an hour."
+        ),
     ] = 0.0,
     calibration: Annotated[
-        Path | None, typer.Option(help="calibration.json with a detector. Default: the model's own.")
+        Path | None,
+        typer.Option(help="calibration.json with a detector or limits. Default: the model's own."),
     ] = None,
+    residuals: Annotated[
+        bool,
+        typer.Option(
+            "--residuals",
+            help="Watch the residuals of outputs and balances of a mechanical machine, too, in place of its energy.",
+        ),
+    ] = False,
     resolution: Annotated[
         list[float] | None,
         typer.Option(
@@ -53,6 +62,7 @@ def monitor(
     from hybrid_mpc.job.monitor import learn as learn_job
     from hybrid_mpc.job.monitor import prepared, watch
     from hybrid_mpc.kit.artifact import FILE, artifact_folder, read_description
+    from hybrid_mpc.scenario import scenario_of
 
     check_folder(out)
     folder = artifact_folder(model)
@@ -61,7 +71,7 @@ def monitor(
         raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
     job = prepared(
         machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
-        calibration=None if learn else calibration,
+        calibration=None if learn else calibration, residuals=residuals,
     )  # fmt: skip
     for finding in job.data.findings:
         print(f"warning: {finding}")
@@ -69,7 +79,9 @@ def monitor(
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)
         line = f"learned from {60 * found.hours:.1f} min, for {found.false_alarms_per_hour:g} false alarms an hour"
-        print_summary([line], out / "calibration.json", "detector")
+        if not getattr(found, "rated", True):
+            line = f"learned from {60 * found.hours:.1f} min: {found.method}"
+        print_summary([line], out / "calibration.json", "detector" if job.energy else "limits")
         return
     print(watching(job))
     with make_progress() as progress:
@@ -81,6 +93,16 @@ def monitor(
 
 def watching(job: MonitorJob) -> str:
     """What decides on alarms, in a line."""
+    if not job.energy:
+        if job.limits is None:
+            return (
+                "the artifact holds no limits of residuals: nothing alarms but a monitor without valid readings (see "
+                "--learn)"
+            )
+        return (
+            f"watched by residuals of {', '.join(job.limits.channels)}; limits learned from "
+            f"{60 * job.limits.hours:.1f} min, {job.limits.method}"
+        )
     detector, calibration = job.detector, job.monitor.calibration
     if detector is not None:
         return (
@@ -106,7 +128,8 @@ def summary(result: MonitorResult) -> list[str]:
         lines.append(f"{row.recording}: {row.seconds:.1f} s, {n} alarm{'' if n == 1 else 's'}{_invalid(row)}")
         for alarm in row.alarms:
             why = f": {alarm.diagnosis}" if alarm.diagnosis else ""
-            lines.append(f"  {alarm.start_s:.2f} to {alarm.end_s:.2f} s{why}")
+            of = f" ({', '.join(alarm.channels)})" if alarm.channels else ""
+            lines.append(f"  {alarm.start_s:.2f} to {alarm.end_s:.2f} s{of}{why}")
     for what, cuts in (("gap", result.gaps), ("not watched", result.not_watched)):
         lines += [f"{what} in {cut.file}: {cut.start:.2f} to {cut.end:.2f} s, {cut.why}" for cut in cuts]
     return lines

@@ -12,7 +12,7 @@ from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordin
 from hybrid_mpc.records import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.stages.results import Guard, Identification, Results
+    from hybrid_mpc.job.stages.results import Guard, Identification, Residuals, Results
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -65,9 +65,9 @@ def run(
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
 
-    The stages are data, prior, training, choice, evaluation, export, noise, control, estimation, monitor, guard,
-    analysis and report. With --resume a stage runs again only where something that it reads has changed. Exit code 1
-    if a stage after the export could not run; the report then says why.
+    The stages are data, prior, training, choice, evaluation, export, noise, control, estimation, residuals, monitor,
+    guard, analysis and report. With --resume a stage runs again only where something that it reads has changed. Exit
+    code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.run import failed_stages
@@ -101,6 +101,7 @@ def summary(results: Results) -> list[str]:
             lines.append(
                 f"closed loop, {name:8} cost {loop.cost:.4g}, tracking {tracking(loop.tracking_rmse)}"
             )
+    lines += residual_lines(results.residuals)
     if results.monitor.alarms is None:
         lines.append(f"energy monitor: {results.monitor.reason}")
     return lines + guard_lines(results.guard)
@@ -145,6 +146,21 @@ def tracking(errors: Mapping[str, float]) -> str:
     """
     split = ((*label.removesuffix("]").split(" [", 1), value) for label, value in errors.items())
     return ", ".join(f"{name} {value:.4g} {unit}" for name, unit, value in split)
+
+
+def residual_lines(found: Residuals) -> list[str]:
+    """What the run says of its monitor of residuals."""
+    if found.alarms is None:
+        return [f"monitor of residuals: {found.reason}"]
+    lines = [
+        f"monitor of residuals: learned from {found.details.source}; {len(found.alarms)} alarms on recordings"
+    ]
+    for row in found.faults or ():
+        seen = "never seen" if row.delay_s is None else f"seen after {row.delay_s:.3g} s in {row.channels[0]}"
+        lines.append(
+            f"  {row.fault} of {row.channel}: {seen}" + (f": {row.diagnosis}" if row.diagnosis else "")
+        )
+    return lines
 
 
 def guard_lines(guard: Guard) -> list[str]:

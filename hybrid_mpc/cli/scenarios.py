@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from hybrid_mpc.scenario import load_scenario, registered_scenarios
-
 
 def scenarios() -> None:
     """List the registered scenarios and what each needs."""
+    from hybrid_mpc.scenario import load_scenario, registered_scenarios
+
     for name in registered_scenarios():
         scenario = load_scenario(name)
         needs = "makes its own data" if scenario.make_data else "needs --data FILE.csv"

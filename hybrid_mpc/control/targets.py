@@ -125,10 +125,12 @@ class Targets:
         w = m.w if w is None else vector(w, m.n_w, "w")
         u = np.clip(m.u0, self._ocp.u_min, self._ocp.u_max)
         best: Steady | None = None
-        starts = [] if start is None else [(start.x, start.h, start.u)]
-        for x0, h0, u0 in (*starts, (m.x0, hidden_fixed_point(m, m.x0, u, w=w), u)):
+        for given in (start, None) if start is not None else (None,):
+            # the operating point's hidden state may take a thousand steps to settle: asked for where it is needed
+            h0 = hidden_fixed_point(m, m.x0, u, w=w) if given is None else given.h
+            first = (m.x0, h0, u) if given is None else (given.x, h0, given.u)
             for bounded in (True, False):
-                found = self._descend(np.concatenate([x0, h0, u0]), goal, d, w, bounded)
+                found = self._descend(np.concatenate(first), goal, d, w, bounded)
                 if found.steady:
                     return found
                 best = best or found

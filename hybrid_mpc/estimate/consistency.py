@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
-from hybrid_mpc.estimate.tuning import Recording
+from hybrid_mpc.estimate.tuning import Recording, surroundings
 
 Array = NDArray[np.float64]
 LEVEL = 0.95
@@ -124,14 +124,16 @@ def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Inno
             f"consistency: y {recording.y.shape} and u {recording.u.shape} given; needed: (n, {n_y}) and "
             f"(n, {estimator.model.n_u}) with n > 0"
         )
-    estimate = estimator.start(recording.y[0])
+    ws = surroundings(estimator.model, recording)
+    estimate = estimator.start(recording.y[0], w=ws[0])
     rows: list[Array] = []
     nis: list[float] = []
     degrees: list[int] = []
     for k in range(1, n):
         u, y = recording.u[k - 1], recording.y[k]
-        s = estimator.innovation_covariance(estimator.predict(estimate, u), u)
-        estimate = estimator.update(estimate, y, u)
+        ahead = estimator.measuring(estimator.predict(estimate, u), ws[k])
+        s = estimator.innovation_covariance(ahead, u)
+        estimate = estimator.update(estimate, y, u, w=ws[k])
         whole = bool(np.all(np.isfinite(estimate.innovation)) and np.all(np.isfinite(s)))
         normalised = (
             np.linalg.solve(np.linalg.cholesky(s), estimate.innovation) if whole else np.full(n_y, np.nan)

@@ -149,6 +149,12 @@ class SwitchingFilter:
             return self.start(y, modes[0].t, w=modes[0].w)
         return self._assessed(modes, probability, y, u_prev)[0]
 
+    def measuring(self, predicted: Estimate, w: ArrayLike | None) -> SwitchingEstimate:
+        """The prediction with the disturbances ``w`` ``(n_w,)`` that were measured at its instant."""
+        before = self._own(predicted)
+        modes = [f.measuring(e, w) for f, e in zip(self.filters, before.modes, strict=True)]
+        return _together(modes, before.probability, predicted.innovation, predicted.nis)
+
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
         if not isinstance(estimate, SwitchingEstimate) or len(estimate.modes) != len(self.filters):
             raise InputError("SwitchingFilter goes on from its own estimates only; begin with start()")

@@ -29,6 +29,10 @@ class Recording(Protocol):
     def y(self) -> Array:
         """Measurements ``(n, n_y)``."""
 
+    @property
+    def w(self) -> Array:
+        """Measured disturbances ``(n, n_w)``."""
+
 
 class Known(Recording, Protocol):
     """A recording with known states, e.g. smoothed ones."""
@@ -36,6 +40,21 @@ class Known(Recording, Protocol):
     @property
     def x(self) -> Array:
         """States ``(n, n_x)``."""
+
+
+def surroundings(model: HybridModel, recording: Recording) -> Array:
+    """Measured disturbances of a recording ``(n, n_w)``; none where the model has none.
+
+    Raises:
+        InputError: If it has others than the model.
+    """
+    n = len(recording.u)
+    if not model.n_w:
+        return np.zeros((n, 0))
+    w: Array = np.asarray(recording.w, dtype=np.float64)
+    if w.shape != (n, model.n_w):
+        raise InputError(f"recording: measured disturbances {w.shape} given, needed: {(n, model.n_w)}")
+    return w
 
 
 def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4000) -> Array:
@@ -56,10 +75,10 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
     """
     errors: list[Array] = []
     for recording in recordings:
-        h = np.zeros(model.n_h)
+        h, ws = np.zeros(model.n_h), surroundings(model, recording)
         for k in range(len(recording.u) - 1):
             x_next, h = (
-                m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], model.w, model.p)
+                m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], ws[k], model.p)
             )
             if k >= model.delay_states:  # before, the inputs under way are unknown
                 errors.append(x_next - recording.x[k + 1])
@@ -81,9 +100,10 @@ def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> f
 
     Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
     """
-    estimate, total = estimator.start(recording.y[0]), 0.0
+    ws = surroundings(estimator.model, recording)
+    estimate, total = estimator.start(recording.y[0], w=ws[0]), 0.0
     for k in range(1, len(recording.y)):
-        ahead = estimator.predict(estimate, recording.u[k - 1])
+        ahead = estimator.measuring(estimator.predict(estimate, recording.u[k - 1]), ws[k])
         estimate, likelihood = estimator.assess(ahead, recording.y[k], recording.u[k - 1])
         if k >= skip:
             total += likelihood

@@ -34,20 +34,13 @@ class CandidateFigures:
 
     Args:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
-        ratio: That over the prior's [-].
-        typical: Where recordings are compared, the geometric mean of each one's ratio [-]; else ``ratio``.
-        upper: Upper bound of ``typical`` with a probability of ``CONFIDENCE`` [-].
+        ratio: That over the prior's [-]; of several recordings the geometric mean of each one's.
+        upper: Upper bound of the ratio with a probability of ``CONFIDENCE`` [-].
     """
 
     error: float
     ratio: float
-    typical: float
     upper: float
-
-    @property
-    def sure(self) -> bool:
-        """Whether it surely beats the prior: over all runs together, and by the bound."""
-        return self.ratio < CONFIDENT and self.upper < CONFIDENT
 
 
 @dataclass(frozen=True)
@@ -81,11 +74,11 @@ def recommend(
 ) -> Choice:
     """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
 
-    The ratio of a hybrid's error to the prior's is that of their root mean squares over all runs. With ``RECORDINGS``
-    or more the bound is that of the mean of the logarithms of each recording's ratio: another recording may be like any
-    of these, so a single one in which the prior is far off does not outweigh the others. A hybrid is sure where both,
-    the ratio over all runs and the bound, are below ``CONFIDENT``. Within a single recording
-    the scatter is found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
+    The ratio of a hybrid's error to the prior's is the geometric mean of each recording's where there are
+    ``RECORDINGS`` or more, and its bound is that of the mean of the logarithms: another recording may be like any of
+    these, so a single one in which the prior is far off does not outweigh the others. Over all runs together the hybrid
+    must be the better one as well. Within a single recording the ratio is that of the root mean squares; its scatter is
+    found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
 
     Args:
         errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
@@ -124,9 +117,14 @@ def recommend(
     figures = {name: _figures(own, sums[prior], sizes, whole) for name, own in sums.items()}
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)
-    safe = [name for name in hybrids if figures[name].sure]
+    safe = [
+        name
+        for name in hybrids
+        if figures[name].upper < CONFIDENT and figures[name].error < figures[prior].error
+    ]
     chosen = min(safe, key=lambda name: figures[name].error, default=prior)
-    reason = _reason(figures, best, chosen, prior, len(sizes), whole)
+    of_what = "recordings, their geometric mean" if whole else "block" if len(sizes) == 1 else "blocks"
+    reason = _reason(figures, best, chosen, prior, f"{len(sizes)} {of_what}")
     if deploy and deploy != chosen:
         reason = f"{deploy} is deployed as asked for. {reason}"
     return Choice(
@@ -134,20 +132,16 @@ def recommend(
     )
 
 
-def _reason(
-    figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: int, whole: bool
-) -> str:
+def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str) -> str:
     if best == prior:
         return "There is no hybrid to compare with the fitted prior."
     if not math.isfinite(figures[best].error):
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
     own = figures[best if chosen == prior else chosen]
     bound = f"at most {own.upper:.2f}" if math.isfinite(own.upper) else "without a bound"
-    said = f"its validation error is {own.ratio:.2f} of the prior's"
-    if whole:
-        said += f", in a typical one of {blocks} recordings {own.typical:.2f} ({bound})"
-    else:
-        said += f" ({bound}, {blocks} block{'s' if blocks > 1 else ''})"
+    said = f"its validation error is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
+    if chosen == prior and own.upper < CONFIDENT:
+        said += ", but over all of them together the prior's is no larger"
     if chosen == prior:
         return f"The fitted prior is recommended: {best} does not surely beat it; {said}."
     return f"{chosen} is recommended: {said}."
@@ -173,20 +167,19 @@ def _figures(own: Array, prior: Array, sizes: Array, whole: bool) -> CandidateFi
     n = len(sizes)
     error = math.sqrt(float(own.sum()) / float(sizes.sum())) if np.isfinite(own).all() else math.inf
     if not math.isfinite(error):
-        return CandidateFigures(math.inf, math.inf, math.inf, math.inf)
+        return CandidateFigures(math.inf, math.inf, math.inf)
     if own is prior:
-        return CandidateFigures(error, 1.0, 1.0, 1.0)
+        return CandidateFigures(error, 1.0, 1.0)
     if not np.isfinite(prior).all():
-        return CandidateFigures(error, 0.0, 0.0, 0.0)
+        return CandidateFigures(error, 0.0, 0.0)
     ratio = float(np.sqrt(own.sum() / max(float(prior.sum()), 1e-300)))
     if n < 2:
-        return CandidateFigures(error, ratio, ratio, math.inf)
+        return CandidateFigures(error, ratio, math.inf)
     if whole:
         each = 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
-        middle = float(each.mean())
-        most = middle + float(student.ppf(CONFIDENCE, n - 1)) * float(each.std(ddof=1)) / math.sqrt(n)
-        return CandidateFigures(error, ratio, *(math.exp(min(value, 700.0)) for value in (middle, most)))
+        most = float(each.mean() + student.ppf(CONFIDENCE, n - 1) * each.std(ddof=1) / math.sqrt(n))
+        return CandidateFigures(error, math.exp(float(each.mean())), math.exp(min(most, 700.0)))
     without = 0.5 * np.log(np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300))
     scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
     bound = math.log(max(ratio, 1e-300)) + float(student.ppf(CONFIDENCE, n - 1)) * scatter
-    return CandidateFigures(error, ratio, ratio, math.exp(min(bound, 700.0)))
+    return CandidateFigures(error, ratio, math.exp(min(bound, 700.0)))

@@ -49,7 +49,7 @@ from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 
 Array = NDArray[np.float64]
-SCHEMA = 4
+SCHEMA = 3
 MODEL_NOTE = "benchmark_model.json"
 CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
 """What may be recommended, where it is trained."""

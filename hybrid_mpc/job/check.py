@@ -460,7 +460,8 @@ def _check_task(
             _check_within("x0", np.array([task.x0]), np.zeros(1), prior.states)
     if plant is not None:
         with report.part(what):
-            check_channels(install(plant, task.faults)[1], len(prior.outputs), len(prior.inputs))
+            names = ([s.name for s in signals] for signals in (prior.outputs, prior.inputs))
+            check_channels(install(plant, task.faults)[1], *names)
     if not (math.isfinite(task.duration) and task.duration >= dt):
         report.add(f"{what}: duration must be at least a period of {dt} s and finite, got {task.duration}")
         return

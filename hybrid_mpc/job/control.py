@@ -22,20 +22,22 @@ from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import Provenance
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.innovations import ResidualLimits
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
 
 Array = NDArray[np.float64]
 NOUN = "control"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 
 @dataclass(frozen=True)
 class FaultNote:
-    """A fault that all loops had."""
+    """A fault that all loops had; ``channel`` is empty where there is only one."""
 
     target: str
     value: float
+    channel: str
     start_s: float
     end_s: float
 
@@ -59,7 +61,8 @@ class FilterNoise:
 class ControlResults:
     """What ``results.json`` of ``hybrid-mpc control`` holds (docs/control.md): what was run, every loop, and means.
 
-    ``guard`` is the detector where a guard reacts, ``reaction`` what it does; ``step_ms`` are percentiles of the
+    ``guard`` is the detector where a guard reacts, ``residuals`` the limits of residuals, of which it hears where the
+    energy cannot be watched, ``reaction`` what it does; ``step_ms`` are percentiles of the
     durations of steps by controller, ``summary`` is by task and controller.
     """
 
@@ -73,6 +76,7 @@ class ControlResults:
     seed: int
     faults: tuple[FaultNote, ...]
     guard: Detector | None
+    residuals: ResidualLimits | None
     reaction: str
     model: Origin
     noise: FilterNoise
@@ -150,8 +154,9 @@ def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[Loop
         tasks=tuple(dict.fromkeys(row.task for row in rows)),
         seeds=len(study.loop_seeds),
         seed=study.run_seed,
-        faults=tuple(FaultNote(f.target, f.value, f.start, f.end) for f in faults),
-        guard=kit.detector() if study.guard else None,
+        faults=tuple(FaultNote(f.target, f.value, f.channel, f.start, f.end) for f in faults),
+        guard=kit.calibration.detector if study.guard and kit.calibration is not None else None,
+        residuals=kit.residuals.get("hybrid") if study.guard else None,
         reaction=study.guard,
         model=Origin(kit.provenance),
         noise=FilterNoise(model.noise_source, {name: tuple(kit.noise(name).tolist()) for name in filters}),

@@ -22,7 +22,6 @@ from hybrid_mpc.job.tasks import repeated, tasks_of
 from hybrid_mpc.kit.artifact import WATCHES, Kit
 from hybrid_mpc.kit.assembly import (
     SOLVERS,
-    energy_is_watched,
     make_adaptive_guard,
     make_backup_guard,
     make_resting_guard,
@@ -46,7 +45,7 @@ MODEL = "model"
 """Label of the model on the bench where there is one."""
 MONITORS = (*WATCHES, "none")
 """What watches a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`; or nothing does."""
-ALARMING = ("energy", "guard")
+ALARMING = ("energy", "guard", "residuals")
 """Monitors that alarm."""
 GUARDS = ("", "rest", "adapt", "prior")
 """What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
@@ -347,16 +346,10 @@ class Bench:
         return self._built[key]
 
     def monitor(self, spec: LoopSpec) -> EnergyMonitor | ResidualMonitor | None:
-        """What watches the loop of a specification; refused if the model lacks what it needs.
-
-        ``"own"``, which only records, is of residuals where the model's energy cannot be watched.
-        """
+        """What watches the loop of a specification; refused if the model lacks what it needs."""
         if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
             return None
-        kit = self.kit(spec)
-        if spec.monitor == "own" and not energy_is_watched(kit.models["hybrid"]):
-            return ResidualMonitor(kit.models["hybrid"])
-        return kit.monitor("hybrid", kind=spec.monitor, task=spec.task)
+        return self.kit(spec).monitor("hybrid", kind=spec.monitor, task=spec.task)
 
     def guard(self, spec: LoopSpec) -> Guard | None:
         """What an alarm does in the loop of a specification; None: nothing. Refused if the model lacks its parts."""
@@ -650,9 +643,8 @@ def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
             )
 
 
-def check_faults(scenario: Scenario, faults: Sequence[Fault]) -> None:
-    """Refuse faults that the machine cannot show."""
+def check_faults(scenario: Scenario, faults: Sequence[Fault], model: HybridModel) -> None:
+    """Refuse faults that the machine, whose signals a ``model`` names, cannot show."""
     assert scenario.plant is not None
-    assert scenario.control is not None
     outside = install(scenario.plant(), faults)[1]
-    check_channels(outside, len(scenario.sensor_sigma), scenario.control.n_u)
+    check_channels(outside, [s.name for s in model.outputs], [s.name for s in model.inputs])

@@ -1,4 +1,4 @@
-"""``hybrid-mpc monitor``: the energy monitor over recordings, or a detector learned from them."""
+"""``hybrid-mpc monitor``: what watches a machine over recordings of it, or what it alarms by learned from them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,20 @@ from hybrid_mpc.files import read_object, write_json, write_text
 from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.controllers import find_noise
 from hybrid_mpc.kit.artifact import Kit, artifact_folder, load
-from hybrid_mpc.kit.assembly import make_monitor, sensor_steps
+from hybrid_mpc.kit.assembly import energy_is_watched, make_monitor, sensor_steps
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnose import Diagnoser
 from hybrid_mpc.monitor.energy import EnergyMonitor, Validity
+from hybrid_mpc.monitor.explain import ResidualDiagnoser
+from hybrid_mpc.monitor.innovations import (
+    ResidualLimits,
+    ResidualMonitor,
+    ResidualTrace,
+    learn_residuals,
+    replay_residuals,
+)
 from hybrid_mpc.monitor.learn import guard_monitor, learn_from
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, along, replay
@@ -44,13 +52,14 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm from its first to its last sample [s] in the recording's own time, and what explains it, if anything
-    can.
+    """An alarm from its first to its last sample [s] in the recording's own time, what explains it, if anything can,
+    and of the residuals the channels that alarmed, in the order in which they did.
     """
 
     start_s: float
     end_s: float
     diagnosis: str
+    channels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -79,24 +88,48 @@ class MonitorResult:
 
 @dataclass(frozen=True)
 class MonitorJob:
-    """What ``hybrid-mpc monitor`` needs: kit, recordings, the step of each sensor, and a detector, or None for the
-    artifact's thresholds.
+    """What ``hybrid-mpc monitor`` needs.
+
+    Args:
+        kit: The models, and what was learned with them.
+        data: The recordings.
+        resolution: Step of each sensor. Default: unknown.
+        detector: Detector of the energy. Default: none, then the artifact's thresholds.
+        energy: Whether the energy is watched; else the residuals. Default: yes.
+        limits: Limits of the residuals. Default: none.
     """
 
     kit: Kit
     data: Dataset
     resolution: tuple[float, ...] | None = None
     detector: Detector | None = None
+    energy: bool = True
+    limits: ResidualLimits | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the model that is compared with the machine: of the energy the hybrid, else the recommended one."""
+        return "hybrid" if self.energy else self.kit.recommended
+
+    @property
+    def model(self) -> HybridModel:
+        """That model."""
+        return self.kit.models[self.name]
 
     @property
     def estimator(self) -> EstimatorLike:
         """The estimator of the closed loops."""
-        return self.kit.observer("hybrid")
+        return self.kit.observer(self.name)
+
+    @property
+    def residuals(self) -> ResidualMonitor:
+        """The monitor of the residuals."""
+        return ResidualMonitor(self.model, limits=self.limits, resolution=self.resolution)
 
     @property
     def monitor(self) -> EnergyMonitor:
         """The guard's monitor where there is a detector, else that of the main job with the artifact's thresholds."""
-        model = self.kit.models["hybrid"]
+        model = self.model
         if self.detector is not None:
             known, ranges = model.n_p > 0, self.kit.problem().input_range
             return guard_monitor(
@@ -112,12 +145,14 @@ def prepared(
     *,
     resolution: tuple[float, ...] | None = None,
     calibration: Path | None = None,
+    residuals: bool = False,
 ) -> MonitorJob:
     """Load and check everything.
 
     ``model`` is an artifact's folder or its run's. The ``resolution`` is the step of each sensor; default: with a
-    detector what the filters' assumed noise comes to, as in the main job. ``calibration`` is a ``calibration.json``
-    with a detector; default: the artifact's, if it has one.
+    detector what the filters' assumed noise comes to, as in the main job, else the limits of the residuals know it.
+    ``calibration`` is a ``calibration.json`` with a detector, or limits of residuals; default: the artifact's, if it
+    has them. ``residuals``: watch these where the energy can be watched, too.
 
     Raises:
         InputError: If the scenario defines no control problem, a file is bad, or things do not fit each other.
@@ -129,7 +164,8 @@ def prepared(
         )
     folder = artifact_folder(model)
     kit = load(folder).on(scenario)
-    hybrid = kit.models["hybrid"]
+    hybrid = kit.models.get("hybrid", kit.models[kit.recommended])
+    energy = not residuals and energy_is_watched(hybrid)
     if abs(hybrid.dt - scenario.data.dt) > 1e-9:
         raise InputError(
             f"the model's period is {hybrid.dt} s, scenario {scenario.name} resamples to {scenario.data.dt} s"
@@ -145,7 +181,11 @@ def prepared(
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
         raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
-    kit = kit.with_noise(find_noise(scenario, kit, ("hybrid_observer",), 0)[0])
+    watched = "hybrid" if energy else kit.recommended
+    kit = kit.with_noise(find_noise(scenario, kit, (f"{watched}_observer",), 0)[0])
+    if not energy:
+        limits = kit.residuals.get(watched) if calibration is None else read_limits(calibration)
+        return MonitorJob(kit, data, resolution, None, False, limits)
     if calibration is not None:
         found: Detector | None = read_detector(calibration)
     else:
@@ -163,10 +203,32 @@ def read_detector(path: Path) -> Detector:
     return record(Detector, stored["detector"], f"{path}: detector")
 
 
-def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = None) -> Detector:
-    """Learn a detector for ``rate`` false alarms an hour from nominal recordings; writes ``calibration.json``."""
-    model, say = job.kit.models["hybrid"], progress or Progress()
+def read_limits(path: Path) -> ResidualLimits:
+    """The limits of residuals in a ``calibration.json`` that :func:`learn` wrote; InputError if there are none."""
+    stored = read_object(path)
+    if stored.get("residuals") is None:
+        raise InputError(
+            f"{path} holds no limits of residuals; make them with hybrid-mpc monitor ... --learn 1"
+        )
+    return record(ResidualLimits, stored["residuals"], f"{path}: residuals")
+
+
+def learn(
+    job: MonitorJob, rate: float, out: Path, progress: Progress | None = None
+) -> Detector | ResidualLimits:
+    """Learn for ``rate`` false alarms an hour from nominal recordings: a detector of the energy, or limits of the
+    residuals; writes ``calibration.json``.
+    """
+    model, say = job.model, progress or Progress()
     say.start("replaying the recordings")
+    if not job.energy:
+        limits = learn_residuals(
+            model, job.estimator, job.data.whole, false_alarms_per_hour=rate,
+            on_progress=lambda done, total: say.update("recordings", done, total, "samples"),
+        )  # fmt: skip
+        say.finish("")
+        write_json(out / "calibration.json", {"residuals": plain(limits)})
+        return limits
     detector = learn_from(
         model, job.estimator, job.data.whole, false_alarms_per_hour=rate, rest_speed=job.kit.rest_speed,
         data_hash=job.data.hash, report=say.update,
@@ -178,10 +240,55 @@ def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = N
 
 def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> MonitorResult:
     """Replay the monitor over each recording: ``NAME.csv`` and ``NAME.png``, and last ``monitor.json``."""
+    progress = progress or Progress()
+    rows, how = (_watch_energy if job.energy else _watch_residuals)(job, out, progress)
+    gaps, short = ([cut for cut in job.data.cuts if ("gap" in cut.why) is gap] for gap in (True, False))
+    result = {
+        "recordings": plain(rows),
+        "warnings": [str(finding) for finding in job.data.findings],
+        "gaps": [cut._asdict() for cut in gaps],
+        "not_watched": [cut._asdict() for cut in short],
+        **how,
+        "data_hash": job.data.hash,
+    }
+    write_json(out / "monitor.json", result)
+    return MonitorResult(tuple(rows), tuple(gaps), tuple(short))
+
+
+def _watch_residuals(
+    job: MonitorJob, out: Path, progress: Progress
+) -> tuple[list[RecordingResult], dict[str, Any]]:
+    """What the residuals say of each recording, and what they alarm by."""
+    from hybrid_mpc.plots.monitor import channels
+    from hybrid_mpc.plots.style import save
+
+    rows, monitor, limits = [], job.residuals, job.limits
+    progress.start("replaying the recordings")
+    for recording, report in along(job.data.whole, progress.update):
+        trace, alarms = explained_residuals(
+            monitor, job.estimator, recording, job.kit.models.get("prior"), job.kit.causes, report
+        )
+        seconds = len(trace.t) * recording.dt
+        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
+        name = recording.name.replace("#", "_")
+        write_text(out / f"{name}.csv", residual_table(trace, recording, monitor))
+        figure = channels(
+            trace, monitor.units, None if limits is None else limits.threshold,
+            notes=[(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis], title=name,
+        )  # fmt: skip
+        save(figure, out / f"{name}.png")
+    progress.finish("")
+    return rows, {"residuals": plain(limits)}
+
+
+def _watch_energy(
+    job: MonitorJob, out: Path, progress: Progress
+) -> tuple[list[RecordingResult], dict[str, Any]]:
+    """What the energy says of each recording, and what it alarms by."""
     from hybrid_mpc.plots.monitor import overview
     from hybrid_mpc.plots.style import save
 
-    rows, progress, model = [], progress or Progress(), job.kit.models["hybrid"]
+    rows, model = [], job.model
     calibration = job.monitor.calibration
     limits = {}
     if calibration is not None:
@@ -200,18 +307,7 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
         )  # fmt: skip
         save(figure, out / f"{name}.png")
     progress.finish("")
-    gaps, short = ([cut for cut in job.data.cuts if ("gap" in cut.why) is gap] for gap in (True, False))
-    result = {
-        "recordings": plain(rows),
-        "warnings": [str(finding) for finding in job.data.findings],
-        "gaps": [cut._asdict() for cut in gaps],
-        "not_watched": [cut._asdict() for cut in short],
-        "detector": plain(job.detector),
-        "thresholds": plain(calibration),
-        "data_hash": job.data.hash,
-    }
-    write_json(out / "monitor.json", result)
-    return MonitorResult(tuple(rows), tuple(gaps), tuple(short))
+    return rows, {"detector": plain(job.detector), "thresholds": plain(calibration)}
 
 
 def watched(
@@ -266,6 +362,51 @@ def explained(
     )
 
 
+def explained_residuals(
+    monitor: ResidualMonitor,
+    estimator: EstimatorLike,
+    recording: TrajectoryLike,
+    prior: HybridModel | None,
+    causes: Mapping[str, tuple[str, ...]],
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[ResidualTrace, tuple[Alarm, ...]]:
+    """Replay the monitor of residuals with the closed loops' estimator, and diagnose each alarm if there are limits.
+
+    ``causes`` and ``prior`` are those of :class:`~hybrid_mpc.monitor.explain.ResidualDiagnoser`.
+    """
+    estimates: list[Any] = []
+    trace = replay_residuals(
+        monitor, estimator, recording, on_sample=lambda k, estimate: estimates.append(estimate),
+        on_progress=on_progress,
+    )  # fmt: skip
+    model = monitor.model
+    diagnoser = None
+    if monitor.limits is not None and trace.alarm.any():
+        diagnoser = ResidualDiagnoser(model, monitor.limits, causes or None, prior=prior)
+    alarms = []
+    for start, end in trace.intervals():
+        k, channels = int(np.searchsorted(trace.t, start - 1e-9)), trace.named(start, end)
+        text = BLIND.get(Validity(int(trace.validity[k])), "") if not channels else ""
+        if diagnoser is not None and channels:
+            text = diagnoser.of_alarm(k, trace, recording, estimates)
+        alarms.append(Alarm(start, end, text, channels))
+    return trace, tuple(alarms)
+
+
+def residual_table(trace: ResidualTrace, recording: Trajectory, monitor: ResidualMonitor) -> str:
+    """The trace as CSV, one row a sample: measurements, residuals and their levels with units, alarms by channel."""
+    columns: dict[str, Any] = {"t_s": trace.t}
+    columns |= {f"{s.name}_{s.unit}": recording.y[:, i] for i, s in enumerate(monitor.model.outputs)}
+    for i, (name, unit) in enumerate(zip(monitor.channels, monitor.units, strict=True)):
+        label = name.replace(" ", "_")
+        columns[f"{label}_residual_{unit}"] = trace.residual[:, i]
+        columns |= {f"{label}_{of}_{unit}": trace.level[:, i, j] for j, of in enumerate(("short", "long"))}
+        columns[f"{label}_alarm"] = trace.on[:, i]
+    columns |= {f"{name}_frozen": trace.frozen[:, i] for i, name in enumerate(trace.outputs)}
+    columns |= {"share": trace.share, "valid": trace.validity == Validity.VALID, "alarm": trace.alarm}
+    return _csv(columns)
+
+
 def table(trace: MonitorTrace, recording: Trajectory, outputs: Sequence[Signal]) -> str:
     """The trace as CSV, one row a sample, columns with units."""
     columns: dict[str, Any] = {"t_s": trace.t}
@@ -274,6 +415,10 @@ def table(trace: MonitorTrace, recording: Trajectory, outputs: Sequence[Signal])
     if trace.scores.size:
         columns |= {"force_score": trace.scores[:, 0], "power_score": trace.scores[:, 1]}
     columns |= {"valid": trace.validity == Validity.VALID, "frozen": trace.frozen, "alarm": trace.alarm}
+    return _csv(columns)
+
+
+def _csv(columns: Mapping[str, Any]) -> str:
     text = io.StringIO()
     rows = np.column_stack([*columns.values()])
     np.savetxt(text, rows, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")

@@ -46,6 +46,7 @@ class FaultKind:
         signed: Whether it takes either sign. Default: no.
         ramp: Time [s] over which it grows. Default: at once.
         length: Shortest and longest duration [s] of this kind, which then always ends. Default: the common one.
+        channel: Name of the output or input concerned. Default: the only one.
 
     Raises:
         InputError: If the target is unknown or a range is empty.
@@ -59,6 +60,7 @@ class FaultKind:
     signed: bool = False
     ramp: float = 0.0
     length: Sequence[float] | None = None
+    channel: str = ""
 
     def __post_init__(self) -> None:
         if self.target != LATE and not str(self.target).startswith("plant_"):
@@ -126,7 +128,7 @@ class RandomFaults:
             if kind.target == LATE:
                 late.append((start, end))
             else:
-                faults.append(Fault(start, end, kind.target, float(sign * size), ramp=kind.ramp))
+                faults.append(Fault(start, end, kind.target, float(sign * size), kind.channel, kind.ramp))
         return tuple(faults), tuple(late)
 
     def examples(self) -> tuple[Fault, ...]:
@@ -135,7 +137,7 @@ class RandomFaults:
         for kind in self.kinds:
             assert isinstance(kind, FaultKind)
             if kind.target != LATE:
-                found.append(Fault(0.0, 1.0, kind.target, kind.high, ramp=kind.ramp))
+                found.append(Fault(0.0, 1.0, kind.target, kind.high, kind.channel, kind.ramp))
         return tuple(found)
 
 

@@ -44,6 +44,7 @@ from hybrid_mpc.job.study_log import (
 from hybrid_mpc.job.tasks import selected_tasks
 from hybrid_mpc.kit.artifact import FILES, Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import adaptable
+from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario, load_scenario
 
@@ -93,7 +94,6 @@ def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> di
     scenario = load_scenario(study.scenario)
     check_complete(scenario)
     selected_tasks(scenario, study.tasks)
-    _check_plant(scenario, study)
     if scenario.oracle is None and (oracles := [c for c in study.controllers if c in ORACLES]):
         raise InputError(f"scenario {scenario.name} has no oracle; leave controller {oracles[0]} out")
     found = {}
@@ -101,10 +101,11 @@ def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> di
         folder = artifact_folder(given)
         kit = load(folder)
         check_kit(scenario, kit, str(folder))
+        _check_plant(scenario, study, kit.models["prior"])
         if "energy" in study.monitors and kit.calibration is None:
             raise InputError(f"study: monitor energy: {folder} holds no calibration; take monitor own")
-        if "guard" in study.monitors:
-            kit.detector()
+        for kind in {"guard", "residuals"}.intersection(study.monitors):
+            kit.on(scenario).monitor("hybrid", kind=kind)
         if study.guard == "adapt":
             adaptable(kit.models["hybrid"], scenario.causes)
         if held is None or label not in held:
@@ -115,15 +116,15 @@ def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> di
     return found
 
 
-def _check_plant(scenario: Scenario, study: Study) -> None:
-    """Refuse faults and parameters that the plant does not have."""
+def _check_plant(scenario: Scenario, study: Study, model: HybridModel) -> None:
+    """Refuse faults and parameters that the plant, or a model with its signals, does not have."""
     assert scenario.plant is not None
     plant = varied(scenario.plant(), [(name, 1.0) for name, _ in study.spans])
     sets = list(study.fault_sets)
     if isinstance(study.random_faults, RandomFaults):
         sets.append(study.random_faults.examples())
     for faults in sets:
-        check_faults(replace(scenario, plant=lambda: plant), faults)
+        check_faults(replace(scenario, plant=lambda: plant), faults, model)
 
 
 # What workers get

@@ -22,6 +22,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.files import read_document, read_object, sha256, write_document
 from hybrid_mpc.kit.assembly import (
+    energy_is_watched,
     make_adaptive_guard,
     make_controller,
     make_estimator,
@@ -38,6 +39,7 @@ from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridMod
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.innovations import ResidualLimits, ResidualMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario
@@ -59,7 +61,7 @@ INPUTS = {
 }
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
-WATCHES = ("own", "energy", "readings", "guard")
+WATCHES = ("own", "energy", "readings", "guard", "residuals")
 """Kinds of monitor, see :meth:`Kit.monitor`."""
 
 
@@ -213,7 +215,8 @@ def loop_settings(
 class Description:
     """What ``model.json`` holds beside its schema version and its hash.
 
-    ``recommended`` is the model that a loop is made of where none is named; empty: the hybrid.
+    ``recommended`` is the model that a loop is made of where none is named; empty: the hybrid. ``residuals`` are the
+    limits of the monitor of residuals, by model.
 
     Raises:
         InputError: If there are no models, too many, or two of one name.
@@ -226,8 +229,11 @@ class Description:
     provenance: Provenance
     loop: LoopSettings = field(default_factory=LoopSettings)
     recommended: str = ""
+    residuals: Mapping[str, ResidualLimits] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if strange := [name for name in self.residuals if name not in self.models]:
+            raise InputError(f"residuals: no model {strange[0]!r}; there are: {', '.join(self.models)}")
         if self.recommended and self.recommended not in self.models:
             raise InputError(
                 f"recommended: no model {self.recommended!r}; there are: {', '.join(self.models)}"
@@ -279,6 +285,16 @@ def set_calibration(folder: Path, calibration: Calibration) -> None:
         StorageError: If it cannot be written.
     """
     write_description(folder, replace(read_description(folder), calibration=calibration))
+
+
+def set_residuals(folder: Path, residuals: Mapping[str, ResidualLimits]) -> None:
+    """Put the limits of the monitor of residuals, by model, into an artifact.
+
+    Raises:
+        InputError: If the folder holds no artifact, or no such model.
+        StorageError: If it cannot be written.
+    """
+    write_description(folder, replace(read_description(folder), residuals=dict(residuals)))
 
 
 def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
@@ -381,7 +397,7 @@ def load(folder: str | Path) -> Kit:
         raise InputError(f"{folder}: {error}") from error
     return Kit(
         models, found.calibration, found.provenance, found.model.input_delay, found.loop,
-        found.recommended or ("hybrid" if "hybrid" in models else found.models[0]),
+        found.recommended or ("hybrid" if "hybrid" in models else found.models[0]), found.residuals,
     )  # fmt: skip
 
 
@@ -406,6 +422,7 @@ class Kit:
         input_delay: Delay [s] that the models hold. Default: none.
         loop: Control problems, noise and what else loops need. Default: nothing.
         recommended: Model that observer, controller and monitor are made of where none is named. Default: the hybrid.
+        residuals: Limits of the monitor of residuals, by model. Default: none were learned.
 
     Example: the whole way from a folder to a loop::
 
@@ -419,6 +436,7 @@ class Kit:
     input_delay: float = 0.0
     loop: LoopSettings = field(default_factory=LoopSettings, repr=False)
     recommended: str = "hybrid"
+    residuals: Mapping[str, ResidualLimits] = field(default_factory=dict, repr=False)
 
     @property
     def name(self) -> str:
@@ -546,23 +564,39 @@ class Kit:
 
     def monitor(
         self, model: str = "", *, kind: str = "", task: str = "", diagnose: bool = False
-    ) -> EnergyMonitor:
-        """The energy monitor with what the run has learned.
+    ) -> EnergyMonitor | ResidualMonitor:
+        """What watches a loop or a recording, with what the run has learned.
+
+        A mechanical model whose positions are measured is watched by its energy, any other by the residuals of its
+        outputs and balances.
 
         Args:
             model: Name of the model that is compared with the machine. Default: the recommended one.
-            kind: ``"guard"``: alarms by the detector, and finds frozen sensors; ``"energy"``: alarms by thresholds, if
-                there are any; ``"own"``: records levels; ``"readings"``: what a detector reads, without one. Default:
-                the detector, else thresholds.
+            kind: ``"guard"``: what a guard listens to: of the energy the detector, with its test for frozen sensors, of
+                any other machine the residuals; ``"energy"``: the energy, which alarms by thresholds, if there are
+                any; ``"residuals"``: the residuals, of a mechanical machine too; ``"own"``: records levels;
+                ``"readings"``: what a detector reads, without one. Default: the detector, else thresholds; the
+                residuals where the energy cannot be watched.
             task: Whose control problem gives the inputs' ranges. Default: the common one.
-            diagnose: Whether it remembers what a diagnosis of its alarms needs. Default: no.
+            diagnose: Whether the energy monitor remembers what a diagnosis of its alarms needs. Default: no.
 
         Raises:
-            InputError: If there is no such model, task or kind, or no detector where one is asked for.
+            InputError: If there is no such model, task or kind, no detector or no limits where one is asked for that
+                alarms, or the energy of a model is asked for that has none.
         """
         watched, learned = self._model(model), self.calibration
+        energy = energy_is_watched(watched)
         detects = learned is not None and learned.detector is not None and self.control is not None
-        kind = known(kind or ("guard" if detects else "energy"), WATCHES, "kind of monitor")
+        default = ("guard" if detects else "energy") if energy else "residuals"
+        kind = known(kind or default, WATCHES, "kind of monitor")
+        if kind == "residuals" or (kind in ("guard", "own") and not energy):
+            limits = self.residuals.get(model or self.recommended)
+            if kind == "guard" and limits is None:
+                raise InputError(
+                    f"{self._whose} holds no limits of residuals: its run did not come to the stage residuals (its "
+                    "report says why); run the main job again, or take learn_residuals"
+                )
+            return ResidualMonitor(watched, limits=None if kind == "own" else limits)
         if kind == "energy":
             return make_monitor(watched, learned)
         if kind == "own":

@@ -33,15 +33,19 @@ class Fault:
             ``"input_offset"`` adds ``value`` to it. ``"plant_..."`` is one of the plant's own, which says what
             it means; see :func:`install`.
         value: Size, in the units of the output or input, [-] for a factor. Freeze and dropout use none.
-        channel: Number of the output or input concerned.
+        channel: Name of the output or input concerned. Default: the only one; where there are several it is needed.
         ramp: Time [s] over which the size grows, in proportion, from nothing to ``value``. Default 0: at once.
 
     Raises:
-        InputError: If the interval is empty, the target unknown, the value not finite, or the ramp negative.
+        InputError: If the interval is empty, the target unknown, the value not finite, the channel no name, or the ramp
+            negative.
 
     Example:
         >>> corrupt_input([Fault(1.0, 2.0, "input_gain", 0.5)], 1.5, np.array([0.4]))
         array([0.2])
+        >>> cold = Fault(1.0, 2.0, "measurement_offset", -5.0, "temperature2")
+        >>> corrupt_measurement([cold], 1.5, np.array([40.0, 30.0]), np.zeros(2), ("temperature1", "temperature2"))
+        array([40., 25.])
         >>> corrupt_input([Fault(1.0, 9.0, "input_offset", 0.2, ramp=2.0)], 2.0, np.array([0.4]))
         array([0.5])
     """
@@ -50,7 +54,7 @@ class Fault:
     end: float
     target: str
     value: float = 0.0
-    channel: int = 0
+    channel: str = ""
     ramp: float = 0.0
 
     def __post_init__(self) -> None:
@@ -63,6 +67,11 @@ class Fault:
             )
         if not self.start < self.end:
             raise InputError(f"fault {self.target}: the interval [{self.start}, {self.end}) s is empty")
+        if not isinstance(self.channel, str):
+            raise InputError(
+                f"fault {self.target}: channel is the name of an output or input, got {self.channel!r}; write "
+                'channel="NAME"'
+            )
         if not math.isfinite(self.value):
             raise InputError(f"fault {self.target}: value must be finite, got {self.value}")
         if not (self.ramp >= 0 and math.isfinite(self.ramp)):
@@ -93,17 +102,43 @@ class Fault:
         return neutral + share * (self.value - neutral)
 
 
-def check_channels(faults: Sequence[Fault], n_y: int, n_u: int) -> None:
-    """Refuse faults of channels that do not exist, and faults that only a plant can show."""
+def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequence[str]) -> None:
+    """Refuse faults of channels that do not exist or are not named, and faults that only a plant can show.
+
+    Args:
+        faults: The faults.
+        outputs: Names of the outputs.
+        inputs: Names of the inputs.
+
+    Raises:
+        InputError: With the names that there are.
+
+    Example:
+        >>> check_channels([Fault(0.0, 1.0, "input_gain", 0.5, "power3")], ["level"], ["power1", "power2"])
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: fault input_gain: no input 'power3'; there are: power1, power2
+    """
     for fault in faults:
         if fault.on_plant:
             raise InputError(
                 f"fault {fault.target} lies in the plant: build it in with "
                 "plant, faults = install(plant, faults) before simulating"
             )
-        n = n_u if fault.on_input else n_y
-        if not 0 <= fault.channel < n:
-            raise InputError(f"fault {fault.target}: channel {fault.channel} given, there are {n} (from 0)")
+        kind, names = ("input", inputs) if fault.on_input else ("output", outputs)
+        if not fault.channel and len(names) > 1:
+            raise InputError(
+                f"fault {fault.target}: which {kind}? Name one of {', '.join(names)}: "
+                f'channel="{names[0]}", in a text {fault.target}:{names[0]}'
+            )
+        if fault.channel and fault.channel not in names:
+            raise InputError(
+                f"fault {fault.target}: no {kind} {fault.channel!r}; there are: {', '.join(names)}"
+            )
+
+
+def _place(fault: Fault, names: Sequence[str]) -> int:
+    """Place of a fault's channel; the first where none is named."""
+    return names.index(fault.channel) if fault.channel else 0
 
 
 def check_plant_faults(faults: Sequence[Fault], known: Sequence[str]) -> None:
@@ -140,31 +175,40 @@ def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]
     return plant.with_faults(inside), outside
 
 
-def corrupt_measurement(faults: Sequence[Fault], t: float, y: Array, y_before: Array) -> Array:
-    """Measurement ``(n_y,)`` that arrives at ``t``; ``y_before`` is the one that arrived before it."""
+def corrupt_measurement(
+    faults: Sequence[Fault], t: float, y: Array, y_before: Array, outputs: Sequence[str] = ()
+) -> Array:
+    """Measurement ``(n_y,)`` that arrives at ``t``; ``y_before`` is the one that arrived before it.
+
+    ``outputs`` are their names; needed where faults name one.
+    """
     y = y.copy()
     for fault in faults:
-        if not fault.active(t):
+        if not fault.active(t) or not fault.target.startswith("measurement_"):
             continue
+        i = _place(fault, outputs)
         if fault.target == "measurement_offset":
-            y[fault.channel] += fault.value_at(t, 0.0)
+            y[i] += fault.value_at(t, 0.0)
         elif fault.target == "measurement_scale":
-            y[fault.channel] *= fault.value_at(t, 1.0)
+            y[i] *= fault.value_at(t, 1.0)
         elif fault.target == "measurement_freeze":
-            y[fault.channel] = y_before[fault.channel]
+            y[i] = y_before[i]
         elif fault.target == "measurement_dropout":
-            y[fault.channel] = np.nan
+            y[i] = np.nan
     return y
 
 
-def corrupt_input(faults: Sequence[Fault], t: float, u: Array) -> Array:
-    """Input ``(n_u,)`` that reaches the plant at ``t`` when ``u`` was commanded."""
+def corrupt_input(faults: Sequence[Fault], t: float, u: Array, inputs: Sequence[str] = ()) -> Array:
+    """Input ``(n_u,)`` that reaches the plant at ``t`` when ``u`` was commanded.
+
+    ``inputs`` are their names; needed where faults name one.
+    """
     u = u.copy()
     for fault in faults:
         if fault.active(t) and fault.target == "input_gain":
-            u[fault.channel] *= fault.value_at(t, 1.0)
+            u[_place(fault, inputs)] *= fault.value_at(t, 1.0)
         elif fault.active(t) and fault.target == "input_offset":
-            u[fault.channel] += fault.value_at(t, 0.0)
+            u[_place(fault, inputs)] += fault.value_at(t, 0.0)
     return u
 
 
@@ -178,18 +222,20 @@ def fault_text(faults: Sequence[Fault], late: Sequence[tuple[float, float]] = ()
     parts = []
     for f in faults:
         end = "" if np.isinf(f.end) else f":{f.end:g}"
-        more = (f" channel {f.channel}" if f.channel else "") + (f" ramp {f.ramp:g}" if f.ramp else "")
-        parts.append(f"{f.target}={f.value:g}@{f.start:g}{end}{more}")
+        more = f" ramp {f.ramp:g}" if f.ramp else ""
+        target = f.target + (f":{f.channel}" if f.channel else "")
+        parts.append(f"{target}={f.value:g}@{f.start:g}{end}{more}")
     parts += [f"late@{a:g}" + ("" if np.isinf(b) else f":{b:g}") for a, b in late]
     return " + ".join(parts) or "none"
 
 
 def parsed_fault(text: str) -> Fault:
-    """A fault from ``TARGET[=VALUE][@START[:END]]``, times in seconds.
+    """A fault from ``TARGET[:CHANNEL][=VALUE][@START[:END]]``, times in seconds.
 
     Args:
-        text: e.g. ``"input_gain=0.8@1.0"``; start 0 by default, end never. A sensor that freezes or drops out has no
-            value, every other fault needs one.
+        text: e.g. ``"input_gain=0.8@1.0"`` or ``"measurement_offset:level=0.1@5:9"``; start 0 by default, end never.
+            The channel is the name of an output or input, needed where there are several. A sensor that freezes or
+            drops out has no value, every other fault needs one.
 
     Raises:
         InputError: If it has another form, or there is no such fault.
@@ -198,19 +244,22 @@ def parsed_fault(text: str) -> Fault:
         >>> fault = parsed_fault("plant_friction=2@1:2.5")
         >>> fault.target, fault.value, fault.start, fault.end
         ('plant_friction', 2.0, 1.0, 2.5)
+        >>> parsed_fault("measurement_freeze:temperature1@3").channel
+        'temperature1'
     """
     head, _, when = text.partition("@")
-    target, _, value = head.partition("=")
+    name, _, value = head.partition("=")
+    target, _, channel = name.partition(":")
     start, _, end = when.partition(":")
     try:
         numbers = [float(v) if v else d for v, d in ((start, 0.0), (end, math.inf), (value, 0.0))]
     except ValueError as error:
         raise InputError(
-            f"fault {text!r}: {error}; the form is TARGET=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
+            f"fault {text!r}: {error}; the form is TARGET:CHANNEL=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
         ) from error
     if math.isnan(numbers[0]) or math.isnan(numbers[1]):
         raise InputError(f"fault {text!r}: times must be numbers of seconds")
-    fault = Fault(numbers[0], numbers[1], target, numbers[2])
+    fault = Fault(numbers[0], numbers[1], target, numbers[2], channel)
     if not value and target not in ("measurement_freeze", "measurement_dropout"):
         raise InputError(f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0")
     return fault

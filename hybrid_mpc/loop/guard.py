@@ -230,11 +230,15 @@ class GuardedController:
             frozen = t
         on = alarm == t or t - alarm < guard.quiet - TINY
         if frozen == t or t - frozen < guard.quiet - TINY:
-            wanted, why = guard.on_sensor, "the sensor repeats itself while motion is predicted"
+            names = ", ".join(getattr(reading, "frozen_outputs", ()))
+            why = "the sensor repeats itself while motion is predicted" + (f": {names}" if names else "")
+            wanted = guard.on_sensor
         elif on and alarm - doubt >= guard.patience - TINY:
             blind = getattr(reading, "blind", False)
             wanted = guard.on_model
+            names = ", ".join(getattr(reading, "channels", ()))
             why = "the monitor has no valid reading" if blind else "the model does not describe the machine"
+            why += f": {names}" if names and not blind else ""
         else:
             wanted, why = Mode.NORMAL, f"no alarm for {guard.quiet:g} s"
         if wanted < state.mode and t - state.since < guard.dwell - TINY:

@@ -41,25 +41,28 @@ class Plant(Protocol):
 
 
 class SimulatedMachine:
-    """A plant behind the delays [periods] and faults of its sensors and actuators. It changes in place."""
+    """A plant behind the delays [periods] and faults of its sensors and actuators, whose names are ``outputs`` and
+    ``inputs``. It changes in place.
+    """
 
     def __init__(
-        self, plant: Plant, x0: Array, seed: int, n_y: int, faults: Sequence[Fault], dt: float,
-        sensor_delay: int, input_delay: int,
+        self, plant: Plant, x0: Array, seed: int, outputs: Sequence[str], inputs: Sequence[str],
+        faults: Sequence[Fault], dt: float, sensor_delay: int, input_delay: int,
     ) -> None:  # fmt: skip
-        self._plant, self._n_y, self._faults, self._dt = plant, n_y, faults, dt
+        self._plant, self._n_y, self._faults, self._dt = plant, len(outputs), faults, dt
+        self._outputs, self._inputs = outputs, inputs
         self._rng = np.random.default_rng(seed)
         self.state = plant.reset(x0, seed)
         self._measurements = [self._sensor() for _ in range(sensor_delay)]
         self._input_delay = input_delay
-        self._y = np.full(n_y, np.nan)
+        self._y = np.full(self._n_y, np.nan)
         self._commands: list[Array] = []
         self._acting: Array = np.zeros(0)
 
     def measure(self, t: float) -> Array:
         """The measurement that arrives at ``t``."""
         self._measurements.append(self._sensor())
-        self._y = corrupt_measurement(self._faults, t, self._measurements.pop(0), self._y)
+        self._y = corrupt_measurement(self._faults, t, self._measurements.pop(0), self._y, self._outputs)
         return self._y
 
     def rest(self, u: Array) -> None:
@@ -75,7 +78,7 @@ class SimulatedMachine:
 
     def advance(self, t: float, w: Array | None = None) -> None:
         """One period on, with measured disturbances ``w`` ``(n_w,)`` if there are any."""
-        u, plant = corrupt_input(self._faults, t, self._acting), self._plant
+        u, plant = corrupt_input(self._faults, t, self._acting, self._inputs), self._plant
         step: Any = plant.step
         self.state = step(self.state, u, self._dt, *(() if w is None else (w,)))
 

@@ -122,13 +122,14 @@ def simulate(
     surroundings = _disturbances(w, estimator.model)
     ocp, model, periods = loop.ocp, loop.model, round(duration / dt)
     plant, faults = install(plant, faults)
-    check_channels(faults, model.n_y, ocp.n_u)
+    outputs, inputs = (tuple(s.name for s in signals) for signals in (model.outputs, model.inputs))
+    check_channels(faults, outputs, inputs)
     cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
     # what the loop previews is for the instant at which its input will act; the cost counts now
     standing = loop.standing
     acting = Previews(reference, weight, ocp, dt, periods * dt, standing) if input_delay else None
     rest = vector(x0, ocp.n_x, "x0")
-    machine = SimulatedMachine(plant, rest, seed, model.n_y, faults, dt, sensor_delay, input_delay)
+    machine = SimulatedMachine(plant, rest, seed, outputs, inputs, faults, dt, sensor_delay, input_delay)
     rows: list[_Row] = []
     for k in range(periods):
         t = k * dt

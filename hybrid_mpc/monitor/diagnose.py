@@ -35,13 +35,18 @@ RANGE = (-0.9, 20.0)
 
 @dataclass(frozen=True)
 class Change:
-    """A change of one cause, as a share of the nominal value (0.5: half as much more), with its standard deviation."""
+    """A change of one cause with its standard deviation: as a share of the nominal value (0.5: half as much more), or,
+    with a ``unit``, as a sum.
+    """
 
     name: str
     value: float
     sigma: float
+    unit: str = ""
 
     def __str__(self) -> str:
+        if self.unit:
+            return f"{self.name} {self.value:+.3g} ± {self.sigma:.2g} {self.unit}"
         return f"{self.name} {100 * self.value:+.0f} ± {100 * self.sigma:.0f} %"
 
 

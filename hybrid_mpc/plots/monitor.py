@@ -28,6 +28,7 @@ from hybrid_mpc.plots.style import (
 )
 
 if TYPE_CHECKING:
+    from hybrid_mpc.monitor.innovations import ResidualTrace
     from hybrid_mpc.monitor.replay import MonitorTrace
 
 LEVEL, POWER = COLOURS["hybrid"], COLOURS["prior"]
@@ -134,6 +135,54 @@ def overview(
     for time, text in notes:
         place = {"xycoords": ("data", "axes fraction"), "va": "top", "fontsize": 8}
         panels[0].annotate(plain(text), (time, 1.0), color=INK, **place)  # type: ignore[arg-type]
+    if title:
+        title_axes(panels[0], plain(title))
+    finish_column(figure, panels)
+    return figure
+
+
+def channels(
+    trace: ResidualTrace,
+    units: Sequence[str],
+    thresholds: Sequence[tuple[float, float]] | None = None,
+    *,
+    notes: Sequence[tuple[float, str]] = (),
+    title: str = "",
+) -> Figure:
+    """Levels of every residual over a recording, a panel each, with thresholds and alarms of the channel.
+
+    Args:
+        trace: What :func:`~hybrid_mpc.monitor.innovations.replay_residuals` returned.
+        units: Unit of each channel.
+        thresholds: Of the short and the long average of each channel. Default: none.
+        notes: Times [s] and what to write there, e.g. a diagnosis. Default: none.
+        title: Title. Default: none.
+
+    Returns:
+        The figure.
+
+    Example:
+        ``channels(replay_residuals(monitor, observer, recording), monitor.units, monitor.limits.threshold)``
+    """
+    t, n = trace.t, len(trace.channels)
+    figure, panels = new_column([1.0] * n, height=1.4)
+    for i, (ax, name, unit) in enumerate(zip(panels, trace.channels, units, strict=True)):
+        for j, (label, ink) in enumerate((("short average", PALE), ("long average", LEVEL))):
+            ax.plot(t, trace.level[:, i, j], color=ink, linewidth=1.2, label=label)
+            limit = None if thresholds is None else thresholds[i][j]
+            if limit is not None and np.isfinite(limit):
+                style: Any = {"color": INK, "linestyle": ":" if j == 0 else "--", "linewidth": 0.9}
+                ax.axhline(limit, label=f"threshold, {label}", **style)
+                ax.axhline(-limit, **style)
+        ax.axhline(0.0, color=INK, linewidth=0.4)
+        kind, _, of = name.rpartition(" of ")
+        ax.set_ylabel(plain(f"{kind} of\n{of} [{unit}]" if kind else f"{name}\n[{unit}]"))
+        _shade(ax, intervals(t, trace.on[:, i]), "alarm of the channel", color=ALARM, alpha=0.3)
+        frozen = trace.frozen[:, i] if i < len(trace.outputs) else np.zeros(len(t), dtype=bool)
+        _shade(ax, intervals(t, frozen), "sensor frozen", color=INK, ymax=0.05)
+    for i, (time, text) in enumerate(notes):
+        place: Any = {"xycoords": ("data", "axes fraction"), "va": "top", "fontsize": 8, "color": INK}
+        panels[0].annotate(plain(text), (time, 1.0 - 0.14 * (i % 6)), **place)
     if title:
         title_axes(panels[0], plain(title))
     finish_column(figure, panels)

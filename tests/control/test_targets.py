@@ -23,6 +23,7 @@ from hybrid_mpc import (
     dare,
     linearize,
 )
+from hybrid_mpc.control import targets as targets_module
 
 TANKS = {"q": [0.0, 0.0], "r": [1e6], "r_delta": [1e6], "u_min": [5e-5], "u_max": [4e-4], "q_y": [1.0]}
 HEATERS = {"q": [0.0] * 2, "r": [0.1] * 2, "r_delta": [0.1] * 2, "u_min": [0.0] * 2, "u_max": [20.0] * 2}
@@ -272,3 +273,16 @@ def test_a_moving_reference_of_outputs_has_targets_between_a_few_steady_states()
     np.testing.assert_allclose(target.x, [s.x for s in exact], atol=0.01)
     steps = problem.target(np.where(np.arange(31) < 12, 0.2, 0.4)[:, None], None, estimate_at(model))
     np.testing.assert_allclose(steps.x[:, 1], np.where(np.arange(31) < 12, 0.2, 0.4), rtol=1e-6)
+
+
+def test_the_last_steady_state_needs_no_settling_of_the_hidden_state(monkeypatch):
+    """A network's memory may take a thousand steps to settle, in every period of every loop."""
+    model = two_tanks(dt=10.0)
+    targets = Targets(model, OCP(10, **TANKS))
+    start = targets.at([0.25])
+
+    def settled(*_, **__):
+        raise AssertionError("asked for")
+
+    monkeypatch.setattr(targets_module, "hidden_fixed_point", settled)
+    assert targets.at([0.26], start=start).reached

@@ -104,23 +104,24 @@ def test_recordings_count_alike_however_far_off_the_prior_is():
     names = [f"file{i}" for i in range(6)]
     by_block = recommend({"phy": prior, "pgrnn": hybrid})
     choice = recommend({"phy": prior, "pgrnn": hybrid}, recordings=names)
-    assert choice.candidates["pgrnn"].ratio == pytest.approx(by_block.candidates["pgrnn"].ratio)
+    assert choice.candidates["pgrnn"].error == pytest.approx(by_block.candidates["pgrnn"].error)
     assert by_block.recommended == "pgrnn"  # blocks of all recordings together are ruled by the first
     assert choice.recommended == "phy"
     assert "6 recordings" in choice.reason
     # the bound by hand: mean and standard deviation of the logarithms, Student's quantile 2.015 of five degrees
     logs = 0.5 * np.log([0.01, 1.0, 1.1, 0.9, 1.05, 0.95])
+    assert choice.candidates["pgrnn"].ratio == pytest.approx(np.exp(logs.mean()))
     upper = np.exp(logs.mean() + 2.015 * logs.std(ddof=1) / np.sqrt(6))
     assert choice.candidates["pgrnn"].upper == pytest.approx(upper, rel=1e-3)
-    assert choice.candidates["pgrnn"].typical == pytest.approx(np.exp(logs.mean()))
     assert (
-        f"in a typical one of 6 recordings {np.exp(logs.mean()):.2f} (at most {upper:.2f})" in choice.reason
+        f"is {np.exp(logs.mean()):.2f} of the prior's (at most {upper:.2f}; 6 recordings, their geometric mean)"
+        in choice.reason
     )
     better = [0.25 * own for own in prior]
     assert recommend({"phy": prior, "pgrnn": better}, recordings=names).recommended == "pgrnn"
 
 
-def test_the_bound_is_that_of_the_typical_recording_and_may_lie_below_the_ratio_over_all():
+def test_the_bound_is_that_of_the_mean_over_recordings_and_both_must_be_better():
     """Much better in all but the loudest recording, which rules the sum: the bound is not raised to the sum's ratio."""
     prior = runs(np.random.default_rng(8), n=8)
     prior[0] = 1000.0 * prior[0]
@@ -128,9 +129,10 @@ def test_the_bound_is_that_of_the_typical_recording_and_may_lie_below_the_ratio_
     errors = {"phy": prior, "pgrnn": [factor * own for factor, own in zip(factors, prior, strict=True)]}
     choice = recommend(errors, recordings=[f"file{i}" for i in range(8)])
     own = choice.candidates["pgrnn"]
-    assert own.typical < own.upper < 1.0 < own.ratio
-    assert not own.sure  # both must be below 1: the rule is no looser
+    assert own.ratio < own.upper < 1.0
+    assert own.error > choice.candidates["phy"].error  # over all together it is worse: the rule is no looser
     assert choice.recommended == "phy"
+    assert "over all of them together the prior's is no larger" in choice.reason
 
 
 def test_runs_of_a_single_recording_are_cut_into_blocks():

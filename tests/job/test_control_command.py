@@ -115,7 +115,9 @@ def test_a_fault_from_the_command_line_acts(call, run_folder, tmp_path):
         assert call("golf_robot", "--model", run_folder, "--out", out, *options)[0] == 0
         results = json.loads((out / "results.json").read_text())
         costs[name] = results["loops"][0]["cost"]
-    assert results["faults"] == [{"target": "plant_friction", "value": 4.0, "start_s": 0.5, "end_s": "inf"}]
+    assert results["faults"] == [
+        {"target": "plant_friction", "value": 4.0, "channel": "", "start_s": 0.5, "end_s": "inf"}
+    ]
     assert (results["guard"], results["reaction"]) == (None, "")
     assert results["loops"][0]["alarms"] is None  # nothing could alarm
     assert results["loops"][0]["switches"] == []
@@ -158,7 +160,7 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
         (["--controller", "oracle", "--solver", "sqp"], ["oracle", "solver of its own"]),
         (["--fault", "fire=1"], ["'fire'", "measurement_offset"]),
         (["--fault", "plant_fire=1@1"], ["plant_fire", "plant_friction"]),
-        (["--fault", "input_gain=lots"], ["input_gain=lots", "TARGET=VALUE@START:END"]),
+        (["--fault", "input_gain=lots"], ["input_gain=lots", "TARGET:CHANNEL=VALUE@START:END"]),
         (["--fault", "input_gain=0.5@2:1"], ["interval"]),
         (["--seeds", "0"], ["seeds"]),
     ],

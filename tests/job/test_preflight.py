@@ -325,7 +325,9 @@ WRONG = {
         task(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["control of task hold: q needs 2 numbers"]
     ),
     "same tasks": (field(tasks=(TASK, TASK)), ["two have the same name"]),
-    "fault of a channel": (task(faults=(Fault(0, 1, "input_gain", 0.5, channel=3),)), ["channel 3"]),
+    "fault of a channel": (
+        task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), ["no input 'third'; there are"],
+    ),
     "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["takes no faults"]),
     "tasks without control": (field(control=None), ["no control problem"]),
     # plant and oracle

@@ -58,7 +58,7 @@ def own(machine, finished, arguments, tmp_path):
     ("pattern", "put", "stages"),
     [
         (r'title="[^"]*"|"My machine[^"]*"', None, ["report"]),
-        (r"q=\(", "q=(2.0 * ", ["control", "monitor", "guard", "analysis", "report"]),
+        (r"q=\(", "q=(2.0 * ", ["control", "residuals", "monitor", "guard", "analysis", "report"]),
         ("$", "\n# a remark\n", []),
     ],
     ids=["title", "weight", "comment"],

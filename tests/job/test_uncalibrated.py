@@ -20,6 +20,7 @@ from hybrid_mpc import (
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.export import NOISE, NoiseResult
 from hybrid_mpc.job.stages.figures import _monitor as monitor_figures
 from hybrid_mpc.job.stages.figures import guard_figures
@@ -27,9 +28,10 @@ from hybrid_mpc.job.stages.guard import GUARD, guard_stage
 from hybrid_mpc.job.stages.identify import PRIOR, PriorResult
 from hybrid_mpc.job.stages.monitor import MONITOR, monitor_stage
 from hybrid_mpc.job.stages.report import guard_tables, guard_words
+from hybrid_mpc.job.stages.residuals import put_residuals, residuals_stage
 from hybrid_mpc.job.stages.results import _guard as guard_results
 from hybrid_mpc.job.stages.results import _monitor as monitor_results
-from hybrid_mpc.kit.artifact import read_description, write_description
+from hybrid_mpc.kit.artifact import read_description, set_residuals, write_description
 
 AXIS = """
 from hybrid_mpc import MechanicalPrior, Parameter, Signal
@@ -159,6 +161,23 @@ def test_monitor_and_guard_take_the_same_rest_speed(slow):
     assert f"in whole blocks of {block:g} s are too little" in guard_results(slow).reason
 
 
+def test_limits_of_residuals_are_learned_kept_and_put_back(slow):
+    found = residuals_stage(slow)
+    (name,) = found.limits
+    assert name == "hybrid"
+    assert found.limits[name].channels == ("q", "energy", "free run of q")
+    assert found.faults is None  # the energy is watched
+    assert found.clean.alarms == 0  # thresholds are above the highest level of these very recordings
+    assert found.clean.seconds > 0
+    kit = load(slow.out / "model")
+    assert dict(kit.residuals) == dict(found.limits)
+    assert kit.monitor(kind="residuals").limits == found.limits[name]
+    assert kit.monitor(kind="energy").calibration is not None
+    set_residuals(slow.out / "model", {})
+    assert put_residuals(slow, found) == ""
+    assert dict(load(slow.out / "model").residuals) == dict(found.limits)
+
+
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """Recordings of 0.18 s, whose parts are shorter than the guard's window; training needs 20 ms for each part."""
@@ -174,6 +193,9 @@ def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(s
     window = 2 * round(0.1 * short.time_unit / QUICK.dt) + 1
     assert f"no recording has the {window} samples ({window * QUICK.dt:g} s)" in found.reason
     assert found.recordings[0]["valid_s"] == 0.0
+    residuals = residuals_stage(short)
+    assert isinstance(residuals, Absent)
+    assert "no recording is longer than" in residuals.reason
     said = monitor_results(short)
     assert said.alarms is None
     assert found.reason == said.reason
@@ -205,7 +227,7 @@ def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_pat
     if stored == "none":
         write_description(short.out / "model", replace(description, calibration=None))
     write_csv(tmp_path / "long.csv", QUICK.recording(5, 900))
-    monkeypatch.setattr("hybrid_mpc.cli.monitor.scenario_of", lambda *given: short.scenario)
+    monkeypatch.setattr("hybrid_mpc.scenario.scenario_of", lambda *given: short.scenario)
     done = CliRunner().invoke(
         app, ["monitor", str(short.out / "model"), str(tmp_path / "long.csv"), "--scenario", "axis",
               "--out", str(tmp_path / "out")],

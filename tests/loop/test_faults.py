@@ -6,9 +6,10 @@ from closed_loop_parts import Recorder, make_ekf, run
 from online_models import PendulumPlant
 
 from hybrid_mpc import Fault, InputError, check_plant_faults, corrupt_input, corrupt_measurement
-from hybrid_mpc.loop.faults import check_channels, install
+from hybrid_mpc.loop.faults import check_channels, fault_text, install, parsed_fault
 
 Y, BEFORE = np.array([1.0, 2.0]), np.array([7.0, 8.0])
+NAMES = "first", "second"
 
 
 @pytest.mark.parametrize(
@@ -23,9 +24,9 @@ Y, BEFORE = np.array([1.0, 2.0]), np.array([7.0, 8.0])
     ],
 )
 def test_measurement_faults(target, channel, want):
-    fault = Fault(1.0, 2.0, target, 0.5, channel)
-    np.testing.assert_array_equal(corrupt_measurement([fault], 1.5, Y, BEFORE), want)
-    np.testing.assert_array_equal(corrupt_measurement([fault], 2.5, Y, BEFORE), Y)
+    fault = Fault(1.0, 2.0, target, 0.5, NAMES[channel])
+    np.testing.assert_array_equal(corrupt_measurement([fault], 1.5, Y, BEFORE, NAMES), want)
+    np.testing.assert_array_equal(corrupt_measurement([fault], 2.5, Y, BEFORE, NAMES), Y)
     np.testing.assert_array_equal(Y, [1.0, 2.0])  # the argument is left alone
 
 
@@ -34,9 +35,9 @@ def test_measurement_faults(target, channel, want):
     [("input_gain", 1, [1.0, 1.0]), ("input_offset", 0, [1.5, 2.0]), ("measurement_offset", 0, [1.0, 2.0])],
 )
 def test_input_faults(target, channel, want):
-    fault = Fault(1.0, 2.0, target, 0.5, channel)
-    np.testing.assert_array_equal(corrupt_input([fault], 1.5, Y), want)
-    np.testing.assert_array_equal(corrupt_input([fault], 0.5, Y), Y)
+    fault = Fault(1.0, 2.0, target, 0.5, NAMES[channel])
+    np.testing.assert_array_equal(corrupt_input([fault], 1.5, Y, NAMES), want)
+    np.testing.assert_array_equal(corrupt_input([fault], 0.5, Y, NAMES), Y)
     np.testing.assert_array_equal(Y, [1.0, 2.0])
 
 
@@ -66,7 +67,8 @@ def test_start_counts_and_end_does_not_in_spite_of_rounding():
         ((np.nan, 1.0, "input_gain"), "empty"),
         ((0.0, 1.0, "input_gain", np.nan), "finite"),
         ((0.0, 1.0, "input_gain", np.inf), "finite"),
-        ((0.0, 1.0, "input_gain", 1.0, 0, -1.0), "ramp"),
+        ((0.0, 1.0, "input_gain", 1.0, "", -1.0), "ramp"),
+        ((0.0, 1.0, "input_gain", 1.0, 1), "name of an output or input"),
         ((0.0, 1.0, "inputs", 1.0), "plant_"),
     ],
 )
@@ -76,12 +78,25 @@ def test_bad_faults_are_refused(arguments, words):
 
 
 @pytest.mark.parametrize(
-    ("target", "channel"), [("input_gain", 1), ("measurement_offset", 2), ("input_gain", -1)]
+    ("target", "channel", "words"),
+    [
+        ("input_gain", "valve", "no input 'valve'; there are: power"),
+        ("measurement_offset", "power", "no output 'power'; there are: level, flow"),
+        ("measurement_freeze", "", "which output.*level, flow.*measurement_freeze:level"),
+    ],
 )
-def test_channels_that_do_not_exist_are_refused(target, channel):
-    check_channels([Fault(0.0, 1.0, "measurement_offset", channel=1)], n_y=2, n_u=1)
-    with pytest.raises(InputError, match=f"channel {channel}"):
-        check_channels([Fault(0.0, 1.0, target, channel=channel)], n_y=2, n_u=1)
+def test_channels_that_do_not_exist_are_refused(target, channel, words):
+    names = ("level", "flow"), ("power",)
+    check_channels([Fault(0.0, 1.0, "measurement_offset", channel="flow")], *names)
+    check_channels([Fault(0.0, 1.0, "input_gain")], *names)  # the only one
+    with pytest.raises(InputError, match=words):
+        check_channels([Fault(0.0, 1.0, target, channel=channel)], *names)
+
+
+def test_texts_name_channels_and_are_read_back():
+    text = "measurement_offset:flow=0.5@1:2 + input_gain=0.8@0"
+    assert fault_text([parsed_fault(part) for part in text.split(" + ")]) == text
+    assert parsed_fault("measurement_freeze:level@3").channel == "level"
 
 
 @pytest.mark.parametrize(

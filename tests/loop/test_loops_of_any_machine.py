@@ -239,7 +239,7 @@ def test_where_nothing_is_known_the_last_input_stays_and_a_run_wants_a_safe_one(
     model = thermal()
     estimator = observer(model, None)
     bare = SafeController(CondensedController(model, HEATERS), max_age=0)
-    lost = Fault(100.0, 300.0, "measurement_dropout")
+    lost = Fault(100.0, 300.0, "measurement_dropout", channel="t1")
     result = simulate(MachinePlant(model), estimator, bare, lambda t: np.full((len(t), 2), np.nan), dt=10.0,
                       duration=400.0, x0=model.x0, seed=0, faults=[lost])  # fmt: skip
     assert set(result.source) == {"HELD"}

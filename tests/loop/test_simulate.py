@@ -269,7 +269,7 @@ def test_several_inputs_and_outputs():
 
 
 def test_a_machine_remembers_its_delays_and_no_more():
-    machine = SimulatedMachine(PendulumPlant(), np.zeros(2), 0, 1, (), DT, 2, 3)
+    machine = SimulatedMachine(PendulumPlant(), np.zeros(2), 0, ("q",), ("u",), (), DT, 2, 3)
     machine.rest(np.zeros(1))
     held, lengths = [], []
     for k in range(20):

@@ -49,7 +49,7 @@ class Odd(PendulumPlant):
         ({"sensor_delay": -1}, "sensor_delay"),
         ({"input_delay": 1.5}, "input_delay"),
         ({"reference": lambda t: np.zeros((len(t), 1))}, r"needed: \(11, 2\)"),
-        ({"faults": [Fault(0.0, 1.0, "input_gain", channel=1)]}, "channel 1 given, there are 1"),
+        ({"faults": [Fault(0.0, 1.0, "input_gain", channel="third")]}, "no input 'third'; there are: "),
         ({"plant": Odd("measure", np.zeros(2))}, r"measurement has shape \(2,\)"),
         ({"plant": Odd("truth", np.zeros(3))}, r"truth has shape \(3,\)"),
         ({"estimator": "prior"}, "give both the same model"),

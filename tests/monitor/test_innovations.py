@@ -10,7 +10,7 @@ from machines import MachinePlant, dc_motor, thermal, two_tanks
 
 from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, ResidualMonitor, Signal, learn_residuals
 from hybrid_mpc.monitor.energy import Validity
-from hybrid_mpc.monitor.innovations import levels_along
+from hybrid_mpc.monitor.innovations import replay_residuals
 
 MACHINES = {
     "tanks": (two_tanks, (4e-5,), 1e-3, 1e-6),
@@ -142,12 +142,12 @@ def test_the_violation_of_a_mechanical_machine_is_its_power():
         xdot=rates, y=x[0], rate=rate, energy=(2.0 * rate[1] - u) * x[1],
     )  # fmt: skip
     monitor = ResidualMonitor(cart)
-    assert (monitor.channels, monitor.units) == (("q", "energy"), ("m", "W"))
+    assert (monitor.channels, monitor.units) == (("q", "energy", "free run of q"), ("m", "W", "m"))
     state, none = monitor.initial(), np.zeros(0)
     for now in ([1.0, 3.0], [1.03, 3.005]):
         estimate = SimpleNamespace(x=np.array(now), h=none, w=none)
         state, reading = monitor.update(state, np.array(now[:1]), np.zeros(1), estimate)
-    np.testing.assert_allclose(reading.residual, [0.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(reading.residual[:2], [0.0, 3.0], atol=1e-12)
 
 
 def test_what_does_not_fit_is_refused():
@@ -156,12 +156,13 @@ def test_what_does_not_fit_is_refused():
     limits = learn_residuals(
         dc_motor(),
         observer(dc_motor(), sigma, step),
-        [recording(make, swing, sigma, 700, 0)],
+        [recording(make, swing, sigma, 1500, 0)],
         false_alarms_per_hour=1.0,
     )
     assert "1.5 x the highest nominal level" in limits.method  # for one an hour 3.5 s are too short
     with pytest.raises(
-        InputError, match=r"the limits are of \('current', 'speed'\) at 0.005 s, the model two tanks has"
+        InputError,
+        match=r"the limits are of \('current', 'speed', 'free run.*\) at 0.005 s, the model two tanks has",
     ):
         ResidualMonitor(model, limits=limits)
     with pytest.raises(InputError, match="resolution needs 1 positive steps"):
@@ -169,8 +170,5 @@ def test_what_does_not_fit_is_refused():
     short = recording(make, swing, sigma, 20, 0)
     with pytest.raises(InputError, match="no recording is longer than the"):
         learn_residuals(dc_motor(), observer(dc_motor(), sigma, step), [short])
-    assert levels_along(ResidualMonitor(dc_motor()), observer(dc_motor(), sigma, step), short).shape == (
-        20,
-        2,
-        2,
-    )
+    trace = replay_residuals(ResidualMonitor(dc_motor()), observer(dc_motor(), sigma, step), short)
+    assert trace.level.shape == (20, 4, 2)

@@ -50,7 +50,7 @@ RESULTS = {
                 "recommended": "mopgrnn",
                 "hybrid": "mopgrnn",
                 "reason": "mopgrnn is recommended.",
-                "candidates": {"phy": {"error": 0.2, "ratio": 1.0, "typical": 1.0, "upper": 1.0}},
+                "candidates": {"phy": {"error": 0.2, "ratio": 1.0, "upper": 1.0}},
             },
             "bands": {
                 "phy": {
@@ -98,6 +98,12 @@ RESULTS = {
         "period_ms": 20.0,
         "misses": 0,
     },
+    "residuals": {
+        "false_alarms_per_hour": 0.0,
+        "alarms": [{"file": "a", "start_s": 1.0, "end_s": 2.0, "channels": ["phi"]}],
+        "faults_reason": "the energy is watched",
+        "details": {"source": "recordings", "limits": {}, "clean": None},
+    },
     "monitor": {"threshold": {"energy [W]": 0.06}, "false_alarms_per_hour": 0.0, "alarms": []},
     "guard": {
         "false_alarms_per_hour": 2.0,
@@ -135,7 +141,7 @@ def leaves(values=RESULTS, prefix=""):
             yield prefix + key
 
 
-DEFAULTS = ("estimation.", "timing.controller_step_ms.", "guard.", "analysis.")
+DEFAULTS = ("estimation.", "timing.controller_step_ms.", "residuals.", "guard.", "analysis.")
 """Groups whose values may be left out."""
 
 

@@ -32,9 +32,7 @@ from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
-from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.loop import Loop
-from hybrid_mpc.monitor.innovations import ResidualMonitor
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
@@ -44,6 +42,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
     from hybrid_mpc.estimate.switching import SwitchingFilter
     from hybrid_mpc.monitor.energy import EnergyMonitor
+    from hybrid_mpc.monitor.innovations import ResidualMonitor
 
 Array = NDArray[np.float64]
 TIMED_PERIODS = 1000
@@ -155,9 +154,7 @@ def _only_timing(context: Context) -> ControlResult:
     controller, estimator, durations = kit.controller(), kit.observer(), []
     for i, recording in enumerate(whole):
         context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
-        watched = kit.models[kit.recommended]
-        monitor = kit.monitor(kind="own") if energy_is_watched(watched) else ResidualMonitor(watched)
-        durations.append(time_on_recording(controller, estimator, monitor, recording, most))
+        durations.append(time_on_recording(controller, estimator, kit.monitor(kind="own"), recording, most))
     reason = f"scenario {context.scenario.name} has no plant to close the loop with"
     return ControlResult((), reason, {"step_ms": np.concatenate(durations)})
 

@@ -20,8 +20,9 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
-from hybrid_mpc.job.stages.monitor import MONITOR, RATES, clean_windows
+from hybrid_mpc.job.stages.monitor import MONITOR, NO_ENERGY, RATES, clean_windows
 from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
+from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.faults import Fault, install
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import (
@@ -32,6 +33,7 @@ from hybrid_mpc.monitor.calibrate import (
     stretches,
 )
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
 from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED, SETTLING_S, block_seconds, samples, seconds
 from hybrid_mpc.monitor.replay import MonitorTrace, along, replay
@@ -211,10 +213,14 @@ def faulted(
     task = nominal_tasks(scenario)[0]
     start = dt * round(0.5 * task.duration / dt)
     monitor = kit.monitor("hybrid", kind="guard", task=task.name, diagnose=True)
+    assert isinstance(monitor, EnergyMonitor)
     loops: list[FaultedLoop] = []
     arrays: dict[str, Array] = {}
     for case in cases(scenario):
-        fault = Fault(start, math.inf, case.target, case.value)
+        hybrid = kit.models["hybrid"]
+        signals = hybrid.inputs if case.target.startswith("input_") else hybrid.outputs
+        channel = "" if case.target.startswith("plant_") else signals[0].name
+        fault = Fault(start, math.inf, case.target, case.value, channel)
         spec = LoopSpec(
             named, MODEL, task.name, CONTROLLER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
             faults=(fault,),
@@ -359,6 +365,8 @@ def guard_stage(context: Context) -> GuardResult | Absent:
     context.read(NOISE)
     kit = context.kit
     model, monitor = kit.models["hybrid"], context.find(MONITOR)
+    if not energy_is_watched(model):
+        return Absent(NO_ENERGY.format(scenario=scenario.name))
     calibration = Calibration.without(monitor.reason) if isinstance(monitor, Absent) else monitor.calibration
     rest = calibration.rest_speed or (REST_SPEED,)
     data = _nominal_data(context, kit, rest)
@@ -508,6 +516,7 @@ def _recorded(
     """
     model = kit.models["hybrid"]
     monitor = kit.monitor("hybrid", kind="energy" if detector is None else "guard", diagnose=True)
+    assert isinstance(monitor, EnergyMonitor)
     estimator = kit.observer("hybrid")
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]
     found: list[ExplainedAlarm] = []
@@ -517,7 +526,7 @@ def _recorded(
         trace, alarms = explained(
             monitor, estimator, recording, context.scenario.causes, say, prior=kit.models["prior"]
         )
-        found += [ExplainedAlarm(recording.name, **vars(alarm)) for alarm in alarms]
+        found += [ExplainedAlarm(recording.name, a.start_s, a.end_s, a.diagnosis) for a in alarms]
         begins, _ = stretches(trace.alarm)
         for window in clean_windows(context, recording, ("test",)):
             inside = _settled(recording.t, *window, model)

@@ -18,7 +18,7 @@ from hybrid_mpc.job.stages.compare import what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
 from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
-from hybrid_mpc.kit.assembly import make_monitor
+from hybrid_mpc.kit.assembly import energy_is_watched, make_monitor
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.model.model import HybridModel
@@ -39,6 +39,10 @@ LOAD_SHARE = 0.2
 """Unknown load of the demonstration, as a share of half the input's range."""
 MARGIN = 1.5
 """Where nominal data are too short for a rate: threshold over the highest nominal level."""
+NO_ENERGY = (
+    "the energy of {scenario} cannot be watched: its model is not mechanical, with its positions measured; its "
+    "residuals are watched instead (stage residuals)"
+)
 
 
 def rates(model: HybridModel) -> tuple[float, ...]:
@@ -138,6 +142,8 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     context.read(NOISE)
     kit, whole = context.kit, context.dataset.whole
     model, reason, rest = kit.models["hybrid"], "", None
+    if not energy_is_watched(model):
+        return Absent(NO_ENERGY.format(scenario=context.scenario.name))
     try:
         rest = nominal_rest(context, model)
     except InputError as short:
@@ -148,7 +154,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     for recording, say in along(whole, context.progress.update):
         trace = replay(watching, estimator, recording, on_progress=say)
         traces.append(trace)
-        nominal = _inside(context, recording, NOMINAL)
+        nominal = inside(context, recording, NOMINAL)
         power.append(np.where(nominal, trace.level_w, np.nan))
         residual.append(np.where(nominal, trace.residual_level, np.nan))
     covered: tuple[Mapping[str, float | str], ...] = tuple(
@@ -177,7 +183,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         # an alarm counts where it begins: it may reach in from a disturbed part
         starts, _ = stretches(trace.alarm)
         every, test = (
-            _inside(context, recording, roles) for roles in (("train", "valid", "nominal", "test"), ("test",))
+            inside(context, recording, roles) for roles in (("train", "valid", "nominal", "test"), ("test",))
         )
         clean = CleanAlarms(
             clean.seconds + float(every.sum() * model.dt),
@@ -243,11 +249,12 @@ def clean_windows(
     return [(float(t.t[0]), float(t.t[-1])) for t in pieces]
 
 
-def _inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> NDArray[np.bool_]:
-    inside = np.zeros(len(recording.t), dtype=bool)
+def inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Which samples ``(n,)`` of a recording lie in stretches of such roles in which nothing disturbs the machine."""
+    found = np.zeros(len(recording.t), dtype=bool)
     for start, end in clean_windows(context, recording, roles):
-        inside |= (recording.t >= start) & (recording.t <= end)
-    return inside
+        found |= (recording.t >= start) & (recording.t <= end)
+    return found
 
 
 def _calibrate(

@@ -32,6 +32,7 @@ from hybrid_mpc.job.stages.identify import (
     training_settings,
 )
 from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
+from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import (
     Analysis,
     Control,
@@ -39,6 +40,7 @@ from hybrid_mpc.job.stages.results import (
     Export,
     Guard,
     Monitor,
+    Residuals,
     Results,
     Timing,
     collect,
@@ -58,6 +60,7 @@ TITLES: Mapping[str, str] = {
     "control": "Closed loops",
     "estimation": "Estimation: are the observers as sure as they may be",
     "timing": "Time of a controller step",
+    "residuals": "Monitor of residuals",
     "monitor": "Energy monitor",
     "guard": "Energy guard",
     "analysis": "Linear analysis",
@@ -201,6 +204,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "control": [_control_table(results.control), _tracking_table(results.control)],
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
+        "residuals": _residual_tables(results.residuals),
         "monitor": [_alarm_table(context, results.monitor)],
         "guard": guard_tables(results.guard),
         "analysis": [_pole_table(results.analysis)],
@@ -209,6 +213,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
     for key in (
         "estimation",
         "timing",
+        "residuals",
         "monitor",
         "guard",
     ):  # words about pictures that are not there help nobody
@@ -317,6 +322,12 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
     if results.timing.misses is None:
         after["timing"] = (f"No step was timed: {results.timing.misses_reason.rstrip('.')}.",)
+    watched = results.residuals
+    after["residuals"] = (
+        (f"No alarms here: {watched.reason.rstrip('.')}.",)
+        if watched.alarms is None
+        else (f"Limits are from {watched.details.source}.",)
+    )
     monitor = results.monitor
     if monitor.details.calibration is None:
         after["monitor"] = (f"No alarms here: {monitor.reason.rstrip('.')}.",)
@@ -430,22 +441,14 @@ def _score_tables(context: Context, results: Results) -> list[Table]:
 def _choice_table(results: Results) -> Table:
     choice = results.identification.details.choice
     rows = [
-        (name_of(name), c.error, c.ratio, *(None if name == "phy" else v for v in (c.typical, c.upper)),
+        (name_of(name), c.error, c.ratio, None if name == "phy" else c.upper,
          "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]  # fmt: skip
-    columns = (
-        "model",
-        "error [spreads]",
-        "over the prior's",
-        "in a typical recording",
-        "that one at most",
-        "",
-    )
+    columns = ("model", "error [spreads]", "over the prior's", "at most, by 95 %", "")
     caption = (
-        f"Validation recordings. {choice.reason} A hybrid is recommended where both, its error over the prior's and "
-        "the bound, are below 1. In a typical recording: the geometric mean of each recording's ratio; with a single "
-        "recording the ratio itself. The bound holds with 95 %."
+        f"Validation recordings. {choice.reason} The error is that of all recordings together; over the prior's it "
+        "stands as the geometric mean of each recording's ratio where there are several, and the bound is that of this mean."
     )
     return Table(columns, rows, caption)
 
@@ -566,6 +569,28 @@ def _timing_table(timing: Timing) -> Table | None:
     return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
 
 
+def _residual_tables(found: Residuals) -> list[Table | None]:
+    if found.alarms is None:
+        return []
+    rows = [(a.file, a.start_s, a.end_s, ", ".join(a.channels)) for a in found.alarms]
+    heads = ("recording", "from [s]", "to [s]", "channels")
+    tables: list[Table | None] = [Table(heads, rows, "Alarms over the recordings.")]
+    if found.faults:
+        broken = [
+            (
+                f"{row.fault} of {row.channel}",
+                row.start_s,
+                row.delay_s,
+                ", ".join(row.channels),
+                row.diagnosis,
+            )
+            for row in found.faults
+        ]
+        columns = ("fault", "at [s]", "alarm after [s]", "channels", "taken for")
+        tables.append(Table(columns, broken, "Loops in which something breaks."))
+    return tables
+
+
 def _alarm_table(context: Context, monitor: Monitor) -> Table | None:
     calibration = monitor.details.calibration
     if monitor.alarms is None or calibration is None:
@@ -598,6 +623,7 @@ def _pole_table(analysis: Analysis) -> Table | None:
 
 REPORT = Stage(
     "report", "writing the report", ReportResult, report_stage, what_report_reads,
-    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, ESTIMATION, MONITOR, GUARD, ANALYSIS),
+    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, ESTIMATION, RESIDUALS, MONITOR, GUARD,
+     ANALYSIS),
     restore=report_is_there,
 )  # fmt: skip

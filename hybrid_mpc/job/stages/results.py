@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,9 +29,11 @@ from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
 from hybrid_mpc.job.stages.identify import DATA, MODELS
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
+from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.innovations import ResidualLimits
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
@@ -122,13 +124,12 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class CandidateErrors:
-    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's, the ratio in a typical
-    recording, and that one's upper bound; None where a run diverged or the bound is not known.
+    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's (of several recordings the
+    geometric mean of each one's), and that one's upper bound; None where a run diverged or the bound is not known.
     """
 
     error: float | None
     ratio: float | None
-    typical: float | None
     upper: float | None
 
 
@@ -265,6 +266,29 @@ class Monitor:
 
 
 @dataclass(frozen=True)
+class ResidualsDetails:
+    """What limits were learned from, limits by model, and alarms where nothing disturbs the machine."""
+
+    source: str = ""
+    limits: Mapping[str, ResidualLimits] = field(default_factory=dict)
+    clean: CleanAlarms | None = None
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """The monitor of residuals: false alarms an hour, alarms on the recordings with their channels, and loops in which
+    an actuator weakens or a sensor freezes, for machines whose energy is not watched.
+    """
+
+    false_alarms_per_hour: float | None = None
+    alarms: tuple[ChannelAlarm, ...] | None = None
+    faults: tuple[FaultedChannel, ...] | None = None
+    faults_reason: str = ""
+    details: ResidualsDetails = ResidualsDetails()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class BrokenLoop:
     """A loop in which something breaks: what and when, time to the alarm (None: never), what it is taken for."""
 
@@ -340,6 +364,7 @@ class Results:
     control: Control
     estimation: Estimation
     timing: Timing
+    residuals: Residuals
     monitor: Monitor
     guard: Guard
     analysis: Analysis
@@ -374,7 +399,16 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
         raise InputError(
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
         )
-    for group in ("identification", "control", "estimation", "timing", "monitor", "guard", "analysis"):
+    for group in (
+        "identification",
+        "control",
+        "estimation",
+        "timing",
+        "residuals",
+        "monitor",
+        "guard",
+        "analysis",
+    ):
         _check_values(values[group], group, where)
     return results
 
@@ -411,6 +445,7 @@ def collect(context: Context) -> Results:
         _control(context),
         _estimation(context),
         _timing(context),
+        _residuals(context),
         _monitor(context),
         _guard(context),
         _analysis(context),
@@ -442,7 +477,7 @@ def _identification(context: Context) -> Identification:
             chosen.hybrid,
             chosen.reason,
             {
-                name: CandidateErrors(*(finite(v) for v in (c.error, c.ratio, c.typical, c.upper)))
+                name: CandidateErrors(*(finite(v) for v in (c.error, c.ratio, c.upper)))
                 for name, c in chosen.candidates.items()
             },
         ),
@@ -582,6 +617,20 @@ def _timing(context: Context) -> Timing:
         return Timing(StepTimes(reason=reason), period, None, reason)
     median, p95, p99 = (float(np.quantile(ms, q)) for q in (0.5, 0.95, 0.99))
     return Timing(StepTimes(median, p95, p99, float(ms.max())), period, int((ms > period).sum()))
+
+
+def _residuals(context: Context) -> Residuals:
+    found = context.find(RESIDUALS)
+    if isinstance(found, Absent):
+        return Residuals(reason=found.reason)
+    clean = found.clean
+    return Residuals(
+        clean.alarms / (clean.seconds / 3600.0) if clean.seconds else 0.0,
+        found.alarms,
+        found.faults,
+        "" if found.faults is not None else "there is no plant, no calm task, or the energy is watched",
+        ResidualsDetails(found.source, found.limits, clean),
+    )
 
 
 def _monitor(context: Context) -> Monitor:

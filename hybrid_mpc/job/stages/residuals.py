@@ -1,0 +1,251 @@
+"""Stage residuals: the monitor of any machine, its limits learned from recordings, and tried on them and in loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
+from hybrid_mpc.job.monitor import explained_residuals
+from hybrid_mpc.job.stage import Absent, Stage
+from hybrid_mpc.job.stages.compare import what_loops_read
+from hybrid_mpc.job.stages.export import EXPORT, NOISE
+from hybrid_mpc.job.stages.identify import DATA
+from hybrid_mpc.job.stages.monitor import CleanAlarms, inside, rates
+from hybrid_mpc.kit.artifact import Kit, read_description, set_residuals
+from hybrid_mpc.kit.assembly import energy_is_watched
+from hybrid_mpc.loop.faults import Fault
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.calibrate import stretches
+from hybrid_mpc.monitor.innovations import (
+    ResidualLimits,
+    ResidualMonitor,
+    ResidualTrace,
+    judged,
+    limits_of,
+    replay_residuals,
+)
+from hybrid_mpc.monitor.replay import along
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
+HELD = ("valid", "nominal")
+"""Roles that no parameter was fitted to. Test recordings are kept to try the limits on."""
+SEED = 600
+"""Number of the loops in which something breaks, as that of the guard's."""
+WEAKER = 0.8
+"""What is left of an actuator's force in them."""
+
+
+@dataclass(frozen=True)
+class ChannelAlarm:
+    """An alarm on a recording: its file, from and to [s], and the channels that alarmed in it, in their order."""
+
+    file: str
+    start_s: float
+    end_s: float
+    channels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FaultedChannel:
+    """A loop in which an actuator weakens or a sensor freezes.
+
+    Args:
+        fault: The fault's target.
+        channel: Name of the input or output.
+        value: Its size.
+        task: Name of the task.
+        start_s: When it sets in [s].
+        delay_s: Time to the first alarm [s]; None: never.
+        channels: The channels of that alarm.
+        diagnosis: What the diagnosis takes it for; empty where it says nothing.
+        false_alarms: Alarms before it sets in.
+    """
+
+    fault: str
+    channel: str
+    value: float
+    task: str
+    start_s: float
+    delay_s: float | None
+    channels: tuple[str, ...]
+    diagnosis: str
+    false_alarms: int
+
+
+@dataclass(frozen=True)
+class ResidualsResult:
+    """Limits of the monitor of residuals, and what it says of recordings and loops.
+
+    Args:
+        limits: Limits by model.
+        source: What they were learned from, in words.
+        alarms: Alarms of the recommended model on the recordings that were replayed.
+        clean: Alarms where nothing disturbs the machine.
+        faults: Loops in which something breaks; None where the energy is watched, or without a plant.
+    """
+
+    limits: Mapping[str, ResidualLimits]
+    source: str
+    alarms: tuple[ChannelAlarm, ...]
+    clean: CleanAlarms
+    faults: tuple[FaultedChannel, ...] | None = None
+
+
+def residuals_stage(context: Context) -> ResidualsResult | Absent:
+    """Learn limits from undisturbed recordings, those that nothing was fitted to if they suffice; put them into the
+    artifact.
+    """
+    scenario = context.scenario
+    if scenario.control is None:
+        return Absent(
+            "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
+        )
+    context.read(NOISE)
+    kit, limits = context.kit, {}
+    for name in dict.fromkeys(("hybrid", kit.recommended)):
+        try:
+            found, recordings, traces, source = _learned(context, kit, name)
+        except InputError as none:
+            return Absent(f"no limits of residuals could be learned: {none}")
+        limits[name] = found
+    set_residuals(context.out / "model", limits)
+    alarms, clean = _on_recordings(
+        context, ResidualMonitor(kit.models[name], limits=found), recordings, traces
+    )
+    faults = None
+    calm = [task for task in scenario.tasks if not task.faults]
+    if scenario.plant is not None and calm and not energy_is_watched(kit.models["hybrid"]):
+        faults = _faulted(context, context.kit, calm[0].name)
+    return ResidualsResult(limits, source, alarms, clean, faults)
+
+
+def put_residuals(context: Context, found: ResidualsResult) -> str:
+    """Write the limits into the artifact, unless they are there."""
+    if read_description(context.out / "model").residuals != found.limits:
+        set_residuals(context.out / "model", found.limits)
+    return ""
+
+
+def _learned(
+    context: Context, kit: Kit, name: str
+) -> tuple[ResidualLimits, list[Trajectory], list[ResidualTrace], str]:
+    """Limits of a model, the recordings that were replayed for them with their traces, and where they come from."""
+    model, estimator = kit.models[name], kit.observer(name)
+    monitor, tried = ResidualMonitor(model), rates(model)
+    held = [r for r in context.dataset.whole if inside(context, r, (*HELD, "test")).any()]
+    recordings, traces = list(held), _replayed(context, monitor, estimator, held)
+
+    def learned(roles: Sequence[str]) -> ResidualLimits:
+        masks = [inside(context, r, tuple(roles)) for r in recordings]
+        return limits_of(monitor, recordings, traces, false_alarms_per_hour=tried, nominal=masks)
+
+    try:
+        found = learned(HELD)
+        if found.rated:
+            return found, recordings, traces, "recordings that nothing was trained on"
+    except InputError:
+        pass  # nothing of them is long enough; the others may be
+    others = [r for r in context.dataset.whole if r not in held]
+    recordings, traces = recordings + others, traces + _replayed(context, monitor, estimator, others)
+    source = "undisturbed recordings, also those of the training, which the model fits better than new ones"
+    return learned((*HELD, "train")), recordings, traces, source
+
+
+def _replayed(
+    context: Context, monitor: ResidualMonitor, estimator: object, recordings: Sequence[Trajectory]
+) -> list[ResidualTrace]:
+    return [
+        replay_residuals(monitor, estimator, recording, on_progress=say)  # type: ignore[arg-type]
+        for recording, say in along(recordings, context.progress.update)
+    ]
+
+
+def _on_recordings(
+    context: Context,
+    monitor: ResidualMonitor,
+    recordings: Sequence[Trajectory],
+    traces: Sequence[ResidualTrace],
+) -> tuple[tuple[ChannelAlarm, ...], CleanAlarms]:
+    alarms: list[ChannelAlarm] = []
+    clean, dt = CleanAlarms(), monitor.model.dt
+    for recording, levels in zip(recordings, traces, strict=True):
+        trace = judged(monitor, levels, recording.y)
+        alarms += [
+            ChannelAlarm(recording.name, start, end, trace.named(start, end))
+            for start, end in trace.intervals()
+        ]
+        starts, _ = stretches(trace.alarm)
+        every, test = (inside(context, recording, roles) for roles in ((*HELD, "train", "test"), ("test",)))
+        clean = CleanAlarms(
+            clean.seconds + float(every.sum() * dt),
+            clean.alarms + int(every[starts].sum()),
+            clean.test_seconds + float(test.sum() * dt),
+            clean.test_alarms + int(test[starts].sum()),
+        )
+    return tuple(alarms), clean
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What a loop recorded: ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u), ``w`` (n, n_w)."""
+
+    t: NDArray[np.float64]
+    y: NDArray[np.float64]
+    u: NDArray[np.float64]
+    w: NDArray[np.float64]
+
+
+def broken(model: HybridModel, start: float) -> list[Fault]:
+    """What is tried from ``start`` [s] on: each actuator loses a fifth of its force, each sensor freezes."""
+    weaker = [Fault(start, math.inf, "input_gain", WEAKER, s.name) for s in model.inputs]
+    return weaker + [Fault(start, math.inf, "measurement_freeze", 0.0, s.name) for s in model.outputs]
+
+
+def _faulted(context: Context, kit: Kit, task_name: str) -> tuple[FaultedChannel, ...]:
+    """A loop of each fault, from the middle of a calm task on; nothing reacts, so that the machine shows it."""
+    scenario, settings = context.scenario, context.settings
+    bench, model = Bench(scenario, {MODEL: kit}), kit.models["hybrid"]
+    base = LoopSpec(
+        settings.scenario, MODEL, task_name, "hybrid_observer", monitor="residuals", seed=SEED,
+        run_seed=settings.seed,
+    )  # fmt: skip
+    start = model.dt * round(0.5 * bench.task(base).duration / model.dt)
+    found, faults = [], broken(model, start)
+    for i, fault in enumerate(faults):
+        context.progress.update("faults", i, len(faults), f"{fault.target} of {fault.channel}")
+        spec = replace(base, faults=(fault,))
+        result = bench.run(spec)[1]
+        record = _Record(result.t, result.y, result.u, result.w)
+        monitor = bench.monitor(spec)
+        assert isinstance(monitor, ResidualMonitor)
+        # the estimator is deterministic: over the record it says again what it said in the loop
+        _, alarms = explained_residuals(
+            monitor, bench.parts(spec)[0], record, kit.models["prior"], kit.causes
+        )
+        before = [alarm for alarm in alarms if alarm.start_s < start - 1e-9]
+        seen = [alarm for alarm in alarms if alarm.end_s >= start - 1e-9]
+        found.append(
+            FaultedChannel(
+                fault.target, fault.channel, fault.value, task_name, start,
+                max(seen[0].start_s - start, 0.0) if seen else None,
+                seen[0].channels if seen else (), seen[0].diagnosis if seen else "", len(before),
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+RESIDUALS = Stage(
+    "residuals", "learning the monitor of residuals", ResidualsResult, residuals_stage,
+    lambda context: {**what_loops_read(context), "causes": context.scenario.causes}, (DATA, EXPORT, NOISE),
+    optional=True, restore=put_residuals,
+)  # fmt: skip

@@ -1,0 +1,176 @@
+"""Six simulated machines: balances, the prior's fit, and closed loops from an artifact of the prior alone."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from energy_checks import check_balances
+from scipy.integrate import solve_ivp
+
+import hybrid_mpc as hm
+from hybrid_mpc.identify.fit import smoothed
+from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.kit.artifact import loop_settings
+from scenarios.simulated import cart_pole, dc_motor, lever, two_heaters, two_link_arm, two_tanks
+from scenarios.simulated.plant import windows
+
+MACHINES = {m.scenario.name: m for m in (cart_pole, dc_motor, lever, two_heaters, two_link_arm, two_tanks)}
+SHORT = {"two_tanks": 1500.0, "dc_motor": 3.0, "two_heaters": 3000.0}
+"""Seconds of a short recording; 10 s of the others."""
+each = pytest.mark.parametrize("name", MACHINES)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """Machine -> scenario, fit of its prior to a short recording, and the artifact of that prior alone."""
+
+    @cache
+    def make(name):
+        machine, scenario = MACHINES[name], MACHINES[name].scenario
+        experiment = replace(machine.EXPERIMENT, seconds=SHORT.get(name, 10.0))
+        folder = tmp_path_factory.mktemp(name)
+        files = [
+            hm.write_csv(
+                folder / f"{role}_01.csv",
+                dict(zip(experiment.columns, experiment.table(role, 1, 0).T, strict=True)),
+            )
+            for role in ("train", "valid")
+        ]
+        spec, dt = replace(scenario.data, windows=windows(experiment.seconds)), scenario.data.dt
+        data = hm.load_trajectories(files, scenario.prior(), spec, needed=("train", "valid"))
+        train, valid = data.by_role("train"), data.by_role("valid")
+        fit = hm.fit_prior(scenario.prior, train, valid, dt=dt, length=scenario.data.free_run)
+        prior = scenario.prior(fit.values)
+        hm.save_artifact(
+            folder / "model", {"prior": prior_programs(prior, dt, fit.substeps)}, hm.model_info(prior, dt),
+            recommended="prior", loop=loop_settings(scenario),
+        )  # fmt: skip
+        kit = hm.load(folder / "model")
+        noise = hm.process_noise(kit.models["prior"], smoothed(scenario.prior, fit, train, dt))
+        return scenario, fit, kit.with_noise({"prior_observer": noise, "prior": noise})
+
+    return make
+
+
+@each
+def test_balances_hold_along_the_flow(name):
+    check_balances(MACHINES[name].scenario.prior())
+
+
+@each
+def test_the_plant_is_integrated_to_its_tolerance(name):
+    """An explicit method of order 8 with tolerances of 1e-10 gives the same states after a period."""
+    machine = MACHINES[name]
+    plant, experiment = machine.EXPERIMENT.plant(), machine.EXPERIMENT
+    table = experiment.table("train", 1, 0)[:40]
+    n_u, n_w = len(experiment.limits[0]), len(machine.scenario.prior().disturbances)
+    state, rates = plant.reset(np.array(experiment.x0), 0), rates_of(plant)
+    for row in table:
+        u, w = row[1 : 1 + n_u], row[1 + n_u : 1 + n_u + n_w]
+        state, before = plant.step(state, u, experiment.dt, w), state
+    exact = solve_ivp(
+        lambda t, z: rates(z, u, w), (0, experiment.dt), before.z, method="DOP853", rtol=1e-10, atol=1e-12
+    )
+    # Local errors of 1e-8 add over some dozen steps.
+    np.testing.assert_allclose(state.z, exact.y[:, -1], rtol=1e-6, atol=1e-6)
+
+
+def rates_of(plant):
+    return lambda z, u, w: np.array([float(v) for v in plant.rates(list(z), list(u), list(w), plant)])
+
+
+STEP = np.sqrt(12)
+"""A sensor whose steps are this many standard deviations has the same noise as one of white noise."""
+
+
+def closed(scenario, kit, task, seed=0, **options):
+    return hm.simulate(
+        scenario.plant(), kit.observer(), kit.controller(), task.reference,
+        dt=scenario.data.dt, x0=task.x0, seed=seed, w=task.w,
+        **{"faults": task.faults, "duration": task.duration, **options},
+    )  # fmt: skip
+
+
+def shown(plant, result):
+    """What the sensors would show without noise ``(n, n_y)``."""
+    rows = zip(result.x, result.u, result.w, strict=True)
+    return np.array([[float(v) for v in plant.outputs(list(x), list(u), list(w), plant)] for x, u, w in rows])
+
+
+@each
+def test_a_constant_load_leaves_no_offset(name, fitted):
+    """The mean error of the last fifth is below two steps of the sensor."""
+    scenario, _, kit = fitted(name)
+    task = next(t for t in scenario.tasks if t.faults)
+    controlled = np.flatnonzero(scenario.control.q_y)
+    assert hm.offset_free(kit.models["prior"], controlled).promised
+    result = closed(scenario, kit, task)
+    late = slice(len(result.t) * 4 // 5, None)
+    error = (shown(scenario.plant(), result) - result.y_ref)[late, controlled].mean(axis=0)
+    assert np.all(np.abs(error) < 2 * STEP * np.array(scenario.sensor_sigma)[controlled])
+    assert set(result.source) == {"MPC"}
+    assert np.all((result.u >= scenario.control.u_min) & (result.u <= scenario.control.u_max))
+
+
+PERIODS = 30
+"""Length of a loop with random faults."""
+
+
+@pytest.mark.parametrize("loops", [3, pytest.param(34, marks=pytest.mark.full)])
+@each
+def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, fitted):
+    scenario, _, kit = fitted(name)
+    control, dt, task = scenario.control, scenario.data.dt, scenario.tasks[0]
+    rng = np.random.default_rng(sorted(MACHINES).index(name))
+    for seed in range(loops):
+        faults = random_faults(scenario, rng, dt)
+        result = closed(scenario, kit, task, seed, faults=faults, duration=PERIODS * dt)
+        assert np.all(np.isfinite(result.u))
+        assert np.all((result.u >= control.u_min) & (result.u <= control.u_max))
+
+
+def random_faults(scenario, rng, dt):
+    """Two to four faults of sensors, actuators and the plant itself, of random sizes, within the loop."""
+    plant, span, faults = scenario.plant(), scenario.control.u_max - scenario.control.u_min, []
+    prior = scenario.prior()
+    y, u = [s.name for s in prior.outputs], [s.name for s in prior.inputs]
+    for _ in range(rng.integers(2, 5)):
+        start = dt * float(rng.integers(2, PERIODS // 2))
+        end = np.inf if rng.random() < 0.3 else start + dt * float(rng.integers(1, PERIODS // 2))
+        j, i = int(rng.integers(len(y))), int(rng.integers(len(u)))
+        kind = rng.integers(7)
+        target, value, channel = [
+            ("measurement_dropout", 0.0, y[j]),
+            ("measurement_freeze", 0.0, y[j]),
+            ("measurement_scale", rng.uniform(0.5, 2.0), y[j]),
+            ("measurement_offset", 100 * scenario.sensor_sigma[j] * rng.normal(), y[j]),
+            ("input_gain", rng.uniform(0.0, 1.5), u[i]),
+            ("input_offset", 0.5 * span[i] * rng.uniform(-1, 1), u[i]),
+            (f"plant_{rng.choice(plant.parameters_of)}", rng.uniform(0.5, 2.0), ""),
+        ][kind]
+        faults.append(hm.Fault(start, end, target, float(value), channel))
+    return faults
+
+
+def test_a_plant_refuses_faults_and_parameters_that_it_does_not_have():
+    with pytest.raises(hm.InputError, match="plant_edge"):
+        two_tanks.TwoTanks().with_faults([hm.Fault(0.0, 1.0, "plant_hole", 2.0)])
+    wider = hm.varied(two_tanks.TwoTanks(), [("area", 2.0)])
+    assert wider.area == 2 * two_tanks.TwoTanks().area
+
+
+def test_a_fault_of_the_plant_acts_while_it_lasts():
+    plant = two_tanks.TwoTanks().with_faults([hm.Fault(5.0, 10.0, "plant_pipe_lower", 0.0)])
+    state, levels = plant.reset(np.array(two_tanks.LEVELS), 0), []
+    for _ in range(3):
+        levels.append(plant.truth(state)[1])
+        state = plant.step(state, np.array([two_tanks.PUMP]), 5.0, np.array([two_tanks.INFLOW]))
+    levels.append(plant.truth(state)[1])
+    rise = np.diff(levels)
+    closed_pipe = (
+        (two_tanks.outflow(plant.pipe_upper, plant.truth(state)[0]) + two_tanks.INFLOW) * 5 / plant.area
+    )
+    assert rise[1] == pytest.approx(closed_pipe, rel=0.05)  # the upper level moves a little
+    assert rise[0] < 0.5 * rise[1]
+    assert rise[2] < 0.5 * rise[1]
