@@ -222,7 +222,7 @@ def picture(found: HeldOut, y, path: Path, title: str) -> None:
     from hybrid_mpc.plots.style import save
     from scenarios.torque_pendulum.prior import TorquePendulumPrior
 
-    figure = overview(found.trace, y, output=TorquePendulumPrior.outputs[0], force_unit="J/rad", title=title)
+    figure = overview(found.trace, y, outputs=TorquePendulumPrior.outputs, force_unit="J/rad", title=title)
     for start, end in CLEAN[found.name]:
         for ax in figure.axes:
             ax.axvspan(start, min(end, found.trace.t[-1]), ymin=0.94, color="#009E73", alpha=0.7, linewidth=0)

@@ -33,7 +33,7 @@ scenario = Scenario(
                   largest_delay=0.3),
     benchmark=BenchmarkSpec(
         {"quick": BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, batch=8)},
-        unit="mm", scale=1e3, piece=20.0,
+        units={"s": ("mm", 1e3)}, piece=20.0,
     ),
 )
 """

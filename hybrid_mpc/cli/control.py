@@ -79,16 +79,18 @@ def control(
 
 def summary(results: ControlResults) -> list[str]:
     """One line a task and controller."""
-    first = next(iter(results.loops[0].tracking_rmse))
-    width = max(len(first) + 5, 11)
-    head = f"{'RMSE ' + first:>{width}}"
-    lines = [f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {head} {'solved':>8}"]
+    cells = [cell for row in results.summary.values() for cell in row.values()]
+    signals = {s: max(len(s) + 5, 11) for s in dict.fromkeys(s for cell in cells for s in cell.tracking_rmse)}
+    heads = " ".join(f"{'RMSE ' + s:>{width}}" for s, width in signals.items())
+    lines = [f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {heads} {'solved':>8}"]
     for task, row in results.summary.items():
         for name, cell in row.items():
-            cost, rmse = cell.cost, cell.tracking_rmse[first].mean
+            cost = cell.cost
+            means = {s: found.mean for s, found in cell.tracking_rmse.items()}
+            errors = " ".join(f"{_number(means.get(s)):>{width}}" for s, width in signals.items())
             lines.append(
-                f"{task:16} {name:16} {_number(cost.mean):>10} {_number(cost.ci95, '±'):>10} "
-                f"{_number(rmse):>{width}} {100 * cell.sources['MPC']:>6.1f} %"
+                f"{task:16} {name:16} {_number(cost.mean):>10} {_number(cost.ci95, '±'):>10} {errors} "
+                f"{100 * cell.sources['MPC']:>6.1f} %"
             )
     lines += [line for row in results.loops if results.reaction for line in _guarded(row)]
     for name, times in results.step_ms.items():

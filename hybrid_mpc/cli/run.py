@@ -138,15 +138,14 @@ def _of(values: object, label: str) -> object:
 
 
 def tracking(errors: Mapping[str, float]) -> str:
-    """The first tracking error with its signal's unit.
+    """Tracking errors, each with its signal's unit.
 
     Example:
         >>> tracking({"phi [rad]": 0.01234, "phi_dot [rad/s]": 0.5})
-        'phi 0.01234 rad'
+        'phi 0.01234 rad, phi_dot 0.5 rad/s'
     """
-    label, value = next(iter(errors.items()))
-    name, _, unit = label.partition(" ")
-    return f"{name} {value:.4g} {unit.strip('[]')}"
+    split = ((*label.removesuffix("]").split(" [", 1), value) for label, value in errors.items())
+    return ", ".join(f"{name} {value:.4g} {unit}" for name, unit, value in split)
 
 
 def residual_lines(found: Residuals) -> list[str]:

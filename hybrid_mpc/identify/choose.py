@@ -123,7 +123,8 @@ def recommend(
         if figures[name].upper < CONFIDENT and figures[name].error < figures[prior].error
     ]
     chosen = min(safe, key=lambda name: figures[name].error, default=prior)
-    reason = _reason(figures, best, chosen, prior, f"{len(sizes)} {'recordings' if whole else 'blocks'}")
+    of_what = "recordings, their geometric mean" if whole else "block" if len(sizes) == 1 else "blocks"
+    reason = _reason(figures, best, chosen, prior, f"{len(sizes)} {of_what}")
     if deploy and deploy != chosen:
         reason = f"{deploy} is deployed as asked for. {reason}"
     return Choice(
@@ -137,7 +138,10 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
     if not math.isfinite(figures[best].error):
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
     own = figures[best if chosen == prior else chosen]
-    said = f"its validation error is {own.ratio:.2f} of the prior's (at most {own.upper:.2f}, {blocks})"
+    bound = f"at most {own.upper:.2f}" if math.isfinite(own.upper) else "without a bound"
+    said = f"its validation error is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
+    if chosen == prior and own.upper < CONFIDENT:
+        said += ", but over all of them together the prior's is no larger"
     if chosen == prior:
         return f"The fitted prior is recommended: {best} does not surely beat it; {said}."
     return f"{chosen} is recommended: {said}."

@@ -7,7 +7,7 @@ A part that cannot be computed is a :class:`Missing` with its reason.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,7 @@ from hybrid_mpc.analyze.properties import (
     SteadyGain,
     Structure,
     frequency_response,
+    hankel_singular_values,
     physical_states,
     steady_gain,
     system_structure,
@@ -210,9 +211,10 @@ class ScheduleAnalysis:
 class LoopAnalysis:
     """A controller and a filter around a linearized machine.
 
-    ``gain`` is the controller's by the physical states ``(n_u, n_x)``, ``open_loop`` the loop gain at the first input
-    ``(n,)`` in negative feedback at ``omega`` [rad/s]. A loop that is not stable has no margins, no sensitivities
-    (``"S"``, ``"T"``, ``"KS"``, ``"GS"``) and no peaks (of ``"S"`` and ``"T"``).
+    ``gain`` is the controller's by the physical states ``(n_u, n_x)``, ``open_loop`` the loop gain ``(n,)`` in negative
+    feedback at ``omega`` [rad/s], broken at one input with the others closed. A loop that is not stable has no margins,
+    no sensitivities at that input (``"S"``, ``"T"`` ``(n,)``, ``"KS"``, ``"GS"`` ``(n_y, n)``) and no peaks (of ``"S"``
+    and ``"T"``).
     """
 
     stable: bool
@@ -254,7 +256,8 @@ class SensitivityAnalysis:
 class AnalysisResult:
     """The parts of an analysis, each by model; linearizations also by point of :data:`POINTS`.
 
-    Loops are by ``"prior on hybrid"`` (controller on machine), point, and mode of the filter.
+    Loops are by ``"prior on hybrid"`` (controller on machine), point, and mode of the filter with, where there are
+    several, the input at which the loop is broken: ``"quiet"``, or ``"quiet at heater_1"``.
     """
 
     equilibria: Mapping[str, Equilibria] | Missing
@@ -493,6 +496,7 @@ def linearizations_of(
 def _linearization(given: AnalysisInput, model: HybridModel, point: Point, system: Any) -> Linearization:
     unit = machine_second(model)
     structure, omega = system_structure(system), np.geomspace(0.02 / unit, np.pi / model.dt, 400)
+    structure = replace(structure, hankel=hankel_singular_values(_scaled(given, model, system)))
     t = np.asarray(model.dt * np.arange(round(4.0 * unit / model.dt) + 1), dtype=np.float64)
     step = control_toolbox().step_response(system, t).outputs
     return Linearization(
@@ -504,6 +508,19 @@ def _linearization(given: AnalysisInput, model: HybridModel, point: Point, syste
         np.reshape(step, (model.n_y, model.n_u, -1)),
         _reduced(given, model, point, system, omega) if model.n_h else None,
         _gain(system),
+    )
+
+
+def _scaled(given: AnalysisInput, model: HybridModel, system: Any) -> Any:
+    """A system with inputs and outputs over their working ranges, so that those of several units can be put together:
+    an output's range is what those of the states, and of the inputs, make of it.
+    """
+    half_x, half_u = (0.5 * (box[:, 1] - box[:, 0]) for box in (given.x_range, given.u_range))
+    a, b, c, d = (np.asarray(m) for m in (system.A, system.B, system.C, system.D))
+    sizes = np.abs(c[:, : model.n_x]) @ half_x + np.abs(d) @ half_u
+    over = np.where(sizes > 0, sizes, 1.0)[:, None]
+    return control_toolbox().ss(
+        a, b * half_u, c / over, d * half_u / over, system.dt, remove_useless_states=False
     )
 
 
@@ -638,25 +655,33 @@ def loops_of(
             steady = steady_filter(ekf, x, u, h, system=made[name][point])
             for machine in (plant for own, plant in around if own == name):
                 loop = mpc_loop(gain, steady, made[machine][point])
-                one = _loop(loop, gain.by_state[:, : model.n_x], model.dt, machine_second(model))
-                found.setdefault(f"{name} on {machine}", {}).setdefault(point, {})[mode] = one
+                rows = found.setdefault(f"{name} on {machine}", {}).setdefault(point, {})
+                for j, signal in enumerate(model.inputs):
+                    own = gain.by_state[:, : model.n_x], model.dt, machine_second(model)
+                    rows[f"{mode}{at_input(model, signal)}"] = _loop(loop, j, *own)
     return found
 
 
-def _loop(loop: LinearLoop, gain: Array, dt: float, unit: float) -> LoopAnalysis:
+def at_input(model: HybridModel, signal: Signal) -> str:
+    """What says at which input a loop is broken; nothing of the only one."""
+    return f" at {signal.name}" if model.n_u > 1 else ""
+
+
+def _loop(loop: LinearLoop, j: int, gain: Array, dt: float, unit: float) -> LoopAnalysis:
     omega = np.geomspace(0.05 / unit, np.pi / dt, 500)
-    response = frequency_response(loop.broken(), omega)
+    response = frequency_response(loop.broken(j), omega)
     open_loop = response.magnitude[0, 0] * np.exp(1j * response.phase[0, 0])
     functions: dict[str, Complex] = {}
     if loop.stable:
-        functions = {k: v[0, 0] for k, v in loop.sensitivity(omega).items() if k in ("S", "T", "KS", "GS")}
+        every = loop.sensitivity(omega)
+        functions = {k: every[k][j, j] for k in ("S", "T")} | {"KS": every["KS"][j], "GS": every["GS"][:, j]}
     return LoopAnalysis(
         loop.stable,
         float(abs(loop.poles[0])),
         gain,
         omega,
         open_loop,
-        loop.margins() if loop.stable else None,
+        loop.margins(j) if loop.stable else None,
         functions,
         {k: float(np.abs(functions[k]).max()) for k in ("S", "T") if k in functions},
     )

@@ -27,6 +27,7 @@ from hybrid_mpc.job.analyze import (
     ResponseAnalysis,
     ScheduleAnalysis,
     SensitivityAnalysis,
+    at_input,
     machine_second,
 )
 from hybrid_mpc.machine.signals import Signal
@@ -127,7 +128,8 @@ def _equilibria(some: HybridModel, part: Mapping[str, Equilibria]) -> Table:
         for p in found.points
     ]
     return Table(
-        ("model", *(s.label for s in some.states), "stability", "spectral radius [-]", "residual [SI]", "hits"),
+        ("model", *(s.label for s in some.states), "stability", "spectral radius [-]",
+         "largest residual of a state [its unit]", "hits"),
         rows, "Points of rest under the operating point's input in the whole range of the states.",
     )  # fmt: skip
 
@@ -143,7 +145,7 @@ def _friction(some: HybridModel, part: Mapping[str, FrictionAnalysis]) -> Table:
     return Table(
         ("model", "tangent at rest [1/s]", "secant [1/s]", "describing function [1/s]", "tangent in motion [1/s]",
          f"tangent at rest [{ratio_unit(some.inputs[0], speed)}]"), rows,
-        f"Damping at rest and of motions of {working:.3g} {speed.unit} (working speed).",
+        f"Damping of {speed.name} at rest and of motions of {working:.3g} {speed.unit} (working speed).",
     )  # fmt: skip
 
 
@@ -156,10 +158,9 @@ def _modes(some: HybridModel, part: Mapping[str, Mapping[str, Linearization]]) -
     ]  # fmt: skip
     return Table(
         ("model", "point", "pole, real [-]", "pole, imaginary [-]", "frequency [rad/s]", "damping [-]",
-         "controllability [-]", "observability [-]",
-         f"Hankel singular value [{ratio_unit(some.outputs[0], some.inputs[0])}]"), rows,
+         "controllability [-]", "observability [-]", "Hankel singular value [-]"), rows,
         "Modes of the linearizations. Controllability and observability are distances from losing them; the Hankel "
-        "singular values have an order of their own.",
+        "singular values, of inputs and outputs over their working ranges, have an order of their own.",
     )  # fmt: skip
 
 
@@ -172,9 +173,10 @@ def _steady_gain(some: HybridModel, part: Mapping[str, Mapping[str, Linearizatio
             gain = own.gain
             if isinstance(gain, SteadyGain):
                 relative = None if gain.relative is None else float(gain.relative[i, j])
-                rows.append((model, point, f"{y.label} by {u.label}", float(gain.gain[i, j]), relative))
+                here = float(gain.gain[i, j]), ratio_unit(y, u)
+                rows.append((model, point, f"{y.name} by {u.name}", *here, relative))
     return Table(
-        ("model", "point", "channel", "steady gain [output unit / input unit]", "relative gain [-]"), rows,
+        ("model", "point", "channel", "steady gain [unit beside it]", "unit", "relative gain [-]"), rows,
         "What an output comes to under a held input. A relative gain near 1 says that this input may be paired with "
         "this output; a negative one, that its sign turns round when the other loops are closed.",
     )  # fmt: skip
@@ -191,7 +193,7 @@ def _margins(some: HybridModel, part: Mapping[str, Mapping[str, Mapping[str, Loo
     return Table(
         ("loop", "point", "filter", "stable", "spectral radius [-]", "gain up [-]", "gain down [-]", "phase [rad]",
          "delay [s]", "delay [periods]", "modulus [-]", "disk [-]"), rows,
-        "Margins of the linearized loops (controller on machine), broken at the plant's input.",
+        "Margins of the linearized loops (controller on machine), broken at the plant's input, one of them at a time.",
     )  # fmt: skip
 
 
@@ -334,15 +336,26 @@ def _draw_measured(given: AnalysisInput, part: ResponseAnalysis) -> Named:
 
 
 def _draw_loops(given: AnalysisInput, part: Mapping[str, Mapping[str, Mapping[str, LoopAnalysis]]]) -> Named:
-    driven = {
-        f"{loop}, {mode}": row for loop, points in part.items() for mode, row in points["driven"].items()
-    }
-    shown = {label: {"omega": r.omega, **r.sensitivity} for label, r in driven.items() if r.stable}
-    if shown:
-        caption = "Sensitivity functions at the plant's input, linearized along a driven run."
-        yield "sensitivity", plots.sensitivity_functions(shown), caption
-    caption = "Nyquist curves of the loops, linearized along a driven run; positive frequencies."
-    yield "nyquist", plots.nyquist({label: r.open_loop for label, r in driven.items()}, modulus=0.5), caption
+    some = _some(given)
+    for signal in some.inputs:
+        where = at_input(some, signal)
+        named = f"{CHANNEL}{signal.name}" if where else ""
+        driven = {
+            f"{loop}, {mode.removesuffix(where)}": row
+            for loop, points in part.items()
+            for mode, row in points["driven"].items()
+            if mode.endswith(where)
+        }
+        shown = {label: {"omega": r.omega, "S": r.sensitivity["S"], "T": r.sensitivity["T"]}
+                 for label, r in driven.items() if r.stable}  # fmt: skip
+        if shown:
+            caption = f"Sensitivity functions at the plant's input{where}, linearized along a driven run."
+            yield f"sensitivity{named}", plots.sensitivity_functions(shown), caption
+        caption = (
+            f"Nyquist curves of the loops broken{where or ' at the input'}, linearized along a driven run; "
+        )
+        curves = {label: r.open_loop for label, r in driven.items()}
+        yield f"nyquist{named}", plots.nyquist(curves, modulus=0.5), f"{caption}positive frequencies."
 
 
 def _draw_schedule(given: AnalysisInput, part: Mapping[str, ScheduleAnalysis]) -> Named:
@@ -362,12 +375,11 @@ def _draw_schedule(given: AnalysisInput, part: Mapping[str, ScheduleAnalysis]) -
 
 def _draw_sensitivity(given: AnalysisInput, part: Mapping[str, SensitivityAnalysis]) -> Named:
     first = next(iter(part.values()))
-    figure = plots.sensitivities(
-        first.t, {name: part[name].relative[:, 0] for name in _names(given)}, first.parameters,
-        output_signal=_some(given).states[0],
-    )  # fmt: skip
-    caption = "Change of a free run per relative change of the prior's parameters."
-    yield "sensitivity_parameters", figure, caption
+    for i, state in enumerate(_some(given).states):
+        relative = {name: part[name].relative[:, i] for name in _names(given)}
+        figure = plots.sensitivities(first.t, relative, first.parameters, output_signal=state)
+        caption = f"Change of {state.name} in a free run per relative change of the prior's parameters."
+        yield f"sensitivity_parameters{CHANNEL}parameters_to_{state.name}", figure, caption
 
 
 def _names(given: AnalysisInput) -> list[str]:
@@ -439,7 +451,10 @@ def _key_figures(result: AnalysisResult) -> list[KeyFigure]:
             keys.append(KeyFigure(label, 100 * error.median, "%", "median"))
     if not isinstance(result.loops, Missing):
         for name in ("prior on prior", "hybrid on hybrid"):
-            margins = result.loops[name]["driven"]["quiet"].margins if name in result.loops else None
-            if margins is not None:
-                keys.append(KeyFigure(f"Delay margin, driven, {name}", 1e3 * margins.delay, "ms"))
+            for mode, row in (result.loops[name]["driven"] if name in result.loops else {}).items():
+                if mode.startswith("quiet") and row.margins is not None:
+                    where = mode.removeprefix("quiet")
+                    keys.append(
+                        KeyFigure(f"Delay margin, driven, {name}{where}", 1e3 * row.margins.delay, "ms")
+                    )
     return keys

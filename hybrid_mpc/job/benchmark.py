@@ -186,6 +186,7 @@ def benchmark(
 
 def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
     budgets = benchmark_of(scenario).budgets
+    scored_signals(scenario.prior().outputs, benchmark_of(scenario))  # refuses units of what is no output
     if settings.budget not in budgets:
         raise InputError(
             f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"

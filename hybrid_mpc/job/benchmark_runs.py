@@ -27,6 +27,7 @@ from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import BenchmarkSpec, Role
+from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -189,7 +190,7 @@ def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tup
     Example:
         >>> z = np.zeros((400, 1))
         >>> run = Trajectory("run", "", 0.1, 0.1 * np.arange(400), z, z, np.zeros((400, 2)), np.zeros((400, 2)))
-        >>> spec = BenchmarkSpec(unit="rad", piece=10.0, cycle=("train", "valid"))
+        >>> spec = BenchmarkSpec(piece=10.0, cycle=("train", "valid"))
         >>> [(p.role, len(p.t)) for p in in_turn(run, spec, 0.4)]
         [('train', 96), ('valid', 96), ('train', 96), ('valid', 96)]
     """
@@ -294,16 +295,18 @@ def run_freely(
 def scored_signals(outputs: Sequence[Signal], spec: BenchmarkSpec) -> list[tuple[Signal, float]]:
     """Outputs in the units of the figures, and how many of these are one of their own.
 
+    Raises:
+        InputError: If the specification has a unit for what is no output.
+
     Example:
-        >>> found = scored_signals((Signal("q", "m"), Signal("v", "m/s")), BenchmarkSpec(unit="mm", scale=1e3))
+        >>> found = scored_signals((Signal("q", "m"), Signal("v", "m/s")), BenchmarkSpec(units={"q": ("mm", 1e3)}))
         >>> [(signal.label, scale) for signal, scale in found]
         [('q [mm]', 1000.0), ('v [m/s]', 1.0)]
     """
-    first, *others = outputs
-    return [
-        (Signal(first.name, spec.unit or first.unit), spec.scale),
-        *((Signal(s.name, s.unit), 1.0) for s in others),
-    ]
+    for name in spec.units:
+        known(name, [s.name for s in outputs], "output in the units of the benchmark")
+    found = [(s.name, *spec.units.get(s.name, (s.unit, 1.0))) for s in outputs]
+    return [(Signal(name, unit), factor) for name, unit, factor in found]
 
 
 def run_error(
@@ -315,7 +318,7 @@ def run_error(
     Example:
         >>> y = np.array([[0.0], [1.0], [2.0]])
         >>> run = BenchmarkRun("run", np.arange(3.0), y, y, {"phy": y + 0.1})
-        >>> found = run_error([run], "phy", [Signal("q", "m")], BenchmarkSpec(unit="mm", scale=1e3))
+        >>> found = run_error([run], "phy", [Signal("q", "m")], BenchmarkSpec(units={"q": ("mm", 1e3)}))
         >>> {name: round(value, 6) for name, value in found.rmse.items()}
         {'q [mm]': 100.0}
     """

@@ -14,7 +14,7 @@ from hybrid_mpc.files import digest, write_json
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
-from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
+from hybrid_mpc.job.loops import DRAWN, Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
 from hybrid_mpc.job.study import Study
 from hybrid_mpc.job.study_run import StudyModel, load_models
 from hybrid_mpc.job.summary import Summary, by_task, summaries
@@ -29,8 +29,6 @@ from hybrid_mpc.scenario import load_scenario
 Array = NDArray[np.float64]
 NOUN = "control"
 SCHEMA_VERSION = 3
-DRAWN = ("t", "x", "u", "reference", "plans")
-"""Arrays of the first loop of a task and controller, for the figures."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,7 @@ def _rows(bench: Bench, study: Study, model: StudyModel, folder: Path, progress:
     """The rows of all loops: those that the folder holds, and the others as they run."""
     first, specs = study.loop_seeds[0], dict[str, list[LoopSpec]]()
     for spec in study.runs():
-        arrays = ("step_ms", *(DRAWN if spec.seed == first else ()))
+        arrays = ("step_ms", *((*DRAWN, "plans") if spec.seed == first else ()))
         specs.setdefault(spec.task, []).append(replace(spec, keep=arrays))
     rows: list[LoopRow] = []
     for task, own in specs.items():
@@ -139,7 +137,7 @@ def _rows(bench: Bench, study: Study, model: StudyModel, folder: Path, progress:
 
 
 def _digest(spec: LoopSpec, model: StudyModel) -> str:
-    return digest([spec.id, model.sha256])
+    return digest([spec.id, spec.keep, model.sha256])
 
 
 def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[LoopRow]) -> ControlResults:
@@ -179,6 +177,7 @@ def _times(rows: Sequence[LoopRow]) -> dict[str, Array]:
 def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progress, gif: bool) -> list[Path]:
     """Figures of the first loop of every task and controller, and the durations of steps."""
     # half a second to import: what is refused, is refused before
+    from hybrid_mpc.job.loop_figures import curves_of, loop_figure
     from hybrid_mpc.plots import animation, loops
     from hybrid_mpc.plots.style import save
 
@@ -189,12 +188,7 @@ def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progr
         progress.update("figures", i, len(drawn), task.name)
         first = {name: found[0].arrays for name, found in drawn[task.name].items()}
         control = kit.problem(task.name)
-        limits, some = (control.u_min, control.u_max), next(iter(first.values()))
-        motions = {name: loops.Motion(a["t"], a["x"], a["u"]) for name, a in first.items()}
-        figure = loops.closed_loops(
-            task.title, some["t"], some["reference"], motions, states=model.states, inputs=model.inputs,
-            limits=limits,
-        )  # fmt: skip
+        figure = loop_figure(task.title, control, model, first)
         written.append(save(figure, folder / f"{task.name}.png"))
         name = next((n for n in ("hybrid_observer", "hybrid") if n in first), next(iter(first)))
         own = first[name]
@@ -202,7 +196,8 @@ def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progr
             path = folder / f"{task.name}.gif"
             animation.animate(
                 path, own["t"], own["x"], own["plans"], dt=model.dt, draw=scenario.draw, u=own["u"],
-                title=f"{task.title} ({name})", position=model.states[0], inputs=model.inputs, limits=limits,
+                title=f"{task.title} ({name})", curves=curves_of(model), inputs=model.inputs,
+                limits=(control.u_min, control.u_max),
             )  # fmt: skip
             written.append(path)
     written.append(save(loops.solve_times(_times(rows), 1e3 * model.dt), folder / "step_times.png"))

@@ -55,6 +55,8 @@ ARRAYS = (
     *(f.name for f in fields(ClosedLoopResult) if f.name not in ("dt", "timing_ms", "switches")),
 )  # fmt: skip
 """What a row may hold of its loop."""
+DRAWN = ("t", "x", "u", "y", "w", "reference", "y_ref")
+"""Those that a figure of a loop needs."""
 TIMES = ("total", "solve", "estimate")
 MOST_BUILT = 64
 """Controllers that a bench holds; loops come ordered by controller, so few are asked for again."""
@@ -213,8 +215,8 @@ class LoopRow:
         seed: Number of the loop.
         seconds: Length [s].
         cost: Closed-loop cost on the plant's true state.
-        tracking_rmse: Root mean square deviation from the reference by signal: of the true states, or of the measured
-            outputs where references are the outputs'.
+        tracking_rmse: Root mean square deviation from the reference by signal: of the true states, or, where references
+            are the outputs', of the measured outputs that the problem weighs.
         largest_x: Largest magnitude of the true states, by signal.
         largest_u: Largest magnitude of the inputs, by signal.
         limits: Largest share of the way from rest to each limit that was used: 1 is the limit, more a violation.
@@ -507,6 +509,10 @@ def with_arrays(rows: Sequence[LoopRow], arrays: Mapping[str, Array]) -> list[Lo
 def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result: ClosedLoopResult) -> LoopRow:
     """The row of a loop, from its task, its control problem, a model that names the signals, and its record."""
     r, labels = result, [signal.label for signal in model.states]
+    tracked, errors = labels, result.tracking_rmse
+    if r.tracks_outputs:  # those that nothing weighs have no reference
+        tracked = [s.label for s, weight in zip(model.outputs, problem.q_y, strict=True) if weight > 0]
+        errors = errors[problem.q_y > 0]
     inputs = [signal.label for signal in model.inputs]
     level = r.level[np.isfinite(r.level)]
     watched = spec.monitor != "none" and CONTROLLERS[spec.controller].model == "hybrid"
@@ -517,7 +523,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         seed=spec.seed,
         seconds=len(r.t) * r.dt,
         cost=r.cost,
-        tracking_rmse=_by([s.label for s in model.outputs] if r.tracks_outputs else labels, r.tracking_rmse),
+        tracking_rmse=_by(tracked, errors),
         largest_x=_by(labels, np.abs(r.x).max(axis=0)),
         largest_u=_by(inputs, np.abs(r.u).max(axis=0)),
         limits=limits_used(problem, r, model),
@@ -562,12 +568,17 @@ def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[s
 
 
 def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
-    """By how much a loop left its limits at most, in the signals' units: inputs and, where limited, changes, states."""
+    """By how much a loop left its limits at most, in the signals' units: inputs and, where limited, changes, states,
+    measured outputs.
+    """
     beyond = np.maximum(r.u - control.u_max, control.u_min - r.u)
     over = {s.label: v for s, v in zip(model.inputs, beyond.T, strict=True)}
     if np.any(np.isfinite([control.x_min, control.x_max])):
         beyond = np.maximum(r.x - control.x_max, control.x_min - r.x)
         over |= {s.label: v for s, v in zip(model.states, beyond.T, strict=True)}
+    if np.any(np.isfinite([control.y_min, control.y_max])):
+        beyond = np.where(np.isfinite(r.y), np.maximum(r.y - control.y_max, control.y_min - r.y), -np.inf)
+        over |= {f"output {s.label}": v for s, v in zip(model.outputs, beyond.T, strict=True)}
     if control.du_max is not None:
         rest = np.clip(model.u0, control.u_min, control.u_max)
         changes = np.abs(np.diff(r.u, axis=0, prepend=rest[None])) - control.du_max

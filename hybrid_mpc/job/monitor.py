@@ -33,7 +33,7 @@ from hybrid_mpc.monitor.innovations import (
 from hybrid_mpc.monitor.learn import guard_monitor, learn_from
 from hybrid_mpc.monitor.lengths import HISTORY_S, samples
 from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, along, replay
-from hybrid_mpc.monitor.residuals import force_units
+from hybrid_mpc.monitor.residuals import force_unit
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario
 
@@ -302,7 +302,7 @@ def _watch_energy(
         name = recording.name.replace("#", "_")
         write_text(out / f"{name}.csv", table(trace, recording, model.outputs))
         figure = overview(
-            trace, recording.y[:, 0], output=model.outputs[0], force_unit=force_units(model)[0], thresholds=limits,
+            trace, recording.y, outputs=model.outputs, force_unit=force_unit(model), thresholds=limits,
             notes=[(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis], title=name,
         )  # fmt: skip
         save(figure, out / f"{name}.png")

@@ -292,6 +292,7 @@ def _report(results: StudyResults, folder: Path) -> Report:
         _what(results),
         Section("Costs", COST_TEXT, _figure(_distributions, results, folder), [costs]),
         *_comparison(results, folder),
+        *_tracking(results, folder),
         Section("Cost against computing time", TIME_TEXT, _figure(_pareto, results, folder)),
         *_task_figures(results),
         *_failures(results),
@@ -304,12 +305,17 @@ def _report(results: StudyResults, folder: Path) -> Report:
 
 
 COST_TEXT = (
-    "Closed-loop cost on the plant's true state, with the 95 % interval of the mean (Student's t). A unit of the "
+    "Closed-loop cost on the plant's true state, with the 95 % interval of the mean (Student's t): squared deviations "
+    "of all signals, each times its weight in the control problem, which brings them to one scale. A unit of the "
     "statistics is a draw where there are several, for its seeds share one machine; else a seed.",
 )
 PAIRED_TEXT = (
     "Differences between runs that met the same draw and the same sensor noise: what varies from draw to draw alike "
     "for all cancels, so that the interval is that of the difference itself.",
+)
+TRACKING_TEXT = (
+    "Root mean square deviations from the reference, each signal in its own unit: of true states, or of measured "
+    "outputs where references are theirs.",
 )
 TIME_TEXT = (
     "Median duration of a whole step (estimate, solve, monitor), averaged over the runs. Runs were computed side by "
@@ -377,6 +383,28 @@ def _comparison(results: StudyResults, folder: Path) -> list[Section]:
         return []
     table = _table(results.paired(over=over), f"Cost of each {over} less that of the first.")
     return [Section("Paired differences", PAIRED_TEXT, _figure(_differences, results, folder), [table])]
+
+
+TRACKING = "tracking_rmse "
+"""Columns of the tracking errors begin with it; the signal's label follows."""
+
+
+def _tracking(results: StudyResults, folder: Path) -> list[Section]:
+    """Tracking errors of every signal in its unit."""
+    tables, figures = [], []
+    for i, column in enumerate(c for c in results.figures if c.startswith(TRACKING)):
+        label = f"RMSE of {column.removeprefix(TRACKING)}"
+        found = results.summary(column)
+        if not (found["n"] > 0).any():
+            continue
+        tables.append(
+            _table(found[found["n"] > 0], f"{label}: mean, ends of the 95 % interval, runs left out.")
+        )
+        values = {task: {str(k): g[column].to_numpy() for k, g in rows} for task, rows in _levels(results)}
+        some = {task: row for task, row in values.items() if any(np.isfinite(v).any() for v in row.values())}
+        figure = save(studies.distributions(some, label), folder / f"tracking_{i}.png")
+        figures.append((figure, f"How the {label} is distributed over the runs of each task."))
+    return [Section("Tracking", TRACKING_TEXT, figures, tables)] if tables else []
 
 
 def _task_figures(results: StudyResults) -> list[Section]:

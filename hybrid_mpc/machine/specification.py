@@ -167,9 +167,8 @@ class BenchmarkSpec:
 
     Args:
         budgets: Effort by name, ``"quick"`` and ``"full"``.
-        unit: Unit of the first output's figures, e.g. ``"mm"`` for an output in metres. Default: the output's own, as
-            further outputs have it.
-        scale: Factor from the first output's unit to ``unit``, e.g. 1000 from m to mm. Default: 1.
+        units: By the name of an output the unit of its figures, and how many of these are one of its own: ``{"x":
+            ("mm", 1e3)}`` for an output in metres. Default: every output's own.
         length: Length [s] of a run after what is given. Default: the whole recording.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
         cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
@@ -179,26 +178,26 @@ class BenchmarkSpec:
             windows in the data specification. Fewer files than that are split by it. Default: zero, never.
 
     Raises:
-        InputError: If a length or the scale is out of its range, a cycle lacks a role that is needed, or
+        InputError: If a length or a factor is out of its range, a cycle lacks a role that is needed, or
             both ``cycle`` and ``valid_every`` are given.
 
     Example:
-        >>> BenchmarkSpec({}, unit="mm", scale=1e3).length is None
+        >>> BenchmarkSpec({}, units={"q": ("mm", 1e3)}).length is None
         True
     """
 
     budgets: Mapping[str, BenchmarkBudget] = field(default_factory=dict)
-    unit: str = field(default="", kw_only=True)
-    scale: float = 1.0
+    units: Mapping[str, tuple[str, float]] = field(default_factory=dict, kw_only=True)
     length: float | None = None
     piece: float = 25.0
     cycle: tuple[str, ...] = ()
     valid_every: int = 0
 
     def __post_init__(self) -> None:
-        if not (self.scale > 0 and self.piece > 0 and (self.length is None or self.length > 0)):
+        factors = [factor for _, factor in self.units.values()]
+        if not (min([*factors, self.piece]) > 0 and (self.length is None or self.length > 0)):
             raise InputError(
-                f"benchmark specification: scale, piece and length must be positive, got {self.scale}, "
+                f"benchmark specification: factors of units, piece and length must be positive, got {factors}, "
                 f"{self.piece}, {self.length}"
             )
         if self.cycle and not {"train", "valid"} <= set(self.cycle) <= {"train", "valid", "test"}:

@@ -25,7 +25,8 @@ from hybrid_mpc.plots.style import FAINT, INK, Array, axis_label, checked, colou
 Draw = Callable[[Array], Sequence[Array]]
 
 DPI = 96
-SIZE = (8.0, 4.1)  # [inch]
+SIZE = (8.0, 4.1)  # [inch], with one curve and one input
+PANEL = 1.1  # height of each further one [inch]
 GHOSTS = 6  # planned positions drawn at most
 PLAN = colour("hybrid")
 MOST_FRAMES = 250  # of a longer loop fewer frames a second are drawn; it still plays in real time
@@ -52,28 +53,36 @@ class Scene:
         self,
         loop: AnimatedLoop,
         title: str,
-        position: Signal,
+        curves: Sequence[tuple[int, Signal]],
         inputs: Sequence[Signal],
         limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None,
         reference: Array | None,
     ) -> None:
         self._loop = loop
-        self._figure = Figure(figsize=SIZE, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
+        self._columns = [column for column, _ in curves]
+        size = (SIZE[0], SIZE[1] + PANEL * max(0, len(curves) + len(inputs) - 2))
+        self._figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
         self._canvas = FigureCanvasAgg(self._figure)
         self._figure.suptitle(plain(title), fontsize=12, fontweight="bold", color=INK)
-        grid = self._figure.add_gridspec(1 + len(inputs), 2, height_ratios=[1.5] + [1.0] * len(inputs))
+        n, heights = len(curves), [1.5] * len(curves) + [1.0] * len(inputs)
+        grid = self._figure.add_gridspec(len(heights), 2, height_ratios=heights)
         machine = self._figure.add_subplot(grid[:, 0])
-        curve = self._figure.add_subplot(grid[0, 1])
-        below = [self._figure.add_subplot(grid[1 + i, 1], sharex=curve) for i in range(len(inputs))]
+        panels: list[Axes] = []
+        for i in range(len(heights)):
+            first = panels[0] if panels else None
+            panels.append(self._figure.add_subplot(grid[i, 1], sharex=first))
         self._live: list[tuple[Axes, Artist]] = []
         self._machine_panel(machine)
-        self._curve_panel(curve, position, reference)
-        for i, (ax, signal) in enumerate(zip(below, inputs, strict=True)):
+        self._curves: list[tuple[Line2D, Line2D, Line2D]] = []
+        for i, (ax, (column, signal)) in enumerate(zip(panels, curves, strict=False)):
+            self._curve_panel(ax, column, signal, None if reference is None else reference[:, i])
+        self._applied: list[Line2D] = []
+        for i, (ax, signal) in enumerate(zip(panels[n:], inputs, strict=True)):
             self._input_panel(ax, i, signal, None if limits is None else (limits[0][i], limits[1][i]))
-        (below[-1] if below else curve).set_xlabel("time [s]")
-        for ax in [curve, *below[:-1]] if below else []:
+        panels[-1].set_xlabel("time [s]")
+        for ax in panels[:-1]:
             ax.tick_params(labelbottom=False)
-        self._figure.align_ylabels([curve, *below])
+        self._figure.align_ylabels(panels)
         shared_legend(self._figure)
 
     def _line(self, ax: Axes, **style: object) -> Line2D:
@@ -133,24 +142,23 @@ class Scene:
         margin = 0.06 * max(float(np.max(high - low)), 1e-3)
         return low - margin, high + margin
 
-    def _curve_panel(self, ax: Axes, position: Signal, reference: Array | None) -> None:
-        loop = self._loop
+    def _curve_panel(self, ax: Axes, column: int, signal: Signal, reference: Array | None) -> None:
+        loop, values, planned = self._loop, self._loop.x[:, column], self._loop.plans[:, :, column]
         dress(ax)
         if reference is not None:
             ax.plot(loop.t, reference, color=FAINT, linewidth=1.2, label="reference")
-        low, high = float(loop.x[:, 0].min()), float(loop.x[:, 0].max())
+        low, high = float(values.min()), float(values.max())
         room = 0.4 * max(high - low, 1e-6)  # a plan that runs away does not flatten the motion
-        seen = loop.plans[:, :, 0][np.isfinite(loop.plans[:, :, 0])]
+        seen = planned[np.isfinite(planned)]
         seen = np.concatenate([seen, [low, high], [] if reference is None else reference])
         low, high = max(float(np.nanmin(seen)), low - room), min(float(np.nanmax(seen)), high + room)
         margin = 0.06 * max(high - low, 1e-6)
         ax.set_ylim(low - margin, high + margin)
         ax.set_xlim(loop.t[0], max(loop.t[-1], loop.t[0] + loop.dt))
-        ax.set_ylabel(axis_label(position))
-        self._past = self._line(ax, color=INK, linewidth=1.8, label="true motion")
-        self._plan = self._line(ax, color=PLAN, linewidth=1.6, linestyle=(0, (4, 2)), label="planned motion")
-        self._dot = self._line(ax, color=INK, marker="o", markersize=4.5, linestyle="")
-        self._applied: list[Line2D] = []
+        ax.set_ylabel(axis_label(signal))
+        past = self._line(ax, color=INK, linewidth=1.8, label="true motion")
+        plan = self._line(ax, color=PLAN, linewidth=1.6, linestyle=(0, (4, 2)), label="planned motion")
+        self._curves.append((past, plan, self._line(ax, color=INK, marker="o", markersize=4.5, linestyle="")))
 
     def _input_panel(self, ax: Axes, index: int, signal: Signal, bounds: tuple[float, float] | None) -> None:
         dress(ax)
@@ -179,9 +187,10 @@ class Scene:
         loop = self._loop
         times = loop.t[k] + loop.dt * np.arange(loop.plans.shape[1])
         ahead = np.all(np.isfinite(loop.plans[k]), axis=1)
-        self._past.set_data(loop.t[: k + 1], loop.x[: k + 1, 0])
-        self._dot.set_data(loop.t[k : k + 1], loop.x[k : k + 1, 0])
-        self._plan.set_data(times[ahead], loop.plans[k, ahead, 0])
+        for column, (past, plan, dot) in zip(self._columns, self._curves, strict=True):
+            past.set_data(loop.t[: k + 1], loop.x[: k + 1, column])
+            dot.set_data(loop.t[k : k + 1], loop.x[k : k + 1, column])
+            plan.set_data(times[ahead], loop.plans[k, ahead, column])
         held = min(k + 1, len(loop.t) - 1)  # the input of this instant holds until the next one
         for i, line in enumerate(self._applied):
             line.set_data(
@@ -224,7 +233,7 @@ def animate(
     u: Array,
     title: str,
     fps: float = 25,
-    position: Signal | None = None,
+    curves: Sequence[tuple[int, Signal]] | None = None,
     inputs: Sequence[Signal] | None = None,
     limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
     reference: Array | None = None,
@@ -232,7 +241,7 @@ def animate(
     """Write a closed loop as GIF that plays in real time: the machine, its planned motion, its input.
 
     The machine is drawn in its true state; the positions planned at that instant follow as fading ghosts, and
-    as a dashed curve of ``x[0]`` that goes on from the past one. A line that no state moves (floor, target) is
+    as dashed curves of states that go on from the past ones. A line that no state moves (floor, target) is
     drawn once, in grey; closed lines are filled.
 
     Args:
@@ -245,10 +254,11 @@ def animate(
         u: Inputs ``(n, n_u)``, held from ``t_k`` on.
         title: The loop in one line.
         fps: Frames a second at most; also never more than one a sample nor 250 in all.
-        position: Signal of ``x[0]``, for its axis. Default: ``x_0`` without a unit.
+        curves: Which states have a curve: places in ``x``, and signals for the axes. Default: all, ``x_0, ...`` without
+            units.
         inputs: Signals of ``u``. Default: ``u_0, ...`` without units.
         limits: Lower and upper bounds of the inputs, drawn as lines where finite. Default: none.
-        reference: Reference of ``x[0]``, ``(n,)``. Default: none.
+        reference: References of the states with a curve, ``(n, len(curves))``. Default: none.
 
     Raises:
         InputError: If the name does not end in ``.gif``, shapes do not fit, times do not increase, a true state
@@ -274,8 +284,14 @@ def animate(
     signals = tuple(inputs) if inputs is not None else tuple(Signal(f"u_{i}", "-") for i in range(n_u))
     if len(signals) != n_u or (limits is not None and {len(bound) for bound in limits} != {n_u}):
         raise InputError(f"animation {path}: needs a signal and both limits for each of the {n_u} inputs")
-    target = None if reference is None else checked("reference", reference, len(loop.t))
-    scene = Scene(loop, title, position or Signal("x_0", "-"), signals, limits, target)
+    if curves is None:
+        curves = [(i, Signal(f"x_{i}", "-")) for i in range(loop.x.shape[1])]
+    if not curves or not all(0 <= column < loop.x.shape[1] for column, _ in curves):
+        raise InputError(
+            f"animation {path}: curves are of states 0 to {loop.x.shape[1] - 1}, got {list(curves)}"
+        )
+    target = None if reference is None else checked("reference", reference, len(loop.t), len(curves))
+    scene = Scene(loop, title, curves, signals, limits, target)
     shown = _frames(loop.t, fps)
     ends = np.append(loop.t[shown[1:]], loop.t[shown[-1]] + LAST)
     # GIF knows hundredths of a second: rounded as a sum, so that the film never drifts from real time.

@@ -51,6 +51,10 @@ class Recording(Protocol):
         """Measured outputs ``(n, n_y)``."""
 
     @property
+    def w(self) -> Array:
+        """Measured disturbances ``(n, n_w)``."""
+
+    @property
     def x(self) -> Array:
         """Smoothed states ``(n, n_x)``."""
 
@@ -60,6 +64,7 @@ def recordings(
     outputs: Sequence[Signal],
     inputs: Sequence[Signal],
     *,
+    disturbances: Sequence[Signal] = (),
     limit: int = 4,
 ) -> Figure:
     """A few recordings over time, a row a file, each part shaded by what it is used for.
@@ -68,6 +73,7 @@ def recordings(
         trajectories: Pieces of recordings; pieces of one file (same stem) share a row.
         outputs: Signals of ``y``.
         inputs: Signals of ``u``.
+        disturbances: Signals of the trajectories' ``w``, measured and not commanded. Default: none drawn.
         limit: Most files drawn; files are chosen so that every role is seen. Default: 4.
 
     Raises:
@@ -82,13 +88,16 @@ def recordings(
         2
     """
     chosen = _chosen(trajectories, limit)
-    signals = (*outputs, *inputs)
-    figure, axes = new_figure(len(chosen), len(signals), sharey="col", size=(10, 0.9 + 1.75 * len(chosen)))
+    signals = (*outputs, *inputs, *disturbances)
+    size = (max(10.0, 2.6 * len(signals)), 0.9 + 1.75 * len(chosen))
+    figure, axes = new_figure(len(chosen), len(signals), sharey="col", size=size)
     for row, (stem, pieces) in zip(axes, chosen.items(), strict=True):
         for piece in pieces:
             y = checked(f"y of {piece.name}", piece.y, len(piece.t), len(outputs))
             u = checked(f"u of {piece.name}", piece.u, len(piece.t), len(inputs))
             columns = [*y.T, *u.T]
+            if disturbances:
+                columns += [*checked(f"w of {piece.name}", piece.w, len(piece.t), len(disturbances)).T]
             for i, (ax, values) in enumerate(zip(row, columns, strict=True)):
                 shade = name_of(piece.role)
                 ax.axvspan(piece.t[0], piece.t[-1], color=colour(piece.role), alpha=0.22, lw=0, label=shade)

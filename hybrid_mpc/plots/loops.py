@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,6 +34,9 @@ from hybrid_mpc.plots.style import (
     title_axes,
 )
 
+Limits: TypeAlias = tuple[Sequence[float] | Array, Sequence[float] | Array]
+"""Lower and upper bounds, one a signal."""
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -43,33 +46,61 @@ class Motion:
         t: Times ``(n,)`` [s].
         x: True states ``(n, n_x)``.
         u: Inputs ``(n, n_u)``, held between samples.
+        y: Measured outputs ``(n, n_y)``; NaN for a dropout. Default: those that are no states are not drawn.
     """
 
     t: Array
     x: Array
     u: Array
+    y: Array | None = None
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A signal of the loops: where its values are, its reference ``(m,)`` if it has one, its bounds."""
+
+    signal: Signal
+    of: Literal["x", "y"]
+    column: int
+    reference: Array | None
+    bounds: tuple[float, ...]
 
 
 def closed_loops(
     title: str,
     t: Array,
-    reference: Array,
+    reference: Array | None,
     results: Mapping[str, Motion],
     *,
     states: Sequence[Signal],
     inputs: Sequence[Signal],
-    limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
+    limits: Limits | None = None,
+    outputs: Sequence[Signal] = (),
+    output_reference: Array | None = None,
+    state_limits: Limits | None = None,
+    output_limits: Limits | None = None,
+    disturbances: Sequence[Signal] = (),
+    w: Array | None = None,
 ) -> Figure:
-    """The same task under each controller: states with their reference, tracking errors, inputs.
+    """The same task under each controller: outputs and states with references and bounds, tracking errors, inputs.
+
+    Every output and every state has a panel, and each that has a reference one of its error. An output that is a state
+    is drawn once, in its true value; another one as it was measured.
 
     Args:
         title: The task in one line.
-        t: Times ``(m,)`` [s] of the reference.
-        reference: Reference states ``(m, n_x)``.
+        t: Times ``(m,)`` [s] of the references.
+        reference: Reference states ``(m, n_x)``; None where references are the outputs'.
         results: Closed loop by controller (``"prior"``, ``"hybrid"``, ``"oracle"``).
         states: Signals of ``x``.
         inputs: Signals of ``u``.
         limits: Lower and upper bounds of the inputs, drawn where finite. Default: none drawn.
+        outputs: Signals of ``y``. Default: those that are no states are not drawn.
+        output_reference: Reference outputs ``(m, n_y)``, NaN for one that is not controlled. Default: none.
+        state_limits: Bounds of the states. Default: none drawn.
+        output_limits: Bounds of the outputs. Default: none drawn.
+        disturbances: Signals of ``w``. Default: none.
+        w: Measured disturbances ``(m, n_w)`` that acted. Default: none drawn.
 
     Raises:
         InputError: If there is no loop or shapes do not fit.
@@ -84,30 +115,85 @@ def closed_loops(
     if not results:
         raise InputError(f"plot of the closed loops {title!r}: there is no controller to draw")
     t = np.asarray(t, dtype=float)
-    target = checked("reference", reference, len(t), len(states))
-    n_x = len(states)
-    figure, panels = new_column([1.6] * n_x + [1.1] * (n_x + len(inputs)), height=1.15, title=title)
-    errors, below = panels[n_x : 2 * n_x], panels[2 * n_x :]
+    measured = all(loop.y is not None for loop in results.values())
+    x_ref = None if reference is None else checked("reference", reference, len(t), len(states))
+    y_ref = output_reference
+    y_ref = None if y_ref is None else checked("output_reference", y_ref, len(t), len(outputs))
+    shown = _panels(states, x_ref, state_limits, outputs, y_ref, output_limits, measured)
+    tracked = [panel for panel in shown if panel.reference is not None]
+    around = (
+        checked("w", w, len(t), len(disturbances))
+        if disturbances and w is not None
+        else np.zeros((len(t), 0))
+    )
+    heights = [1.6] * len(shown) + [1.1] * (len(tracked) + len(inputs) + around.shape[1])
+    figure, panels = new_column(heights, height=1.15, title=plain(title))
+    errors = panels[len(shown) : len(shown) + len(tracked)]
+    below = panels[len(shown) + len(tracked) :][: len(inputs)]
     for controller, loop in results.items():
-        x = checked(f"x of {controller}", loop.x, len(loop.t), n_x)
+        columns = {"x": checked(f"x of {controller}", loop.x, len(loop.t), len(states))}
+        if measured and outputs:
+            columns["y"] = checked(f"y of {controller}", loop.y, len(loop.t), len(outputs))
         u = checked(f"u of {controller}", loop.u, len(loop.t), len(inputs))
         line = line_style(controller)
-        for ax, values in zip(panels, x.T, strict=False):
-            ax.plot(loop.t, values, **line)
-        for i, ax in enumerate(errors):
-            ax.plot(loop.t, x[:, i] - np.interp(loop.t, t, target[:, i]), **line)
+        for ax, panel in zip(panels, shown, strict=False):
+            ax.plot(loop.t, columns[panel.of][:, panel.column], **line)
+        for ax, panel in zip(errors, tracked, strict=True):
+            assert panel.reference is not None
+            goal = np.interp(loop.t, t, panel.reference)
+            ax.plot(loop.t, columns[panel.of][:, panel.column] - goal, **line)
         plot_inputs(below, loop.t, u, inputs, **line)
-    for ax, values, signal in zip(panels, target.T, states, strict=False):
-        ax.plot(t, values, **(line_style("reference") | {"zorder": 4}))
-        ax.set_ylabel(axis_label(signal))
-    for ax, signal in zip(errors, states, strict=True):
+    for ax, panel in zip(panels, shown, strict=False):
+        if panel.reference is not None:
+            ax.plot(t, panel.reference, **(line_style("reference") | {"zorder": 4}))
+        _bounds(ax, panel.bounds, "limits of outputs and states")
+        ax.set_ylabel(axis_label(panel.signal))
+    for ax, panel in zip(errors, tracked, strict=True):
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
-        ax.set_ylabel(f"error of\n{axis_label(signal)}")
+        ax.set_ylabel(f"error of\n{axis_label(panel.signal)}")
     for i, ax in enumerate(below):
-        for bound in filter(math.isfinite, (limits[0][i], limits[1][i]) if limits is not None else ()):
-            ax.axhline(bound, color=INK, linestyle=":", linewidth=1.1, label="input limits")
+        _bounds(ax, () if limits is None else (limits[0][i], limits[1][i]), "input limits")
+    if around.shape[1]:
+        plot_inputs(panels[len(heights) - around.shape[1] :], t, around, disturbances)
     finish_column(figure, panels)
     return figure
+
+
+def _panels(
+    states: Sequence[Signal],
+    x_ref: Array | None,
+    x_limits: Limits | None,
+    outputs: Sequence[Signal],
+    y_ref: Array | None,
+    y_limits: Limits | None,
+    measured: bool,
+) -> list[_Panel]:
+    """Outputs in their order, then the states that are none of them."""
+
+    def bounds(limits: Limits | None, i: int) -> tuple[float, ...]:
+        return () if limits is None or not len(limits[0]) else (float(limits[0][i]), float(limits[1][i]))
+
+    place = {(signal.name, signal.unit): i for i, signal in enumerate(states)}
+    shown, seen = [], set()
+    for j, signal in enumerate(outputs):
+        i = place.get((signal.name, signal.unit))
+        goal = None if y_ref is None or not np.isfinite(y_ref[:, j]).any() else y_ref[:, j]
+        if i is None:
+            if measured:
+                shown.append(_Panel(signal, "y", j, goal, bounds(y_limits, j)))
+            continue
+        seen.add(i)
+        goal = x_ref[:, i] if goal is None and x_ref is not None else goal
+        shown.append(_Panel(signal, "x", i, goal, (*bounds(x_limits, i), *bounds(y_limits, j))))
+    for i, signal in enumerate(states):
+        if i not in seen:
+            shown.append(_Panel(signal, "x", i, None if x_ref is None else x_ref[:, i], bounds(x_limits, i)))
+    return shown
+
+
+def _bounds(ax: Axes, bounds: Sequence[float], label: str) -> None:
+    for bound in dict.fromkeys(filter(math.isfinite, bounds)):
+        ax.axhline(bound, color=INK, linestyle=":", linewidth=1.1, label=label)
 
 
 def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:

@@ -42,21 +42,21 @@ def trace(
     alarm: Any,
     y: Array,
     *,
-    output: Signal,
+    outputs: Sequence[Signal],
     windows: Sequence[tuple[float, float]] = (),
     residual: tuple[Array, float, str] | None = None,
     title: str = "",
 ) -> Figure:
-    """The monitor over a whole recording: violation, residual force, alarms, and the position beneath.
+    """The monitor over a whole recording: violation, residual force, alarms, and the measured outputs beneath.
 
-    All arrays are ``(n,)``. ``level`` is what is compared with the threshold, the averaged violation [W]; NaN where the
-    monitor has no valid reading. ``windows`` are stretches [s] known to be clean, ``residual`` is the level of the
-    residual force, its threshold and its unit.
+    ``y`` is ``(n, n_y)``, other arrays are ``(n,)``. ``level`` is what is compared with the threshold, the averaged
+    violation [W]; NaN where the monitor has no valid reading. ``windows`` are stretches [s] known to be clean,
+    ``residual`` is the level of the residual force, its threshold and its unit.
     """
     t = np.asarray(t, dtype=float)
     raw, averaged = checked("violation", violation, len(t)), checked("level", level, len(t))
-    position, active = checked("y", y, len(t)), checked("alarm", alarm, len(t)) > 0.5
-    figure, panels = new_column((1.5, 1.0) if residual is None else (1.5, 1.0, 1.0), height=2.6)
+    measured, active = checked("y", y, len(t), len(outputs)), checked("alarm", alarm, len(t)) > 0.5
+    figure, panels = new_column([1.5] + [1.0] * ((residual is not None) + len(outputs)), height=2.6)
     _violation(panels[0], t, raw, averaged, threshold)
     positive = raw[np.isfinite(raw) & (raw > 0)]
     if len(positive) and positive.max() > 30 * threshold:
@@ -65,7 +65,7 @@ def trace(
     if residual is not None:
         force, limit, unit = residual
         _residual(panels[1], t, checked("residual", force, len(t)), limit, unit)
-    _position(panels[-1], t, position, output)
+    _outputs(panels[-len(outputs) :], t, measured, outputs)
     for ax in panels:
         _shade(ax, intervals(t, active), "alarm", color=ALARM, alpha=0.35)
         _shade(ax, windows, "clean window", color=GOOD, ymax=0.035, zorder=4)
@@ -79,19 +79,19 @@ def overview(
     trace: MonitorTrace,
     y: Array,
     *,
-    output: Signal,
+    outputs: Sequence[Signal],
     force_unit: str,
     thresholds: Mapping[str, float] | None = None,
     notes: Sequence[tuple[float, str]] = (),
     marks: Sequence[tuple[float, str]] = (),
     title: str = "",
 ) -> Figure:
-    """Violation, residual force, energy of the free runs, scores, position; alarms shaded throughout.
+    """Violation, residual force, energy of the free runs, scores, measured outputs; alarms shaded throughout.
 
     Args:
         trace: What :func:`hybrid_mpc.monitor.replay` returned.
-        y: Measured position ``(n,)``.
-        output: Its signal.
+        y: Measured outputs ``(n, n_y)``.
+        outputs: Their signals.
         force_unit: Unit of the residual force.
         thresholds: ``"violation"`` [W] and ``"residual"``, where the monitor has them. Default: none.
         notes: Times [s] and what to write there, e.g. a diagnosis. Default: none.
@@ -108,13 +108,13 @@ def overview(
         >>> from hybrid_mpc.monitor.replay import MonitorTrace
         >>> t, zero = np.array([0.0, 0.1]), np.zeros(2)
         >>> trace = MonitorTrace(t, zero, zero, zero, zero, zero, zero > 0)
-        >>> len(overview(trace, zero, output=Signal("phi", "rad"), force_unit="J/rad").axes)
+        >>> len(overview(trace, zero, outputs=[Signal("phi", "rad")], force_unit="J/rad").axes)
         3
     """
     t, limits = trace.t, thresholds or {}
-    position = checked("y", y, len(t))
+    measured = checked("y", y, len(t), len(outputs))
     energy, scores = bool(np.isfinite(trace.energy_j).any()), bool(trace.scores.size)
-    figure, panels = new_column([1.0] * (3 + energy + scores), height=2.0)
+    figure, panels = new_column([1.0] * (2 + energy + scores + len(outputs)), height=2.0)
     _violation(panels[0], t, trace.violation_w, trace.level_w, limits.get("violation"))
     _residual(panels[1], t, trace.residual_level, limits.get("residual"), force_unit)
     if energy:
@@ -122,8 +122,8 @@ def overview(
         panels[2].axhline(0.0, color=INK, linewidth=0.6)
         panels[2].set_ylabel("energy of the\nfree run [J]")
     if scores:
-        _scores(panels[-2], trace)
-    _position(panels[-1], t, position, output)
+        _scores(panels[-len(outputs) - 1], trace)
+    _outputs(panels[-len(outputs) :], t, measured, outputs)
     for ax in panels:
         _shade(ax, intervals(t, trace.alarm), "alarm", color=ALARM, alpha=0.3)
         _shade(
@@ -234,9 +234,10 @@ def _scores(ax: Axes, trace: MonitorTrace) -> None:
     ax.set_ylabel("share of\nthreshold [-]")
 
 
-def _position(ax: Axes, t: Array, y: Array, output: Signal) -> None:
-    ax.plot(t, y, color=INK, linewidth=1.0, label="measured")
-    ax.set_ylabel(axis_label(output))
+def _outputs(panels: Sequence[Axes], t: Array, y: Array, outputs: Sequence[Signal]) -> None:
+    for ax, values, signal in zip(panels, y.T, outputs, strict=True):
+        ax.plot(t, values, color=INK, linewidth=1.0, label="measured")
+        ax.set_ylabel(axis_label(signal))
 
 
 def _marks(ax: Axes, marks: Sequence[tuple[float, str]], middle: float) -> None:

@@ -38,7 +38,6 @@ scenario = Scenario(
                 16, 4, teacher_steps=0, free_run_steps=1000, horizon=250, batch=16, decay=3000.0
             ),
         },
-        unit="V",
         piece=5000.0,  # uncut: an error of the start fades within some hundred seconds, drift shows later
     ),
 )

@@ -36,6 +36,5 @@ scenario = Scenario(
                 16, 4, teacher_steps=0, free_run_steps=1000, horizon=90, batch=16, decay=3000.0
             ),
         },
-        unit="V",
     ),
 )

@@ -47,7 +47,6 @@ scenario = Scenario(
                 32, 4, teacher_steps=0, free_run_steps=1000, horizon=50, batch=32, decay=1000.0
             ),
         },
-        unit="rad",
         length=0.5,
         piece=1.0,
         valid_every=3,

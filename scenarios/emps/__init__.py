@@ -42,7 +42,6 @@ scenario = Scenario(
                 16, 4, teacher_steps=0, free_run_steps=800, horizon=400, batch=32, decay=3000.0
             ),
         },
-        unit="mm",
-        scale=1e3,
+        units={"q": ("mm", 1e3)},
     ),
 )

@@ -42,7 +42,7 @@ scenario = Scenario(
                 16, 4, teacher_steps=0, free_run_steps=1000, horizon=75, batch=32, decay=3000.0
             ),
         },
-        unit="K",
+        units={"outlet": ("K", 1.0)},
         length=300.0,
         piece=700.0,
     ),

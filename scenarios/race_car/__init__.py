@@ -36,8 +36,7 @@ scenario = Scenario(
                 16, 4, teacher_steps=0, free_run_steps=1000, horizon=115, batch=16, decay=3000.0
             ),
         },
-        unit="mm",
-        scale=1e3,
+        units={"x": ("mm", 1e3), "y": ("mm", 1e3)},
         valid_every=4,
     ),
 )

@@ -37,7 +37,7 @@ scenario = Scenario(
                 16, 4, teacher_steps=0, free_run_steps=800, horizon=60, batch=16, decay=3000.0
             ),
         },
-        unit="K",
+        units=dict.fromkeys(("temperature1", "temperature2"), ("K", 1.0)),
         length=600.0,
         piece=900.0,
     ),

@@ -89,7 +89,6 @@ scenario = Scenario(
             "quick": BenchmarkBudget(16, 4, teacher_steps=300, free_run_steps=400, horizon=50, decay=6000.0),
             "full": BenchmarkBudget(16, 16, teacher_steps=300, free_run_steps=1200, horizon=50, decay=6000.0),
         },
-        unit="rad",
         length=2.5,  # a swing-up, from hanging down
     ),
 )

@@ -37,7 +37,6 @@ scenario = Scenario(
                 32, 4, teacher_steps=500, free_run_steps=2000, horizon=250, batch=32, decay=1000.0
             ),
         },
-        unit="rad",
         valid_every=3,
     ),
 )

@@ -106,6 +106,7 @@ def test_every_number_of_the_page_has_a_unit(prior_alone):
         "hits",
         "contraction certified",
         "positions that no input holds",
+        "unit",
     }
     for table in tables.values():
         assert all(column.endswith("]") for column in table.columns if column not in words), table.columns
@@ -184,7 +185,7 @@ def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, t
     assert found["loops"]["prior on prior"]["driven"]["quiet"]["stable"]
     assert found["loops"]["hybrid on hybrid"]["moving"]["jump"]["margins"]["gain_up"] > 1
     assert "--scenario golf_robot" in (out / "analysis.html").read_text()
-    assert len(list((out / "figures").glob("*.png"))) == 13
+    assert len(list((out / "figures").glob("*.png"))) == 14
 
 
 @pytest.mark.full

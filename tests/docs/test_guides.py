@@ -1,5 +1,6 @@
 """The code that the guides show runs, from top to bottom, and gives what the text beside it says."""
 
+import importlib.util
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -83,10 +84,60 @@ def test_the_guide_to_the_fit():
     assert any("F_c may be zero" in line for line in found["again"].identifiability)
 
 
+@pytest.fixture(scope="module")
+def what_fits():
+    spec = importlib.util.spec_from_file_location("what_fits", ROOT / "benchmarks" / "what_fits.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def own():
+    return executed("docs/own-machine.md", blocks("docs/own-machine.md"))
+
+
+def test_every_prior_of_ones_own_machine_passes_the_preflight(own):
+    kinds = {
+        name: kind for name, kind in own.items() if isinstance(kind, type) and issubclass(kind, own["Prior"])
+    }
+    del kinds["Prior"], kinds["MechanicalPrior"], kinds["TorchPrior"], kinds["Wrong"]
+    assert len(kinds) == 7
+    for prior in kinds.values():
+        columns = {
+            key: tuple(s.name for s in getattr(prior, key)) for key in ("inputs", "outputs", "disturbances")
+        }
+        dt = 0.02 if prior is own["Crane"] else 5.0
+        data = replace(own["data"], **columns, dt=dt, warm_up=12 * dt)
+        check_scenario(replace(own["tank"], prior=prior, data=data))
+    with pytest.raises(InputError, match="operating_point is no equilibrium"):
+        check_scenario(replace(own["tank"], prior=own["Wrong"]))
+    leaking = replace(own["scenario"], disturbance_model=own["leak"], data=own["delayed"])
+    check_scenario(leaking)
+    tank, other = own["Tank"](), own["TorchTank"]()
+    point = [0.3], [5.0], []
+    assert float(tank.equations.xdot(*point, tank.p)) == pytest.approx(
+        float(other.equations.xdot(*point, other.p)), rel=1e-12
+    )
+
+
+def test_what_does_not_fit_is_refused_as_the_page_says(what_fits):
+    """The cases of benchmarks/what_fits.py, whose words the page sums up."""
+    for prior in what_fits.REFUSED.values():
+        with pytest.raises(InputError):
+            check_scenario(what_fits.machine(prior))
+    check_scenario(what_fits.machine(what_fits.Base))  # it is what each case adds that is refused
+    check_scenario(what_fits.machine(what_fits.rod(5), 2.0))
+    with pytest.raises(InputError, match="no output tells of"):
+        check_scenario(what_fits.machine(what_fits.rod(20), 2.0))
+
+
 def test_the_machines_of_the_readme():
     sources = [source for source in blocks("README.md") if re.search(r"^class ", source, re.MULTILINE)]
-    assert len(sources) == 2  # in CasADi with its scenario, and the same in torch
-    found = executed("README.md", sources)
+    assert len(sources) == 3  # in CasADi with its scenario, another machine, and the first one in torch
+    check_scenario(executed("README.md", sources[1:2])["scenario"])
+    assert len(sources[1].splitlines()) <= 25
+    found = executed("README.md", sources[::2])
     scenario = found["scenario"]
     check_scenario(scenario)
     check_scenario(replace(scenario, prior=found["TorchPendulum"]))

@@ -113,8 +113,26 @@ def test_recordings_count_alike_however_far_off_the_prior_is():
     assert choice.candidates["pgrnn"].ratio == pytest.approx(np.exp(logs.mean()))
     upper = np.exp(logs.mean() + 2.015 * logs.std(ddof=1) / np.sqrt(6))
     assert choice.candidates["pgrnn"].upper == pytest.approx(upper, rel=1e-3)
+    assert (
+        f"is {np.exp(logs.mean()):.2f} of the prior's (at most {upper:.2f}; 6 recordings, their geometric mean)"
+        in choice.reason
+    )
     better = [0.25 * own for own in prior]
     assert recommend({"phy": prior, "pgrnn": better}, recordings=names).recommended == "pgrnn"
+
+
+def test_the_bound_is_that_of_the_mean_over_recordings_and_both_must_be_better():
+    """Much better in all but the loudest recording, which rules the sum: the bound is not raised to the sum's ratio."""
+    prior = runs(np.random.default_rng(8), n=8)
+    prior[0] = 1000.0 * prior[0]
+    factors = [1.1**2] + [0.2**2 * (1 + 0.01 * i) for i in range(7)]
+    errors = {"phy": prior, "pgrnn": [factor * own for factor, own in zip(factors, prior, strict=True)]}
+    choice = recommend(errors, recordings=[f"file{i}" for i in range(8)])
+    own = choice.candidates["pgrnn"]
+    assert own.ratio < own.upper < 1.0
+    assert own.error > choice.candidates["phy"].error  # over all together it is worse: the rule is no looser
+    assert choice.recommended == "phy"
+    assert "over all of them together the prior's is no larger" in choice.reason
 
 
 def test_runs_of_a_single_recording_are_cut_into_blocks():

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from cart import recording, written
 
-from hybrid_mpc import BenchmarkSpec, InputError, Window, load_scenario
+from hybrid_mpc import BenchmarkSpec, InputError, Signal, Window, load_scenario
 from hybrid_mpc.job.benchmark import recommended
-from hybrid_mpc.job.benchmark_runs import read_training
+from hybrid_mpc.job.benchmark_runs import read_training, scored_signals
 
 
 @pytest.fixture(scope="module")
@@ -107,4 +107,18 @@ def test_what_begins_after_a_gap_is_no_run_of_full_length(machine, tmp_path):
 )
 def test_a_bad_choice_of_validating_files_is_refused(given):
     with pytest.raises(InputError, match="valid_every must be 2 or more"):
-        BenchmarkSpec({}, unit="rad", **given)
+        BenchmarkSpec({}, **given)
+
+
+def test_figures_of_an_output_may_have_a_unit_of_their_own():
+    signals = Signal("x", "m"), Signal("y", "m"), Signal("heading", "rad")
+    scored = scored_signals(signals, BenchmarkSpec(units={"y": ("mm", 1e3)}))
+    assert [(s.label, factor) for s, factor in scored] == [
+        ("x [m]", 1.0),
+        ("y [mm]", 1e3),
+        ("heading [rad]", 1.0),
+    ]
+    with pytest.raises(InputError, match="no output in the units of the benchmark 'yy'; did you mean 'y'"):
+        scored_signals(signals, BenchmarkSpec(units={"yy": ("mm", 1e3)}))
+    with pytest.raises(InputError, match="factors of units"):
+        BenchmarkSpec(units={"y": ("mm", 0.0)})

@@ -26,7 +26,11 @@ def swing(n=151, dt=0.02, horizon=50):
 
 
 def write(path, t, x, plans, u, **more):
-    labels = {"position": Signal("phi", "rad"), "inputs": (Signal("u", "N m"),), "limits": ((-0.5,), (0.5,))}
+    labels = {
+        "curves": [(0, Signal("phi", "rad"))],
+        "inputs": (Signal("u", "N m"),),
+        "limits": ((-0.5,), (0.5,)),
+    }
     options = {"dt": 0.02, "draw": draw, "title": "A swing"} | labels | more
     return animate(path, t, x, plans, u=u, **options)
 
@@ -93,7 +97,7 @@ def test_ghosts_fade_into_the_future(tmp_path):
     plans = np.linspace([0.0, 0.0], [1.0, 0.0], 51)[None].repeat(2, axis=0)
     x = plans[:, 0] + [[0.0, 0.0], [1.0, 0.0]]
     scene = Scene(
-        animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, cart, u), "", Signal("q", "m"),
+        animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, cart, u), "", [(0, Signal("q", "m"))],
         (Signal("F", "N"),), None, None,
     )  # fmt: skip
     scene._set(0)
@@ -108,7 +112,9 @@ def test_ghosts_fade_into_the_future(tmp_path):
 def test_axes_carry_units_and_the_legend_is_complete(tmp_path):
     t, x, plans, u = swing(n=3)
     loop = animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, draw, u)
-    scene = Scene(loop, "A $1 swing", Signal("phi", "rad"), (Signal("u", "N m"),), ((-0.5,), (0.5,)), x[:, 0])
+    scene = Scene(
+        loop, "A $1 swing", [(0, Signal("phi", "rad"))], (Signal("u", "N m"),), ((-0.5,), (0.5,)), x[:, :1]
+    )
     figure = scene._figure
     labels = [ax.get_ylabel() for ax in figure.axes] + [
         figure.axes[0].get_xlabel(),
@@ -123,7 +129,7 @@ def test_a_plan_that_runs_away_does_not_flatten_the_motion(tmp_path):
     t, x, plans, u = swing(n=5)
     plans[3] *= 1e6
     loop = animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, draw, u)
-    scene = Scene(loop, "", Signal("phi", "rad"), (Signal("u", "N m"),), None, None)
+    scene = Scene(loop, "", [(0, Signal("phi", "rad"))], (Signal("u", "N m"),), None, None)
     low, high = scene._figure.axes[1].get_ylim()
     span = np.ptp(x[:, 0])
     assert high - low <= 1.8 * 1.12 * span + 1e-9  # 0.4 of the motion to either side, 6 % margin each
@@ -200,3 +206,18 @@ def test_the_club_hangs_at_zero_and_swings_right_when_positive():
             np.testing.assert_array_equal(a, b)
     with pytest.raises(InputError, match="finite angle"):
         draw(np.array([np.nan]))
+
+
+def test_every_state_that_is_asked_for_has_a_curve_in_its_unit(tmp_path):
+    t, x, plans, u = swing(n=5)
+    loop = animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, draw, np.hstack([u, 2 * u]))
+    curves = [(1, Signal("phi_dot", "rad/s")), (0, Signal("phi", "rad"))]
+    scene = Scene(loop, "", curves, (Signal("u", "N m"), Signal("valve", "%")), None, None)
+    scene._set(4)
+    labels = [ax.get_ylabel() for ax in scene._figure.axes[1:]]
+    assert labels == [r"$\dot{\varphi}$ [rad/s]", r"$\varphi$ [rad]", "u [N m]", "valve [%]"]
+    np.testing.assert_array_equal(scene._curves[0][0].get_ydata(), x[:, 1])
+    np.testing.assert_array_equal(scene._curves[1][1].get_ydata(), plans[4, :, 0])
+    assert write(tmp_path / "b.gif", t, x, plans, u, curves=None).exists()
+    with pytest.raises(InputError, match="curves are of states 0 to 1"):
+        write(tmp_path / "c.gif", t, x, plans, u, curves=[(2, Signal("q", "m"))])

@@ -130,7 +130,7 @@ def monitor_figure():
     alarm = level > 0.06
     y = swing(t)[:, 0] + 0.8 * push
     windows = ((0.0, 20.0), (48.0, 60.0))
-    return monitor.trace(t, violation, level, 0.06, alarm, y, output=OUTPUTS[0], windows=windows)
+    return monitor.trace(t, violation, level, 0.06, alarm, y, outputs=OUTPUTS, windows=windows)
 
 
 def poles_figure():
@@ -182,7 +182,7 @@ def guard_figure():
     marks = ((3.0, "friction doubles"), (3.1, "guard: rest"))
     title = "something breaks at 3 s"
     return monitor.overview(
-        seen, np.sin(2 * t), output=OUTPUTS[0], force_unit="J/rad", marks=marks, title=title
+        seen, np.sin(2 * t), outputs=OUTPUTS, force_unit="J/rad", marks=marks, title=title
     )
 
 

@@ -17,6 +17,7 @@ from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.loops import (
+    DRAWN,
     MODEL,
     Bench,
     LoopRow,
@@ -48,8 +49,6 @@ TIMED_PERIODS = 1000
 """Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
 TIMED = ("prior_observer", "hybrid_observer")
 """Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
-SHOWN = ("t", "x", "u", "reference")
-"""What is kept of the first seed, to be drawn."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class Part:
 
     def specs(self, scenario: str, run_seed: int) -> list[LoopSpec]:
         """Its loops."""
-        first = (*SHOWN, "step_ms", "plans") if self.timed else SHOWN
+        first = (*DRAWN, "step_ms", "plans") if self.timed else DRAWN
         return [
             LoopSpec(
                 scenario, MODEL, self.task.name, self.controller, seed=seed, run_seed=run_seed,
@@ -256,7 +255,7 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
         return f"unknown {time.monotonic_ns()}"
     return digest(
         [
-            [spec.id for spec in specs],
+            [(spec.id, spec.keep) for spec in specs],
             model.programs_sha256,
             plain(replace(loop, control={})),
             of_monitor,
@@ -306,7 +305,7 @@ CONTROL = Stage(
     "closing the loop",
     ControlResult,
     control_stage,
-    what_loops_read,
+    lambda context: {**what_loops_read(context), "what is drawn": DRAWN},
     (EXPORT, NOISE),
     optional=True,
 )

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from hybrid_mpc.identify.evaluate import Scores
 from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.loop_figures import curves_of, loop_figure
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
@@ -26,7 +27,7 @@ from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
 from hybrid_mpc.job.summary import summaries
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.monitor.residuals import force_units
+from hybrid_mpc.monitor.residuals import force_unit
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import save
 
@@ -58,7 +59,7 @@ def draw_all(context: Context) -> Figures:
 def _data(context: Context) -> Any:
     prior = context.scenario.prior()
     pieces = [t for t in context.dataset.trajectories if t.role != "nominal"]
-    figure = data.recordings(pieces, prior.outputs, prior.inputs)
+    figure = data.recordings(pieces, prior.outputs, prior.inputs, disturbances=prior.disturbances)
     yield "data", "recordings", figure, "Recordings with what each part is used for."
     parts = {role: context.smoothed(role) for role in ("train", "test")}  # states that no sensor sees, too
     smoothed = [t for part in parts.values() for t in part]
@@ -158,14 +159,7 @@ def _loops(context: Context) -> Any:
         own = {row.controller: row.arrays for row in drawn if row.task == task.name}
         names = {short: n for short, n in REPORTED.items() if n in own}
         control = task.control or scenario.control
-        hybrid = own[names["hybrid"]]
-        motions = {
-            short: loops.Motion(*(own[n][key] for key in ("t", "x", "u"))) for short, n in names.items()
-        }
-        figure = loops.closed_loops(
-            task.title, hybrid["t"], hybrid["reference"], motions,
-            states=prior.states, inputs=prior.inputs, limits=(control.u_min, control.u_max),
-        )  # fmt: skip
+        figure = loop_figure(task.title, control, prior, {short: own[n] for short, n in names.items()})
         yield "control", f"loop_{task.name}", figure, f"{task.title}, first seed."
 
 
@@ -205,7 +199,7 @@ def _moving(context: Context) -> list[tuple[Path, str]]:
     )
     path = animation.animate(
         context.out / "figures" / f"{task.name}.gif", own["t"], own["x"], own["plans"], dt=context.spec.dt,
-        draw=scenario.draw, u=own["u"], title=task.title, position=prior.states[0], inputs=prior.inputs,
+        draw=scenario.draw, u=own["u"], title=task.title, curves=curves_of(prior), inputs=prior.inputs,
         limits=(control.u_min, control.u_max),
     )  # fmt: skip
     return [(path, f"{task.title}: the machine, and in outline what the hybrid MPC plans.")]
@@ -242,7 +236,7 @@ def _monitor(context: Context) -> Any:
     found = context.find(MONITOR)
     if isinstance(found, Absent) or found.reason:
         return
-    arrays, output, calibration = found.arrays, context.scenario.prior().outputs[0], found.calibration
+    arrays, outputs, calibration = found.arrays, context.scenario.prior().outputs, found.calibration
     power, force = calibration.threshold_w, calibration.residual_threshold
     assert power is not None
     assert force is not None
@@ -250,18 +244,18 @@ def _monitor(context: Context) -> Any:
         keys = ("t", "violation_w", "level_w", "residual_level", "alarm", "y")
         own = {k: arrays[f"{recording.name}/{k}"] for k in keys}
         figure = monitor.trace(
-            own["t"], own["violation_w"], own["level_w"], power, own["alarm"], own["y"], output=output,
+            own["t"], own["violation_w"], own["level_w"], power, own["alarm"], own["y"], outputs=outputs,
             windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
-            residual=(own["residual_level"], force, force_units(context.kit.models["prior"])[0]),
+            residual=(own["residual_level"], force, force_unit(context.kit.models["prior"])),
             title=recording.name,
         )  # fmt: skip
         name = recording.name.replace("#", "-")
         yield "monitor", f"monitor_{name}", figure, f"The monitor over the whole recording {recording.name}."
     if found.load is not None:
         load = found.load
-        own = {k: arrays[f"load/{k}"] for k in ("t", "violation", "level", "alarm", "x")}
+        own = {k: arrays[f"load/{k}"] for k in ("t", "violation", "level", "alarm", "y")}
         figure = monitor.trace(
-            own["t"], own["violation"], own["level"], power, own["alarm"], own["x"][:, 0], output=output,
+            own["t"], own["violation"], own["level"], power, own["alarm"], own["y"], outputs=outputs,
             windows=((0.0, load.start_s),),
             title=f"closed loop, {load.task}: an unknown load from {load.start_s:g} s on",
         )  # fmt: skip
@@ -320,12 +314,12 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
     found = context.find(GUARD)
     if isinstance(found, Absent) or not (found.faults or found.shown):
         return
-    arrays, output = found.arrays, context.scenario.prior().outputs[0]
-    unit = force_units(context.kit.models["prior"])[0]
+    arrays, outputs = found.arrays, context.scenario.prior().outputs
+    unit = force_unit(context.kit.models["prior"])
     for row in found.faults or ():
         marks = [(row.start_s, row.title), *((s.t_s, f"guard: {s.after.lower()}") for s in row.switches)]
         figure = monitor.overview(
-            read_trace(arrays, row.fault), arrays[f"{row.fault}/y"], output=output, force_unit=unit, marks=marks,
+            read_trace(arrays, row.fault), arrays[f"{row.fault}/y"], outputs=outputs, force_unit=unit, marks=marks,
             title=f"{row.task}: {row.title} at {row.start_s:g} s",
         )  # fmt: skip
         seen = "without an alarm" if row.delay_s is None else f"alarm after {row.delay_s:.2f} s"
@@ -339,7 +333,7 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
             known = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
             limits = {name: limit for name, limit in known.items() if limit is not None}
         figure = monitor.overview(
-            read_trace(arrays, "recorded"), arrays["recorded/y"], output=output, force_unit=unit,
+            read_trace(arrays, "recorded"), arrays["recorded/y"], outputs=outputs, force_unit=unit,
             thresholds=limits, title=found.shown,
         )  # fmt: skip
         by = "thresholds of the section before" if found.detector is None else "learned detector"

@@ -253,7 +253,7 @@ def trace_arrays(name: str, trace: MonitorTrace, y: Array) -> dict[str, Array]:
         >>> read_trace(trace_arrays("a", trace, np.zeros((2, 1))), "a").alarm.tolist()
         [False, False]
     """
-    return {f"{name}/{key}": np.asarray(getattr(trace, key)) for key in SHOWN} | {f"{name}/y": y[:, 0]}
+    return {f"{name}/{key}": np.asarray(getattr(trace, key)) for key in SHOWN} | {f"{name}/y": y}
 
 
 def read_trace(arrays: Mapping[str, Any], name: str) -> MonitorTrace:

@@ -179,7 +179,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         alarms += [RecordedAlarm(recording.name, a, b) for a, b in trace.intervals()]
         for key in ("t", "violation_w", "level_w", "residual_level", "alarm"):
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)
-        arrays[f"{recording.name}/y"] = recording.y[:, 0]
+        arrays[f"{recording.name}/y"] = recording.y
         # an alarm counts where it begins: it may reach in from a disturbed part
         starts, _ = stretches(trace.alarm)
         every, test = (
@@ -194,9 +194,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     load = None
     if context.scenario.plant is not None and context.scenario.tasks:
         load, loop = _load_loop(context, replace(kit, calibration=calibration))
-        arrays |= {
-            f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "x", "u")
-        }
+        arrays |= {f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "y")}
     result = MonitorResult(calibration, covered, "", tuple(alarms), clean, load, arrays)
     put_calibration(context, result)
     return result

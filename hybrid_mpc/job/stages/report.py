@@ -47,7 +47,7 @@ from hybrid_mpc.job.stages.results import (
     finite,
 )
 from hybrid_mpc.job.summary import Summary
-from hybrid_mpc.monitor.residuals import force_units
+from hybrid_mpc.monitor.residuals import force_unit
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 
@@ -201,7 +201,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "models": [_prior_table(context)],
         "free_run": [*_score_tables(context, results), _choice_table(results), _band_table(context, results)],
         "export": [_export_table(results.export)],
-        "control": [_control_table(results.control)],
+        "control": [_control_table(results.control), _tracking_table(results.control)],
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
         "residuals": _residual_tables(results.residuals),
@@ -354,8 +354,9 @@ def _prior_replay_text(weight: float) -> tuple[str, ...]:
 def _monitor_words(found: MonitorResult) -> str:
     assert found.clean is not None
     clean, load = found.clean, found.load
+    there = "was 1 alarm" if clean.alarms == 1 else f"were {clean.alarms} alarms"
     words = (
-        f"In {clean.seconds:.0f} s known to be undisturbed there were {clean.alarms} alarms, "
+        f"In {clean.seconds:.0f} s known to be undisturbed there {there}, "
         f"in the {clean.test_seconds:.0f} s of test data among them {clean.test_alarms}."
     )
     if load is None:
@@ -440,11 +441,16 @@ def _score_tables(context: Context, results: Results) -> list[Table]:
 def _choice_table(results: Results) -> Table:
     choice = results.identification.details.choice
     rows = [
-        (name_of(name), c.error, c.ratio, c.upper, "recommended" if name == choice.recommended else "")
+        (name_of(name), c.error, c.ratio, None if name == "phy" else c.upper,
+         "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
-    ]
+    ]  # fmt: skip
     columns = ("model", "error [spreads]", "over the prior's", "at most, by 95 %", "")
-    return Table(columns, rows, f"Validation recordings. {choice.reason}")
+    caption = (
+        f"Validation recordings. {choice.reason} The error is that of all recordings together; over the prior's it "
+        "stands as the geometric mean of each recording's ratio where there are several, and the bound is that of this mean."
+    )
+    return Table(columns, rows, caption)
 
 
 def _band_table(context: Context, results: Results) -> Table:
@@ -500,11 +506,38 @@ def _control_table(control: Control) -> Table | None:
         costs = (_cost(cells.get(name)) for name in names)
         rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
     caption = (
-        "Closed-loop cost J on the true state: mean over seeds with its 95 % interval (none for one seed). Gap: "
+        "Closed-loop cost J on the true state: mean over seeds with its 95 % interval (none for one seed); squared "
+        "deviations of all signals, each times its weight in the control problem, which brings them to one scale. Gap: "
         "share of the distance from the better baseline to the measuring oracle that the hybrid with observer "
         "covers; a dash where baseline and oracle do not differ enough to say."
     )
     return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
+
+
+def _tracking_table(control: Control) -> Table | None:
+    """Tracking errors of every signal that has a reference, in its unit."""
+    if control.details is None:
+        return None
+    cells = [
+        (task, name, own[name])
+        for task, own in control.details.tasks.items()
+        for name in CONTROLLERS
+        if name in own
+    ]
+    signals = list(dict.fromkeys(s for *_, cell in cells for s in cell.tracking_rmse))
+    rows = [
+        (
+            task,
+            name.replace("_", ", "),
+            *(cell.tracking_rmse[s].mean if s in cell.tracking_rmse else None for s in signals),
+        )
+        for task, name, cell in cells
+    ]
+    caption = (
+        "Root mean square deviations from the reference, means over seeds: of true states, or of measured outputs "
+        "where references are theirs."
+    )
+    return Table(("task", "controller", *(f"RMSE of {s}" for s in signals)), rows, caption)
 
 
 def _cost(cell: Summary | None) -> str:
@@ -563,7 +596,7 @@ def _alarm_table(context: Context, monitor: Monitor) -> Table | None:
     if monitor.alarms is None or calibration is None:
         return None
     rows = [(a.file, a.start_s, a.end_s) for a in monitor.alarms]
-    unit = force_units(context.kit.models["prior"])[0]
+    unit = force_unit(context.kit.models["prior"])
     caption = (
         f"Alarms over the whole recordings; thresholds {calibration.threshold_w:.3g} W and "
         f"{calibration.residual_threshold:.3g} {unit}."

@@ -124,8 +124,8 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class CandidateErrors:
-    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's, and that one's upper
-    bound; None where a run diverged or the bound is not known.
+    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's (of several recordings the
+    geometric mean of each one's), and that one's upper bound; None where a run diverged or the bound is not known.
     """
 
     error: float | None
@@ -155,7 +155,9 @@ class Export:
 
 @dataclass(frozen=True)
 class ControllerCosts:
-    """Cost on the plant's true state, summed over the tasks, and tracking error by state."""
+    """Cost on the plant's true state, summed over the tasks, and tracking error by signal: that of the states, or
+    of the outputs where tasks have references of those.
+    """
 
     cost: float | None
     tracking_rmse: Mapping[str, float] | None
@@ -475,7 +477,7 @@ def _identification(context: Context) -> Identification:
             chosen.hybrid,
             chosen.reason,
             {
-                name: CandidateErrors(finite(c.error), finite(c.ratio), finite(c.upper))
+                name: CandidateErrors(*(finite(v) for v in (c.error, c.ratio, c.upper)))
                 for name, c in chosen.candidates.items()
             },
         ),
@@ -540,9 +542,12 @@ def _costs(
     loops = [row for row in rows if row.controller == controller]
     if not own:
         return ControllerCosts(None, None, reason="the scenario has no oracle")
+    signals = dict.fromkeys(signal for row in loops for signal in row.tracking_rmse)
     tracking = {
-        signal: float(np.sqrt(np.mean(np.square([row.tracking_rmse[signal] for row in loops]))))
-        for signal in loops[0].tracking_rmse
+        signal: float(
+            np.sqrt(np.mean([row.tracking_rmse[signal] ** 2 for row in loops if signal in row.tracking_rmse]))
+        )
+        for signal in signals
     }
     known = [cost for cost in own if cost is not None]
     diverged = len(known) < len(own)
