@@ -447,8 +447,8 @@ def _choice_table(results: Results) -> Table:
     ]  # fmt: skip
     columns = ("model", "error [spreads]", "over the prior's", "at most, by 95 %", "")
     caption = (
-        f"Validation recordings. {choice.reason} The error is that of all recordings together; over the prior's it "
-        "stands as the geometric mean of each recording's ratio where there are several, and the bound is that of this mean."
+        f"Validation recordings. {choice.reason} The error is that of all recordings together. Where there are "
+        "several, the ratio is the geometric mean of the ratios of each, and the bound is a bound of this mean."
     )
     return Table(columns, rows, caption)
 
