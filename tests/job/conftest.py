@@ -59,6 +59,19 @@ def arguments(machine) -> list[str]:
     return ["run", str(machine / "my_machine.py"), *data]
 
 
+@pytest.fixture(scope="module")
+def jobs_here():
+    """Networks are trained and loops computed in this process: others take longer to start than these to end."""
+    from engine_jobs import one_by_one
+
+    from hybrid_mpc.job.stages import compare, identify
+
+    with pytest.MonkeyPatch.context() as patch:
+        for stage in (compare, identify):
+            patch.setattr(stage, "run_jobs", one_by_one)
+        yield
+
+
 @pytest.fixture(scope="session")
 def finished(arguments, tmp_path_factory) -> Path:
     """Folder of a finished run."""

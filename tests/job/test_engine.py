@@ -10,6 +10,7 @@ from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from pathlib import Path
 
+import engine_jobs as work
 import pytest
 import trivial_runs
 
@@ -17,7 +18,7 @@ from hybrid_mpc import InputError, StudyResults, run_study
 from hybrid_mpc.errors import StorageError
 from hybrid_mpc.job import engine
 from hybrid_mpc.job.context import Progress
-from hybrid_mpc.job.engine import THREADS, Lost, make_engine, run_jobs
+from hybrid_mpc.job.engine import Lost, make_engine, run_jobs
 from hybrid_mpc.job.study_run import TIMING
 
 # the root first: tests/ has a folder nn_export
@@ -60,75 +61,9 @@ def quiet(*given):
     pass
 
 
-def double(x, report):
-    report(1, 2, "half")
-    return 2 * x
-
-
-def bad_input(report):
-    raise StorageError("cannot write there")
-
-
-def defect(report):
-    return 1 / 0
-
-
-def dies(report):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def lasts(path, report):
-    with open(path, "a") as file:
-        file.write(f"{os.getpid()}\n")
-    time.sleep(60)
-
-
-def fails_beside(path, report):
-    while not os.path.exists(path):
-        time.sleep(0.01)
-    raise ValueError("too bad")
-
-
-def fails_after(go, failing, report):
-    while not os.path.exists(go):
-        time.sleep(0.01)
-    Path(failing).touch()
-    raise ValueError("too bad")
-
-
-def leaves(report):
-    """What jobs before this one have left in its process: none may."""
-    LEFT.append("here")
-    return os.getpid(), len(LEFT), os.environ[THREADS[0]]
-
-
-LEFT = []
-
-
-def tells(n, report):
-    for i in range(n):
-        report(i, n, "")
-    return n
-
-
-def stops(report):
-    sys.exit(3)
-
-
-def locked(*given):
-    return threading.Lock()
-
-
-def place(batch):
-    """Where a batch is computed, with how many threads; one that holds 0 kills its process."""
-    if 0 in batch:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return os.getpid(), os.environ[THREADS[0]], sum(batch)
-
-
 def test_results_by_name_whatever_ends_first():
     seen = []
-    assert run_jobs({"a": (double, (1,)), "b": (double, (2,))}, lambda *p: seen.append(p), 2) == {
+    assert run_jobs({"a": (work.double, (1,)), "b": (work.double, (2,))}, lambda *p: seen.append(p), 2) == {
         "a": 2,
         "b": 4,
     }
@@ -138,12 +73,12 @@ def test_results_by_name_whatever_ends_first():
 @pytest.mark.parametrize(
     ("job", "kind", "message"),
     [
-        ((bad_input, ()), StorageError, r"^cannot write there$"),
-        ((defect, ()), RuntimeError, r"(?s)a failed:\n.*ZeroDivisionError"),
-        ((dies, ()), RuntimeError, r"(?s)a failed:\nits process ended .*SIGKILL\(-9\)"),
-        ((stops, ()), RuntimeError, r"(?s)a failed:\n.*SystemExit: 3"),
-        ((locked, ()), RuntimeError, r"(?s)a failed:\n.*pickle"),
-        ((double, (threading.Lock(),)), RuntimeError, r"(?s)a failed:\n.*pickle"),
+        ((work.bad_input, ()), StorageError, r"^cannot write there$"),
+        ((work.defect, ()), RuntimeError, r"(?s)a failed:\n.*ZeroDivisionError"),
+        ((work.dies, ()), RuntimeError, r"(?s)a failed:\nits process ended .*SIGKILL\(-9\)"),
+        ((work.stops, ()), RuntimeError, r"(?s)a failed:\n.*SystemExit: 3"),
+        ((work.locked, ()), RuntimeError, r"(?s)a failed:\n.*pickle"),
+        ((work.double, (threading.Lock(),)), RuntimeError, r"(?s)a failed:\n.*pickle"),
     ],
 )
 def test_a_workers_bad_input_is_the_users_and_a_defect_is_ours(job, kind, message):
@@ -155,9 +90,9 @@ def test_a_workers_bad_input_is_the_users_and_a_defect_is_ours(job, kind, messag
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_every_job_has_a_process_of_its_own_and_the_threads_of_the_environment(monkeypatch, workers):
-    monkeypatch.setenv(THREADS[0], "3")
+    monkeypatch.setenv(work.THREADS, "3")
     pids, left, threads = zip(
-        *run_jobs(dict.fromkeys("abc", (leaves, ())), quiet, workers).values(), strict=True
+        *run_jobs(dict.fromkeys("abc", (work.leaves, ())), quiet, workers).values(), strict=True
     )
     assert len({*pids, os.getpid()}) == 4
     assert left == (1, 1, 1)
@@ -171,7 +106,7 @@ def test_all_reports_come_in_order_in_the_callers_thread_before_the_result():
         assert threading.current_thread() is threading.main_thread()
         seen.append((name, report))
 
-    jobs = {"a": (tells, (3000,)), "b": (tells, (2,))}  # more than a pipe holds
+    jobs = {"a": (work.tells, (3000,)), "b": (work.tells, (2,))}  # more than a pipe holds
     results = run_jobs(jobs, told, 2, lambda name, result: seen.append((name, result)))
     for name, n in results.items():
         assert [what for who, what in seen if who == name] == [*((i, n, "") for i in range(n)), n]
@@ -182,7 +117,7 @@ def test_all_reports_come_in_order_in_the_callers_thread_before_the_result():
 def test_one_that_fails_ends_the_others_at_once(tmp_path):
     path, begin = tmp_path / "pids", time.monotonic()
     with pytest.raises(RuntimeError, match="too bad"):
-        run_jobs({"a": (lasts, (path,)), "b": (fails_beside, (path,))}, quiet, 2)
+        run_jobs({"a": (work.lasts, (path,)), "b": (work.fails_beside, (path,))}, quiet, 2)
     assert gone(int(path.read_text()))
     assert time.monotonic() - begin < 30.0
 
@@ -198,16 +133,16 @@ def test_what_is_done_beside_one_that_fails_is_kept(tmp_path):
             time.sleep(0.01)
         time.sleep(3.0)
 
-    jobs = {"a": (fails_after, (str(go), str(failing))), "b": (double, (2,))}
+    jobs = {"a": (work.fails_after, (str(go), str(failing))), "b": (work.double, (2,))}
     with pytest.raises(RuntimeError, match="too bad"):
         run_jobs(jobs, told, 2, kept.__setitem__)
     assert kept == {"b": 4}
 
 
 def test_a_local_engine_computes_anything_and_survives_its_workers(monkeypatch):
-    monkeypatch.setenv(THREADS[0], "3")
+    monkeypatch.setenv(work.THREADS, "3")
     for threads, expected in ((1, "1"), (None, "3")):
-        local = make_engine(place, 1, threads=threads)
+        local = make_engine(work.place, 1, threads=threads)
         pids = []
         for batch in ((1, 2), (3, 4), (5, 0), (6,)):
             local.submit(batch)
@@ -242,8 +177,8 @@ def test_workers_end_with_their_parent_and_say_nothing(tmp_path, end):
     """Killed they end within seconds; at Ctrl-C, which reaches all of them, only the parent speaks."""
     path = tmp_path / "pids"
     code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from test_engine import *\n"
-        "if __name__ == '__main__': run_jobs({n: (lasts, (sys.argv[1],)) for n in 'ab'}, quiet, 2)"
+        "import sys\nfrom engine_jobs import lasts\nfrom hybrid_mpc.job.engine import run_jobs\n"
+        "if __name__ == '__main__': run_jobs({n: (lasts, (sys.argv[1],)) for n in 'ab'}, print, 2)"
     )
     (tmp_path / "main.py").write_text(code)
     parent = subprocess.Popen(
@@ -345,17 +280,9 @@ def here_cluster():
         yield make
 
 
-def raises(batch):
-    raise batch[0]("not a worker's death")
-
-
-def waits(batch):
-    time.sleep(1.0)
-
-
 @pytest.mark.parametrize("kind", [TypeError, OSError, CancelledError])
 def test_what_the_work_raises_on_a_cluster_is_no_lost_worker(here_cluster, kind):
-    far = make_engine(raises, 1, here_cluster(1)[1])
+    far = make_engine(work.raises, 1, here_cluster(1)[1])
     far.submit((kind,))
     with pytest.raises(kind, match="not a worker's death"):
         far.next(60.0)
@@ -366,7 +293,7 @@ def test_what_a_cluster_has_forgotten_is_lost(here_cluster):
     from distributed import Future
 
     client = here_cluster(1)[1]
-    far = make_engine(waits, 1, client)
+    far = make_engine(work.waits, 1, client)
     far.submit((1,))
     client.cancel([Future(key, client) for key in client.futures if "call" in key])
     batch, ended = far.next(60.0)

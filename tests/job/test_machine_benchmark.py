@@ -13,7 +13,6 @@ from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model, training_settings
 from hybrid_mpc.job.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
-from hybrid_mpc.job.stages import identify as training_stage
 
 
 @pytest.fixture(scope="module")
@@ -21,21 +20,11 @@ def machine(tmp_path_factory):
     return written(tmp_path_factory.mktemp("cart"))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def trained_here():
-    """Networks are trained in this process: others of their own would take longer to start than to train."""
-
-    def one_by_one(jobs, on_progress, workers):
-        for name, (function, arguments) in jobs.items():
-            function(*arguments, lambda *told, name=name: on_progress(name, *told))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training_stage, "run_jobs", one_by_one)
-        yield
+pytestmark = pytest.mark.usefixtures("jobs_here")
 
 
 @pytest.fixture(scope="module")
-def made(machine, tmp_path_factory):
+def made(machine, jobs_here, tmp_path_factory):
     """A finished benchmark, by the command itself."""
     scenario, train, test = machine
     out = tmp_path_factory.mktemp("out") / "run"

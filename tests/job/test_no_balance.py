@@ -2,13 +2,13 @@
 
 import json
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hybrid_mpc import write_csv
+from hybrid_mpc.cli.main import app
 from hybrid_mpc.job.stages.results import read_results
 
 MACHINE = """
@@ -55,16 +55,15 @@ def recording(path):
 
 
 @pytest.fixture(scope="module")
-def bodies(tmp_path_factory):
+def bodies(jobs_here, tmp_path_factory):
     """Folder of a run, and what the terminal was told."""
     folder = tmp_path_factory.mktemp("bodies")
     (folder / "bodies.py").write_text(MACHINE)
     data, out = recording(folder / "run.csv"), folder / "run"
     skipped = [word for stage in ("control", "estimation", "monitor", "guard") for word in ("--skip", stage)]
     words = ("run", folder / "bodies.py", "--data", data, *skipped, "--out", out)
-    command = [sys.executable, "-m", "hybrid_mpc.cli", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = CliRunner().invoke(app, [*map(str, words)])
+    assert done.exit_code == 0, done.output
     return out, done.stdout.partition("free runs on unseen data:")[2]
 
 
