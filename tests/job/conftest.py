@@ -1,5 +1,6 @@
 """What jobs work on: a small machine of a user's own with its recordings, and the folder of a golf robot's run."""
 
+import math
 import re
 import shutil
 from pathlib import Path
@@ -17,9 +18,9 @@ scenario = dataclasses.replace(scenario, budgets=tiny)
 
 
 def recording(seed: int, seconds: float = 12.0, dt: float = 0.01) -> dict[str, np.ndarray]:
-    """A pendulum with dry friction (the README's prior has none), by semi-implicit Euler at 1 ms."""
+    """A pendulum with dry friction (the README's prior has none), by semi-implicit Euler at 2.5 ms."""
     rng = np.random.default_rng(seed)
-    n, fine = round(seconds / dt), round(dt / 1e-3)
+    n, fine = round(seconds / dt), 4
     t = dt * np.arange(n)
     u = 0.4 * np.sin(2 * np.pi * rng.uniform(0.2, 0.4) * t) + 0.3 * np.sign(
         np.sin(2 * np.pi * 0.13 * t + seed)
@@ -28,8 +29,8 @@ def recording(seed: int, seconds: float = 12.0, dt: float = 0.01) -> dict[str, n
     for k in range(n):
         out[k] = phi
         for _ in range(fine):
-            v += 1e-3 * (u[k] - 1.1 * np.sin(phi) - 0.06 * v - 0.08 * np.tanh(v / 0.05)) / 0.1
-            phi += 1e-3 * v
+            v += dt / fine * (u[k] - 1.1 * math.sin(phi) - 0.06 * v - 0.08 * math.tanh(v / 0.05)) / 0.1
+            phi += dt / fine * v
     return {"time_s": t, "tau_nm": u, "phi_rad": out + 2e-4 * rng.standard_normal(n)}
 
 
@@ -74,14 +75,14 @@ def jobs_here():
 
 @pytest.fixture(scope="session")
 def finished(arguments, tmp_path_factory) -> Path:
-    """Folder of a finished run."""
-    import subprocess
-    import sys
+    """Folder of a finished run: by the command itself, its networks trained in processes as a user's are."""
+    from typer.testing import CliRunner
+
+    from hybrid_mpc.cli.main import app
 
     out = tmp_path_factory.mktemp("finished") / "run"
-    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = CliRunner().invoke(app, [*arguments, "--out", str(out)])
+    assert done.exit_code == 0, done.output
     assert "report.html" in done.stdout
     (out.parent / "told.txt").write_text(done.stdout)
     return out

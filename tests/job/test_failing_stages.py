@@ -30,17 +30,24 @@ def without(finished, tmp_path, name):
     return out
 
 
-@pytest.mark.parametrize("name", ["control", "monitor", "analysis"])
+FAIL = ("control", "monitor", "analysis")
+
+
+@pytest.mark.parametrize("names", [FAIL, *(pytest.param((name,), marks=pytest.mark.full) for name in FAIL)])
 def test_a_stage_that_cannot_run_leaves_its_reason_and_a_report(
-    call, arguments, finished, tmp_path, monkeypatch, name
+    call, arguments, finished, tmp_path, monkeypatch, names
 ):
-    out = without(finished, tmp_path, name)
-    monkeypatch.setattr(job, "STAGES", broken(job.STAGES, name, InputError(f"no {name} on Sundays")))
+    out = without(finished, tmp_path, names[0])
+    stages = job.STAGES
+    for name in names:
+        stages = broken(stages, name, InputError(f"no {name} on Sundays"))
+    monkeypatch.setattr(job, "STAGES", stages)
     code, told, _ = call(*arguments, "--out", out, "--resume")
     assert code == 1
-    assert f"stage {name} could not run: no {name} on Sundays" in told
-    assert failed_stages(out)[name] == f"no {name} on Sundays"
-    assert f"no {name} on Sundays" in (out / "report.html").read_text()
+    for name in names:
+        assert f"stage {name} could not run: no {name} on Sundays" in told
+        assert failed_stages(out)[name] == f"no {name} on Sundays"
+        assert f"no {name} on Sundays" in (out / "report.html").read_text()
     results = json.loads((out / "results.json").read_text())
     assert results["identification"]["rmse"]["mopgrnn"] is not None
 

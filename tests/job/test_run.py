@@ -74,6 +74,7 @@ def test_bounds_never_rise(finished):
             assert (np.diff(bound, axis=0) <= 0).all()
 
 
+@pytest.mark.full
 def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp_path):
     """Also the test of determinism: everything but timing is the same, bit for bit."""
     out = tmp_path / "run"

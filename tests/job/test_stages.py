@@ -25,6 +25,7 @@ from hybrid_mpc.job.stage import (
     source_of,
     write_stage,
 )  # fmt: skip
+from hybrid_mpc.job.stages import report
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 
@@ -47,8 +48,9 @@ def rerun(before, after):
 
 
 @pytest.fixture
-def own(machine, finished, arguments, tmp_path):
-    """A finished run, and its machine's file to edit."""
+def own(machine, finished, arguments, tmp_path, monkeypatch):
+    """A finished run, and its machine's file to edit. Its figures, which others look at, are not drawn again."""
+    monkeypatch.setattr(report, "draw_all", lambda context: {})
     source = shutil.copy(machine / "my_machine.py", tmp_path / "my_machine.py")
     out = shutil.copytree(finished, tmp_path / "run")
     return Path(source), out, ["run", source, *arguments[2:], "--out", str(out), "--resume"]

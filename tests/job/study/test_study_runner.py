@@ -196,6 +196,7 @@ def test_killed_many_times(tmp_path):
         killed_and_resumed(tmp_path / str(seed), 3, seed)
 
 
+@pytest.mark.full
 def test_ctrl_c_ends_the_workers_and_resumes(tmp_path):
     process = begun(tmp_path / "s", "slow", 60)
     wait_for(lambda: count(tmp_path / "s") > 4, process)

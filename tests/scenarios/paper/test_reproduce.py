@@ -65,6 +65,7 @@ def test_the_hybrid_has_as_many_steps_as_the_others(finished):
         assert switched == (free > 0)
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("no_sindy")
 def test_interrupted_and_resumed_equals_the_finished_one(exact, finished, tmp_path):
     """Also the test of determinism: everything but timing is the same, bit for bit."""
