@@ -51,12 +51,16 @@ def test_every_name_is_there_and_documented(package):
         if inspect.isclass(found) or inspect.isroutine(found):
             text = inspect.getdoc(found) or ""
             assert text, name
-            assert not text.startswith(f"{name}("), name  # what a dataclass without a docstring says of itself
+            assert not text.startswith(f"{name}("), (
+                name
+            )  # what a dataclass without a docstring says of itself
         else:
             home = importlib.import_module(f"{package.__name__}.{package._HOME[name]}")
             body = ast.parse(inspect.getsource(home)).body
             (place,) = (
-                i for i, n in enumerate(body) if isinstance(n, ast.Assign | ast.AnnAssign) and name in assigned(n)
+                i
+                for i, n in enumerate(body)
+                if isinstance(n, ast.Assign | ast.AnnAssign) and name in assigned(n)
             )
             after = body[place + 1]
             assert isinstance(after, ast.Expr), name

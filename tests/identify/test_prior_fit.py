@@ -108,7 +108,7 @@ def test_true_parameters_are_found_in_noise(sensor, noise):
         assert abs(found.values[name] - value) < 6 * found.standard_errors[name], name
 
 
-@pytest.mark.parametrize("kind", [Tanks, TorchTanks])
+@pytest.mark.parametrize("kind", [Tanks, pytest.param(TorchTanks, marks=pytest.mark.full)])
 def test_a_tank_is_found_whose_level_has_no_sensor(kind):
     exact = fitted(kind, [tanks(seed) for seed in range(3)], dt=1.0)
     # the same integrator with other sub-steps
@@ -138,9 +138,9 @@ def reaching(noise=NOISE):
 
 
 @pytest.mark.parametrize(("one", "other", "runs"), [
-    (Swing, TorchSwing, lambda: swings(noise=NOISE)),
+    pytest.param(Swing, TorchSwing, lambda: swings(noise=NOISE), marks=pytest.mark.full),
     (Tanks, TorchTanks, lambda: [tanks(seed, noise=1e-3) for seed in range(3)]),
-    (Arm, TorchArm, lambda: reaching()),
+    pytest.param(Arm, TorchArm, lambda: reaching(), marks=pytest.mark.full),
 ])  # fmt: skip
 def test_the_same_machine_in_casadi_and_in_torch_has_the_same_fit(one, other, runs):
     data, found = runs(), []

@@ -60,7 +60,12 @@ def torch_run(prior, x0, u, w, p, extra=0.0):
     return torch.stack(states)
 
 
-@pytest.mark.parametrize("kind", EVERY)
+ONE_OF_EACH = (TorchSwing, Tanks)
+
+
+@pytest.mark.parametrize(
+    "kind", [k if k in ONE_OF_EACH else pytest.param(k, marks=pytest.mark.full) for k in EVERY]
+)
 def test_values_and_derivatives_are_those_of_torch(kind):
     prior = kind()
     x0, u, w, p = given(prior)

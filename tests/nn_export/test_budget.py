@@ -147,8 +147,8 @@ class Recurrent(nn.Module):
         (nn.GRU, 512, 1, 1),
         (nn.LSTM, 512, 2, 1),
         (nn.GRU, 1024, 1, 1),
-        (nn.GRU, 64, 2, 100),
-        (nn.LSTM, 32, 1, 400),
+        pytest.param(nn.GRU, 64, 2, 100, marks=pytest.mark.full),
+        pytest.param(nn.LSTM, 32, 1, 400, marks=pytest.mark.full),
     ],
 )
 def test_real_networks_keep_the_limits_with_room_for_more(kind, size, layers, steps):

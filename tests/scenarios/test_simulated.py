@@ -19,6 +19,12 @@ MACHINES = {m.scenario.name: m for m in (cart_pole, dc_motor, lever, two_heaters
 SHORT = {"two_tanks": 1500.0, "dc_motor": 3.0, "two_heaters": 3000.0}
 """Seconds of a short recording; 10 s of the others."""
 each = pytest.mark.parametrize("name", MACHINES)
+KINDS = ("cart_pole", "two_heaters", "two_tanks")
+"""A mechanical machine, one of several inputs and outputs, one with a measured disturbance."""
+each_fitted = pytest.mark.parametrize(
+    "name", [n if n in KINDS else pytest.param(n, marks=pytest.mark.full) for n in MACHINES]
+)
+"""Machines whose prior is fitted first; the quick set takes one of each kind."""
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +104,7 @@ def shown(plant, result):
     return np.array([[float(v) for v in plant.outputs(list(x), list(u), list(w), plant)] for x, u, w in rows])
 
 
-@each
+@each_fitted
 def test_a_constant_load_leaves_no_offset(name, fitted):
     """The mean error of the last fifth is below two steps of the sensor."""
     scenario, _, kit = fitted(name)
@@ -118,7 +124,7 @@ PERIODS = 30
 
 
 @pytest.mark.parametrize("loops", [3, pytest.param(34, marks=pytest.mark.full)])
-@each
+@each_fitted
 def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, fitted):
     scenario, _, kit = fitted(name)
     control, dt, task = scenario.control, scenario.data.dt, scenario.tasks[0]

@@ -96,7 +96,18 @@ def test_the_paper_form_is_compared_with_the_recorded_derivative():
 SHORT = TrainingSettings("mopgrnn", 4, 2, 15, 10, seed=3, warm=10, horizon=20, batch=8, every=5)
 
 
-@pytest.mark.parametrize("options", [{}, {"kind": "rnn"}, {"prior_parameters": "trained"}], ids=str)
+FULL = pytest.mark.full
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, marks=FULL),
+        pytest.param({"kind": "rnn"}, marks=FULL),
+        {"prior_parameters": "trained"},
+    ],
+    ids=str,
+)
 def test_it_trains_resumes_and_leaves_torch_at_rounding(options, tmp_path):
     data, prior, file = dragged(), Pendulum(TRUTH), tmp_path / "training.safetensors"
     settings = replace(SHORT, **options)
