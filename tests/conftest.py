@@ -1,10 +1,13 @@
 """Shared material of the tests."""
 
+import os
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 LONG = (
     "job/test_machines.py",
@@ -48,6 +51,23 @@ def call(monkeypatch, capsys):
         return code, told.out, told.err.replace("\n", " ")
 
     return run
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """``shared(name, make)``: a folder that ``make`` fills once for all processes that share the tests."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+
+    def folder(name: str, make: Callable[[Path], None]) -> Path:
+        with FileLock(root / f"{name}.lock"):
+            if not (root / f"{name}.made").exists():
+                (root / name).mkdir()
+                make(root / name)
+                (root / f"{name}.made").touch()
+        return root / name
+
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -41,16 +41,18 @@ def write(path: Path, columns: dict[str, np.ndarray]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def machine(tmp_path_factory) -> Path:
+def machine(shared) -> Path:
     """Folder with ``my_machine.py`` (the README's lines) and two recordings, one with ten samples that repeat."""
-    folder = tmp_path_factory.mktemp("machine")
+    return shared("machine", write_machine)
+
+
+def write_machine(folder: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     (folder / "my_machine.py").write_text(blocks[0] + TINY)
     for i, name in enumerate(("monday", "tuesday")):
         columns = recording(i)
         columns["phi_rad"][600 : 600 + 10 * i] = columns["phi_rad"][600]
         write(folder / f"{name}.csv", columns)
-    return folder
 
 
 @pytest.fixture(scope="session")
@@ -74,18 +76,19 @@ def jobs_here():
 
 
 @pytest.fixture(scope="session")
-def finished(arguments, tmp_path_factory) -> Path:
+def finished(arguments, shared) -> Path:
     """Folder of a finished run: by the command itself, its networks trained in processes as a user's are."""
     from typer.testing import CliRunner
 
     from hybrid_mpc.cli.main import app
 
-    out = tmp_path_factory.mktemp("finished") / "run"
-    done = CliRunner().invoke(app, [*arguments, "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    assert "report.html" in done.stdout
-    (out.parent / "told.txt").write_text(done.stdout)
-    return out
+    def make(folder: Path) -> None:
+        done = CliRunner().invoke(app, [*arguments, "--out", str(folder / "run")])
+        assert done.exit_code == 0, done.output
+        assert "report.html" in done.stdout
+        (folder / "told.txt").write_text(done.stdout)
+
+    return shared("finished", make) / "run"
 
 
 @pytest.fixture(scope="session")

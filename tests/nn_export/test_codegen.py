@@ -100,6 +100,7 @@ def _compile_and_call(folder):
 
 
 @needs_compiler
+@pytest.mark.full
 def test_many_processes_at_once(tmp_path):
     with multiprocessing.get_context("spawn").Pool(3) as pool:
         assert pool.map(_compile_and_call, [str(tmp_path)] * 6) == [8.0] * 6
