@@ -187,7 +187,7 @@ def program():
     return trace(nn.GRUCell(3, 16), (torch.zeros(3), torch.zeros(16)))
 
 
-@pytest.mark.parametrize("how", ["threads", "fork", "spawn"])
+@pytest.mark.parametrize("how", ["threads", "fork", pytest.param("spawn", marks=pytest.mark.full)])
 def test_pools_give_the_same_bits(program, how):
     expected = evaluate(program)
     if how == "threads":

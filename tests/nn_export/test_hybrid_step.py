@@ -56,8 +56,17 @@ def examples(z):
     return torch.zeros(2), torch.zeros(z), torch.zeros(1)
 
 
-@pytest.mark.parametrize("torch_cell", [True, False])
-@pytest.mark.parametrize("z", [1, 8, 32])
+FULL = pytest.mark.full
+
+
+@pytest.mark.parametrize(
+    ("z", "torch_cell"),
+    [
+        (1, True),
+        (32, False),
+        *(pytest.param(*case, marks=FULL) for case in ((1, False), (8, True), (8, False), (32, True))),
+    ],
+)
 def test_parity_of_the_step(z, torch_cell):
     torch.manual_seed(z)
     module = Step(z, torch_cell).double()

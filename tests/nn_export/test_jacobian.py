@@ -117,7 +117,13 @@ MODULES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", MODULES)
+ALIKE = ("cells in series", "lstm in series", "lstm layers", "rnn cell")
+"""Modules whose parts others of the table have: for the full set."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.full) if name in ALIKE else name for name in MODULES]
+)
 def test_three_routes_agree(name):
     torch.manual_seed(0)
     make, inputs = MODULES[name]
