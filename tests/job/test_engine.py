@@ -237,6 +237,7 @@ class Killer(Progress):
             self.killed = True
 
 
+@pytest.mark.full
 def test_a_cluster_computes_the_same_and_loses_its_workers(tmp_path, monkeypatch, cluster):
     address, workers = cluster
     trivial_runs.stand_in(monkeypatch, trivial_runs.slow)
@@ -280,6 +281,15 @@ def here_cluster():
         yield make
 
 
+def test_a_cluster_computes_a_study(here_cluster, tmp_path, monkeypatch):
+    trivial_runs.stand_in(monkeypatch, trivial_runs.trivial)
+    study = trivial_runs.study(12)
+    results = run_study(study, tmp_path / "far", cluster=here_cluster(2)[0])
+    found = results.table.set_index("id")["cost"]
+    assert {run.id: trivial_runs.trivial(run)["cost"] for run in study.runs()} == found.to_dict()
+    assert results.note.engine == "dask, 2 workers"
+
+
 @pytest.mark.parametrize("kind", [TypeError, OSError, CancelledError])
 def test_what_the_work_raises_on_a_cluster_is_no_lost_worker(here_cluster, kind):
     far = make_engine(work.raises, 1, here_cluster(1)[1])
@@ -303,12 +313,12 @@ def test_what_a_cluster_has_forgotten_is_lost(here_cluster):
     far.close()
 
 
-@pytest.mark.parametrize("how", [pytest.param("once", marks=pytest.mark.full), "always"])
+@pytest.mark.parametrize("how", ["once", pytest.param("always", marks=pytest.mark.full)])
 def test_a_local_worker_that_dies(tmp_path, monkeypatch, how):
     trivial_runs.stand_in(monkeypatch, trivial_runs.deadly)
     monkeypatch.setenv("DEADLY", how)
     monkeypatch.setenv("MARK", str(tmp_path / "mark"))
-    results = run_study(trivial_runs.study(12), tmp_path / "s")
+    results = run_study(trivial_runs.study(12), tmp_path / "s", workers=1)
     assert results.missing == 0
     assert results.table["id"].is_unique
     assert results.note.workers_died == {"once": 1, "always": 3}[how]

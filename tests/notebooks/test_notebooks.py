@@ -10,8 +10,6 @@ import pytest
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "notebooks"
 FILES = sorted(FOLDER.glob("*.ipynb"))
-QUICK = ("01",)
-"""The one a newcomer opens first is executed in the quick set too."""
 # "/a/b" where no word, number, "." , ":" (of an address) or "<" (of a closing tag) stands before it, or "C:\"
 ABSOLUTE = re.compile(r"(?<![\w.:/<~*)])/[A-Za-z_][\w.-]*/|\b[A-Z]:\\\\?\w")
 MODULE = re.compile(r"^\s*(?:from|import) ((?:hybrid_mpc|nn_export|scenarios)[\w.]*)", re.MULTILINE)
@@ -82,15 +80,20 @@ def test_links_between_the_notebooks(path):
         assert link.startswith("http") or (FOLDER / link).exists(), link
 
 
-def cases():
-    for path in FILES:
-        marks = () if path.name[:2] in QUICK else (pytest.mark.full,)
-        yield pytest.param(path, id=path.stem, marks=marks)
-
-
-@pytest.mark.parametrize("path", list(cases()))
-def test_it_runs(path):
-    tool = load("execute")
-    fresh = tool.clean(tool.execute(path))  # a cell that fails raises
+def sound(fresh, path):
     assert not [m.group() for text in texts(fresh) for m in [ABSOLUTE.search(text)] if m]
     assert [len(c.outputs) > 0 for c in code(fresh)] == [len(c.outputs) > 0 for c in code(read(path))]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_it_runs(path):
+    tool = load("execute")
+    sound(tool.clean(tool.execute(path)), path)  # a cell that fails raises
+
+
+def test_the_one_that_a_newcomer_opens_first_runs_with_a_short_training(tmp_path):
+    short, changed = re.subn(r"(teacher|free_run)_steps=\d+", r"\1_steps=20", FILES[0].read_text())
+    assert changed == 2
+    (tmp_path / "short.ipynb").write_text(short)
+    sound(load("execute").execute(tmp_path / "short.ipynb"), FILES[0])
