@@ -1,10 +1,12 @@
 """Jobs and batches for the tests of engines. A worker imports this module alone, which takes it no time."""
 
 import os
+import pickle
 import signal
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 THREADS = "OMP_NUM_THREADS"
@@ -85,9 +87,27 @@ def waits(batch):
 
 
 def one_by_one(jobs, on_progress, workers, on_result=lambda name, result: None):
-    """``run_jobs`` in this process: others of their own take longer to start than small jobs to end."""
+    """``run_jobs`` in this process: others of their own take longer to start than small jobs to end.
+
+    Jobs and results are what would reach another process, and come back from it.
+    """
     results = {}
-    for name, (function, arguments) in jobs.items():
-        results[name] = function(*arguments, lambda *told, name=name: on_progress(name, *told))
+    for name, job in jobs.items():
+        function, arguments = pickle.loads(pickle.dumps(job))
+        result = function(*arguments, lambda *told, name=name: on_progress(name, *told))
+        results[name] = pickle.loads(pickle.dumps(result))
         on_result(name, results[name])
     return results
+
+
+@contextmanager
+def jobs_in_this_process():
+    """Networks are trained and loops of a comparison computed in this process."""
+    import pytest
+
+    from hybrid_mpc.job.stages import compare, identify
+
+    with pytest.MonkeyPatch.context() as patch:
+        for stage in (compare, identify):
+            patch.setattr(stage, "run_jobs", one_by_one)
+        yield

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from engine_jobs import jobs_in_this_process
 
 README = Path(__file__).parents[2] / "README.md"
 TINY = """
@@ -64,26 +65,21 @@ def arguments(machine) -> list[str]:
 
 @pytest.fixture(scope="module")
 def jobs_here():
-    """Networks are trained and loops computed in this process: others take longer to start than these to end."""
-    from engine_jobs import one_by_one
-
-    from hybrid_mpc.job.stages import compare, identify
-
-    with pytest.MonkeyPatch.context() as patch:
-        for stage in (compare, identify):
-            patch.setattr(stage, "run_jobs", one_by_one)
+    """See there: for a module."""
+    with jobs_in_this_process():
         yield
 
 
 @pytest.fixture(scope="session")
 def finished(arguments, shared) -> Path:
-    """Folder of a finished run: by the command itself, its networks trained in processes as a user's are."""
+    """Folder of a finished run, by the command itself but in this process."""
     from typer.testing import CliRunner
 
     from hybrid_mpc.cli.main import app
 
     def make(folder: Path) -> None:
-        done = CliRunner().invoke(app, [*arguments, "--out", str(folder / "run")])
+        with jobs_in_this_process():
+            done = CliRunner().invoke(app, [*arguments, "--out", str(folder / "run")])
         assert done.exit_code == 0, done.output
         assert "report.html" in done.stdout
         (folder / "told.txt").write_text(done.stdout)

@@ -65,11 +65,11 @@ def excess(u, ocp):
     return max(beyond)
 
 
-@pytest.fixture(scope="module")
-def loops(golf_artifact):
-    """The draw and the result of ten loops, with the limits they had; an exception in any ends them all."""
+@pytest.fixture(scope="module", params=[range(9, 12), pytest.param(range(12, 19), marks=pytest.mark.full)])
+def loops(request, golf_artifact):
+    """The draw and the result of loops, with the limits they had; an exception in any ends them all."""
     models, done = load(golf_artifact).models, []
-    for seed in range(9, 19):
+    for seed in request.param:
         task, kinds, faults, late, start = drawn(seed)
         model, control = models[("hybrid", "prior")[seed % 2]], task.control or scenario.control
         controller = make_controller(model, models["prior"], control)
