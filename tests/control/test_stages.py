@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -43,6 +44,7 @@ def test_a_run_is_the_models_own_with_the_jacobians_along_it():
     np.testing.assert_allclose(z_next, z[1:], rtol=1e-14, atol=1e-15)
 
 
+@cache
 def golf_robot(z):
     """The golf robot's model as it is loaded from an artifact: the hybrid, or with z = 0 the prior alone."""
     torch.manual_seed(z)
