@@ -45,15 +45,17 @@ def test_scale_is_found_again():
     )
 
 
-def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_one(learned):
+@pytest.mark.parametrize(("count", "most"), [(2, 10), pytest.param(4, 16, marks=pytest.mark.full)])
+def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_one(learned, count, most):
     _, detector = learned
     armed = EnergyMonitor(pendulum(), **WINDOW, detector=detector)
     starts = 0
-    for seed in range(10, 14):
+    for seed in range(10, 10 + count):
         alarm = replay(armed, Observer(pendulum()), simulate(5000, seed, noise=NOISE)).alarm[60:]
         starts += int(np.sum(np.diff(alarm.astype(int)) == 1))
     # 400 s at 30/h: 3.3 expected; a factor 3 for the thresholds' own error: P(n > 16 | 10) = 3 %
-    assert starts <= 16
+    # half of it: P(n > 10 | 5) = 1 %
+    assert starts <= most
 
 
 @pytest.mark.parametrize(("fault", "limit"), [(pendulum(friction=2 * GAMMA), 0.6), (pendulum(push=0.1), 0.4)])

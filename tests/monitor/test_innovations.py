@@ -69,12 +69,13 @@ def readings(name, limits, run, **options):
     return found
 
 
-def test_unseen_nominal_runs_raise_few_alarms(watched):
+@pytest.mark.parametrize("n", [1000, pytest.param(3000, marks=pytest.mark.full)])
+def test_unseen_nominal_runs_raise_few_alarms(watched, n):
     """A rate of 0.1 over dt an hour is one in 36000 periods; in 3000 unseen ones a second alarm has a probability of
     0.3 %, and thresholds from 9000 periods are known to some tens of per cent of the rate."""
     name, limits = watched
     make, swing, sigma, _ = MACHINES[name]
-    alarm = [r.alarm for r in readings(name, limits, recording(make, swing, sigma, 3000, 11))[200:]]
+    alarm = [r.alarm for r in readings(name, limits, recording(make, swing, sigma, n, 11))[200:]]
     assert np.sum(np.diff(np.array(alarm, dtype=int)) > 0) <= 1
 
 
