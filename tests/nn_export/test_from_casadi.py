@@ -173,7 +173,7 @@ def _slope_bytes(module):
     return x.grad.numpy().tobytes()
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.full)])
 def test_processes_give_the_same_bits(context):
     module = from_casadi(pendulum())
     with multiprocessing.get_context(context).Pool(1) as pool:

@@ -47,6 +47,7 @@ def test_labelled_with_units_and_legend(make):
     assert len(texts) == len(set(texts))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("make", [errors_figure, run_figure])
 def test_same_data_same_bytes(make, tmp_path):
     files = [save(make(), tmp_path / f"{i}.png") for i in range(2)]

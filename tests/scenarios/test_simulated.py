@@ -19,7 +19,7 @@ MACHINES = {m.scenario.name: m for m in (cart_pole, dc_motor, lever, two_heaters
 SHORT = {"two_tanks": 1500.0, "dc_motor": 3.0, "two_heaters": 3000.0}
 """Seconds of a short recording; 10 s of the others."""
 each = pytest.mark.parametrize("name", MACHINES)
-KINDS = ("cart_pole", "two_heaters", "two_tanks")
+KINDS = ("lever", "two_heaters", "two_tanks")
 """A mechanical machine, one of several inputs and outputs, one with a measured disturbance."""
 each_fitted = pytest.mark.parametrize(
     "name", [n if n in KINDS else pytest.param(n, marks=pytest.mark.full) for n in MACHINES]

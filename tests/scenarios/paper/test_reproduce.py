@@ -90,6 +90,7 @@ def test_where_only_the_angle_is_measured(measured, tmp_path):
     assert table.cell("exact", 2, "phy").mean < 0.5 * table.cell("exact", 2, "phy_nominal").mean
 
 
+@pytest.mark.full
 def test_sindy_has_a_row_where_it_is_there(exact, tmp_path, monkeypatch):
     def fit(training, prior, dt, *, validation, warm):
         assert len(training) == 1

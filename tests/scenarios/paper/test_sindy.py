@@ -71,6 +71,7 @@ def test_the_pendulums_equation_comes_out_of_exact_runs(exact, target, tolerance
     assert np.abs(run.y_hat - run.y).max() < 1e-4
 
 
+@pytest.mark.full
 @needs_pysindy
 def test_friction_of_an_unknown_slope_is_found_and_beats_what_lacks_it(runs):
     step = fit_sindy(runs[0], Pendulum(), DT, validation=runs[1], warm=WARM)
@@ -165,6 +166,7 @@ def test_a_step_is_its_equation_for_any_batch():
         )
 
 
+@pytest.mark.full
 def test_it_exports_at_rounding():
     step = SindyStep(Pendulum(), LAW, VALUES, DT)
     parity = check_parity(
