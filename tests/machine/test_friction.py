@@ -81,7 +81,13 @@ def lost(prior, free, x, u):
     return (rates(free, x, u) - rates(prior, x, u))[:, 1] * inertia
 
 
-@pytest.mark.parametrize("kind", TERMS)
+IN_TORCH = pytest.mark.parametrize(
+    "kind", [k if k in ("stribeck", "all") else pytest.param(k, marks=pytest.mark.full) for k in TERMS]
+)
+"""On a prior in torch, which takes a second to trace: the quick set has the one with most parts, and all together."""
+
+
+@IN_TORCH
 def test_torques_are_the_hand_written_formulas(kind):
     prior, free = with_friction(PendulumPrior, *TERMS[kind])(), PendulumPrior()
     x, u, _ = random_points(prior, np.random.default_rng(0), 50)
@@ -91,8 +97,11 @@ def test_torques_are_the_hand_written_formulas(kind):
     np.testing.assert_allclose(lost(prior, free, x, u), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", TERMS)
-@pytest.mark.parametrize("base", [PendulumPrior, GolfRobotPrior, TorquePendulumPrior, Pendulum])
+@pytest.mark.parametrize(
+    ("kind", "base"),
+    [(kind, base) for base in (GolfRobotPrior, TorquePendulumPrior, Pendulum) for kind in TERMS]
+    + [pytest.param(kind, PendulumPrior, marks=[] if kind == "all" else pytest.mark.full) for kind in TERMS],
+)
 def test_energy_balance_stays_zero_along_the_flow(kind, base):
     # those without m, l and g have a load that changes its sign
     load = {PendulumPrior: carried("l"), GolfRobotPrior: carried("a")}.get(base, lambda q, v, p: 5.0 * q[0])
@@ -116,7 +125,7 @@ class Values:
         self.__dict__.update(prior.values)
 
 
-@pytest.mark.parametrize("kind", TERMS)
+@IN_TORCH
 def test_friction_only_takes_energy(kind):
     prior, free = with_friction(PendulumPrior, *TERMS[kind])(), PendulumPrior()
     x, u, _ = random_points(prior, np.random.default_rng(1))

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from engine_jobs import jobs_in_this_process
 
 from hybrid_mpc import write_csv
 from hybrid_mpc.job.run import run
@@ -102,7 +103,7 @@ def job(tmp_path_factory):
         drawn[path.stem] = [t for ax in figure.axes for t in (ax.get_xlabel(), ax.get_ylabel()) if t]
         return save(figure, path)
 
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, jobs_in_this_process():
         patch.setattr(stage, "save", noted)
         results = run(RunSettings(str(folder / "heaters.py"), data), folder / "run")
     text = re.sub(
