@@ -484,8 +484,8 @@ def test_a_user_s_file_with_seven_errors_has_seven_lines(call, tmp_path):
     assert "7 to be mended" in told_to_user
     for word in (
         "its derivative by x is not finite at x = [0.0]", "balance water [l/s]: dS/dt - supply + loss",
-        "operating_point is no equilibrium", "2 columns of inputs", "sensor_sigma needs 1 numbers", "safe_input (-3.0,)",
-        "task fill: x0 needs 1",
+        "operating_point is no equilibrium", "2 columns of inputs", "sensor_sigma needs 1 numbers",
+        "safe_input (-3.0,)", "task fill: x0 needs 1",
     ):  # fmt: skip
         assert sum(word in line for line in told_to_user.splitlines()) == 1, word
 
