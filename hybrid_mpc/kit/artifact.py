@@ -36,12 +36,13 @@ from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import numbers
-from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel
+from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.innovations import ResidualLimits, ResidualMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
+from hybrid_mpc.monitor.lengths import SHARE
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario
 
@@ -535,6 +536,16 @@ class Kit:
         """Speeds ``(n_q,)`` below which friction may stick, learned from recordings; None: unknown."""
         return None if self.calibration is None else self.calibration.rest_speed
 
+    @property
+    def known_rest(self) -> tuple[float, ...] | None:
+        """The same; where none was learned, a share of the natural speeds of the recordings; None: unknown."""
+        held, prior = self.predicting, self.models.get("prior")
+        if self.rest_speed is not None or held is None or prior is None:
+            return self.rest_speed
+        n_q = prior.n_x // 2
+        natural = tuple(SHARE * size for size in held.sizes.x[n_q : 2 * n_q])
+        return natural if kinematics(prior) == {i: n_q + i for i in range(n_q)} and min(natural) > 0 else None
+
     def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
         """The kit with other process noise, by estimator (see :meth:`noise`)."""
         return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
@@ -662,9 +673,9 @@ class Kit:
         if kind == "energy":
             return make_monitor(watched, learned)
         if kind == "own":
-            return make_monitor(watched, None, rest_speed=self.rest_speed)
+            return make_monitor(watched, None, rest_speed=self.known_rest)
         if kind == "readings":
-            return guard_monitor(watched, rest_speed=self.rest_speed)
+            return guard_monitor(watched, rest_speed=self.known_rest)
         return guard_monitor(
             watched, self.detector(), resolution=sensor_steps(self.sensor_sigma),
             input_range=self.problem(task).input_range, diagnose=diagnose and watched.n_p > 0,
