@@ -59,9 +59,9 @@ def _packages() -> Iterator[Finding]:
     extras: dict[str, list[str]] = {"": []}
     for line in needed:
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", line)
-        name = re.match(r"[\w.-]+", line)
-        if name and name[0].lower().replace("_", "-") != PACKAGE:
-            extras.setdefault(extra[1] if extra else "", []).append(name[0])
+        named = re.match(r"[\w.-]+", line)
+        if named and named[0].lower().replace("_", "-") != PACKAGE:
+            extras.setdefault(extra[1] if extra else "", []).append(named[0])
     for extra, names in extras.items():
         there = {name: _version(name) for name in dict.fromkeys(names)}
         told = ", ".join(f"{name} {found or 'absent'}" for name, found in there.items())

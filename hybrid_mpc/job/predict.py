@@ -75,9 +75,8 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
         least = spec.warm_up + MIN_SCORED * spec.dt + late
         long = [t for t in data.whole if len(t.t) * spec.dt > least - 0.5 * spec.dt]
         if not long:
-            parts = [t.t[-1] - t.t[0] + spec.dt for t in data.whole] + [
-                cut.end - cut.start for cut in data.cuts
-            ]
+            parts = [t.t[-1] - t.t[0] + spec.dt for t in data.whole]
+            parts += [c.end - c.start for c in data.cuts if not c.why.startswith("gap")]
             problems.append(
                 f"{path}: too short: its longest part without a gap has {max(parts, default=0.0):.4g} s, the warm-up "
                 f"of {spec.warm_up:g} s and {MIN_SCORED} periods need {least:.4g} s"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -91,7 +92,7 @@ def weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
     return position, velocity, acceleration, kernel, np.diff(kernel) / dt
 
 
-def _given(model: HybridModel, g: ca.MX) -> tuple[ca.MX, ca.MX]:
+def _given(model: HybridModel, g: ca.MX) -> tuple[ca.MX, Any]:
     """Input and measured disturbances of ``g``: both, or the input alone, under those of the operating point."""
     n_u = model.n_u
     return (g, model.w) if g.shape[0] == n_u else (g[:n_u], g[n_u:])
