@@ -80,12 +80,14 @@ if TYPE_CHECKING:
     from hybrid_mpc.identify.fit import FirstStates, fit_prior
     from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
     from hybrid_mpc.identify.networks import GRUNetwork
+    from hybrid_mpc.identify.predict import Prediction, predict
     from hybrid_mpc.identify.prior_model import model_info
     from hybrid_mpc.identify.settings import TrainingSettings
     from hybrid_mpc.identify.smooth import fit_smoother
     from hybrid_mpc.identify.step import HybridStep, PriorStep, Scaling, n_features
     from hybrid_mpc.identify.train import train
     from hybrid_mpc.identify.tune import SearchSpace, tune
+    from hybrid_mpc.job.check import check_scenario
     from hybrid_mpc.job.controllers import find_noise
     from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, varied
     from hybrid_mpc.job.run import run
@@ -198,6 +200,7 @@ __all__ = [
     "OffsetFree",
     "OperatingPoint",
     "Parameter",
+    "Prediction",
     "Prior",
     "PriorStep",
     "Provenance",
@@ -237,6 +240,7 @@ __all__ = [
     "check_excitation",
     "check_parity",
     "check_plant_faults",
+    "check_scenario",
     "chirp",
     "contraction",
     "corrupt_input",
@@ -294,6 +298,7 @@ __all__ = [
     "parameter_states",
     "physical_states",
     "prbs",
+    "predict",
     "process_noise",
     "random_steps",
     "replay",
@@ -367,12 +372,14 @@ _ROOMS = {
     "identify.fit": ("FirstStates", "fit_prior"),
     "identify.linear": ("LinearModel", "fit_arx", "fit_subspace"),
     "identify.networks": ("GRUNetwork",),
+    "identify.predict": ("Prediction", "predict"),
     "identify.prior_model": ("model_info",),
     "identify.settings": ("TrainingSettings",),
     "identify.smooth": ("fit_smoother",),
     "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
     "identify.train": ("train",),
     "identify.tune": ("SearchSpace", "tune"),
+    "job.check": ("check_scenario",),
     "job.controllers": ("find_noise",),
     "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
     "job.run": ("run",),

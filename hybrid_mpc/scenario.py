@@ -136,7 +136,8 @@ class Scenario:
         prior: Prior class or factory ``(values=None) -> Prior``.
         data: How recordings are read.
         make_data: ``(folder, seed, budget name) -> CSV or npz paths`` for a simulated machine; default: none.
-        plant: ``() -> Plant``; default: none (then there is no closed loop, only timing).
+        plant: ``() -> Plant``; default: none. Then loops run on a trained model in place of the machine, which tells
+            nothing of the machine.
         oracle: ``(dt) -> HybridModel`` with the plant's own equations, its hidden states as ``h``.
         control: The control problem that all controllers share; default: none.
         sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them. Needed
@@ -146,7 +147,8 @@ class Scenario:
         safe_input: Input ``(n_u,)`` [input units] that the machine may be left with: when a sensor is lost, when
             nothing is finite, at the end of a run. It is never guessed: a guard that rests and a run on the real
             machine need it. Default: none is declared; a loop in simulation then holds its last input.
-        tasks: Closed-loop tasks.
+        tasks: Closed-loop tasks. Default: none; without a plant, too, a step and holding against a disturbance
+            (:func:`~hybrid_mpc.job.default_tasks.default_tasks`).
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
         figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a

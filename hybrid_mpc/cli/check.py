@@ -94,6 +94,10 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
     control = scenario.control
     if control is not None and hasattr(control, "horizon"):
         tasks = ", ".join(task.name for task in scenario.tasks) or "none"
+        if found.default_tasks:
+            tasks = f"none declared, so default ones: {'; '.join(task.title for task in found.default_tasks)}"
+        if scenario.plant is None:
+            tasks += "; loops run on a trained model, for there is no plant"
         _line(
             console,
             "control",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -60,7 +61,10 @@ def control(
     resume: Annotated[bool, typer.Option("--resume", help="Finish the loops that the folder holds.")] = False,
     gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,
 ) -> None:
-    """Close the loop around the simulated machine with a trained model, without training anything."""
+    """Close the loop around the simulated machine with a trained model, without training anything.
+
+    A machine without plant is stood in for by a model: then nothing that is found is of the machine.
+    """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.control import run_control
     from hybrid_mpc.job.study import DEFAULT_CONTROLLERS, Study
@@ -78,11 +82,15 @@ def control(
 
 
 def summary(results: ControlResults) -> list[str]:
-    """One line a task and controller."""
+    """One line a task and controller; on models those of each controller by itself."""
+    if len(results.on_model) > 1:
+        parts = (_of_controller(results, name) for name in results.on_model)
+        return [line for part in parts for line in summary(part)]
+    said = [f"{name} on the model {plant}, not the machine:" for name, plant in results.on_model.items()]
     cells = [cell for row in results.summary.values() for cell in row.values()]
     signals = {s: max(len(s) + 5, 11) for s in dict.fromkeys(s for cell in cells for s in cell.tracking_rmse)}
     heads = " ".join(f"{'RMSE ' + s:>{width}}" for s, width in signals.items())
-    lines = [f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {heads} {'solved':>8}"]
+    lines = [*said, f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {heads} {'solved':>8}"]
     for task, row in results.summary.items():
         for name, cell in row.items():
             cost = cell.cost
@@ -99,6 +107,15 @@ def summary(results: ControlResults) -> list[str]:
             f"{results.period_ms:g} ms"
         )
     return lines
+
+
+def _of_controller(results: ControlResults, name: str) -> ControlResults:
+    """The part of the results that is of one controller."""
+    return replace(
+        results, on_model={name: results.on_model[name]}, step_ms={name: results.step_ms[name]},
+        summary={task: {name: cells[name]} for task, cells in results.summary.items()},
+        loops=tuple(row for row in results.loops if row.controller == name),
+    )  # fmt: skip
 
 
 def _guarded(row: LoopRow) -> list[str]:

@@ -19,7 +19,21 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
-from hybrid_mpc.cli import analyze, benchmark, check, control, data, monitor, new, run, scenarios, study, tune
+from hybrid_mpc.cli import (
+    analyze,
+    benchmark,
+    check,
+    control,
+    data,
+    doctor,
+    monitor,
+    new,
+    predict,
+    run,
+    scenarios,
+    study,
+    tune,
+)
 from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.files import reason
 
@@ -32,6 +46,7 @@ SAVED = {
     "tune": "finished trials are saved: the same command with --resume goes on",
     "study": "finished runs are saved: the same command with --resume goes on",
     "analyze": "figures and tables are not complete: the same command with another --out makes them anew",
+    "predict": "tables and pictures are not complete: the same command with another --out makes them anew",
     "monitor": "tables and pictures are not complete: the same command with another --out makes them anew",
     "data": "the recordings are not complete: the same command with another --out makes them anew",
 }
@@ -48,6 +63,7 @@ app = typer.Typer(
 app.command("new", epilog=new.EXAMPLES)(new.new)
 app.command("check", epilog=check.EXAMPLES)(check.check)
 app.command("run", epilog=run.EXAMPLES)(run.run)
+app.command("predict", epilog=predict.EXAMPLES)(predict.predict)
 app.command("control", epilog=control.EXAMPLES)(control.control)
 app.command("analyze", epilog=analyze.EXAMPLES)(analyze.analyze)
 app.command("benchmark", epilog=benchmark.EXAMPLES)(benchmark.benchmark)
@@ -55,6 +71,7 @@ app.command("data", epilog=data.EXAMPLES)(data.data)
 app.command("tune", epilog=tune.EXAMPLES)(tune.tune)
 app.command("monitor", epilog=monitor.EXAMPLES)(monitor.monitor)
 app.command("scenarios")(scenarios.scenarios)
+app.command("doctor")(doctor.doctor)
 app.add_typer(study.app, name="study")
 for entry in entry_points(group="hybrid_mpc.commands"):  # commands of scenarios, e.g. `reproduce`
     command = entry.load()

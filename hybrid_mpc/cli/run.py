@@ -12,7 +12,7 @@ from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordin
 from hybrid_mpc.records import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.stages.results import Guard, Identification, Residuals, Results
+    from hybrid_mpc.job.stages.results import Guard, Identification, OnModel, Residuals, Results
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -65,9 +65,9 @@ def run(
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
 
-    The stages are data, prior, training, choice, evaluation, export, noise, control, estimation, residuals, monitor,
-    guard, analysis and report. With --resume a stage runs again only where something that it reads has changed. Exit
-    code 1 if a stage after the export could not run; the report then says why.
+    The stages are data, prior, training, choice, evaluation, export, noise, control, on_model, estimation, residuals,
+    monitor, guard, analysis and report. With --resume a stage runs again only where something that it reads has
+    changed. Exit code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.run import failed_stages
@@ -101,10 +101,20 @@ def summary(results: Results) -> list[str]:
             lines.append(
                 f"closed loop, {name:8} cost {loop.cost:.4g}, tracking {tracking(loop.tracking_rmse)}"
             )
+    lines += on_model_lines(results.on_model)
     lines += residual_lines(results.residuals)
     if results.monitor.alarms is None:
         lines.append(f"energy monitor: {results.monitor.reason}")
     return lines + guard_lines(results.guard)
+
+
+def on_model_lines(found: OnModel) -> list[str]:
+    """What the run says of its closed loops on models."""
+    lines = []
+    for name, cells in (found.details.controllers if found.details is not None else {}).items():
+        words = ", ".join(f"{task} {_cell(cell.cost.mean)}" for task, cell in cells.items())
+        lines.append(f"{name} on the model {found.plants[name]}, not the machine: cost of {words}")
+    return lines
 
 
 def errors_table(found: Identification) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +22,21 @@ SHORTEST = 5
 NOISY = 0.02
 """Share of noise in the power of the acceleration from which on the window is too short: the steps of a coarse sensor
 are no white noise, and up to half of what they make would pass for motion."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Natural sizes of a machine's signals, found in its recordings.
+
+    ``y`` ``(n_y,)`` are the spreads of the outputs, ``noise`` ``(n_y,)`` what of them is noise. ``x`` ``(n_x,)`` is how
+    far each state alone moves the outputs by their spread, within the machine's second; ``rate`` ``(n_x,)`` is that
+    over this second. They depend on no unit.
+    """
+
+    y: tuple[float, ...]
+    noise: tuple[float, ...]
+    x: tuple[float, ...]
+    rate: tuple[float, ...]
 
 
 class Outputs(Protocol):

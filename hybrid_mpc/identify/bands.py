@@ -18,14 +18,17 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.fit import parameter_variance
+from hybrid_mpc.kit.prediction import SHARE, Bands
+from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
-SHARE = 0.9
-"""Share of the measurements that a band is to hold."""
 KNOWN = 8
 """Independent errors that the validation runs count for at least; more runs count one each."""
 LEAST = 1e-6
 """Least weight of the noise: a variance is never zero."""
+FAR = 1e3
+"""Spreads of an output beyond which a part of an error's variance says no more."""
 
 
 @dataclass(frozen=True)
@@ -41,51 +44,68 @@ class RunParts:
     parts: Array
 
 
-@dataclass(frozen=True)
-class Bands:
-    """Half widths of a band as a function of the parts of the variance.
-
-    Args:
-        weights: Weight of each part, by output ``(n_y, m)``.
-        scale: Half width over the standard deviation, by output.
-        constant: The same for a band of constant width, over the noise of the sensor. Default: not known.
-        share: Share of the measurements that it is to hold. Default: 90 %.
-    """
-
-    weights: tuple[tuple[float, ...], ...]
-    scale: tuple[float, ...]
-    constant: tuple[float, ...] = ()
-    share: float = SHARE
-
-    def of_constant_width(self) -> Bands:
-        """A band of one width for all times, as it is calibrated to hold the same share; see :func:`fit_bands`."""
-        return Bands(
-            tuple((1.0, *(0.0 for _ in own[1:])) for own in self.weights),
-            self.constant,
-            self.constant,
-            self.share,
-        )
-
-    def half_width(self, parts: Array) -> Array:
-        """Half widths ``(n, n_y)`` [output units] of parts ``(n, n_y, m)``."""
-        variance = np.einsum("kjm,jm->kj", parts, np.array(self.weights))
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * np.array(self.scale))
-
-
-def variance_parts(t: Array, sigma: Array, spread: Array, networks: Array, parameters: Array) -> Array:
+def variance_parts(
+    t: Array,
+    sigma: Array,
+    spread: Array,
+    networks: Array,
+    parameters: Array,
+    *,
+    longest: float = math.inf,
+) -> Array:
     """Parts of the variance of a free run's errors ``(n, n_y, 4)`` [output units^2].
 
     Args:
-        t: Time since the start ``(n,)``, in the run's own length or the machine's seconds; only its shape counts.
+        t: Time since the start ``(n,)`` [s]; the growth is one at the run's end.
         sigma: Noise of the sensors ``(n_y,)`` [output units].
         spread: Spread of the outputs ``(n_y,)`` [output units].
         networks: Variance between the networks ``(n, n_y)`` [output units^2]; zero for the prior.
         parameters: Variance by the covariance of the fitted parameters ``(n, n_y)`` [output units^2].
+        longest: Length [s] at which the growth is one and beyond which it goes on, in a longer run. Default: its own.
     """
     n, n_y = networks.shape
-    growth = (np.asarray(t) / max(float(np.max(t)), 1e-300))[:, None] * np.square(spread)
+    growth = (np.asarray(t) / max(min(float(np.max(t)), longest), 1e-300))[:, None] * np.square(spread)
     noise = np.broadcast_to(np.square(sigma), (n, n_y))
     return np.stack([noise, networks, parameters, growth], axis=-1)
+
+
+def run_variance(
+    prior: Prior,
+    covariance: Array,
+    outputs: Array,
+    start: tuple[Array, Array, Array],
+    t: Array,
+    sigma: Array,
+    spread: Array,
+    *,
+    dt: float,
+    substeps: int,
+    longest: float = math.inf,
+) -> Array:
+    """Parts of the variance of a free run's errors ``(n, n_y, 4)``, from the runs of all networks.
+
+    Args:
+        prior: The fitted prior.
+        covariance: Covariance of its parameters ``(n_p, n_p)``; empty where it is not known.
+        outputs: Outputs of the runs of all networks ``(m, n, n_y)``; of the prior a single one.
+        start: First state ``(n_x,)``, acting inputs ``(n, n_u)`` and disturbances ``(n, n_w)``.
+        t: Time since the start ``(n,)`` [s].
+        sigma: Noise of the sensors ``(n_y,)``.
+        spread: Spread of the outputs ``(n_y,)``.
+        dt: Period [s].
+        substeps: Runge-Kutta sub-steps a period.
+        longest: As :func:`variance_parts` has it.
+    """
+    n_p, limit = len(prior.parameters), np.square(FAR * spread)
+    if not covariance.size:
+        covariance = np.zeros((n_p, n_p))
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges has a band without end
+        networks = np.nan_to_num(outputs.var(axis=0), nan=np.inf)
+        x, u, w = (values[None] for values in start)
+        parameters = parameter_variance(prior, covariance, x, u, w, dt, substeps)[0]
+    return variance_parts(
+        t, sigma, spread, np.minimum(networks, limit), np.minimum(parameters, limit), longest=longest
+    )
 
 
 def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:

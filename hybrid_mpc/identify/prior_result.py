@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.smooth import Sizes, Smoother
+from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter
 

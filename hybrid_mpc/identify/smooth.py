@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.scales import evenly, robust_spread
+from hybrid_mpc.data.scales import Sizes, evenly, robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.simulation import (
     flow_slope,
@@ -55,21 +55,6 @@ QUIETEST = 1e-6
 is not known at first is some 10 spreads, whose square holds no more digits."""
 UNSEEN = 1e-6
 """Share of the outputs' spread below which a state's whole range shows in no output."""
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Natural sizes of a machine's signals, found in its recordings.
-
-    ``y`` ``(n_y,)`` are the spreads of the outputs, ``noise`` ``(n_y,)`` what of them is noise. ``x`` ``(n_x,)`` is how
-    far each state alone moves the outputs by their spread, within the machine's second; ``rate`` ``(n_x,)`` is that
-    over this second. They depend on no unit.
-    """
-
-    y: tuple[float, ...]
-    noise: tuple[float, ...]
-    x: tuple[float, ...]
-    rate: tuple[float, ...]
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of
 from hybrid_mpc.job.check_prior import DRIFT, Report, check_prior
+from hybrid_mpc.job.default_tasks import default_tasks
 from hybrid_mpc.kit.artifact import build_model, loop_settings
 from hybrid_mpc.kit.assembly import make_controller, make_estimator
 from hybrid_mpc.loop.faults import check_channels, install
@@ -79,6 +80,7 @@ class Preflight:
         doubts: What is doubtful about the recordings.
         rest: Where the prior rests; None if its equations cannot be asked there.
         dataset: The recordings; None if there are none, or they cannot be read.
+        default_tasks: Tasks that the scenario gets where it declares none and has no plant.
     """
 
     scenario: Scenario
@@ -88,6 +90,7 @@ class Preflight:
     doubts: tuple[str, ...]
     rest: Rest | None
     dataset: Dataset | None
+    default_tasks: tuple[Task, ...] = ()
 
 
 def check_scenario(
@@ -129,6 +132,9 @@ def preflight(
         rest, model = _check_rest(report, scenario, prior)
     _check_control(report, scenario, prior, model if len(report.problems) == before else None, rest)
     _check_plant(report, scenario, prior, model, rest)
+    tasks: tuple[Task, ...] = ()
+    if len(report.problems) == before and model is not None:
+        tasks = _default_tasks(report, scenario)
     dataset, n_warnings = None, len(report.warnings)
     if recordings is not None and prior is not None:
         dataset = _check_recordings(report, prior, recordings, rest, scenario.data.dt)
@@ -137,7 +143,18 @@ def preflight(
         for texts in (report.problems, report.warnings)
     )
     told, doubts = warnings[:n_warnings], warnings[n_warnings:]
-    return Preflight(scenario, prior, problems, told, doubts, rest, dataset)
+    return Preflight(scenario, prior, problems, told, doubts, rest, dataset, tasks)
+
+
+def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
+    """Those of a scenario without plant and tasks; that there can be none is told, and stops nothing."""
+    if scenario.plant is not None or scenario.control is None or scenario.tasks:
+        return ()
+    try:
+        return default_tasks(scenario)
+    except InputError as none:
+        report.warn(f"tasks: {str(none).partition(': ')[2]}")
+        return ()
 
 
 def _sizes(signals: tuple[Signal, ...], at: Array) -> Array:

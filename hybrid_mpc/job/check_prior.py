@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.simulation import rest_of
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import POINT, BalanceEquations, OperatingPoint, Prior, column
 from hybrid_mpc.machine.signals import Parameter, Signal
@@ -147,8 +148,11 @@ class Points:
     @property
     def nominal(self) -> Points:
         """Those with the prior's own parameters."""
-        own = (self.p == self.p[0]).all(axis=1)
-        return Points(self.x[own], self.u[own], self.w[own], self.p[own])
+        return self.where((self.p == self.p[0]).all(axis=1))
+
+    def where(self, kept: NDArray[np.bool_]) -> Points:
+        """Those of a mask ``(n,)``."""
+        return Points(self.x[kept], self.u[kept], self.w[kept], self.p[kept])
 
     def named(self, k: int) -> str:
         """One of them as text; parameters where they are not the prior's own."""
@@ -387,19 +391,37 @@ def _check_numbers(report: Report, prior: Prior) -> bool:
                 _check_smooth(what, f, prior, points)
     with report.part("prior"):
         _check_clock(prior)
-    if len(finite) == 2:
-        _check_effects(report, prior, points)
-        rates = prior.equations.xdot(*points.nominal.columns).full()
+    sound = points.nominal
+    if len(finite) < 2:  # an end of a range must not hide what is wrong elsewhere
+        sound = sound.where(_finite_at(prior, sound))
+    if len(sound.x):
+        _check_effects(report, prior, sound)
+        rates = prior.equations.xdot(*sound.columns).full()
         for balance in prior.equations.balances:
             with report.part("prior"):
-                _check_balance(prior, balance, points.nominal, rates)
+                _check_balance(prior, balance, sound, rates)
     for balance in prior.equations.balances:
         if differ(balance.rate_unit, per_second(balance.unit)):
             report.add(
                 f"prior: balance {balance.name}: what is stored in {balance.unit} comes and goes in "
                 f"{per_second(balance.unit)}, not in {balance.rate_unit}; correct unit or rate_unit"
             )
-    return len(finite) == 2
+    if len(finite) == 2:
+        return True
+    try:
+        x, u, w = rest_of(prior)
+        return bool(_finite_at(prior, Points(x[None], u[None], w[None], prior.p[None]))[0])
+    except (ValueError, RuntimeError):  # an operating point that does not fit, which was told
+        return False
+
+
+def _finite_at(prior: Prior, points: Points) -> NDArray[np.bool_]:
+    """Where rates and outputs and their derivatives are finite ``(n,)``."""
+    symbols = [ca.SX.sym(key, len(prior.names_of(key))) for key in POINT]
+    value = ca.vertcat(prior.equations.xdot(*symbols), prior.equations.output(*symbols))
+    slopes = [ca.vec(ca.densify(ca.jacobian(value, symbol))) for symbol in symbols]
+    found = ca.Function("parts", symbols, [ca.vertcat(value, *slopes)])(*points.columns)
+    return np.asarray(np.isfinite(found.full()).all(axis=0))
 
 
 def _check_again(prior: Prior, points: Points) -> None:

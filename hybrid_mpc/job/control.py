@@ -15,6 +15,7 @@ from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
 from hybrid_mpc.job.loops import DRAWN, Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
+from hybrid_mpc.job.stages.on_model import ON_MODEL
 from hybrid_mpc.job.study import Study
 from hybrid_mpc.job.study_run import StudyModel, load_models
 from hybrid_mpc.job.summary import Summary, by_task, summaries
@@ -28,7 +29,7 @@ from hybrid_mpc.scenario import load_scenario
 
 Array = NDArray[np.float64]
 NOUN = "control"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,9 @@ class ControlResults:
 
     ``guard`` is the detector where a guard reacts, ``residuals`` the limits of residuals, of which it hears where the
     energy cannot be watched, ``reaction`` what it does; ``step_ms`` are percentiles of the
-    durations of steps by controller, ``summary`` is by task and controller.
+    durations of steps by controller, ``summary`` is by task and controller. ``on_model`` names the model that stood in
+    for the machine, by controller, where there is no plant: then nothing here is of the machine, and controllers, which
+    met different plants, are not to be compared.
     """
 
     schema: str
@@ -83,6 +86,7 @@ class ControlResults:
     versions: Mapping[str, str]
     period_ms: float
     step_ms: Mapping[str, Mapping[str, float]]
+    on_model: Mapping[str, str]
     summary: Mapping[str, Mapping[str, Summary]]
     loops: tuple[LoopRow, ...]
 
@@ -99,7 +103,7 @@ def run_control(
     """
     check_out(out, NOUN, resume=resume)
     progress.start("reading the model, and the filters' noise")
-    (model,) = load_models(study).values()
+    (model,) = load_models(study, plant=False).values()
     bench = Bench(load_scenario(study.scenario), dict.fromkeys(study.folders, model.kit))
     progress.finish(model.noise_source)
     settings = {key: value for key, value in study.identity().items() if key != "name"}
@@ -163,6 +167,7 @@ def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[Loop
         versions=versions(),
         period_ms=1e3 * kit.models["prior"].dt,
         step_ms={name: percentiles(values) for name, values in _times(rows).items()},
+        on_model={row.controller: row.on_model for row in rows if row.on_model},
         summary=summaries(rows),
         loops=tuple(rows),
     )
@@ -188,15 +193,22 @@ def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progr
         progress.update("figures", i, len(drawn), task.name)
         first = {name: found[0].arrays for name, found in drawn[task.name].items()}
         control = kit.problem(task.name)
-        figure = loop_figure(task.title, control, model, first)
-        written.append(save(figure, folder / f"{task.name}.png"))
+        stands = {row.controller: row.on_model for row in rows if row.on_model}
+        if stands:  # each controller met another plant: no picture compares them
+            for name, arrays in first.items():
+                title = f"{task.title}, {name}, {ON_MODEL} ({stands[name]})"
+                figure = loop_figure(title, control, model, {f"{name} on {stands[name]}": arrays})
+                written.append(save(figure, folder / f"{task.name}_{name}.png"))
+        else:
+            figure = loop_figure(task.title, control, model, first)
+            written.append(save(figure, folder / f"{task.name}.png"))
         name = next((n for n in ("hybrid_observer", "hybrid") if n in first), next(iter(first)))
-        own = first[name]
+        own, said = first[name], f", {ON_MODEL}" if stands else ""
         if gif and scenario.draw is not None and np.all(np.isfinite(own["x"])):
             path = folder / f"{task.name}.gif"
             animation.animate(
                 path, own["t"], own["x"], own["plans"], dt=model.dt, draw=scenario.draw, u=own["u"],
-                title=f"{task.title} ({name})", curves=curves_of(model), inputs=model.inputs,
+                title=f"{task.title} ({name}{said})", curves=curves_of(model), inputs=model.inputs,
                 limits=(control.u_min, control.u_max),
             )  # fmt: skip
             written.append(path)

@@ -18,7 +18,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
 from hybrid_mpc.job.controllers import CONTROLLERS, build
-from hybrid_mpc.job.tasks import repeated, tasks_of
+from hybrid_mpc.job.tasks import ready, repeated, tasks_of
 from hybrid_mpc.kit.artifact import WATCHES, Kit
 from hybrid_mpc.kit.assembly import (
     SOLVERS,
@@ -28,7 +28,7 @@ from hybrid_mpc.kit.assembly import (
 )
 from hybrid_mpc.loop.faults import Fault, check_channels, fault_text, install
 from hybrid_mpc.loop.guard import Guard
-from hybrid_mpc.loop.plant import Plant
+from hybrid_mpc.loop.plant import ModelPlant, Plant
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.loop.simulate import ClosedLoopResult, Step, simulate
 from hybrid_mpc.model.limits import share_used
@@ -229,6 +229,7 @@ class LoopRow:
         invalid_s: Time in which the monitor had no valid level [s]; None without one.
         switches: Changes of the guard's mode.
         timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
+        on_model: Name of the model that stood in for the machine; empty: the loop ran on the scenario's plant.
         arrays: What the specification asked to keep. Default: nothing.
     """
 
@@ -250,6 +251,7 @@ class LoopRow:
     invalid_s: float | None
     switches: tuple[ModeChange, ...]
     timing_ms: Mapping[str, Mapping[str, float]]
+    on_model: str = ""
     arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
 
     def plain(self) -> dict[str, Any]:
@@ -278,10 +280,11 @@ class LoopRow:
 class Bench:
     """What loops run on: a machine, its models, and the controllers that were built for them so far.
 
-    Control problem and sensors are the scenario's, for all models; what was learned is the models' own.
+    Control problem and sensors are the scenario's, for all models; what was learned is the models' own. A machine
+    without plant is stood in for by a model (:func:`stand_in`), and has default tasks if it has none.
 
     Args:
-        scenario: The machine, with plant, tasks and control problem.
+        scenario: The machine, with control problem; with a plant it needs tasks, too.
         kits: Loaded artifacts by label; their process noise is that of the filters.
 
     Raises:
@@ -295,6 +298,7 @@ class Bench:
     def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
         if not isinstance(scenario, Scenario):
             raise InputError(f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME)")
+        scenario = ready(scenario)
         check_complete(scenario)
         if not isinstance(kits, Mapping):
             raise InputError(
@@ -378,8 +382,9 @@ class Bench:
         return spec.task if spec.task in self.kit(spec).loop.control else ""
 
     def plant(self, spec: LoopSpec) -> Plant:
-        """The plant of a specification, with its parameters changed."""
-        assert self.scenario.plant is not None
+        """The plant of a specification, with its parameters changed; without one the model that stands in."""
+        if self.scenario.plant is None:
+            return varied(stand_in(self.kit(spec), spec.controller), spec.parameters)
         return varied(self.scenario.plant(), spec.parameters)
 
     def run(
@@ -413,6 +418,8 @@ class Bench:
             late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
         )  # fmt: skip
         row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
+        if self.scenario.plant is None:
+            row = replace(row, on_model=stand_in(self.kit(spec), spec.controller).model.name)
         derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
         arrays = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
         return replace(row, arrays=arrays), result
@@ -619,9 +626,34 @@ def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
     return replace(plant, parameters=other) if holder is inner else other
 
 
-def check_complete(scenario: Scenario) -> None:
-    """Refuse a scenario without plant, control problem or task."""
-    parts = {"plant": scenario.plant, "control problem": scenario.control, "task": scenario.tasks or None}
+def stand_in(kit: Kit, controller: str) -> ModelPlant:
+    """The model that a controller meets where there is no plant: the prior's meets the hybrid, the hybrid's another
+    network of the same training.
+
+    Raises:
+        InputError: If the controller is an oracle's, or the artifact holds no such model.
+    """
+    of = CONTROLLERS[controller].model
+    if of == "oracle":
+        raise InputError(
+            f"controller {controller} knows the equations of a plant, and there is none; leave it out"
+        )
+    model = kit.models.get("hybrid") if of == "prior" else next(iter(kit.members.values()), None)
+    if model is None:
+        needed = "a hybrid" if of == "prior" else "another network than the controller's"
+        raise InputError(
+            f"there is no plant, and the model of scenario {kit.name} holds no model to stand in for the machine of "
+            f"controller {controller}: needed is {needed}. Train 2 networks or more (networks of the budget) and run "
+            "it again, leave this controller out, or write a plant"
+        )
+    return ModelPlant(model, kit.sensor_sigma)
+
+
+def check_complete(scenario: Scenario, *, plant: bool = False) -> None:
+    """Refuse a scenario without control problem or task, or without ``plant`` where it takes the machine's own."""
+    parts: dict[str, object] = {"control problem": scenario.control, "task": scenario.tasks or None}
+    if plant:
+        parts = {"plant": scenario.plant, **parts}
     if lacks := [name for name, part in parts.items() if part is None]:
         raise InputError(
             f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation"

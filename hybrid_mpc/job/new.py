@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.files import Source, name_and_unit, opened
-from hybrid_mpc.data.recording import UNITS
+from hybrid_mpc.data.recording import MIN_SCORED, UNITS
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
 
@@ -302,7 +302,11 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     slowest = max(lag.seconds for lag in lags)
     length = draft.period * len(draft.outputs[0].values)
     dt = draft.period
-    warm = min(max(10 * dt, slowest), length / 10)
+    # a fifth of the recording validates and a fifth tests: each must hold a warm-up and what is scored
+    smoothing = max(5 * dt, min(10 * dt, length / 40))
+    warm = max(
+        2 * dt, min(max(10 * dt, slowest), length / 10, length / 5 - smoothing - (MIN_SCORED + 2) * dt)
+    )
     time = f'"{draft.time.full}"' if draft.time else _rounded(draft.period)
     time_note = "rises evenly; in seconds?" if draft.time and not draft.time.unit else ""
     if draft.time is None:
@@ -356,7 +360,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         *([f"        # {MARK}: not used: {', '.join(draft.left_out)}"] if draft.left_out else []),
         f"        dt={_rounded(dt)},  # s, as it was sampled; a tenth of the fastest motion is enough",
         f"        max_gap={_rounded(5 * draft.period)},",
-        f"        smoothing={_rounded(10 * draft.period)},",
+        f"        smoothing={_rounded(smoothing)},",
         f"        warm_up={_rounded(warm)},  # s of the past that start a free run",
         "    ),",
         f"    # {MARK}: control=OCP(horizon, q=, r=, r_delta=, u_min=, u_max=), sensor_sigma=, safe_input=, and tasks",

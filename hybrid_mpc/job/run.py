@@ -22,6 +22,7 @@ from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.guard import GUARD
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
 from hybrid_mpc.job.stages.monitor import MONITOR
+from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.job.stages.report import REPORT
 from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import Results, read_results
@@ -29,8 +30,8 @@ from hybrid_mpc.records import known
 from hybrid_mpc.scenario import load_scenario
 
 STAGES: tuple[Stage[Any], ...] = (
-    DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, CONTROL, ESTIMATION, RESIDUALS, MONITOR, GUARD,
-    ANALYSIS, REPORT,
+    DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION, RESIDUALS,
+    MONITOR, GUARD, ANALYSIS, REPORT,
 )  # fmt: skip
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)

@@ -19,7 +19,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_bytes
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec
-from hybrid_mpc.job.tasks import selected_tasks
+from hybrid_mpc.job.tasks import ready, selected_tasks
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault, parsed_fault
 from hybrid_mpc.records import MOST_SEED, known, plain, record
@@ -273,7 +273,7 @@ hybrid, hybrid_observer, oracle, oracle_state
     def axes(self) -> dict[str, int]:
         """How many of each thing there are; their product is the number of runs."""
         lengths = {name: len(getattr(self, name)) for name in AXES}
-        tasks = len(selected_tasks(load_scenario(self.scenario), self.tasks))
+        tasks = len(selected_tasks(ready(load_scenario(self.scenario)), self.tasks))
         return {**lengths, "tasks": tasks, "draws": self.draws}
 
     @property
@@ -283,7 +283,7 @@ hybrid, hybrid_observer, oracle, oracle_state
 
     def runs(self) -> Iterator[LoopSpec]:
         """The runs, one by one, those of a controller next to each other."""
-        tasks = [t.name for t in selected_tasks(load_scenario(self.scenario), self.tasks)]
+        tasks = [t.name for t in selected_tasks(ready(load_scenario(self.scenario)), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
         outer = product(
             self.folders, tasks, self.controllers, self.solvers, self.horizons, self.monitors, self.fault_sets

@@ -25,7 +25,7 @@ from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES, find_noise
 from hybrid_mpc.job.engine import Engine, Lost, make_engine
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
-from hybrid_mpc.job.loops import Bench, LoopSpec, check_complete, check_faults, check_kit, varied
+from hybrid_mpc.job.loops import Bench, LoopSpec, check_complete, check_faults, check_kit, stand_in, varied
 from hybrid_mpc.job.study import RandomFaults, Study
 from hybrid_mpc.job.study_log import (
     NOUN,
@@ -41,10 +41,9 @@ from hybrid_mpc.job.study_log import (
     rows,
     study_note,
 )
-from hybrid_mpc.job.tasks import selected_tasks
+from hybrid_mpc.job.tasks import ready, selected_tasks
 from hybrid_mpc.kit.artifact import FILES, Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import adaptable
-from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario, load_scenario
 
@@ -81,8 +80,11 @@ class StudyModel:
     noise_source: str
 
 
-def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> dict[str, StudyModel]:
-    """Load and check everything that a study's loops need, before the first.
+def load_models(
+    study: Study, held: Mapping[str, NoiseNote] | None = None, *, plant: bool = True
+) -> dict[str, StudyModel]:
+    """Load and check everything that a study's loops need, before the first; without ``plant`` a model may stand in for
+    the machine.
 
     Process noise by label in ``held`` is taken as it is; else it is the artifact's, or, where that holds none,
     estimated on recordings that the scenario makes (budget quick, seed ``study.run_seed``).
@@ -92,7 +94,9 @@ def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> di
             fault or parameter does not fit.
     """
     scenario = load_scenario(study.scenario)
-    check_complete(scenario)
+    if not plant:
+        scenario = ready(scenario)
+    check_complete(scenario, plant=plant)
     selected_tasks(scenario, study.tasks)
     if scenario.oracle is None and (oracles := [c for c in study.controllers if c in ORACLES]):
         raise InputError(f"scenario {scenario.name} has no oracle; leave controller {oracles[0]} out")
@@ -101,7 +105,7 @@ def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> di
         folder = artifact_folder(given)
         kit = load(folder)
         check_kit(scenario, kit, str(folder))
-        _check_plant(scenario, study, kit.models["prior"])
+        _check_plant(scenario, study, kit)
         if "energy" in study.monitors and kit.calibration is None:
             raise InputError(f"study: monitor energy: {folder} holds no calibration; take monitor own")
         for kind in {"guard", "residuals"}.intersection(study.monitors):
@@ -116,10 +120,14 @@ def load_models(study: Study, held: Mapping[str, NoiseNote] | None = None) -> di
     return found
 
 
-def _check_plant(scenario: Scenario, study: Study, model: HybridModel) -> None:
-    """Refuse faults and parameters that the plant, or a model with its signals, does not have."""
-    assert scenario.plant is not None
-    plant = varied(scenario.plant(), [(name, 1.0) for name, _ in study.spans])
+def _check_plant(scenario: Scenario, study: Study, kit: Kit) -> None:
+    """Refuse faults and parameters that the plant, or a model with its signals, does not have; and controllers that
+    have no model to run on where there is no plant.
+    """
+    own = scenario.plant
+    stands = [] if own is not None else [stand_in(kit, name) for name in study.controllers]
+    plant = varied(stands[0] if own is None else own(), [(name, 1.0) for name, _ in study.spans])
+    model = kit.models["prior"]
     sets = list(study.fault_sets)
     if isinstance(study.random_faults, RandomFaults):
         sets.append(study.random_faults.examples())

@@ -10,9 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.job.default_tasks import default_tasks
 from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
+
+
+def ready(scenario: Scenario) -> Scenario:
+    """The scenario; one with a control problem and neither plant nor tasks gets default tasks, which run on a model.
+
+    Raises:
+        InputError: If default tasks cannot be made.
+    """
+    if scenario.plant is not None or scenario.control is None or scenario.tasks:
+        return scenario
+    return replace(scenario, tasks=default_tasks(scenario))
 
 
 def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:

@@ -7,7 +7,7 @@ torch and executes nothing from the folder.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -30,17 +30,19 @@ from hybrid_mpc.kit.assembly import (
     make_resting_guard,
     sensor_steps,
 )
+from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import numbers
-from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel
+from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.innovations import ResidualLimits, ResidualMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
+from hybrid_mpc.monitor.lengths import SHARE
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario
 
@@ -50,6 +52,9 @@ FILES = (FILE, PROGRAMS, "weights.safetensors")
 """All files of an artifact; others in its folder do not belong to it."""
 MOST_MODELS = 16
 """Models that an artifact may hold: prior, hybrid, and a few to compare them with."""
+HYBRID = "hybrid"
+MOST_MEMBERS = 32
+"""Other networks of the hybrid's training that an artifact may hold."""
 FUNCTIONS = ("step", "xdot", "output")
 BALANCE = "balance"
 """Function of a balance: its program is ``<model>/balance/<name of the balance>``."""
@@ -59,6 +64,8 @@ INPUTS = {
     "output": ("x", "u", "w", "p"),
     BALANCE: ("x", "xdot", "u", "w", "p"),
 }
+OWN = ("step", "xdot")
+"""Functions of another network that are its own; the others are those of the prior that it stands on."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 WATCHES = ("own", "energy", "readings", "guard", "residuals")
@@ -216,7 +223,8 @@ class Description:
     """What ``model.json`` holds beside its schema version and its hash.
 
     ``recommended`` is the model that a loop is made of where none is named; empty: the hybrid. ``residuals`` are the
-    limits of the monitor of residuals, by model.
+    limits of the monitor of residuals, by model. ``members`` is how many other networks of the hybrid's training there
+    are, the best first; ``predicting`` what predictions of recordings need beside the models.
 
     Raises:
         InputError: If there are no models, too many, or two of one name.
@@ -230,8 +238,14 @@ class Description:
     loop: LoopSettings = field(default_factory=LoopSettings)
     recommended: str = ""
     residuals: Mapping[str, ResidualLimits] = field(default_factory=dict)
+    members: int = 0
+    predicting: Predicting | None = None
 
     def __post_init__(self) -> None:
+        if not 0 <= self.members <= (MOST_MEMBERS if HYBRID in self.models else 0):
+            raise InputError(
+                f"members: 0 to {MOST_MEMBERS} networks beside a model {HYBRID!r} are needed, got {self.members}"
+            )
         if strange := [name for name in self.residuals if name not in self.models]:
             raise InputError(f"residuals: no model {strange[0]!r}; there are: {', '.join(self.models)}")
         if self.recommended and self.recommended not in self.models:
@@ -251,6 +265,8 @@ def save_artifact(
     provenance: Provenance | None = None,
     loop: LoopSettings | None = None,
     recommended: str = "",
+    members: Sequence[Mapping[str, nn_export.Program]] = (),
+    predicting: Predicting | None = None,
 ) -> None:
     """Write models to ``folder``; ``model.json`` comes last.
 
@@ -263,18 +279,25 @@ def save_artifact(
         provenance: What the models were made from.
         loop: What loops need beside the models.
         recommended: Model that a loop is made of where none is named. Default: the hybrid.
+        members: ``step`` and ``xdot`` of other networks of the hybrid's training, the best first. Default: none.
+        predicting: What predictions of recordings need beside the models. Default: there can be none.
 
     Raises:
         InputError: If an expression of a control problem cannot be stated as a program.
     """
     folder.mkdir(parents=True, exist_ok=True)
     flat = {f"{model}/{name}": p for model, functions in programs.items() for name, p in functions.items()}
+    for name, own in zip(member_names(len(members)), members, strict=True):
+        flat |= {f"{name}/{key}": own[key] for key in OWN}
     nn_export.save_programs(folder, flat)
     digest, origin = sha256(folder / PROGRAMS), provenance or Provenance()
     write_description(
         folder,
-        Description(tuple(programs), digest, info, calibration, origin, loop or LoopSettings(), recommended),
-    )
+        Description(
+            tuple(programs), digest, info, calibration, origin, loop or LoopSettings(), recommended,
+            members=len(members), predicting=predicting,
+        ),
+    )  # fmt: skip
 
 
 def set_calibration(folder: Path, calibration: Calibration) -> None:
@@ -369,6 +392,40 @@ def build_model(name: str, programs: Mapping[str, nn_export.Program], info: Mode
     return with_input_delay(model, info.input_delay) if info.input_delay else model
 
 
+def member_names(count: int) -> list[str]:
+    """Names of the other networks of the hybrid's training: ``"hybrid_2"``, ``"hybrid_3"``, ..."""
+    return [f"{HYBRID}_{i + 2}" for i in range(count)]
+
+
+class Members(Mapping[str, HybridModel]):
+    """Models of the other networks of the hybrid's training by name, the best first; each is built when it is asked
+    for: no loop on the machine needs them.
+    """
+
+    def __init__(self, programs: Mapping[str, nn_export.Program], info: ModelInfo, count: int) -> None:
+        shared = (*(f for f in FUNCTIONS if f not in OWN), *(b.program for b in info.balances))
+        names = member_names(count)
+        self._programs = {f"{name}/{key}": programs[f"{name}/{key}"] for name in names for key in OWN}
+        self._programs |= {f"{name}/{key}": programs[f"{HYBRID}/{key}"] for name in names for key in shared}
+        self._info = info
+        self._built: dict[str, HybridModel | None] = dict.fromkeys(names)
+
+    def __getitem__(self, name: str) -> HybridModel:
+        built = self._built[name]
+        if built is None:
+            try:
+                built = self._built[name] = build_model(name, self._programs, self._info)
+            except nn_export.ExportError as error:
+                raise InputError(f"model {name}: {error}") from error
+        return built
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._built)
+
+    def __len__(self) -> int:
+        return len(self._built)
+
+
 def load(folder: str | Path) -> Kit:
     """The kit of an artifact: models, and all that loops on them need.
 
@@ -391,6 +448,7 @@ def load(folder: str | Path) -> Kit:
         programs = nn_export.load_programs(folder)
         built = {name: build_model(name, programs, found.model) for name in found.models}
         models = _disturbed(built, found.loop.disturbance_model)
+        members = Members(programs, found.model, found.members)
     except KeyError as error:
         raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {FILE} names") from error
     except nn_export.ExportError as error:
@@ -398,6 +456,7 @@ def load(folder: str | Path) -> Kit:
     return Kit(
         models, found.calibration, found.provenance, found.model.input_delay, found.loop,
         found.recommended or ("hybrid" if "hybrid" in models else found.models[0]), found.residuals,
+        members, found.predicting,
     )  # fmt: skip
 
 
@@ -423,6 +482,8 @@ class Kit:
         loop: Control problems, noise and what else loops need. Default: nothing.
         recommended: Model that observer, controller and monitor are made of where none is named. Default: the hybrid.
         residuals: Limits of the monitor of residuals, by model. Default: none were learned.
+        members: Other networks of the hybrid's training by name, the best first. Default: none.
+        predicting: What :func:`hybrid_mpc.predict` needs beside the models. Default: there can be no predictions.
 
     Example: the whole way from a folder to a loop::
 
@@ -437,6 +498,8 @@ class Kit:
     loop: LoopSettings = field(default_factory=LoopSettings, repr=False)
     recommended: str = "hybrid"
     residuals: Mapping[str, ResidualLimits] = field(default_factory=dict, repr=False)
+    members: Mapping[str, HybridModel] = field(default_factory=dict, repr=False)
+    predicting: Predicting | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
@@ -472,6 +535,16 @@ class Kit:
     def rest_speed(self) -> tuple[float, ...] | None:
         """Speeds ``(n_q,)`` below which friction may stick, learned from recordings; None: unknown."""
         return None if self.calibration is None else self.calibration.rest_speed
+
+    @property
+    def known_rest(self) -> tuple[float, ...] | None:
+        """The same; where none was learned, a share of the natural speeds of the recordings; None: unknown."""
+        held, prior = self.predicting, self.models.get("prior")
+        if self.rest_speed is not None or held is None or prior is None:
+            return self.rest_speed
+        n_q = prior.n_x // 2
+        natural = tuple(SHARE * size for size in held.sizes.x[n_q : 2 * n_q])
+        return natural if kinematics(prior) == {i: n_q + i for i in range(n_q)} and min(natural) > 0 else None
 
     def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
         """The kit with other process noise, by estimator (see :meth:`noise`)."""
@@ -600,9 +673,9 @@ class Kit:
         if kind == "energy":
             return make_monitor(watched, learned)
         if kind == "own":
-            return make_monitor(watched, None, rest_speed=self.rest_speed)
+            return make_monitor(watched, None, rest_speed=self.known_rest)
         if kind == "readings":
-            return guard_monitor(watched, rest_speed=self.rest_speed)
+            return guard_monitor(watched, rest_speed=self.known_rest)
         return guard_monitor(
             watched, self.detector(), resolution=sensor_steps(self.sensor_sigma),
             input_range=self.problem(task).input_range, diagnose=diagnose and watched.n_p > 0,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.loop.faults import Fault, corrupt_input, corrupt_measurement
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import hidden_fixed_point
 
 Array = NDArray[np.float64]
 
@@ -38,6 +41,65 @@ class Plant(Protocol):
 
     def hidden(self, state: Any) -> Array:
         """True internal states ``(n_h,)`` in the order of the scenario's oracle model (may be empty)."""
+
+
+class ModelState(NamedTuple):
+    """State and hidden state of a model, with the input and the measured disturbances of the last period."""
+
+    x: Array
+    h: Array
+    u: Array
+    w: Array
+
+
+@dataclass(frozen=True)
+class ModelPlant:
+    """A model in place of the machine, for a controller of another model. It tells whether two models agree, and
+    nothing of the machine.
+
+    Args:
+        model: The model.
+        sigma: Standard deviations of its sensors' white noise ``(n_y,)`` [output units].
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m"),)
+        >>> tank = HybridModel.of("tank", 1.0, level, (Signal("u", "m/s"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> plant = ModelPlant(tank, (0.0,))
+        >>> state = plant.step(plant.reset(np.array([0.5]), seed=0), np.array([0.25]), 1.0)
+        >>> plant.truth(state), plant.measure(state, np.random.default_rng(0))
+        (array([0.75]), array([0.75]))
+    """
+
+    model: HybridModel
+    sigma: tuple[float, ...]
+
+    def reset(self, x0: Array, seed: int) -> ModelState:
+        """At ``x0`` ``(n_x,)``, its memory as after a long rest there under the operating point's input."""
+        m = self.model
+        return ModelState(np.asarray(x0, dtype=float), hidden_fixed_point(m, x0, m.u0), m.u0, m.w)
+
+    def step(self, state: ModelState, u: Array, dt: float, w: Array | None = None) -> ModelState:
+        """A period on."""
+        m, now = self.model, self.model.w if w is None else w
+        x, h = (part.full().ravel() for part in m.step(state.x, state.h, u, now, m.p))
+        return ModelState(x, h, np.asarray(u, dtype=float), now)
+
+    def measure(self, state: ModelState, rng: np.random.Generator) -> Array:
+        """Outputs with noise, within the ranges of the sensors that declare one."""
+        m = self.model
+        y = m.output(state.x, state.u, state.w, m.p).full().ravel() + self.sigma * rng.standard_normal(m.n_y)
+        low, high = np.array([s.saturation or (-np.inf, np.inf) for s in m.outputs]).T
+        return np.asarray(np.clip(y, low, high))
+
+    def truth(self, state: ModelState) -> Array:
+        """The model's state."""
+        return state.x
+
+    def hidden(self, state: ModelState) -> Array:
+        """None: no oracle has a network's memory."""
+        return np.zeros(0)
 
 
 class SimulatedMachine:

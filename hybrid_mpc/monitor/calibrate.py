@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED
+from hybrid_mpc.monitor.lengths import BLOCK_S
 
 Array = NDArray[np.float64]
 MIN_BLOCKS = 30
@@ -57,7 +57,7 @@ class Calibration:
     residual_threshold: float | None = None
     residual_release: float | None = None
     detector: Detector | None = None
-    rest_speed: tuple[float, ...] | None = (REST_SPEED,)
+    rest_speed: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.rest_speed is not None:
@@ -90,7 +90,7 @@ def calibrate(
     false_alarms_per_hour: float = 1.0,
     data_hash: str = "",
     block_s: float = BLOCK_S,
-    rest_speed: ArrayLike = REST_SPEED,
+    rest_speed: ArrayLike | None = None,
 ) -> Calibration:
     """Threshold that nominal levels, ``(n,)`` [W] of each run, pass upwards at the wanted rate; NaN are left out.
 
@@ -136,7 +136,7 @@ def calibrate(
     method = f"Gumbel tail of maxima in blocks of {block_s:g} s (L-moments), {maxima.size} blocks"
     return Calibration(
         threshold, release, false_alarms_per_hour, finite.size, hours, method, data_hash,
-        rest_speed=tuple(np.ravel(rest_speed).tolist()),
+        rest_speed=None if rest_speed is None else tuple(np.ravel(rest_speed).tolist()),
     )  # fmt: skip
 
 

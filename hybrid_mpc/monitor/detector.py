@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor.lengths import REST_SPEED, SHORTEST_S, checked_rest
+from hybrid_mpc.monitor.lengths import NOTHING_STICKS, SHORTEST_S, checked_rest
 
 Array = NDArray[np.float64]
 CAP = 1.5
@@ -76,7 +76,7 @@ class Detector:
     force_threshold: float
     energy_threshold: float = math.inf
     release: float = 0.5
-    rest_speed: tuple[float, ...] = (REST_SPEED,)
+    rest_speed: tuple[float, ...] = (NOTHING_STICKS,)
     false_alarms_per_hour: float = math.nan
     hours: float = 0.0
     interval: tuple[float, ...] = ()

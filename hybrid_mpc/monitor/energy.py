@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from types import MappingProxyType
 from typing import Any
@@ -17,7 +17,7 @@ from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.lengths import REST_SPEED, checked_rest
+from hybrid_mpc.monitor.lengths import NOTHING_STICKS, checked_rest
 from hybrid_mpc.monitor.residuals import Layout, check_model, reading_function
 
 Array = NDArray[np.float64]
@@ -61,6 +61,7 @@ class MonitorState:
         frozen: True while the sensor is held for frozen.
         seen: Samples taken; ``whole``: since something was missing; both up to the window's.
         invalid: Samples in a row without a reading.
+        w: Measured disturbances ``(n_w,)`` from that sample on.
     """
 
     memory: Array
@@ -73,6 +74,7 @@ class MonitorState:
     seen: int = 0
     whole: int = 0
     invalid: int = 0
+    w: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -154,8 +156,8 @@ class EnergyMonitor:
         average: Samples in the moving average of the level.
         calibration: Thresholds of the alarm. Default: none, then there is no alarm from the levels.
         rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all; see
-            :func:`~hybrid_mpc.monitor.lengths.rest_speeds`. Default: the detector's, else the calibration's, else 0.2,
-            which suits angles in rad/s.
+            :func:`~hybrid_mpc.monitor.lengths.rest_speeds`. Default: the detector's, else the calibration's, else
+            nothing is known to stick.
         free_run: Length [s] of the model's free runs. Default 0: none.
         resolution: Step of each sensor ``(n_y,)``. Default: unknown, then there is no test for freezing.
         detector: Detector of scaled residuals. Default: none.
@@ -213,7 +215,7 @@ class EnergyMonitor:
         self.calibration, self.detector = calibration, detector
         if rest_speed is None:
             stored = (part.rest_speed for part in (detector, calibration) if part is not None)
-            rest_speed = next((rest for rest in stored if rest is not None), REST_SPEED)
+            rest_speed = next((rest for rest in stored if rest is not None), NOTHING_STICKS)
         self.rest_speed = checked_rest(rest_speed, model.n_x // 2, "energy monitor")
         self._resolution = _positive(resolution, model.n_y)
         if detector is not None:
@@ -232,7 +234,7 @@ class EnergyMonitor:
         empty = np.full(self.model.n_x, np.nan), np.full(self.model.n_h, np.nan)
         first = None if self.detector is None else self.detector.initial()
         memory, left = self.layout.initial()
-        return MonitorState(memory, *empty, QUIET, left, first)
+        return MonitorState(memory, *empty, QUIET, left, first, w=self.model.w)
 
     def update(
         self, state: MonitorState, y: Array, u_prev: Array, estimate: Any
@@ -243,7 +245,8 @@ class EnergyMonitor:
             state: State after the previous sample, or :meth:`initial`.
             y: Measurement ``(n_y,)`` now; NaN where missing.
             u_prev: Input ``(n_u,)`` applied over the period that just ended.
-            estimate: Estimate at this sample, of which ``x`` ``(n_x,)`` and ``h`` ``(n_h,)`` are read.
+            estimate: Estimate at this sample, of which ``x`` ``(n_x,)`` and ``h`` ``(n_h,)`` are read, and of a model
+                with measured disturbances ``w`` ``(n_w,)``; where it has none they are the operating point's.
 
         Returns:
             The next state and the reading.
@@ -257,6 +260,9 @@ class EnergyMonitor:
             )
         ins, outs = self._function.inputs, self._function.outputs
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
+        ins[6][:] = state.w
+        w = getattr(estimate, "w", self.model.w)
+        w = np.array(w, dtype=np.float64) if np.size(w) == self.model.n_w else self.model.w
         left = state.left and self._free_runs(state)
         self._function()
         memory, numbers, n_q = outs[0].copy(), outs[1].tolist(), self.model.n_y
@@ -275,7 +281,7 @@ class EnergyMonitor:
         validity = self._validity(numbers[2 : 3 + n_q], seen, whole)
         invalid = state.invalid + 1 if validity else 0
         blind = invalid > self.window + self.average
-        following = MonitorState(memory, x, h, alarms, left, detector, frozen, seen, whole, invalid)
+        following = MonitorState(memory, x, h, alarms, left, detector, frozen, seen, whole, invalid, w)
         reading = MonitorReading(
             dE_model_w=numbers[0],
             dE_measured_w=numbers[1],

@@ -19,7 +19,7 @@ from hybrid_mpc.monitor.lengths import (
     BLOCK_S,
     FREE_RUN_S,
     HISTORY_S,
-    REST_SPEED,
+    NOTHING_STICKS,
     SETTLING_S,
     SHORTEST_S,
     WINDOW_S,
@@ -141,7 +141,7 @@ def learn_detector(
     free_runs: bool = True,
     drift: float = 1.0,
     false_alarms_per_hour: float = 1.0,
-    rest_speed: ArrayLike = REST_SPEED,
+    rest_speed: ArrayLike = NOTHING_STICKS,
     data_hash: str = "",
     seed: int = 0,
     trusted: bool = False,
@@ -154,7 +154,8 @@ def learn_detector(
     come from a Gumbel tail of the block maxima (:func:`~hybrid_mpc.monitor.calibrate.calibrate`), half of the wanted
     rate for either alarm. A block bootstrap of the same maxima, six neighbours at a time, gives their interval.
 
-    ``rest_speed`` and ``time_unit`` are those of the monitor that made the numbers. Unless the data are ``trusted``,
+    ``rest_speed`` and ``time_unit`` are those of the monitor that made the numbers; by default nothing is
+    taken to stick. Unless the data are ``trusted``,
     as simulated ones are, a block that stands out is refused. A block lasts ``block_s`` [s], by default 5 of the
     machine's seconds and 50 periods at least; shorter where there is little data, and a higher rate is enough.
 

@@ -28,8 +28,8 @@ BLOCK_S = 5.0
 """Blocks whose largest levels tell the rate of false alarms: much longer than what one sample does to the next."""
 SHORTEST_S = 0.08
 """A free run counts from this accumulated time on."""
-REST_SPEED = 0.2
-"""Rest speed [unit of v] where no recording gave one; it suits angles in rad/s."""
+NOTHING_STICKS = 1e-12
+"""Rest speed, in any unit, where none was found in recordings and none is given: nothing is known to stick."""
 SHARE = 0.05
 """Share of the speed at work below which friction may stick: on the recorded machines the smoothed step of the priors'
 dry friction (0.002 m/s to 0.1 rad/s) has risen to 99 % there."""

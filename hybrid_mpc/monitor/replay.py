@@ -27,14 +27,16 @@ class EstimatorLike(Protocol):
     """The estimator as the replay uses it; estimates have ``x`` (n_x,) and ``h`` (n_h,)."""
 
     def start(self, y: Array, t: float) -> Any:
-        """Estimate at the first sample."""
+        """Estimate at the first sample; with measured disturbances ``start(y, t, w=w)``."""
 
     def update(self, estimate: Any, y: Array, u_prev: Array) -> Any:
-        """Estimate at the next sample, one period later."""
+        """Estimate at the next sample, one period later; with measured disturbances ``update(..., w=w)``."""
 
 
 class TrajectoryLike(Protocol):
-    """A recording on the uniform grid: ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) held over [t_k, t_k+dt)."""
+    """A recording on the uniform grid: ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) held over [t_k, t_k+dt); and, where
+    the model has measured disturbances, ``w`` (n, n_w).
+    """
 
     @property
     def t(self) -> Array:
@@ -98,7 +100,8 @@ def replay(
     Args:
         monitor: The monitor.
         estimator: With ``start(y, t)`` and ``update(estimate, y, u_prev)``.
-        trajectory: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) on the model's grid.
+        trajectory: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) and, where the model has measured disturbances,
+            ``w`` (n, n_w), on the model's grid.
         on_reading: Called with each sample's number, the state after it and its reading. Default: none.
         on_progress: Called with ``(done, total)`` samples every so often. Default: none.
 
@@ -110,14 +113,18 @@ def replay(
     """
     t, y, u = (np.asarray(a, dtype=np.float64) for a in (trajectory.t, trajectory.y, trajectory.u))
     _check(t, y, u, monitor.model.dt)
-    state, estimate = monitor.initial(), estimator.start(y[0], float(t[0]))
+    ws: Any = getattr(trajectory, "w", None)
+    also: list[dict[str, Any]] = (
+        [{"w": w} for w in ws] if monitor.model.n_w and ws is not None else [{}] * t.size
+    )
+    state, estimate = monitor.initial(), estimator.start(y[0], float(t[0]), **also[0])
     columns: dict[str, Any] = {}
     for k in range(t.size):
         if k % REPORTED == 0:
             on_progress(k, t.size)
         u_prev = u[k - 1] if k else np.full(monitor.model.n_u, np.nan)
         if k:
-            estimate = estimator.update(estimate, y[k], u_prev)
+            estimate = estimator.update(estimate, y[k], u_prev, **also[k])
         state, reading = monitor.update(state, y[k], u_prev, estimate)
         for name in COLUMNS:
             value = np.asarray(getattr(reading, name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -42,8 +43,8 @@ class Layout:
             history,
         )
         n_q = self.n_q = model.n_x // 2
-        self.row = 2 * n_q + model.n_u
-        """Model increments and input of a period."""
+        self.row = 2 * n_q + model.n_u + model.n_w
+        """Model increments, input and measured disturbances of a period."""
         self.one_step = window * n_q + (window - 1) * self.row
         """Size of the window's part of the memory."""
         self.averaged = self.one_step + 3 * n_q + model.n_u
@@ -91,9 +92,17 @@ def weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
     return position, velocity, acceleration, kernel, np.diff(kernel) / dt
 
 
-def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, u: ca.MX) -> ca.MX:
-    """Residual [W] of the model's energy balance if its state changes at ``xdot``."""
-    return _energy_of(model).residual(x, xdot, u, model.w, model.p)
+def _given(model: HybridModel, g: ca.MX) -> tuple[ca.MX, Any]:
+    """Input and measured disturbances of ``g``: both, or the input alone, under those of the operating point."""
+    n_u = model.n_u
+    return (g, model.w) if g.shape[0] == n_u else (g[:n_u], g[n_u:])
+
+
+def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, g: ca.MX) -> ca.MX:
+    """Residual [W] of the model's energy balance if its state changes at ``xdot``; ``g`` is the input ``(n_u,)``, or
+    the input and the measured disturbances.
+    """
+    return _energy_of(model).residual(x, xdot, *_given(model, g), model.p)
 
 
 def _energy_of(model: HybridModel) -> Balance:
@@ -134,7 +143,7 @@ def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
 
 
 def _near_rest(
-    model: HybridModel, position: ca.MX, h: ca.MX, u: ca.MX, rest: ca.DM
+    model: HybridModel, position: ca.MX, h: ca.MX, g: ca.MX, rest: ca.DM
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
     """What a model says of slow motion: its mean acceleration there, and by how much dry friction and damping slow it.
 
@@ -144,7 +153,10 @@ def _near_rest(
     """
     n_q = model.n_x // 2
     (back, forth), (faster_back, faster_forth) = (
-        [model.xdot(ca.vertcat(position, sign * speed), h, u, model.w, model.p)[n_q:] for sign in (-1, 1)]
+        [
+            model.xdot(ca.vertcat(position, sign * speed), h, *_given(model, g), model.p)[n_q:]
+            for sign in (-1, 1)
+        ]
         for speed in (rest, 2 * rest)
     )
     slowed = 0.5 * (back - forth)
@@ -152,14 +164,14 @@ def _near_rest(
 
 
 def _residual(
-    model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest: ca.DM
+    model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, g: ca.MX, rest: ca.DM
 ) -> ca.MX:
     """Force ``(n_q,)`` that the model does not explain; near rest, what dry friction could not hold either.
 
     The model's accelerations near rest are half the monitor's work, so they are left out at speed.
     """
     n_q = model.n_x // 2
-    sizes = {"e": n_q, "a": n_q, "x": model.n_x, "h": model.n_h, "u": model.n_u}
+    sizes = {"e": n_q, "a": n_q, "x": model.n_x, "h": model.n_h, "g": model.n_u + model.n_w}
     sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
     error, measured, state, hidden, held_input = sym
     inertia, speed = inertia_of(model, state, held_input), state[n_q:]
@@ -173,11 +185,11 @@ def _residual(
     fast = ca.Function("fast", sym, [ca.densify(inertia @ error)])
     at_speed = ca.mmin(ca.fabs(x[n_q:]) / rest) >= 2
     choice = ca.Function.if_else("residual", fast, slow)
-    return choice(at_speed, a_measured - a_model, a_measured, x, h, u)
+    return choice(at_speed, a_measured - a_model, a_measured, x, h, g)
 
 
 def _free_run(
-    layout: Layout, memory: ca.MX, u: ca.MX, measured_w: ca.MX, u_mean: ca.MX, v: ca.MX, full: ca.MX
+    layout: Layout, memory: ca.MX, g: ca.MX, measured_w: ca.MX, g_mean: ca.MX, v: ca.MX, full: ca.MX
 ) -> tuple[ca.MX, ca.MX]:
     """A free run one period on: its memory, and its sums over the periods whose windows are full.
 
@@ -185,19 +197,28 @@ def _free_run(
     """
     model, window, n_q = layout.model, layout.window, layout.n_q
     n_x, n_z = model.n_x, model.n_x + model.n_h
-    x, h = model.step(memory[:n_x], memory[n_x:n_z], u, model.w, model.p)
+    x, h = model.step(memory[:n_x], memory[n_x:n_z], *_given(model, g), model.p)
     ring = ca.vertcat(memory[n_z + n_q : n_z + window * n_q], x[:n_q])
     position, velocity, acceleration, _, _ = weights(window, model.dt)
     # No need to take the newest off: a run is short.
     q_m, v_m, a_m = (ca.reshape(ring, n_q, window) @ ca.DM(w) for w in (position, velocity, acceleration))
-    power = energy_balance(model, ca.vertcat(q_m, v_m), ca.vertcat(v_m, a_m), u_mean)
+    power = energy_balance(model, ca.vertcat(q_m, v_m), ca.vertcat(v_m, a_m), g_mean)
+    u_mean = g_mean[: model.n_u]
     added = model.dt * ca.vertcat(power - measured_w, ca.dot(v, v), ca.dot(u_mean, u_mean))
     sums = memory[n_z + window * n_q :] + ca.if_else(full, added, 0)
     return ca.vertcat(x, h, ring, sums), sums
 
 
 def _pushed(
-    layout: Layout, memory: ca.MX, still: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, rest: ca.DM, spans: ca.DM
+    layout: Layout,
+    memory: ca.MX,
+    still: ca.MX,
+    x: ca.MX,
+    h: ca.MX,
+    u: ca.MX,
+    w: ca.MX,
+    rest: ca.DM,
+    spans: ca.DM,
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Speed and travel ``(n_q,)`` that the input should have caused since the sensors' last step, and the input then.
 
@@ -215,17 +236,17 @@ def _pushed(
         u = h[: model.n_u]
     before = ca.if_else(ca.logic_and(still, ca.mmin(_known(before))), before, u)
     strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - HELD_SHARE * spans) > 0)
-    sizes = {"x": model.n_x, "h": model.n_h, "u": model.n_u, "before": model.n_u}
+    sizes = {"x": model.n_x, "h": model.n_h, "u": model.n_u, "before": model.n_u, "w": model.n_w}
     sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
     (mean, _, jump), (earlier, _, _) = (
-        _near_rest(model, sym[0][:n_q], sym[1], pull, rest) for pull in sym[2:]
+        _near_rest(model, sym[0][:n_q], sym[1], ca.vertcat(pull, sym[4]), rest) for pull in sym[2:4]
     )
     alone = ca.sign(mean) * ca.fmax(0, ca.fabs(mean) - ca.fmax(0, jump))
     change = mean - earlier
     both = ca.sign(alone) * ca.fmin(ca.fabs(alone), ca.fabs(change)) * (alone * change > 0)
     asked = ca.Function("asked", sym, [ca.densify(both)])
     none = ca.Function("none", sym, [ca.DM.zeros(n_q)])
-    push = ca.Function.if_else("push", asked, none)(strong, x, h, u, before)
+    push = ca.Function.if_else("push", asked, none)(strong, x, h, u, before, w)
     speed = ca.if_else(strong, speed + model.dt * push, 0)
     travel = ca.if_else(still, travel + model.dt * ca.fabs(speed), 0)
     return ca.if_else(_known(speed), speed, 0), ca.if_else(_known(travel), travel, 0), before
@@ -237,7 +258,7 @@ def _known(values: ca.MX) -> ca.MX:
 
 
 def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) -> ca.Function:
-    """``(memory, x_prev, h_prev, u_prev, y, full) -> (memory_next, numbers)``.
+    """``(memory, x_prev, h_prev, u_prev, y, full, w_prev) -> (memory_next, numbers)``.
 
     The numbers: balances of model and measurement, violation, residual ``(n_q)``, travel ``(n_q)``, speed ``(n_q)``
     and input ``(n_u)`` at the centre; with free runs the sums of each. ``full`` says of each run whether its window is
@@ -249,28 +270,29 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     position, velocity, acceleration, kernel, slope = weights(window, dt)
     memory = ca.MX.sym("memory", layout.size)
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", n_u)
-    y, full = ca.MX.sym("y", n_q), ca.MX.sym("full", RUNS)
-    x_next = model.step(x, h, u, model.w, model.p)[0]
+    y, full, w = ca.MX.sym("y", n_q), ca.MX.sym("full", RUNS), ca.MX.sym("w", model.n_w)
+    given = ca.vertcat(u, w)
+    x_next = model.step(x, h, u, w, model.p)[0]
     dv = x_next[n_q:] - x[n_q:]
     dp = x_next[:n_q] - x[:n_q] - dt * x[n_q:]
     ys = ca.vertcat(memory[n_q : window * n_q], y)
-    rows = ca.vertcat(memory[window * n_q + row : layout.one_step], dv, dp, u)
+    rows = ca.vertcat(memory[window * n_q + row : layout.one_step], dv, dp, given)
     y_grid, row_grid = ca.reshape(ys, n_q, window), ca.reshape(rows, row, window - 1)
     # Positions relative to the newest: after many turns the small differences keep their digits.
     relative = y_grid - ca.repmat(y, 1, window)
     q, v, a_measured = (relative @ ca.DM(w) for w in (position, velocity, acceleration))
     a_model = row_grid[:n_q, :] @ ca.DM(kernel[1:]) - row_grid[n_q : 2 * n_q, :] @ ca.DM(slope)
-    u_mean = row_grid[2 * n_q :, :] @ ca.DM(0.5 * dt * (kernel[:-1] + kernel[1:]))
-    state = ca.vertcat(q + y, v)
-    balances = [energy_balance(model, state, ca.vertcat(v, a), u_mean) for a in (a_model, a_measured)]
-    residual = _residual(model, a_measured, a_model, state, h, u_mean, rest)
+    g_mean = row_grid[2 * n_q :, :] @ ca.DM(0.5 * dt * (kernel[:-1] + kernel[1:]))
+    u_mean, state = g_mean[:n_u], ca.vertcat(q + y, v)
+    balances = [energy_balance(model, state, ca.vertcat(v, a), g_mean) for a in (a_model, a_measured)]
+    residual = _residual(model, a_measured, a_model, state, h, g_mean, rest)
     # What is predicted while the sensor repeats itself; a missing sample or estimate begins anew. Where friction may
     # stick nothing counts: there an estimate creeps that does not know of it.
     y_before = memory[(window - 1) * n_q : window * n_q]
     moved = x_next[:n_q] - x[:n_q]
     ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest * dt)
     travel = ca.if_else(ca.logic_and(y == y_before, _known(ahead)), ahead, 0)
-    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u, rest, ca.DM(spans))
+    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u, w, rest, ca.DM(spans))
     shown = ca.if_else(pushed[1] > ca.fabs(travel), pushed[1], travel)
     violation = ca.fabs(balances[0] - balances[1])
     averaged = memory[layout.averaged : layout.runs]
@@ -288,13 +310,13 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     if layout.length:
         for i in range(RUNS):
             part = memory[layout.runs + i * layout.run : layout.runs + (i + 1) * layout.run]
-            run, sums = _free_run(layout, part, u, balances[1], u_mean, v, full[i])
+            run, sums = _free_run(layout, part, given, balances[1], g_mean, v, full[i])
             outs.append(run)
             numbers.append(sums)
     if layout.history:
         outs += [memory[layout.rows + layout.history_row :], state, u_mean, residual]
     vectors = [ca.densify(ca.vertcat(*parts)) for parts in (outs, numbers)]
-    return ca.Function("monitor", [memory, x, h, u, y, full], vectors)
+    return ca.Function("monitor", [memory, x, h, u, y, full, w], vectors)
 
 
 def check_model(model: HybridModel) -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.plots.animation import Scene, animate
     from hybrid_mpc.plots.data import coverage, recordings
     from hybrid_mpc.plots.estimation import innovations
-    from hybrid_mpc.plots.fit import BalanceRun, curves, errors_bar, free_run, parity
+    from hybrid_mpc.plots.fit import BalanceRun, curves, errors_bar, free_run, parity, prediction
     from hybrid_mpc.plots.loops import Motion, closed_loops, solve_times
     from hybrid_mpc.plots.monitor import overview
     from hybrid_mpc.plots.studies import differences, distributions, pareto
@@ -49,7 +49,7 @@ __all__ = [
     "animate",
     "coverage", "recordings",
     "innovations",
-    "BalanceRun", "errors_bar", "free_run", "parity",
+    "BalanceRun", "errors_bar", "free_run", "parity", "prediction",
     "Motion", "closed_loops", "solve_times",
     "overview",
     "Scene",
@@ -64,7 +64,7 @@ _MODULES = {
     "animation": ("Scene", "animate"),
     "data": ("coverage", "recordings"),
     "estimation": ("innovations",),
-    "fit": ("BalanceRun", "curves", "errors_bar", "free_run", "parity"),
+    "fit": ("BalanceRun", "curves", "errors_bar", "free_run", "parity", "prediction"),
     "loops": ("Motion", "closed_loops", "solve_times"),
     "monitor": ("overview",),
     "studies": ("differences", "distributions", "pareto"),

@@ -344,6 +344,53 @@ def _course(t: Array, error: Array) -> tuple[Array, Array]:
     return np.array([t[part].mean() for part in parts]), np.maximum(rms, 1e-12)
 
 
+def prediction(
+    t: Array,
+    measured: Array,
+    runs: Mapping[str, tuple[Array, Array]],
+    *,
+    outputs: Sequence[Signal],
+    model: str,
+    title: str = "",
+) -> Figure:
+    """Predictions of a recording: every output with its bands, and under it the residuals.
+
+    Args:
+        t: Times ``(n,)`` [s].
+        measured: Measured outputs ``(n, n_y)``; NaN where a sample is missing.
+        runs: Predictions and half widths of their band, ``(n, n_y)`` each, by name; the first in the model's colour.
+        outputs: Signals of the outputs.
+        model: Name of the model.
+        title: Over all panels. Default: none.
+
+    Example:
+        >>> t = np.linspace(0.0, 1.0, 5)
+        >>> y, level = t[:, None] ** 2, Signal("level", "m")
+        >>> figure = prediction(t, y, {"free run": (y + 0.1, 0.2 + 0 * y)}, outputs=[level], model="hybrid")
+        >>> len(figure.axes)
+        2
+    """
+    n, n_y = len(t), len(outputs)
+    y = checked("measured", measured, n, n_y)
+    figure, panels = new_column([1.4, 0.9] * n_y, title=plain(title))
+    for j, signal in enumerate(outputs):
+        top, bottom = panels[2 * j : 2 * j + 2]
+        top.plot(t, y[:, j], color=INK, linewidth=1.0, label="measured")
+        for k, (name, (hat, half)) in enumerate(runs.items()):
+            values, width = (checked(name, part, n, n_y)[:, j] for part in (hat, half))
+            shade = colour(model) if k == 0 else FAINT
+            for ax, centre in ((top, values), (bottom, y[:, j] - values)):
+                ax.plot(t, centre, color=shade, linewidth=1.2 if k == 0 else 0.9, label=name, zorder=3 - k)
+            ends = (top, values - width, values + width), (bottom, -width, width)
+            for ax, low, high in ends if k == 0 else ():
+                ax.fill_between(t, low, high, color=shade, alpha=0.18, linewidth=0, label="its band")
+        bottom.axhline(0.0, color=FAINT, linewidth=0.8)
+        top.set_ylabel(axis_label(signal))
+        bottom.set_ylabel(f"residual\n[{plain(signal.unit)}]")
+    finish_column(figure, panels)
+    return figure
+
+
 def curves(
     training: Mapping[str, Mapping[str, Any]],
     *,

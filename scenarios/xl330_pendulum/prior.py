@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from hybrid_mpc import MechanicalPrior, Parameter, Signal
+from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Signal
 
 FRICTION_SPEED = 0.1
 """Speed [rad/s] over which dry friction changes its sign."""
@@ -32,6 +32,9 @@ class Xl330PendulumPrior(MechanicalPrior):
         Signal("enabled", "-", 0.0, 1.0),
     )
     outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
+    operating_point: ClassVar[OperatingPoint] = OperatingPoint(
+        x=(0.0, 0.0), u=(0.0, 12.0, 1.0)
+    )  # hangs, powered
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("mgl", 0.4807, "N m", 0.4807, 0.4807, "largest gravity torque: 0.49 kg at 0.10 m (fixed)"),
         Parameter("J", 0.00671, "kg m^2", 0.004, 0.015, "inertia with the rotor's"),

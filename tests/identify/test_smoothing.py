@@ -12,8 +12,9 @@ from scipy.linalg import expm
 
 from hybrid_mpc import MechanicalPrior, Parameter, Prior, Signal, Trajectory, fit_smoother
 from hybrid_mpc.data.differentiate import local_polynomial
+from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.identify.simulation import Simulation
-from hybrid_mpc.identify.smooth import IGNORANCE, Sizes, Smoother, sizes_of, unseen_states
+from hybrid_mpc.identify.smooth import IGNORANCE, Smoother, sizes_of, unseen_states
 from tests.simulated_pendulum import DT, TRUTH, Pendulum, record
 
 SIGMA = 1e-3

@@ -99,3 +99,41 @@ def run_folder(golf_artifact, tmp_path_factory) -> Path:
     limits = {"residual_threshold": 1e9, "residual_release": 1e8}
     set_calibration(model, Calibration(1e-9, 1e-10, 1.0, 10, 1.0, "for tests", **limits))
     return folder
+
+
+BARE = """
+from dataclasses import replace
+from hybrid_mpc import Budget
+from scenarios.simulated.two_tanks import scenario as tanks
+few = Budget(hidden=4, networks=2, teacher_steps=10, free_run_steps=0, seeds=1)
+short = replace(tanks.data, windows={}, warm_up=100.0, free_run=400.0)
+scenario = replace(
+    tanks, name="bare_tanks", plant=None, tasks=(), make_data=None, data=short, budgets={"quick": few},
+    control=tanks.control.changed(horizon=20),
+)
+"""
+
+
+@pytest.fixture(scope="session")
+def bare_tanks(tmp_path_factory) -> Path:
+    """Folder of a scenario without plant and tasks: ``tanks.py``, recordings, a finished ``run``, and what it told."""
+    import subprocess
+    import sys
+
+    from scenarios.simulated.two_tanks import EXPERIMENT
+
+    folder = tmp_path_factory.mktemp("bare_tanks")
+    (folder / "tanks.py").write_text(BARE)
+    words = []
+    for i, name in enumerate(("monday", "tuesday", "later")):
+        table = dict(zip(EXPERIMENT.columns, EXPERIMENT.table("train", i + 1, 0).T, strict=True))
+        path = write(folder / f"{name}.csv", table)
+        words += ["--data", str(path)] if name != "later" else []
+    skipped = [word for stage in ("estimation", "residuals", "analysis") for word in ("--skip", stage)]
+    command = [sys.executable, "-m", "hybrid_mpc.cli", "run", str(folder / "tanks.py"), *words, *skipped]
+    done = subprocess.run(
+        [*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder / "told.txt").write_text(done.stdout)
+    return folder

@@ -4,7 +4,12 @@ of them at once.
 
 import itertools
 import math
+import re
+import resource
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -436,3 +441,64 @@ def test_what_a_signal_cannot_be_is_told_by_the_file(tmp_path, given, words):
         load_scenario(str(tmp_path / "valve.py"))
     for word in words:
         assert word in str(error.value)
+
+
+SEVEN = """
+import casadi as ca
+import numpy as np
+
+from hybrid_mpc import OCP, Balance, DataSpec, OperatingPoint, Parameter, Prior, Scenario, Signal, Task
+
+
+class Tank(Prior):
+    states = outputs = (Signal("level", "m", 0, 1),)
+    inputs = (Signal("pump", "l/min", 0, 20),)
+    parameters = (Parameter("area", 5, "dm^2", 5, 5), Parameter("k", 15, "l/min/m^0.5", 5, 40))
+    operating_point = OperatingPoint(x=(0.25,), u=(9.5,))
+
+    def out(self, x, p):
+        return p.k * ca.sqrt(x.level)
+
+    def xdot(self, x, u, w, p):
+        return ((u.pump - self.out(x, p)) / (600 * p.area),)
+
+    def balances(self, x, u, w, p):
+        return (Balance("water", 10 * p.area * x.level, -u.pump / 60, self.out(x, p) / 60, "l", "l/s"),)
+
+
+scenario = Scenario(
+    "tank", "A tank", "", prior=Tank,
+    data=DataSpec("t", ("pump", "valve"), ("level",), dt=5.0, max_gap=12.0, smoothing=50.0, warm_up=60.0),
+    control=OCP(30, q=(0,), r=(1e-3,), r_delta=(1e-2,), u_min=(0,), u_max=(20,), q_y=(1e3,)),
+    sensor_sigma=(2e-3, 1e-3),
+    safe_input=(-3.0,),
+    tasks=(Task("fill", "Fill", 600.0, (0.25, 0.1), lambda t: np.full((len(t), 1), 0.4)),),
+)
+"""
+
+
+def test_a_user_s_file_with_seven_errors_has_seven_lines(call, tmp_path):
+    (tmp_path / "tank.py").write_text(SEVEN)
+    code, told_to_user, _ = call("check", tmp_path / "tank.py")
+    assert code == 2
+    assert "7 to be mended" in told_to_user
+    for word in (
+        "its derivative by x is not finite at x = [0.0]", "balance water [l/s]: dS/dt - supply + loss",
+        "operating_point is no equilibrium", "2 columns of inputs", "sensor_sigma needs 1 numbers",
+        "safe_input (-3.0,)", "task fill: x0 needs 1",
+    ):  # fmt: skip
+        assert sum(word in line for line in told_to_user.splitlines()) == 1, word
+
+
+@pytest.mark.parametrize("block", [0, 1])
+def test_it_takes_three_seconds_at_most(tmp_path, block):
+    """Processor time of the command with its interpreter on the README's machines; half of it was measured."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    (tmp_path / "machine.py").write_text(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[block])
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "hybrid_mpc.cli", "check", str(tmp_path / "machine.py")]
+    assert (
+        "Nothing to be mended" in subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime) < 3.0

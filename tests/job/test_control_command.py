@@ -197,7 +197,8 @@ def test_bad_models(call, run_folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "told"),
-    [("plant=None", "has no plant"), ("control=None", "has no control problem"), ("tasks=()", "has no task"),
+    [("plant=None", "no model to stand in for the machine"), ("control=None", "has no control problem"),
+     ("tasks=()", "has no task"),
      ("make_data=None", "holds no process noise"), ("oracle=None", "has no oracle")],
 )  # fmt: skip
 def test_scenarios_without_what_is_needed(call, golf_artifact, tmp_path, change, told):

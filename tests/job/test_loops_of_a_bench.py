@@ -71,8 +71,8 @@ def test_another_machine_s_model_is_refused(kit):
         Bench(GOLF, {"mine": replace(kit, provenance=Provenance("emps"))})
     with pytest.raises(InputError, match="model mine holds hybrid; needed is a model prior"):
         Bench(GOLF, {"mine": replace(kit, models={"hybrid": kit.models["hybrid"]})})
-    with pytest.raises(InputError, match="has no plant"):
-        Bench(replace(GOLF, plant=None), {})
+    with pytest.raises(InputError, match="has no control problem"):
+        Bench(replace(GOLF, control=None), {})
     with pytest.raises(InputError, match="a Scenario is needed, got 'golf_robot'; give load_scenario"):
         Bench("golf_robot", {"mine": kit})
     with pytest.raises(InputError, match=r"kits by label are needed, got a Kit; give .*hm\.load"):

@@ -1,5 +1,7 @@
 """``hybrid-mpc new``: a recording becomes a scenario that passes the check, with what is left to decide."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,35 @@ def test_a_swing_has_two_states(machine, tmp_path):
     assert 0.28 < scenario.prior().values["T_phi_rad"] < 0.36
     assert preflight(scenario).problems == ()
     assert any("its unit" in line for line in left_to_decide(tmp_path / "swing.py"))
+
+
+RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
+
+
+@pytest.mark.parametrize(
+    ("file", "inputs", "outputs"),
+    [
+        ("cascaded_tanks/estimation.csv", ["pump_v"], ["level_v"]),
+        (
+            "temperature_lab/prbs.csv",
+            ["heater1_pct", "heater2_pct"],
+            ["temperature1_degc", "temperature2_degc"],
+        ),
+        ("race_car/run_07.csv", ["steering_rad"], ["x_m", "y_m", "heading_rad", "speed_m_s"]),  # 3 s alone
+    ],
+)
+def test_what_is_written_from_a_real_recording_passes_the_check_with_it(
+    call, tmp_path, file, inputs, outputs
+):
+    if not (RECORDINGS / file).is_file():
+        pytest.skip(f"the recording {file} is not here")
+    machine = tmp_path / "mine.py"
+    draft = write_scenario(machine, RECORDINGS / file)
+    assert [c.full for c in draft.inputs] == inputs
+    assert [c.full for c in draft.outputs] == outputs
+    code, told, _ = call("check", machine, "--data", RECORDINGS / file)
+    assert code == 0, told
+    assert "'hybrid-mpc run' may start" in told
 
 
 def test_columns_may_be_named_and_may_have_any_names(tmp_path):

@@ -1,13 +1,14 @@
 """The energy monitor against a machine whose faults are known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 import pytest
 from monitor_parts import DT, GAMMA, NOISE, Estimate, Exact, Observer, Run, pendulum, simulate
 
-from hybrid_mpc import Calibration, EnergyMonitor, InputError, count_alarms, replay
+from hybrid_mpc import Calibration, EnergyMonitor, HybridModel, InputError, Signal, count_alarms, replay
 from hybrid_mpc.model.model import step_symbols
 from hybrid_mpc.monitor.calibrate import calibrate, with_residual
 from hybrid_mpc.monitor.replay import with_alarms
@@ -139,7 +140,7 @@ def test_residual_force_is_the_unknown_torque_while_the_machine_moves():
 def test_at_rest_only_what_friction_cannot_hold_counts(torque, excess):
     n = 60
     run = Run(np.arange(n) * DT, np.zeros((n, 1)), np.full((n, 1), torque), np.zeros((n, 2)))
-    monitor = EnergyMonitor(pendulum(friction=0.1, dry=0.2), window=5, average=5)
+    monitor = EnergyMonitor(pendulum(friction=0.1, dry=0.2), window=5, average=5, rest_speed=0.2)
     trace = replay(monitor, Exact(run), run)
     # dry friction holds 0.2 (tanh(10) = 1 - 4e-9); viscous friction, 0.02 at the rest speed of 0.2 rad/s, holds nothing
     np.testing.assert_allclose(trace.residual_level[20:], excess, atol=1e-6)
@@ -189,3 +190,43 @@ def test_bad_input_speaks():
         EnergyMonitor(model, window=5, average=1, rest_speed=0.0)
     with pytest.raises(InputError, match="release_w"):
         Calibration(1.0, 2.0, 1.0, 1, 1.0, "by hand")
+
+
+def windy() -> HybridModel:
+    """The pendulum with a second torque, which is measured and not commanded."""
+    model = pendulum()
+    x, h, u, _, p = step_symbols(model)
+    w, rate = ca.MX.sym("w"), ca.MX.sym("rate", 2)
+    return HybridModel.of(
+        "windy", DT, model.states, model.inputs, model.outputs, x=x, u=u, w=w, p=p,
+        x_next=model.step(x, h, u + w, [], p)[0], xdot=model.xdot(x, h, u + w, [], p), y=x[0], rate=rate,
+        energy=model.balances[0].residual(x, rate, u + w, [], p), disturbances=(Signal("wind", "N m"),),
+        parameters=model.parameters,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("free_run", [0.0, 0.6])
+def test_what_disturbs_and_is_measured_is_no_violation(free_run):
+    """The wind is 0.6 N m at most; a monitor that takes the operating point's, none, is off by it times the speed."""
+    model, run = windy(), simulate(400, kind="sine")
+    wind = 0.6 * np.sin(2 * np.pi * 0.3 * run.t)[:, None]
+    blown = SimpleNamespace(t=run.t, y=run.y, u=run.u - wind, w=wind)  # together the torque that acted
+
+    class Knowing(Exact):
+        def start(self, y, t, *, w):
+            self.told = [w]
+            return SimpleNamespace(**vars(super().start(y, t)), w=w)
+
+        def update(self, estimate, y, u_prev, *, w):
+            self.told.append(w)
+            return SimpleNamespace(**vars(super().update(estimate, y, u_prev)), w=w)
+
+    monitor, estimator = EnergyMonitor(model, window=11, average=5, free_run=free_run), Knowing(run)
+    trace = replay(monitor, estimator, blown)
+    assert np.array_equal(estimator.told, wind)
+    # as of a perfect model above; without wind it is 0.6 N m times 3 rad/s
+    assert np.nanmax(trace.violation_w) < 1e-5
+    assert np.nanmax(trace.residual_level) < 1e-5
+    if free_run:
+        calm = replay(EnergyMonitor(pendulum(), window=11, average=5, free_run=free_run), Exact(run), run)
+        assert np.nanmax(np.abs(trace.energy_j - calm.energy_j)) < 1e-9  # the same run, but for rounding

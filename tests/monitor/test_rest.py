@@ -24,6 +24,7 @@ from hybrid_mpc import (
     rest_speeds,
 )
 from hybrid_mpc.data.scales import noise_of, time_unit
+from hybrid_mpc.monitor.lengths import NOTHING_STICKS
 from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.records import plain, record
 
@@ -143,7 +144,12 @@ def test_every_consumer_takes_the_stored_value():
     assert EnergyMonitor(model, window=5, average=1, calibration=calibration).rest_speed == (0.004,)
     for part in (detector, calibration):
         assert record(type(part), json.loads(json.dumps(plain(part))), "") == part
-    assert EnergyMonitor(model, window=5, average=1).rest_speed == (0.2,)
+    # nobody gave one: no number of any unit stands for it, and nothing is taken to stick
+    unknown = EnergyMonitor(model, window=5, average=1)
+    assert unknown.rest_speed == (NOTHING_STICKS,)
+    pulled = Run(0.01 * np.arange(40), np.zeros((40, 1)), np.full((40, 1), 0.3), np.zeros((40, 2)))
+    # dry friction of 0.1 N would hold a third of it; all of it counts
+    np.testing.assert_allclose(replay(unknown, Exact(pulled), pulled).residual_level[10:], 0.3, atol=1e-6)
 
 
 def test_bad_input_speaks(strokes):

@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 6,
+    "schema_version": 7,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -81,6 +81,11 @@ RESULTS = {
         "oracle": {"cost": 1.5, "tracking_rmse": {"phi [rad]": 0.04}},
         "gap_closed": 0.67,
     },
+    "on_model": {
+        "plants": {"prior_observer": "hybrid"},
+        "left_out": {"hybrid_observer": "one network was trained"},
+        "default_tasks": True,
+    },
     "estimation": {
         name: {
             "mean_nis": 1.2,
@@ -141,7 +146,7 @@ def leaves(values=RESULTS, prefix=""):
             yield prefix + key
 
 
-DEFAULTS = ("estimation.", "timing.controller_step_ms.", "residuals.", "guard.", "analysis.")
+DEFAULTS = ("on_model.", "estimation.", "timing.controller_step_ms.", "residuals.", "guard.", "analysis.")
 """Groups whose values may be left out."""
 
 
@@ -185,7 +190,7 @@ def test_null_needs_a_reason():
 
 
 def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match="this version reads 6"):
+    with pytest.raises(InputError, match="this version reads 7"):
         read_results(put("schema_version", 4))
     with pytest.raises(InputError, match="no field 'programs'"):
         read_results(put("export.programs", 3))

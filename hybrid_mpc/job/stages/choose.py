@@ -8,21 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.identify.bands import Bands, RunParts, fit_bands, variance_parts
+from hybrid_mpc.identify.bands import FAR, RunParts, fit_bands, run_variance
 from hybrid_mpc.identify.choose import Choice, recommend
 from hybrid_mpc.identify.evaluate import FreeRun, free_runs, unseen_runs
-from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of, training_settings
+from hybrid_mpc.kit.prediction import Bands
 from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 CANDIDATES = ("phy", "pgrnn", "mopgrnn")
 """What may be recommended: the fitted prior, and the hybrids that :func:`models_of` the prior has."""
-FAR = 1e3
-"""Spreads of an output beyond which a part of an error's variance says no more."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +30,12 @@ class ChoiceResult:
     Args:
         choice: Which one is recommended, and why.
         bands: Bands around free runs, by candidate.
+        longest: Length [s] of the longest of these runs.
     """
 
     choice: Choice
     bands: Mapping[str, Bands]
+    longest: float
 
     @property
     def deployed(self) -> str:
@@ -73,34 +73,25 @@ def choice_stage(context: Context) -> ChoiceResult:
     samples = max(1, round(context.time_unit / spec.dt))
     recordings = [t.file for _, them in runs for t in them]
     found = recommend(errors, deploy=context.settings.deploy, samples=samples, recordings=recordings)
-    return ChoiceResult(found, bands)
+    longest = max((len(t.t) - warm - 2) * spec.dt for _, them in runs for t in them)
+    return ChoiceResult(found, bands, longest)
 
 
 def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float) -> list[RunParts]:
     """Errors of each run of the first network, and the parts of their variance; ``every`` has a row a network."""
     assert fit.sizes is not None
     covariance, spread = np.array(fit.covariance(phy.parameters)), np.array(fit.sizes.y)
-    if not covariance.size:
-        covariance = np.zeros((len(phy.parameters), len(phy.parameters)))
     found = []
     for runs in zip(*every, strict=True):
         own = runs[0]
-        outputs = np.stack([run.y_hat for run in runs])
-        limit = np.square(FAR * spread)
-        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges has a band without end
-            networks = np.nan_to_num(outputs.var(axis=0), nan=np.inf)
-            parameters = parameter_variance(
-                phy, covariance, own.x_hat[None, 0], own.u[None], own.w[None], dt, fit.substeps
-            )[0]
-        found.append(
-            RunParts(
-                np.clip(np.nan_to_num(own.y_hat - own.y, nan=np.nan, posinf=np.inf), -FAR * spread, FAR * spread),
-                variance_parts(
-                    own.t - own.t[0], np.array(fit.sigma), spread,
-                    np.minimum(networks, limit), np.minimum(parameters, limit),
-                ),
-            )
+        error = np.clip(
+            np.nan_to_num(own.y_hat - own.y, nan=np.nan, posinf=np.inf), -FAR * spread, FAR * spread
+        )
+        parts = run_variance(
+            phy, covariance, np.stack([run.y_hat for run in runs]), (own.x_hat[0], own.u, own.w), own.t - own.t[0],
+            np.array(fit.sigma), spread, dt=dt, substeps=fit.substeps,
         )  # fmt: skip
+        found.append(RunParts(error, parts))
     return found
 
 

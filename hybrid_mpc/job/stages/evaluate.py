@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.bands import Bands, RunParts, coverage, interval_score
+from hybrid_mpc.identify.bands import RunParts, coverage, interval_score
 from hybrid_mpc.identify.evaluate import (
     FreeRun,
     OutputErrors,
@@ -27,6 +27,7 @@ from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.choose import CHOICE, run_parts
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of
+from hybrid_mpc.kit.prediction import Bands
 from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[Any]

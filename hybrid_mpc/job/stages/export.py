@@ -16,12 +16,16 @@ from hybrid_mpc.job.stage import Absent, Stage, source_of
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, trained_models
 from hybrid_mpc.kit.artifact import (
+    MOST_MEMBERS,
     Provenance,
     loop_settings,
+    member_names,
     read_description,
     save_artifact,
     write_description,
 )
+from hybrid_mpc.kit.prediction import Predicting
+from hybrid_mpc.machine.prior import Prior
 
 
 @dataclass(frozen=True)
@@ -47,12 +51,15 @@ class NoiseResult:
 
 
 def export_stage(context: Context) -> ExportResult:
-    """Write the hybrid and the fitted prior as one artifact; compare both with torch."""
+    """Write the hybrid, the fitted prior and the other networks as one artifact; compare all with torch."""
     dt, settings, prior, chosen = context.spec.dt, context.settings, context.prior, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
+    networks = trained_models(context, chosen.deployed).steps(phy, dt)[: MOST_MEMBERS + 1]
+    others = member_names(len(networks) - 1)
     steps: dict[str, RecurrentStep | PriorStep] = {
-        "hybrid": trained_models(context, chosen.deployed).step(phy, dt),
+        "hybrid": networks[0],
         "prior": PriorStep(phy, dt, prior.fit.substeps),
+        **dict(zip(others, networks[1:], strict=True)),
     }
     info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
     deployed = replace(info, input_delay=prior.fit.delay, time_unit=context.time_unit)
@@ -68,15 +75,29 @@ def export_stage(context: Context) -> ExportResult:
         phy.values,
     )  # fmt: skip
     folder = context.out / "model"
+    members = [programs.pop(name) for name in others]
     save_artifact(
         folder, programs, deployed, provenance=provenance, loop=loop_settings(context.scenario),
-        recommended="prior" if chosen.choice.recommended == "phy" else "hybrid",
+        recommended="prior" if chosen.choice.recommended == "phy" else "hybrid", members=members,
+        predicting=predicting(context, phy),
     )  # fmt: skip
     return ExportResult(
         max(p.max_abs_error for p in parities),
         max(p.jacobian_max_abs_error for p in parities),
         read_description(folder).programs_sha256,
     )
+
+
+def predicting(context: Context, phy: Prior) -> Predicting | None:
+    """What predictions need beside the models."""
+    fit, chosen = context.prior.fit, context.read(CHOICE)
+    if fit.sizes is None:
+        return None
+    bands = {name: chosen.bands[key] for name, key in (("prior", "phy"), ("hybrid", chosen.deployed))}
+    return Predicting(
+        replace(context.spec, windows={}), tuple(phy.states[i].name for i in phy.corrected), fit.sigma, fit.walk,
+        fit.sizes, fit.fading, fit.substeps, bands, chosen.longest,
+    )  # fmt: skip
 
 
 def artifact_is_there(context: Context, found: ExportResult) -> str:
@@ -123,7 +144,8 @@ def observed(context: Context) -> dict[str, object]:
 
 EXPORT = Stage(
     "export", "exporting to CasADi", ExportResult, export_stage,
-    lambda context: {"seed": context.settings.seed}, (DATA, PRIOR, TRAINING, CHOICE), restore=artifact_is_there,
+    lambda context: {"seed": context.settings.seed, "data specification": context.spec},
+    (DATA, PRIOR, TRAINING, CHOICE), restore=artifact_is_there,
 )  # fmt: skip
 NOISE = Stage(
     "noise", "tuning the observers", NoiseResult, noise_stage, observed, (DATA, PRIOR, EXPORT), optional=True,

@@ -23,9 +23,10 @@ from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
+from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL, by_controller
 from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
 from hybrid_mpc.job.summary import summaries
-from hybrid_mpc.job.tasks import tasks_of
+from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.monitor.residuals import force_unit
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
@@ -44,7 +45,8 @@ SHOWN_RECORDINGS = 4
 def draw_all(context: Context) -> Figures:
     """Draw every figure that the run's stages allow into ``figures/``."""
     parts = (
-        _data, _training, _free_runs, _overview, _loops, _estimation, _timing, _monitor, guard_figures, _analysis,
+        _data, _training, _free_runs, _overview, _loops, _on_model, _estimation, _timing, _monitor, guard_figures,
+        _analysis,
     )  # fmt: skip
     figures: Figures = {}
     for i, part in enumerate(parts):
@@ -161,6 +163,23 @@ def _loops(context: Context) -> Any:
         control = task.control or scenario.control
         figure = loop_figure(task.title, control, prior, {short: own[n] for short, n in names.items()})
         yield "control", f"loop_{task.name}", figure, f"{task.title}, first seed."
+
+
+def _on_model(context: Context) -> Any:
+    """A figure a task and controller: each controller met another plant."""
+    found = context.find(LOOPS_ON_MODEL)
+    if isinstance(found, Absent):
+        return
+    scenario = ready(context.scenario)
+    tasks = {task.name: task for task in scenario.tasks}
+    for name, rows in by_controller([row for row in found.drawn if row.arrays]).items():
+        for row in rows:
+            task = tasks[row.task]
+            control = task.control or scenario.control
+            assert control is not None
+            title = f"{task.title}, {name}, {ON_MODEL} ({row.on_model})"
+            figure = loop_figure(title, control, scenario.prior(), {f"{name} on {row.on_model}": row.arrays})
+            yield "on_model", f"on_model_{task.name}_{name}", figure, f"{title}; first seed."
 
 
 def _overview(context: Context) -> Any:

@@ -35,7 +35,7 @@ from hybrid_mpc.monitor.calibrate import (
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
-from hybrid_mpc.monitor.lengths import BLOCK_S, REST_SPEED, SETTLING_S, block_seconds, samples, seconds
+from hybrid_mpc.monitor.lengths import BLOCK_S, NOTHING_STICKS, SETTLING_S, block_seconds, samples, seconds
 from hybrid_mpc.monitor.replay import MonitorTrace, along, replay
 from hybrid_mpc.scenario import Budget, Scenario, Task
 
@@ -368,7 +368,7 @@ def guard_stage(context: Context) -> GuardResult | Absent:
     if not energy_is_watched(model):
         return Absent(NO_ENERGY.format(scenario=scenario.name))
     calibration = Calibration.without(monitor.reason) if isinstance(monitor, Absent) else monitor.calibration
-    rest = calibration.rest_speed or (REST_SPEED,)
+    rest = calibration.rest_speed or kit.known_rest or (NOTHING_STICKS,)
     data = _nominal_data(context, kit, rest)
     detector, reason, faults = None, "", None
     try:
@@ -405,7 +405,7 @@ def learned(
     n_q: int,
     data_hash: str,
     *,
-    rest_speed: ArrayLike = REST_SPEED,
+    rest_speed: ArrayLike = NOTHING_STICKS,
     time_unit: float = 1.0,
 ) -> Detector:
     """The detector for the lowest of the rates 1, 2, 5 and 10 an hour that the data are long enough for.

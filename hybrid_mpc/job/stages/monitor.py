@@ -150,7 +150,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         reason = f"the monitor could not be calibrated: {short}"
     power, residual, traces = [], [], []
     # the estimator of the closed loops; the monitor ignores its disturbance estimate
-    watching, estimator = make_monitor(model, None, rest_speed=rest), kit.observer("hybrid")
+    watching, estimator = make_monitor(model, None, rest_speed=rest or kit.known_rest), kit.observer("hybrid")
     for recording, say in along(whole, context.progress.update):
         trace = replay(watching, estimator, recording, on_progress=say)
         traces.append(trace)

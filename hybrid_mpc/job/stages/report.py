@@ -32,6 +32,7 @@ from hybrid_mpc.job.stages.identify import (
     training_settings,
 )
 from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
+from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL
 from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import (
     Analysis,
@@ -40,6 +41,7 @@ from hybrid_mpc.job.stages.results import (
     Export,
     Guard,
     Monitor,
+    OnModel,
     Residuals,
     Results,
     Timing,
@@ -58,6 +60,7 @@ TITLES: Mapping[str, str] = {
     "free_run": "Free runs: how well the models predict",
     "export": "Export",
     "control": "Closed loops",
+    "on_model": "Closed loops on the model, not the machine",
     "estimation": "Estimation: are the observers as sure as they may be",
     "timing": "Time of a controller step",
     "residuals": "Monitor of residuals",
@@ -202,6 +205,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "free_run": [*_score_tables(context, results), _choice_table(results), _band_table(context, results)],
         "export": [_export_table(results.export)],
         "control": [_control_table(results.control), _tracking_table(results.control)],
+        "on_model": _on_model_tables(results.on_model),
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
         "residuals": _residual_tables(results.residuals),
@@ -229,6 +233,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
             after.get(key, ()),
         )
         for key in TITLES
+        if key != "on_model" or not results.on_model.reason
     )
     versions = ", ".join(f"{name} {v}" for name, v in results.versions.items())
     return Report(
@@ -304,9 +309,15 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
         if control.hybrid.cost is None:
             timed = " The controller was built and timed on recordings instead."
             timed = "" if results.timing.misses is None else timed
+            if results.on_model.plants:
+                timed += f" Loops {ON_MODEL}, are in the next section."
             instead["control"] = (f"There is no closed loop here: {reason}.{timed}",)
         else:
             after["control"] = (f"The gap closed is not defined: {reason}.",)
+    on_model = results.on_model
+    after["on_model"] = tuple(f"{name}: {why}." for name, why in on_model.left_out.items())
+    if on_model.default_tasks:
+        after["on_model"] += ("The tasks are default ones, since the scenario declares none.",)
     tested = results.estimation
     observers = (tested.prior_observer, tested.hybrid_observer)
     without = [text for text in (tested.reason, *(o.reason for o in observers if o is not None)) if text]
@@ -540,6 +551,31 @@ def _tracking_table(control: Control) -> Table | None:
     return Table(("task", "controller", *(f"RMSE of {s}" for s in signals)), rows, caption)
 
 
+def _on_model_tables(found: OnModel) -> list[Table | None]:
+    """A table a controller: each met another plant, so no table holds two."""
+    tables: list[Table | None] = []
+    for name, cells in (found.details.controllers if found.details is not None else {}).items():
+        signals = list(dict.fromkeys(s for cell in cells.values() for s in cell.tracking_rmse))
+        rows = [
+            (
+                task,
+                _cost(cell),
+                *(cell.tracking_rmse[s].mean if s in cell.tracking_rmse else None for s in signals),
+                f"{100 * max(cell.limits.values(), default=0.0):.0f} %",
+                f"{100 * cell.sources['MPC']:.1f} %",
+            )
+            for task, cell in cells.items()
+        ]
+        caption = (
+            f"Controller {name.replace('_', ', ')} on the model {found.plants[name]} in place of the machine: "
+            f"{ON_MODEL}. Cost J on the model's state, root mean square deviations from the reference, means over "
+            "seeds."
+        )
+        heads = ("task", "cost", *(f"RMSE of {s}" for s in signals), "largest share of a limit", "solved")
+        tables.append(Table(heads, rows, caption))
+    return tables
+
+
 def _cost(cell: Summary | None) -> str:
     if cell is None:
         return "–"
@@ -623,7 +659,7 @@ def _pole_table(analysis: Analysis) -> Table | None:
 
 REPORT = Stage(
     "report", "writing the report", ReportResult, report_stage, what_report_reads,
-    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, ESTIMATION, RESIDUALS, MONITOR, GUARD,
-     ANALYSIS),
+    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, RESIDUALS, MONITOR,
+     GUARD, ANALYSIS),
     restore=report_is_there,
 )  # fmt: skip

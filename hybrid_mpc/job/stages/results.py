@@ -29,6 +29,7 @@ from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
 from hybrid_mpc.job.stages.identify import DATA, MODELS
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
+from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.monitor.calibrate import Calibration
@@ -37,7 +38,7 @@ from hybrid_mpc.monitor.innovations import ResidualLimits
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 ENERGY = "energy [W]"
 """The balance that the monitor watches, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
@@ -191,6 +192,29 @@ class Control:
     gap_closed: float | None
     gap_closed_reason: str = ""
     details: ControlDetails | None = None
+
+
+@dataclass(frozen=True)
+class OnModelDetails:
+    """Figures by controller and task."""
+
+    controllers: Mapping[str, Mapping[str, Summary]]
+
+
+@dataclass(frozen=True)
+class OnModel:
+    """Closed loops of a machine without plant, by controller, each on another model than its own. They tell whether two
+    models agree, and nothing of the machine; each controller met another plant, so they compare nothing.
+
+    ``plants`` names the models in place of the machine; ``default_tasks`` says that the scenario declares no tasks;
+    ``left_out`` why a controller has no loops.
+    """
+
+    plants: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    default_tasks: bool = False
+    details: OnModelDetails | None = None
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -362,6 +386,7 @@ class Results:
     identification: Identification
     export: Export
     control: Control
+    on_model: OnModel
     estimation: Estimation
     timing: Timing
     residuals: Residuals
@@ -443,6 +468,7 @@ def collect(context: Context) -> Results:
         _identification(context),
         Export(context.read(EXPORT).parity_max_abs_error, context.read(EXPORT).jacobian_max_abs_error),
         _control(context),
+        _on_model(context),
         _estimation(context),
         _timing(context),
         _residuals(context),
@@ -576,6 +602,18 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     if gap <= 2.0 * error:
         return None, f"baseline {baseline.mean():.4g} and oracle {oracle.mean():.4g} do not differ enough"
     return float(baseline.mean() - hybrid.mean()) / gap, ""
+
+
+def _on_model(context: Context) -> OnModel:
+    found = context.find(LOOPS_ON_MODEL)
+    if isinstance(found, Absent):
+        return OnModel(reason=found.reason)
+    tables = {
+        name: {task: cells[name] for task, cells in summaries(rows).items()}
+        for name, rows in by_controller(found.rows).items()
+        if rows
+    }
+    return OnModel(found.plants, found.left_out, found.default_tasks, OnModelDetails(tables))
 
 
 def _estimation(context: Context) -> Estimation:

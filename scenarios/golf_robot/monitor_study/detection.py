@@ -15,9 +15,11 @@ from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, block_ma
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import FROZEN_STEPS
 from hybrid_mpc.monitor.learn import DRIFT, detector_levels, learn_detector
-from hybrid_mpc.monitor.lengths import REST_SPEED, SETTLING_S, WINDOW_S, block_seconds
+from hybrid_mpc.monitor.lengths import SETTLING_S, WINDOW_S, block_seconds
 
 Array = NDArray[np.float64]
+REST_SPEED = 0.2
+"""Speed of this robot [rad/s] below which its friction may stick, where no recording gave one."""
 RELEASE = 0.5
 METHODS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {

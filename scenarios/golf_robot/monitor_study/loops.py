@@ -21,10 +21,15 @@ from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
-from hybrid_mpc.monitor.lengths import REST_SPEED
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario
-from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors, Trace, learn_detectors
+from scenarios.golf_robot.monitor_study.detection import (
+    METHODS,
+    REST_SPEED,
+    Detectors,
+    Trace,
+    learn_detectors,
+)
 from scenarios.golf_robot.monitor_study.plan import FAULT, GUARD, LEARN, LoopPlan, MonitorJob, MonitorStudy
 
 Array = NDArray[np.float64]

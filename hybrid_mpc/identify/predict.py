@@ -1,0 +1,243 @@
+"""Predictions of a recording from an artifact alone: a free run with its band, and one step ahead. No torch in here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.bands import run_variance
+from hybrid_mpc.identify.delay import lost_samples, shifted
+from hybrid_mpc.identify.smooth import Smoother
+from hybrid_mpc.kit.artifact import Kit
+from hybrid_mpc.kit.prediction import SHARE, Predicting
+from hybrid_mpc.machine.prior import OperatingPoint, Prior
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Predicted outputs beside the measured ones.
+
+    Args:
+        y_hat: Predictions ``(n, n_y)`` [output units]; NaN one step ahead of a sample that was not measured.
+        half_width: Half widths of the band ``(n, n_y)``; NaN where there is none.
+        rmse: Root mean square of the residuals by output, ``"phi [rad]"``; None where a run diverged.
+        fit_percent: ``100 (1 - RMSE / standard deviation of the measurement)`` by output; None where a run diverged, or
+            the output does not change.
+        inside: Share of the measurements within the band, by output; None where there is no band.
+        share: Share that the band is to hold.
+    """
+
+    y_hat: Array
+    half_width: Array
+    rmse: Mapping[str, float | None]
+    fit_percent: Mapping[str, float | None]
+    inside: Mapping[str, float | None]
+    share: float
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a model predicts of a recording after its warm-up, ``n`` samples.
+
+    Args:
+        name: Name of the recording.
+        model: Name of the model.
+        outputs: Signals of ``y``.
+        t: Times ``(n,)`` [s] in the recording's own time.
+        y: Measurement ``(n, n_y)``; NaN where a sample is missing.
+        free_run: From the state that the warm-up tells, under the measured inputs alone.
+        one_step: By the observer that loops have, from all samples before; None where the artifact has none.
+        reason: Why there are no one-step predictions. Default: there are.
+    """
+
+    name: str
+    model: str
+    outputs: tuple[Signal, ...]
+    t: Array
+    y: Array
+    free_run: Predicted
+    one_step: Predicted | None
+    reason: str = ""
+
+    def columns(self) -> dict[str, Array]:
+        """The prediction as columns of a table ``(n,)`` with units in their names."""
+        found = {"t_s": self.t}
+        runs = (("", self.free_run), ("_one_step", self.one_step))
+        for j, signal in enumerate(self.outputs):
+            name, unit = signal.name, signal.unit
+            found[f"{name}_{unit}"] = self.y[:, j]
+            for kind, run in runs:
+                if run is None:
+                    continue
+                hat, half = run.y_hat[:, j], run.half_width[:, j]
+                parts = {"hat": hat, "lower": hat - half, "upper": hat + half, "residual": self.y[:, j] - hat}
+                found |= {f"{name}{kind}_{what}_{unit}": values for what, values in parts.items()}
+        return found
+
+
+def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
+    """Free run and one-step predictions of a recording, with bands.
+
+    The first ``warm_up`` seconds of the recording give the first state, smoothed by the fitted prior, and the networks'
+    memory; they are not predicted. The free run's band is the one that validation calibrated (docs/choice.md); it grows
+    on beyond the longest run that it was calibrated on, where nobody has tried it. One-step predictions are those of
+    ``kit.observer(model)``; their band is what its own covariance says, not calibrated.
+
+    Args:
+        kit: A loaded artifact.
+        trajectory: A recording on the model's grid, inputs as they were commanded; its states are not used.
+        model: ``"prior"`` or ``"hybrid"``. Default: the recommended one.
+
+    Raises:
+        InputError: If there is no such model, the artifact does not hold what predictions need, or the recording is
+            shorter than the warm-up or has another period.
+
+    Example:
+        ``prediction = hm.predict(hm.load("runs/mine"), trajectory); prediction.free_run.fit_percent``
+    """
+    name, held = _checked(kit, trajectory, model)
+    chosen, prior, dt = kit.models[name], stored_prior(kit, held), trajectory.dt
+    warm, delay = round(held.data.warm_up / dt), kit.input_delay
+    lost = lost_samples(delay, dt)
+    if len(trajectory.t) < lost + warm + 2:
+        raise InputError(
+            f"{trajectory.name}: {len(trajectory.t) * dt:.4g} s are too short: {(lost + warm + 2) * dt:.4g} s are "
+            f"needed, of which {warm * dt:.4g} s are the warm-up"
+        )
+    (acting,) = shifted([trajectory], delay)
+    smoother = Smoother(prior, dt, held.sigma, held.walk, held.sizes, held.fading, held.substeps)
+    (start,) = smoother.smooth([acting.part(slice(0, warm + 1))])
+    shown = slice(warm, None)
+    u, w, t = acting.u[shown], acting.w[shown], acting.t[shown]
+    networks = [chosen, *(kit.members.values() if name == "hybrid" else ())]
+    states = [_free_run(one, trajectory, start.x, lost, warm) for one in networks]
+    outputs = np.stack([_outputs(prior, x, u, w) for x in states])
+    half = np.full(outputs[0].shape, np.nan)
+    bands = held.bands.get(name)
+    if bands is not None:
+        parts = run_variance(
+            prior, np.array(chosen.covariance), outputs, (states[0][0], u, w), t - t[0], np.array(held.sigma),
+            np.array(held.sizes.y), dt=dt, substeps=held.substeps, longest=held.longest or np.inf,
+        )  # fmt: skip
+        half = bands.half_width(parts)
+    y = acting.y[shown]
+    free = _predicted(outputs[0], half, y, chosen.outputs, SHARE if bands is None else bands.share)
+    one_step, reason = None, ""
+    try:
+        hat, width = _one_step(kit, name, trajectory.part(slice(lost, None)))
+        one_step = _predicted(hat[shown], width[shown], y, chosen.outputs, SHARE)
+    except InputError as none:
+        reason = str(none)
+    return Prediction(trajectory.name, name, chosen.outputs, t, y, free, one_step, reason)
+
+
+def _checked(kit: Kit, trajectory: Trajectory, model: str) -> tuple[str, Predicting]:
+    """Name of the model, and what predictions need."""
+    name = model or kit.recommended
+    if name not in kit.models:
+        raise InputError(f"no model {name!r}; there are: {', '.join(kit.models)}")
+    if kit.predicting is None or "prior" not in kit.models:
+        raise InputError(
+            f"the model of scenario {kit.name or '(unnamed)'} was saved without what predictions need (columns, "
+            "smoother, bands): an older version wrote it, or save_artifact without predicting; run the scenario again"
+        )
+    chosen = kit.models[name]
+    if abs(trajectory.dt - chosen.dt) > 1e-9 * chosen.dt:
+        raise InputError(
+            f"{trajectory.name} has a period of {trajectory.dt:g} s, the model one of {chosen.dt:g} s; resample it"
+        )
+    return name, kit.predicting
+
+
+def stored_prior(kit: Kit, held: Predicting) -> Prior:
+    """The fitted prior of an artifact, its equations from the stored programs."""
+    model = kit.models["prior"]
+
+    def expressions(self: Prior, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[Any, Any, tuple[()]]:
+        return model.xdot(x, ca.SX.zeros(model.n_h), u, w, p), model.output(x, u, w, p), ()
+
+    of_class = {
+        "states": model.states, "inputs": model.inputs, "outputs": model.outputs, "disturbances": model.disturbances,
+        "parameters": model.parameters, "corrects": held.corrects, "expressions": expressions,
+        "operating_point": OperatingPoint(model.nominal_x, model.nominal_u, model.nominal_w),
+    }  # fmt: skip
+    made: Prior = type("StoredPrior", (Prior,), of_class)()
+    return made
+
+
+def _free_run(model: HybridModel, whole: Trajectory, x: Array, lost: int, warm: int) -> Array:
+    """States ``(n, n_x)`` from the end of the warm-up on; ``x`` ``(warm + 1, n_x)`` are those of the warm-up."""
+    step = BufferedFunction(model.step)
+    step.inputs[4][:] = model.p
+    h = np.zeros(model.n_h)
+    if model.delay_states:  # the inputs on their way, the oldest first
+        h[: model.delay_states] = whole.u[lost - model.delay_states // model.n_u : lost].ravel()
+    u, w = whole.u[lost:], whole.w[lost:]
+    states = np.empty((len(u) - warm, model.n_x))
+    now = x[0]
+    for k in range(len(u)):
+        now = x[k] if k <= warm else step.outputs[0].copy()
+        if k >= warm:
+            states[k - warm] = now
+        step.inputs[0][:], step.inputs[1][:], step.inputs[2][:], step.inputs[3][:] = now, h, u[k], w[k]
+        step()
+        h = step.outputs[1].copy()
+    return states
+
+
+def _outputs(prior: Prior, x: Array, u: Array, w: Array) -> Array:
+    """Outputs ``(n, n_y)`` as the sensors show them: within the ranges that they declare."""
+    ends = np.array([s.saturation or (-np.inf, np.inf) for s in prior.outputs]).T
+    y = prior.equations.output(x.T, u.T, w.T, prior.p).full().T
+    return np.asarray(np.clip(y, *ends))
+
+
+def _one_step(kit: Kit, name: str, recording: Trajectory) -> tuple[Array, Array]:
+    """Predictions of each sample from those before, and half widths of their band, both ``(n, n_y)``."""
+    observer, model = kit.observer(name), kit.models[name]
+    n, n_y = recording.y.shape
+    hat, variance = np.full((2, n, n_y), np.nan)
+    for k in range(n):
+        w = recording.w[k]
+        if k == 0:
+            estimate = observer.start(recording.y[0], float(recording.t[0]), w=w if model.n_w else None)
+            continue
+        u = recording.u[k - 1]
+        ahead = observer.predict(estimate, u)
+        if model.n_w:
+            ahead = observer.measuring(ahead, w)
+        variance[k] = np.diag(observer.innovation_covariance(ahead, u))
+        estimate = observer.update(estimate, recording.y[k], u, w=w if model.n_w else None)
+        hat[k] = recording.y[k] - estimate.innovation
+    factor = float(norm.ppf(0.5 * (1 + SHARE)))
+    return hat, factor * np.sqrt(np.maximum(variance, 0.0))
+
+
+def _predicted(hat: Array, half: Array, y: Array, outputs: Sequence[Signal], share: float) -> Predicted:
+    rmse: dict[str, float | None] = {}
+    fit: dict[str, float | None] = {}
+    inside: dict[str, float | None] = {}
+    for j, signal in enumerate(outputs):
+        seen = np.isfinite(y[:, j]) & ~np.isnan(hat[:, j])
+        off = np.abs(hat[seen, j] - y[seen, j])
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = float(np.sqrt(np.mean(np.square(off)))) if seen.any() else np.nan
+        size = float(y[seen, j].std()) if seen.any() else 0.0
+        rmse[signal.label] = error if np.isfinite(error) else None
+        fit[signal.label] = 100 * (1 - error / size) if size > 0 and np.isfinite(error) else None
+        banded = np.isfinite(half[seen, j])
+        inside[signal.label] = float(np.mean(off[banded] <= half[seen, j][banded])) if banded.any() else None
+    return Predicted(hat, half, rmse, fit, inside, share)

@@ -1,0 +1,219 @@
+"""Default tasks of a machine without any: a step of what is controlled, and holding against a constant disturbance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.simulation import rest_of
+from hybrid_mpc.loop.faults import Fault
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.scenario import Scenario, Task
+
+Array = NDArray[np.float64]
+TOLERATED = 10.0
+"""A step is so many times what the weights tolerate, ``1 / sqrt(q)``, at most."""
+ROOM, PUSH = 0.5, 0.2
+"""Share of the room from the operating point to a limit that a step, and that a disturbance at an input, may take."""
+HOLD, LEAD, LASTS = 3, 0.5, 6
+"""Horizons that a set-point is held, that the machine rests before the first change, and that holding lasts."""
+TURNS = 20
+"""Newton steps to a point of rest at most."""
+STILL = 1e-6
+"""Largest rate, in sizes of the states a horizon, that counts as rest."""
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """The prior where it works: its point of rest, and the control problem; ``horizon`` in seconds."""
+
+    prior: Prior
+    control: OCP
+    horizon: float
+    x: Array
+    u: Array
+    w: Array
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What references are of."""
+        return self.prior.outputs if self.control.n_y else self.prior.states
+
+    @property
+    def weights(self) -> Array:
+        """Weights of what references are of."""
+        return self.control.q_y if self.control.n_y else self.control.q
+
+    def tracked(self, x: Array, u: Array) -> Array:
+        """What references are of, at a point."""
+        if not self.control.n_y:
+            return x
+        return np.asarray(self.prior.equations.output(x, u, self.w, self.prior.p).full().ravel())
+
+    def sizes(self) -> Array:
+        """Sizes of ``(x, u)``: ranges, else what the weights tolerate, else 1."""
+        ranges = np.array([s.upper - s.lower for s in self.prior.states])
+        tolerated = 1.0 / np.sqrt(np.where(self.control.q > 0, self.control.q, 1.0))
+        return np.concatenate([np.where(np.isfinite(ranges), ranges, tolerated), self.control.input_range])
+
+    def slopes(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Rates ``(n_x,)`` in sizes of the states a horizon, and their slopes by ``(x, u)`` in sizes."""
+        n_x, sizes = len(self.x), self.sizes()
+        xs, us = ca.SX.sym("x", n_x), ca.SX.sym("u", len(self.u))
+        rates = self.prior.equations.xdot(xs, us, self.w, self.prior.p)
+        slope = ca.Function("slope", [xs, us], [rates, ca.densify(ca.jacobian(rates, ca.vertcat(xs, us)))])
+        value, matrix = (m.full() for m in slope(x, u))
+        scale = self.horizon / sizes[:n_x]
+        return value.ravel() * scale, matrix * scale[:, None] * sizes
+
+    def moved(self, j: int, by: float) -> tuple[Array, Array] | None:
+        """The point of rest at which tracked signal ``j`` is off by ``by``, the inputs changed least; None: none is."""
+        sizes, n_x = self.sizes(), len(self.x)
+        z, goal = np.concatenate([self.x, self.u]), self.tracked(self.x, self.u)[j] + by
+        for _ in range(TURNS):
+            rates, matrix = self.slopes(z[:n_x], z[n_x:])
+            row, off = self._row(j, z[:n_x], z[n_x:])
+            unit = max(abs(by), 1e-300)
+            missed = np.append(rates, (off - goal) / unit)
+            if not np.all(np.isfinite(matrix)):
+                return None
+            if np.abs(missed).max() < STILL:
+                return z[:n_x], z[n_x:]
+            z = z - sizes * np.linalg.lstsq(np.vstack([matrix, row * sizes / unit]), missed, rcond=1e-9)[0]
+        return None
+
+    def _row(self, j: int, x: Array, u: Array) -> tuple[Array, float]:
+        """Slope of tracked signal ``j`` by ``(x, u)``, and its value."""
+        if not self.control.n_y:
+            return np.eye(len(x) + len(u))[j], float(x[j])
+        xs, us = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
+        y = self.prior.equations.output(xs, us, self.w, self.prior.p)[j]
+        row = ca.Function("row", [xs, us], [ca.densify(ca.jacobian(y, ca.vertcat(xs, us))), y])
+        slope, value = row(x, u)
+        return slope.full().ravel(), float(value)
+
+    def within(self, x: Array, u: Array) -> bool:
+        """Whether a point takes no more than its share of the room to any limit."""
+        c, y = self.control, self.prior.outputs
+        at = self.prior.equations.output
+        rest, now = (at(*p, self.w, self.prior.p).full().ravel() for p in ((self.x, self.u), (x, u)))
+        pairs = (
+            (self.u, u, c.u_min, c.u_max),
+            (self.x, x, c.x_min, c.x_max),
+            (self.x, x, *_ranges(self.prior.states)),
+            (rest, now, *_ranges(y)),
+            *([(rest, now, c.y_min, c.y_max)] if c.y_min.size else []),
+        )
+        return all(
+            bool(np.all((b >= a - ROOM * (a - low) - 1e-12) & (b <= a + ROOM * (high - a) + 1e-12)))
+            for a, b, low, high in pairs
+        )
+
+
+def _ranges(signals: Sequence[Signal]) -> tuple[Array, Array]:
+    low, high = np.array([(s.lower, s.upper) for s in signals], dtype=np.float64).reshape(-1, 2).T
+    return low, high
+
+
+def default_tasks(scenario: Scenario) -> tuple[Task, ...]:
+    """Two tasks around the operating point of a scenario with a control problem.
+
+    ``step``: each signal that the problem weighs, as many as there are inputs, is stepped, one after the other, and the
+    last set-point is the operating point's. Set-points are points of rest within half of the room to every limit, and
+    ten times what the weights tolerate away at most. ``hold``: the operating point is held while a constant
+    disturbance, a fifth of the room to a limit, acts at the first input.
+
+    Raises:
+        InputError: If the prior does not rest at its operating point, or nothing that is weighed can be moved to
+            another point of rest.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from hybrid_mpc.scenario import load_scenario
+        >>> golf = load_scenario("golf_robot")
+        >>> [task.title for task in default_tasks(replace(golf, tasks=()))]
+        ['A step of phi by 0.1 rad (default task)', 'Hold against -0.1 N m at u (default task)']
+    """
+    prior, control, dt = scenario.prior(), scenario.control, scenario.data.dt
+    assert control is not None
+    length = control.horizon * dt
+    rest = _Rest(prior, control, length, *rest_of(prior))
+    why = f"scenario {scenario.name} declares no tasks, and default ones cannot be made: "
+    rates = rest.slopes(rest.x, rest.u)[0]
+    if not np.all(np.abs(rates) < 0.1):
+        moving = ", ".join(s.name for s, r in zip(prior.states, rates, strict=True) if not abs(r) < 0.1)
+        raise InputError(
+            f"{why}{moving} of the prior would not rest at the operating point; give operating_point = "
+            "OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),)"
+        )
+    steps = _steps(rest)
+    if not steps:
+        raise InputError(
+            f"{why}no signal that the control problem weighs has another point of rest within half of the room to the "
+            "limits; give tasks=(Task(...),)"
+        )
+    return _step_task(rest, steps, dt), _hold_task(rest, dt)
+
+
+def _steps(rest: _Rest) -> list[tuple[int, float, Array]]:
+    """Place of each signal that steps, by how much, and all references at the new point of rest."""
+    found = []
+    for j in np.flatnonzero(rest.weights > 0).tolist():
+        size = TOLERATED / math.sqrt(rest.weights[j])
+        candidates = ((sign, size / 2**k) for k in range(12) for sign in (1.0, -1.0))
+        for sign, own in candidates:
+            point = rest.moved(j, sign * own)
+            if point is not None and rest.within(*point):
+                found.append((j, sign * own, rest.tracked(*point)))
+                break
+        if len(found) == len(rest.u):
+            break
+    return found
+
+
+def _step_task(rest: _Rest, steps: Sequence[tuple[int, float, Array]], dt: float) -> Task:
+    start, hold = LEAD * rest.horizon, HOLD * rest.horizon
+    first, n_p = rest.tracked(rest.x, rest.u), rest.control.n_p
+    goals = np.array([*(goal for *_, goal in steps), first])
+
+    def reference(t: Array) -> Array:
+        number = np.floor((np.asarray(t, dtype=float) - start) / hold + 1e-9).astype(int)
+        rows = goals[np.clip(number, 0, len(goals) - 1)]
+        rows[number < 0] = first
+        return np.hstack([rows, np.zeros((len(rows), n_p))])
+
+    names = ", ".join(f"{rest.signals[j].name} by {by:.3g} {rest.signals[j].unit}" for j, by, _ in steps)
+    return Task(
+        "step", f"A step of {names} (default task)", _periods(start + hold * len(goals), dt), tuple(rest.x.tolist()),
+        reference,
+    )  # fmt: skip
+
+
+def _hold_task(rest: _Rest, dt: float) -> Task:
+    c, signal = rest.control, rest.prior.inputs[0]
+    up, down = float(c.u_max[0] - rest.u[0]), float(rest.u[0] - c.u_min[0])
+    room = max(up, down) if math.isfinite(max(up, down)) else 0.5 * float(c.input_range[0])
+    push = -PUSH * room if up >= down else PUSH * room
+    first, n_p = rest.tracked(rest.x, rest.u), c.n_p
+    several = signal.name if len(rest.u) > 1 else ""
+
+    def reference(t: Array) -> Array:
+        return np.hstack([np.tile(first, (len(t), 1)), np.zeros((len(t), n_p))])
+
+    return Task(
+        "hold", f"Hold against {push:.3g} {signal.unit} at {signal.name} (default task)",
+        _periods(LASTS * rest.horizon, dt), tuple(rest.x.tolist()), reference,
+        faults=(Fault(_periods(LEAD * rest.horizon, dt), math.inf, "input_offset", push, several),),
+    )  # fmt: skip
+
+
+def _periods(seconds: float, dt: float) -> float:
+    return round(seconds / dt) * dt
