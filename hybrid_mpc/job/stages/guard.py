@@ -219,6 +219,7 @@ def faulted(
         hybrid = kit.models["hybrid"]
         signals = hybrid.inputs if case.target.startswith("input_") else hybrid.outputs
         channel = "" if case.target.startswith("plant_") else signals[0].name
+        title = f"{case.title} ({channel})" if channel and len(signals) > 1 else case.title
         fault = Fault(start, math.inf, case.target, case.value, channel)
         spec = LoopSpec(
             named, MODEL, task.name, CONTROLLER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
@@ -231,7 +232,7 @@ def faulted(
         before, seen = begun(alarms, start)
         loops.append(
             FaultedLoop(
-                case.name, case.title, case.target, case.value, task.name, start,
+                case.name, title, case.target, case.value, task.name, start,
                 seen[0].start_s - start if seen else None,
                 seen[0].diagnosis if seen else "",
                 len(before),
