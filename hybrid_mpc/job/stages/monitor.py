@@ -217,16 +217,16 @@ def _load_loop(context: Context, kit: Kit) -> tuple[UnknownLoad, ClosedLoopResul
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
     task, settings = context.scenario.tasks[0], context.settings
     load = unknown_load(kit.problem(task.name), kit.models["hybrid"], task.duration)
-    start = load.start
     spec = LoopSpec(
         settings.scenario, MODEL, task.name, "hybrid_observer", monitor="energy", run_seed=settings.seed,
         faults=(load,),
     )  # fmt: skip
     calm = replace(task, faults=())
     result = Bench(context.scenario, {MODEL: kit}).run(spec, task=calm)[1]
-    before, after = result.alarm[result.t < start], np.flatnonzero(result.alarm & (result.t >= start))
-    delay = float(result.t[after[0]] - start) if after.size else None
-    return UnknownLoad(task.name, load.value, start, delay, len(alarm_intervals(before, result.dt))), result
+    begins = np.array([begin for begin, _ in alarm_intervals(result.alarm, result.dt)])
+    seen = begins[begins >= load.start - 1e-9]
+    delay = float(seen[0] - load.start) if seen.size else None
+    return UnknownLoad(task.name, load.value, load.start, delay, begins.size - seen.size), result
 
 
 def unknown_load(control: OCP, model: HybridModel, duration: float) -> Fault:
