@@ -1,7 +1,7 @@
 """The six simulated machines: free runs, rest under a constant load, and cost against PI(D) and linear MPC.
 
     hybrid-mpc run two_tanks --budget quick --out runs/two_tanks   (and the other five)
-    python benchmarks/simulated_machines.py --runs runs [--machines lever] [--seeds 10] [--loads] [--workers 2]
+    python benchmarks/simulated_machines.py --runs runs [--machines lever] [--tasks hold] [--seeds 10] [--workers 2]
 
 Reads the runs and closes loops on the plants, every controller with the same seeds, limits and measurements:
 
@@ -15,9 +15,9 @@ Reads the runs and closes loops on the plants, every controller with the same se
 
 The cost counts what all pay for alike: weighed outputs without noise, weighed speeds, changes of the input. A ratio is
 the geometric mean over seeds with its 95 % interval (paired, by Student's t of the logarithms). With a constant load,
-*offset* is the mean error of the controlled outputs over the last 20 % of the task, and *rest* its root mean square
-there, the largest of the seeds, over what is allowed: the larger of two steps of the sensor (of a sensor of steps with
-the same noise) and 0.5 % of the range that the training recordings cover.
+*offset* is the mean error of the controlled outputs over the last 20 % of the task, the largest of the seeds, over what
+is allowed: the larger of two steps of the sensor (of a sensor of steps with the same noise) and 0.5 % of the range that
+the training recordings cover; *rest* is the root mean square error there, so that a ripple counts.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from hybrid_mpc.loop.plant import SimulatedMachine
 from hybrid_mpc.model.model import output_with_jacobian
 
 MACHINES = ("two_tanks", "dc_motor", "lever", "two_heaters", "two_link_arm", "cart_pole")
+LOADS = ("leak", "brake", "hold", "draught", "carry", "push")
 CONTROLLERS = ("hybrid", "prior", "linear", "pid")
 TUNED_ON = (1000, 1001)
 """Seeds of the loops that PI(D) are tuned on."""
@@ -281,45 +282,52 @@ def free_runs(name: str, runs: Path) -> dict:
             **{key: value / error["phy"] for key, value in ratios.items()}}  # fmt: skip
 
 
+def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
+    """Ratios of cost, offsets, and how the hybrid rests against its prior, of one task."""
+    own = {
+        c: [r for r in cells if (r["machine"], r["task"], r["controller"]) == (name, task.name, c)]
+        for c in CONTROLLERS
+    }
+    costs = {c: np.log([r["cost"] for r in found]) for c, found in own.items()}
+    row = {"machine": name, "task": task.name}
+    row |= {f"hybrid / {c}": interval(costs["hybrid"] - costs[c]) for c in CONTROLLERS[1:]}
+    if task.faults:
+        bound = allowed(name, runs)
+        share = {c: np.max(np.abs([r["offset"] for r in own[c]]) / bound) for c in CONTROLLERS}
+        row |= {f"offset, {c}": f"{share[c]:.2f}" for c in CONTROLLERS}
+        rest = {c: np.log(np.linalg.norm([r["rest"] for r in own[c]] / bound, axis=1)) for c in CONTROLLERS}
+        row["rest, hybrid / prior"] = interval(rest["hybrid"] - rest["prior"])
+    row["beyond limits"] = max(0.0, *(r["beyond"] for found in own.values() for r in found))
+    return row
+
+
 def main() -> None:
     """Measure and print."""
     parser = arguments(__doc__)
     parser.add_argument("--runs", type=Path, required=True, help="folder of the runs, one a machine")
     parser.add_argument("--machines", nargs="+", default=[*MACHINES], choices=MACHINES)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--loads", action="store_true", help="only the task with a constant load of each")
+    parser.add_argument(
+        "--tasks", nargs="+", help="only these; those with a constant load: " + " ".join(LOADS)
+    )
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
-    rows: list[dict] = []
-    cells = []
+    tasks = [
+        (name, place, task)
+        for name in given.machines
+        for place, task in enumerate(hm.load_scenario(name).tasks)
+        if not given.tasks or task.name in given.tasks
+    ]
     with ProcessPoolExecutor(given.workers) as pool:
         jobs = [
             pool.submit(loop, name, given.runs, controller, place, seed)
-            for name in given.machines
-            for place, task in enumerate(hm.load_scenario(name).tasks)
-            if task.faults or not given.loads
+            for name, place, _ in tasks
             for controller in CONTROLLERS
             for seed in range(given.seeds)
         ]
         cells = [job.result() for job in jobs]
-    rows += [free_runs(name, given.runs) for name in given.machines]
-    for name in given.machines:
-        scenario, bound = hm.load_scenario(name), allowed(name, given.runs)
-        for task in scenario.tasks:
-            if given.loads and not task.faults:
-                continue
-            own = {
-                c: [r for r in cells if (r["machine"], r["task"], r["controller"]) == (name, task.name, c)]
-                for c in CONTROLLERS
-            }
-            costs = {c: np.log([r["cost"] for r in found]) for c, found in own.items()}
-            row = {"machine": name, "task": task.name}
-            row |= {f"hybrid / {c}": interval(costs["hybrid"] - costs[c]) for c in CONTROLLERS[1:]}
-            for kind in ("offset", "rest") if task.faults else ():
-                for c in CONTROLLERS:
-                    row[f"{kind}, {c}"] = f"{np.max(np.abs([r[kind] for r in own[c]]) / bound):.2f}"
-            row["beyond limits"] = max(r["beyond"] for found in own.values() for r in found)
-            rows.append(row)
+    rows = [free_runs(name, given.runs) for name in given.machines]
+    rows += [row_of(name, given.runs, task, cells) for name, _, task in tasks]
     report(rows, given.out, loops=cells)
 
 
