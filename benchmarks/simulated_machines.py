@@ -9,9 +9,9 @@ Reads the runs and closes loops on the plants, every controller with the same se
 - ``linear``: the same MPC and observer on the fitted prior, linearized at the operating point: offset-free linear MPC;
 - ``pid``: one PI(D) a controlled output, on the input of the same place, all on a measurement through a filter of first
   order, on top of the input that holds set-point and measured disturbances by the fitted prior; the integral stops
-  where the input is at a limit. Gains and filter are those that make *this very task* cheapest, load included, on the
-  fitted prior with its sensors' noise; then all gains are multiplied by what is cheapest on the plant itself, among
-  1 and less. Both with seeds of their own. Nobody has so much when he tunes: it is the best that PI(D) does here.
+  where the input is at a limit. Gains and filters are those that make *this very task* cheapest, load included: by
+  differential evolution on the fitted prior with its sensors' noise, then by Nelder and Mead's method on the plant
+  itself, both with seeds of their own. Nobody has so much when he tunes: it is about the best that PI(D) does here.
 
 The cost counts what all pay for alike: weighed outputs without noise, weighed speeds, changes of the input. A ratio is
 the geometric mean over seeds with its 95 % interval (paired, by Student's t of the logarithms). With a constant load,
@@ -47,8 +47,8 @@ TUNED_ON = (1000, 1001)
 BOUNDS = ((-3, 2), (-2.5, 2), (-4, 0.5), (-2, 0))
 """Logarithms: gain over the inverse steady gain, times of integral and derivative over the slowest time constant, share
 of a new measurement in the filter."""
-WEAKER = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
-"""Factors on all gains that are tried on the plant."""
+FACTORS, TRIALS = (4.0, 1.0, 0.4, 0.15), 25
+"""Factors on the gains that the search on the plant begins with, and its loops by number of unknowns."""
 
 
 def linear_model(model: hm.HybridModel) -> hm.HybridModel:
@@ -158,21 +158,26 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
 
     best = differential_evolution(loss, BOUNDS * m, seed=0, popsize=10, maxiter=40, tol=1e-4, polish=False)
     best = minimize(loss, best.x, method="Nelder-Mead", bounds=BOUNDS * m, options={"maxfev": 200 * m})
-    tried = []
-    for share in WEAKER:
-        own = [(share * kp, share * ki, share * kd, f) for kp, ki, kd, f in gains(best.x)]
-        costs = [
-            cost_of(scenario, model, task, *run_pid(scenario, model, own, controlled, task, s))
-            for s in TUNED_ON
-        ]
-        tried.append((np.mean(np.log(costs)), own))
-    return min(tried, key=lambda pair: pair[0])[1]
+
+    def on_plant(point):
+        course = t, goals, forward, w
+        loops = [run_pid(scenario, model, gains(point), controlled, task, s, course) for s in TUNED_ON]
+        costs = [cost_of(scenario, model, task, *loop) for loop in loops]
+        return float(np.log(np.mean(costs))) if np.all(np.isfinite(costs)) else 1e3
+
+    firsts = [best.x + np.tile([math.log10(f), 0, 0, 0], m) for f in FACTORS]
+    first = min((np.clip(v, *np.array(BOUNDS * m).T) for v in firsts), key=on_plant)
+    limits = {
+        "maxfev": TRIALS * first.size,
+        "initial_simplex": np.vstack([first, first + 0.15 * np.eye(first.size)]),
+    }
+    return gains(minimize(on_plant, first, method="Nelder-Mead", options=limits).x)
 
 
-def run_pid(scenario, model, gains, controlled, task, seed):
-    """States ``(n, n_x)`` and inputs ``(n, n_u)`` of a loop with PI(D)."""
+def run_pid(scenario, model, gains, controlled, task, seed, course=None):
+    """States ``(n, n_x)`` and inputs ``(n, n_u)`` of a loop with PI(D); ``course`` is what :func:`courses` says."""
     control, dt = task.control or scenario.control, model.dt
-    times, goals, forward, w, _ = courses(scenario, model, task)
+    times, goals, forward, w = course or courses(scenario, model, task)[:4]
     names = [[s.name for s in group] for group in (model.outputs, model.inputs)]
     machine = SimulatedMachine(scenario.plant(), np.array(task.x0), seed, *names, task.faults, dt, 0, 0)
     memory, x, inputs = None, [], []
