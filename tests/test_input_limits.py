@@ -90,7 +90,9 @@ def test_a_whole_loop_with_its_figures(limits):
     assert left[model.inputs[0].label] == 0.0
     assert left[model.states[0].label] == max(0.0, -1.0 - result.x[:, 0].min())
     assert working_point(model, control)[1] == rest
-    assert unknown_load(control) == pytest.approx(0.1 * span)
+    load = unknown_load(control, model, 6.0)
+    assert (load.start, load.channel) == (3.0, u)
+    assert load.value == pytest.approx(0.1 * span)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ InputColumns: TypeAlias = Annotated[
     list[str] | None, typer.Option(help="Column of an input, in the prior's order.")
 ]
 OutputColumns: TypeAlias = Annotated[
-    list[str] | None, typer.Option(help="Column of a measured position, in the prior's order.")
+    list[str] | None, typer.Option(help="Column of a measured output, in the prior's order.")
 ]
 Device: TypeAlias = Annotated[str, typer.Option(help="Where networks are trained: cpu, cuda, cuda:1, ...")]
 ArtifactFolder: TypeAlias = Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")]

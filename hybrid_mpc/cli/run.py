@@ -159,16 +159,26 @@ def tracking(errors: Mapping[str, float]) -> str:
 
 
 def residual_lines(found: Residuals) -> list[str]:
-    """What the run says of its monitor of residuals."""
+    """What the run says of its monitor of residuals.
+
+    Example:
+        >>> from hybrid_mpc.job.stages.results import FaultedChannel, Residuals
+        >>> row = FaultedChannel("input_gain", "pump", 0.8, "levels", 450.0, None, (), "", 1)
+        >>> print(*residual_lines(Residuals(alarms=(), faults=(row,)))[1:])
+          input_gain of pump: never seen (alarms before it: 1)
+    """
     if found.alarms is None:
         return [f"monitor of residuals: {found.reason}"]
     lines = [
         f"monitor of residuals: learned from {found.details.source}; {len(found.alarms)} alarms on recordings"
     ]
     for row in found.faults or ():
-        seen = "never seen" if row.delay_s is None else f"seen after {row.delay_s:.3g} s in {row.channels[0]}"
+        seen = "never seen" if row.delay_s is None else f"seen after {row.delay_s:.3g} s"
+        seen += f" in {row.channels[0]}" if row.channels else ""
+        before = f" (alarms before it: {row.false_alarms})" if row.false_alarms else ""
         lines.append(
-            f"  {row.fault} of {row.channel}: {seen}" + (f": {row.diagnosis}" if row.diagnosis else "")
+            f"  {row.fault} of {row.channel}: {seen}{before}"
+            + (f": {row.diagnosis}" if row.diagnosis else "")
         )
     return lines
 

@@ -450,8 +450,10 @@ class Problem:
         )
         found: list[Steady] = []
         for k in knots:
-            start = self.targets.at(y_ref[k], d, w[k], start)
-            found.append(start)
+            # where nothing was found once, the rest of the horizon is not searched as widely again
+            wide = not found or found[-1].steady
+            found.append(self.targets.at(y_ref[k], d, w[k], start, wide=wide))
+            start = found[-1] if found[-1].steady else start
         weighed = self.ocp.q_y > 0
         point = self.model.x0, self.u_rest
         x = np.array([s.x if s.steady else point[0] for s in found])

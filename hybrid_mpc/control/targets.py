@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +26,16 @@ RANK = 1e-9
 """Singular values below this share of the largest count as zero."""
 FREE = 1e-6
 """Weight of the inputs' distance from the operating point along directions that the outputs do not see."""
+ASIDE = 0.1
+"""Distance of further starts from the operating point's input, in scales of the input. A network that has learned how a
+machine sticks feels no input between the two on which the machine breaks loose, and Newton's method stops there."""
+STALLED, WITHIN = 0.9, 5
+"""A descent is given up whose lack of a steady state has not fallen to this share within so many steps, which those
+that arrive do many times over."""
+STILL = 1e-6
+"""Largest lack of a steady state, in the states' scales, that is rounding."""
+LEAST_SHARE = 1e-3
+"""Smallest share of a step that is tried."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +59,28 @@ class Steady:
     steady: bool
 
 
+class _Point(NamedTuple):
+    """A point ``v = (x, h, u)``.
+
+    Args:
+        v: ``(n_z + n_u,)``.
+        rest: ``F(z, u) - z`` ``(n_z,)``.
+        rest_by_v: Its Jacobian ``(n_z, n_z + n_u)``.
+        y: Outputs ``(n_y,)``.
+        y_by_v: Their Jacobian ``(n_y, n_z + n_u)``.
+        lacks: Size of ``rest`` in the scales of the states.
+        merit: What a descent lowers: ``lacks``, and the outputs' weighted error, less.
+    """
+
+    v: Array
+    rest: Array
+    rest_by_v: Array
+    y: Array
+    y_by_v: Array
+    lacks: float
+    merit: float
+
+
 class Targets:
     """Steady states for set-points of outputs: ``y_ref`` to ``(x_ref, u_ref)``.
 
@@ -55,8 +90,9 @@ class Targets:
     nearest that can, and ``reached`` is False. Where no steady state keeps the bounds of states and outputs, they are
     left out.
 
-    It is Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. No method
-    changes the object's answers; not for several threads at once.
+    It is Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. It begins
+    where it is told to, then at the operating point, then beside it. No method changes the object's answers; not for
+    several threads at once.
 
     Args:
         model: The model, with its disturbance model.
@@ -88,6 +124,7 @@ class Targets:
         self.model, self._ocp = model, ocp
         self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
         self._step.inputs[4][:] = model.p
+        self._n_z = model.n_x + model.n_h
         self._on_u, self._on_x, self._on_y = model.disturbed
         self._tracked = np.flatnonzero(ocp.q_y > 0)
         self._root = np.sqrt(ocp.q_y[self._tracked])
@@ -105,6 +142,8 @@ class Targets:
         d: ArrayLike | None = None,
         w: ArrayLike | None = None,
         start: Steady | None = None,
+        *,
+        wide: bool = True,
     ) -> Steady:
         """The steady state for a set-point.
 
@@ -113,6 +152,7 @@ class Targets:
             d: Unmeasured disturbances ``(n_d,)``. Default: zero.
             w: Measured disturbances ``(n_w,)``. Default: those of the operating point.
             start: Where to begin, e.g. the last answer. Default: the operating point.
+            wide: Whether to begin elsewhere where a steady ``start`` does not lead to one. Default: yes.
 
         Raises:
             InputError: If a size does not fit, or a value that is needed is not finite.
@@ -123,58 +163,71 @@ class Targets:
             raise InputError(f"y_ref {goal} given; needed: {m.n_y} outputs, finite where q_y weighs them")
         d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
         w = m.w if w is None else vector(w, m.n_w, "w")
-        u = np.clip(m.u0, self._ocp.u_min, self._ocp.u_max)
+        given = start if start is not None and start.steady else None
         best: Steady | None = None
-        for given in (start, None) if start is not None else (None,):
-            # the operating point's hidden state may take a thousand steps to settle: asked for where it is needed
-            h0 = hidden_fixed_point(m, m.x0, u, w=w) if given is None else given.h
-            first = (m.x0, h0, u) if given is None else (given.x, h0, given.u)
-            for bounded in (True, False):
-                found = self._descend(np.concatenate(first), goal, d, w, bounded)
+        for bounded in (True, False):
+            beside = None if wide and bounded else int(wide or given is None)
+            for first in self._firsts(given, beside):
+                found = self._descend(first, goal, d, w, bounded)
                 if found.steady:
                     return found
                 best = best or found
         assert best is not None
         return best
 
+    def _firsts(self, given: Steady | None, most: int | None) -> Iterator[Array]:
+        """Points at which a descent begins: the given one and ``most`` of :attr:`_beside`, which is asked if needed."""
+        if given is not None:
+            yield np.concatenate([given.x, given.h, given.u])
+        if most != 0:
+            yield from self._beside[:most]
+
+    @cached_property
+    def _beside(self) -> list[Array]:
+        """The operating point, and points with one input more or less; hidden states, which may take a thousand steps
+        to settle, at rest there.
+        """
+        m, ocp = self.model, self._ocp
+        u0 = np.clip(m.u0, ocp.u_min, ocp.u_max)
+        moves = np.diag(ASIDE * ocp.input_scale)
+        inputs = [u0, *(np.clip(u0 + move, ocp.u_min, ocp.u_max) for row in moves for move in (row, -row))]
+        return [np.concatenate([m.x0, hidden_fixed_point(m, m.x0, u), u]) for u in inputs]
+
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def _descend(self, v: Array, goal: Array, d: Array, w: Array, bounded: bool) -> Steady:
         """Gauss-Newton from ``v = (x, h, u)``; ``bounded``: within the bounds of states and outputs."""
-        n_z = v.size - self.model.n_u
-        done = False
-        merit = self._merit(v, goal, d, w)
+        n_x, n_z = self.model.n_x, self._n_z
+        at, done = self._point(v, goal, d, w), False
+        lacks = [at.lacks]
         for _ in range(ITERATIONS):
-            step = self._newton(v, goal, d, w, bounded)
+            step = self._newton(at, goal, bounded)
             if step is None or not np.all(np.isfinite(step)):
                 break
             size = float(np.max(np.abs(step / self._scale)))
             if size <= STEADY:
-                done = True
+                done = at.lacks <= STILL
                 break
             share = 1.0
-            while True:
-                moved = v + share * step
-                after = self._merit(moved, goal, d, w)
-                if after < merit or share * size < 1e-8:
-                    break
+            after = self._point(at.v + step, goal, d, w)
+            while not after.merit < at.merit and share > LEAST_SHARE:
                 share *= 0.5
-            done = not after < merit and size < 1e-5  # rounding is all that is left
-            v, merit = (moved, after) if np.isfinite(after) else (v, merit)
-            if done or not np.isfinite(after):
+                after = self._point(at.v + share * step, goal, d, w)
+            if not after.merit < at.merit:
+                done = size < 1e-5 and at.lacks <= STILL  # rounding is all that is left
                 break
-        y = self._outputs(v, d, w)[0]
-        off = np.max(np.abs(self._root * (y - goal)[self._tracked]), initial=0.0)
-        u = np.clip(v[n_z:], self._ocp.u_min, self._ocp.u_max)
-        n_x = self.model.n_x
-        return Steady(v[:n_x], v[n_x:n_z], u, y, bool(done and off <= REACHED), done)
+            at = after
+            lacks.append(at.lacks)
+            if len(lacks) > WITHIN and at.lacks > max(STALLED * lacks[-1 - WITHIN], STILL):
+                break
+        off = np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0)
+        u = np.clip(at.v[n_z:], self._ocp.u_min, self._ocp.u_max)
+        return Steady(at.v[:n_x], at.v[n_x:n_z], u, at.y, bool(done and off <= REACHED), done)
 
-    def _newton(self, v: Array, goal: Array, d: Array, w: Array, bounded: bool) -> Array | None:
+    def _newton(self, at: _Point, goal: Array, bounded: bool) -> Array | None:
         """The step that the linearization asks for; None where its QP has no answer."""
-        m, scale = self.model, self._scale
-        n_z, n_x = v.size - m.n_u, m.n_x
-        rest, e = self._rest(v, d, w)
-        y, by_v = self._outputs(v, d, w)
-        e, j = e * scale, by_v * scale
+        m, scale, v, y, rest = self.model, self._scale, at.v, at.y, at.rest
+        n_z, n_x = self._n_z, m.n_x
+        e, j = at.rest_by_v * scale, at.y_by_v * scale
         if not (np.all(np.isfinite(e)) and np.all(np.isfinite(j)) and np.all(np.isfinite(rest))):
             return None
         left, sizes, right = np.linalg.svd(e)
@@ -209,20 +262,17 @@ class Targets:
         eta = bounded_least_squares(h, g, np.vstack(rows), np.concatenate(lower), np.concatenate(upper))
         return None if eta is None else (onto + along @ eta) * scale
 
-    def _merit(self, v: Array, goal: Array, d: Array, w: Array) -> float:
-        """Size of what a point lacks of a steady state, and of the outputs' weighted error, less."""
-        rest, _ = self._rest(v, d, w)
-        y, _ = self._outputs(v, d, w)
-        n_z = rest.size
-        off = self._root * (y - goal)[self._tracked]
-        lacks = float(np.sum(np.abs(rest / self._scale[:n_z])))
-        found = 100.0 * lacks + float(np.sqrt(np.sum(off**2)))
-        return found if np.isfinite(found) else np.inf
+    def _point(self, v: Array, goal: Array, d: Array, w: Array) -> _Point:
+        """What descents need to know of ``v``; the merit is infinite where something is not finite."""
+        rest, rest_by_v = self._rest(v, d, w)
+        y, y_by_v = self._outputs(v, d, w)
+        lacks = float(np.sum(np.abs(rest / self._scale[: self._n_z])))
+        merit = 100.0 * lacks + float(np.linalg.norm(self._root * (y - goal)[self._tracked]))
+        return _Point(v, rest, rest_by_v, y, y_by_v, lacks, merit if np.isfinite(merit) else np.inf)
 
     def _rest(self, v: Array, d: Array, w: Array) -> tuple[Array, Array]:
         """``F(z, u) - z`` and its Jacobian ``(n_z, n_z + n_u)``."""
-        m, f = self.model, self._step
-        n_x, n_z = m.n_x, v.size - m.n_u
+        m, f, n_x, n_z = self.model, self._step, self.model.n_x, self._n_z
         f.inputs[0][:], f.inputs[1][:] = v[:n_x], v[n_x:n_z]
         f.inputs[2][:], f.inputs[3][:] = v[n_z:] + self._on_u @ d, w
         f()
@@ -232,12 +282,11 @@ class Targets:
 
     def _outputs(self, v: Array, d: Array, w: Array) -> tuple[Array, Array]:
         """Outputs and their Jacobian ``(n_y, n_z + n_u)``."""
-        m, f = self.model, self._output
-        n_z = v.size - m.n_u
+        m, f, n_z = self.model, self._output, self._n_z
         f.inputs[0][:], f.inputs[1][:], f.inputs[2][:] = v[: m.n_x], v[n_z:] + self._on_u @ d, w
         f()
         y, by_x, by_u = f.outputs
-        hidden = np.zeros((m.n_y, m.n_h))
+        hidden = np.zeros((m.n_y, n_z - m.n_x))
         return y + self._on_y @ d, np.hstack(
             [by_x.reshape(m.n_x, m.n_y).T, hidden, by_u.reshape(m.n_u, m.n_y).T]
         )

@@ -393,6 +393,20 @@ def explained_residuals(
     return trace, tuple(alarms)
 
 
+def begun(alarms: Sequence[Alarm], start: float) -> tuple[list[Alarm], list[Alarm]]:
+    """Alarms that begin before ``start`` [s], and those from then on.
+
+    One that is on already when something breaks says nothing of it.
+
+    Example:
+        >>> before, seen = begun((Alarm(1.0, 9.0, ""), Alarm(5.0, 6.0, "pump")), 4.0)
+        >>> len(before), seen[0].diagnosis
+        (1, 'pump')
+    """
+    before = [alarm for alarm in alarms if alarm.start_s < start - 1e-9]
+    return before, [alarm for alarm in alarms if alarm not in before]
+
+
 def residual_table(trace: ResidualTrace, recording: Trajectory, monitor: ResidualMonitor) -> str:
     """The trace as CSV, one row a sample: measurements, residuals and their levels with units, alarms by channel."""
     columns: dict[str, Any] = {"t_s": trace.t}

@@ -250,12 +250,17 @@ def plain_log(axis: Axis, lowest: float, highest: float) -> None:
 
 
 def number(value: float) -> str:
-    """A number as figures and tables print it: three significant digits."""
+    """A number as figures and tables print it: three significant digits.
+
+    Example:
+        >>> number(0.0255), number(1.023e-4), number(50.0)
+        ('0.0255', '0.000102', '50.0')
+    """
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     size = abs(value)
     if size < 1e-3 or size >= 1e5:
-        return f"{value:.2g}"
+        return f"{value:.3g}"
     return f"{value:.{max(0, 2 - math.floor(math.log10(size)))}f}"
 
 

@@ -277,12 +277,50 @@ def test_a_moving_reference_of_outputs_has_targets_between_a_few_steady_states()
 
 def test_the_last_steady_state_needs_no_settling_of_the_hidden_state(monkeypatch):
     """A network's memory may take a thousand steps to settle, in every period of every loop."""
-    model = two_tanks(dt=10.0)
-    targets = Targets(model, OCP(10, **TANKS))
-    start = targets.at([0.25])
+    model, ocp = two_tanks(dt=10.0), OCP(10, **TANKS)
+    start, targets = Targets(model, ocp).at([0.25]), Targets(model, ocp)
 
     def settled(*_, **__):
         raise AssertionError("asked for")
 
     monkeypatch.setattr(targets_module, "hidden_fixed_point", settled)
     assert targets.at([0.26], start=start).reached
+
+
+def pumped(rate):
+    """A level that rises with ``rate(u)``, a pump within +-1."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    level = (Signal("x", "m"),)
+    model = HybridModel.of("level", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, y=x, x_next=x + rate(u),
+                           xdot=rate(u))  # fmt: skip
+    return Targets(model, OCP(5, [0.0], [1.0], [0.0], [-1.0], [1.0], q_y=[1.0]))
+
+
+def test_newton_begins_beside_the_operating_point_where_it_stops_there():
+    """At 0.05 the rate has its least magnitude near rest, as with a machine that sticks; only -0.12 holds the level."""
+    found = pumped(lambda u: u**3 - 0.0075 * u + 7.2e-4).at([0.0])
+    assert found.reached
+    assert found.u**3 - 0.0075 * found.u == pytest.approx(-7.2e-4)
+
+
+def test_a_search_for_what_does_not_exist_ends_soon():
+    targets, points = pumped(lambda u: (u - 0.3) ** 2 + 0.01), []
+    evaluated = targets._point
+    targets._point = lambda *args: points.append(args) or evaluated(*args)
+    assert not targets.at([0.0]).steady
+    assert len(points) < 150  # of 240 steps that four descents may make, each with a dozen points
+
+
+def test_a_period_searches_widely_once(monkeypatch):
+    targets_at, wide = Targets.at, []
+
+    def at(self, *args, **options):
+        wide.append(options["wide"])
+        return targets_at(self, *args, **options)
+
+    monkeypatch.setattr(Targets, "at", at)
+    model = pumped(lambda u: (u - 0.3) ** 2 + 0.01).model
+    problem = CondensedController(model, OCP(9, [0.0], [1.0], [0.1], [-1.0], [1.0], q_y=[1.0])).problem
+    wide.clear()
+    problem.target(np.arange(10.0)[:, None])
+    assert wide == [True] + [False] * 7

@@ -165,8 +165,8 @@ def test_alarm_intervals():
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.01234, "0.0123"), (12.34, "12.3"), (123.4, "123"), (1234.5, "1234"), (2.5e-13, "2.5e-13"), (0.0, "0"),
-     (float("nan"), "nan")],
+    [(0.01234, "0.0123"), (12.34, "12.3"), (123.4, "123"), (1234.5, "1234"), (1.023e-4, "0.000102"),
+     (2.5e-13, "2.5e-13"), (0.0, "0"), (float("nan"), "nan")],
 )  # fmt: skip
 def test_numbers_have_three_digits(value, text):
     assert number(value) == text

@@ -278,10 +278,8 @@ def _monitor(context: Context) -> Any:
             windows=((0.0, load.start_s),),
             title=f"closed loop, {load.task}: an unknown load from {load.start_s:g} s on",
         )  # fmt: skip
-        unit = context.scenario.prior().inputs[0].unit
-        caption = (
-            f"The monitor inside the loop: a constant load of {load.load:g} {unit} at the input sets in."
-        )
+        first = context.scenario.prior().inputs[0]
+        caption = f"The monitor inside the loop: a constant load of {load.load:g} {first.unit} at {first.name} sets in."
         yield "monitor", "monitor_load", figure, caption
 
 

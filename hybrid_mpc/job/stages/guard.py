@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec, ModeChange
-from hybrid_mpc.job.monitor import explained
+from hybrid_mpc.job.monitor import begun, explained
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
@@ -29,7 +29,6 @@ from hybrid_mpc.monitor.calibrate import (
     MAX_EXTRAPOLATION,
     MIN_BLOCKS,
     Calibration,
-    alarm_intervals,
     stretches,
 )
 from hybrid_mpc.monitor.detector import Detector
@@ -186,7 +185,7 @@ class FaultedLoop:
         value: Its size.
         task: Name of the task.
         start_s: When it breaks [s].
-        delay_s: Time to the alarm [s]; None: never.
+        delay_s: Time to the first alarm that begins from then on [s]; None: never.
         diagnosis: What the diagnosis takes it for; empty where it says nothing.
         false_alarms: Alarms before it breaks.
         switches: Changes of the guard's mode.
@@ -220,6 +219,7 @@ def faulted(
         hybrid = kit.models["hybrid"]
         signals = hybrid.inputs if case.target.startswith("input_") else hybrid.outputs
         channel = "" if case.target.startswith("plant_") else signals[0].name
+        title = f"{case.title} ({channel})" if channel and len(signals) > 1 else case.title
         fault = Fault(start, math.inf, case.target, case.value, channel)
         spec = LoopSpec(
             named, MODEL, task.name, CONTROLLER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
@@ -229,14 +229,13 @@ def faulted(
         # The estimator is deterministic: over the record it says again what it said in the loop.
         samples = Samples(result.t, result.y, result.u)
         trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes, prior=kit.models["prior"])
-        after = np.flatnonzero(trace.alarm & (trace.t >= start - 1e-9))
-        seen = [alarm for alarm in alarms if alarm.end_s >= start - 1e-9]
+        before, seen = begun(alarms, start)
         loops.append(
             FaultedLoop(
-                case.name, case.title, case.target, case.value, task.name, start,
-                float(trace.t[after[0]]) - start if after.size else None,
+                case.name, title, case.target, case.value, task.name, start,
+                seen[0].start_s - start if seen else None,
                 seen[0].diagnosis if seen else "",
-                len(alarm_intervals(trace.alarm[trace.t < start - 1e-9], 1.0)),
+                len(before),
                 tuple(row.switches),
             )
         )  # fmt: skip

@@ -216,26 +216,32 @@ def nominal_rest(context: Context, model: HybridModel) -> tuple[float, ...]:
 def _load_loop(context: Context, kit: Kit) -> tuple[UnknownLoad, ClosedLoopResult]:
     """The first task with an unknown constant load from its middle on: does the monitor see it?"""
     task, settings = context.scenario.tasks[0], context.settings
-    start, added = 0.5 * task.duration, unknown_load(kit.problem(task.name))
+    load = unknown_load(kit.problem(task.name), kit.models["hybrid"], task.duration)
     spec = LoopSpec(
         settings.scenario, MODEL, task.name, "hybrid_observer", monitor="energy", run_seed=settings.seed,
-        faults=(Fault(start, task.duration, "input_offset", added),),
+        faults=(load,),
     )  # fmt: skip
     calm = replace(task, faults=())
     result = Bench(context.scenario, {MODEL: kit}).run(spec, task=calm)[1]
-    before, after = result.alarm[result.t < start], np.flatnonzero(result.alarm & (result.t >= start))
-    delay = float(result.t[after[0]] - start) if after.size else None
-    return UnknownLoad(task.name, added, start, delay, len(alarm_intervals(before, result.dt))), result
+    begins = np.array([begin for begin, _ in alarm_intervals(result.alarm, result.dt)])
+    seen = begins[begins >= load.start - 1e-9]
+    delay = float(seen[0] - load.start) if seen.size else None
+    return UnknownLoad(task.name, load.value, load.start, delay, begins.size - seen.size), result
 
 
-def unknown_load(control: OCP) -> float:
-    """Load of the demonstration at the first input [input unit].
+def unknown_load(control: OCP, model: HybridModel, duration: float) -> Fault:
+    """Load of the demonstration at the first input, from the middle of a task of that ``duration`` [s] on.
 
     Example:
-        >>> unknown_load(OCP(9, [1.0], [1.0], [1.0], u_min=[-5.0], u_max=[0.0]))
-        0.5
+        >>> from types import SimpleNamespace as Some
+        >>> arm = Some(inputs=[Some(name="tau_1"), Some(name="tau_2")])
+        >>> ocp = OCP(9, [1.0], [1.0] * 2, [1.0] * 2, u_min=[-5.0, -1.0], u_max=[0.0, 1.0])
+        >>> load = unknown_load(ocp, arm, 6.0)
+        >>> load.start, load.value, load.channel
+        (3.0, 0.5, 'tau_1')
     """
-    return LOAD_SHARE * float(0.5 * control.input_range[0])
+    size = LOAD_SHARE * float(0.5 * control.input_range[0])
+    return Fault(0.5 * duration, duration, "input_offset", size, model.inputs[0].name)
 
 
 def clean_windows(

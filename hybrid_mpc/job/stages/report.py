@@ -616,13 +616,14 @@ def _residual_tables(found: Residuals) -> list[Table | None]:
             (
                 f"{row.fault} of {row.channel}",
                 row.start_s,
-                row.delay_s,
+                "never" if row.delay_s is None else f"{row.delay_s:.3g}",
+                row.false_alarms,
                 ", ".join(row.channels),
                 row.diagnosis,
             )
             for row in found.faults
         ]
-        columns = ("fault", "at [s]", "alarm after [s]", "channels", "taken for")
+        columns = ("fault", "at [s]", "alarm after [s]", "alarms before", "channels", "taken for")
         tables.append(Table(columns, broken, "Loops in which something breaks."))
     return tables
 

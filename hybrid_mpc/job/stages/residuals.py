@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
-from hybrid_mpc.job.monitor import explained_residuals
+from hybrid_mpc.job.monitor import begun, explained_residuals
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
@@ -65,7 +65,7 @@ class FaultedChannel:
         value: Its size.
         task: Name of the task.
         start_s: When it sets in [s].
-        delay_s: Time to the first alarm [s]; None: never.
+        delay_s: Time to the first alarm that begins from then on [s]; None: never.
         channels: The channels of that alarm.
         diagnosis: What the diagnosis takes it for; empty where it says nothing.
         false_alarms: Alarms before it sets in.
@@ -232,12 +232,11 @@ def _faulted(context: Context, kit: Kit, task_name: str) -> tuple[FaultedChannel
         _, alarms = explained_residuals(
             monitor, bench.parts(spec)[0], record, kit.models["prior"], kit.causes
         )
-        before = [alarm for alarm in alarms if alarm.start_s < start - 1e-9]
-        seen = [alarm for alarm in alarms if alarm.end_s >= start - 1e-9]
+        before, seen = begun(alarms, start)
         found.append(
             FaultedChannel(
                 fault.target, fault.channel, fault.value, task_name, start,
-                max(seen[0].start_s - start, 0.0) if seen else None,
+                seen[0].start_s - start if seen else None,
                 seen[0].channels if seen else (), seen[0].diagnosis if seen else "", len(before),
             )
         )  # fmt: skip
