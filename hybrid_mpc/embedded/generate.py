@@ -125,7 +125,7 @@ def _modes(estimator: Filter) -> tuple[ExtendedKalmanFilter, ...]:
 def _config(sizes: Mapping[str, int], single: bool) -> str:
     names = "".join(f"#define HMPC_{name} {value}\n" for name, value in sizes.items())
     # A float has seven digits: the QP is as exact as that allows.
-    exact = ("1e-4", "1e-4", "2e-3", "1e-4") if single else (
+    exact = ("2e-5", "1e-4", "2e-3", "1e-3") if single else (
         "1e-10", "1e-12", repr(KKT_TOLERANCE), repr(BOUND_TOLERANCE)
     )  # fmt: skip
     tolerances = zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE"), exact, strict=True)
@@ -137,7 +137,7 @@ def _config(sizes: Mapping[str, int], single: bool) -> str:
         + names
         + "".join(f"#define HMPC_{name} R({value})\n" for name, value in tolerances)
         + f"#define HMPC_NEGLIGIBLE {NEGLIGIBLE!r}\n"
-        + "#define HMPC_QP_CAP (8 * (HMPC_BLOCKS * HMPC_NU) + 100) /* iterations of the QP */\n#endif\n"
+        + "#define HMPC_QP_CAP (4 * HMPC_MOST + 100) /* iterations of the QP */\n#endif\n"
     )
 
 

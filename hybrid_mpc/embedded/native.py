@@ -31,14 +31,19 @@ _BRIDGE = """
 #define PLACE(field) offsetof(hmpc_state, field)
 const size_t hmpc_places[] = {
   sizeof(hmpc_state), PLACE(x), PLACE(h), PLACE(d), PLACE(w), PLACE(plan.u), PLACE(plan.z), PLACE(plan.w),
-  PLACE(plan.cost), PLACE(plan.excess), PLACE(working.kkt), PLACE(linear.largest_defect)
+  PLACE(plan.cost), PLACE(plan.excess), PLACE(working.kkt), PLACE(linear.largest_defect), PLACE(u), PLACE(status),
+  PLACE(source), PLACE(age)
 };
 """
 """What the state's fields are found by."""
-FIELDS = ("x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect")
+FIELDS = (
+    "x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect", "u", "status", "source", "age",
+)  # fmt: skip
 
 
-class _Goal(ctypes.Structure):
+class Goal(ctypes.Structure):
+    """``hmpc_goal``."""
+
     _fields_ = (
         ("x", ctypes.c_void_p), ("rows", ctypes.c_int), ("weight", ctypes.c_void_p), ("u", ctypes.c_void_p),
         ("u_min", ctypes.c_void_p), ("u_max", ctypes.c_void_p),
@@ -76,33 +81,16 @@ class NativeController(SplitController):
     def __init__(self, model: HybridModel, ocp: OCP, *, flags: Sequence[str] = FLAGS) -> None:
         self.problem = Problem(model, ocp)
         self._library = load_library(make_sources(model, ocp), flags)
-        self._places = dict(zip(FIELDS, self._library.places[1:], strict=True))
-        self._memory = np.zeros(-(-self._library.places[0] // 64) * 8 + 8)
-        self._state = ctypes.c_void_p(-(-self._memory.ctypes.data // 64) * 64)
-        self._library.c.hmpc_clear(self._state)
+        self._state = State(self._library)
         self._ticket = 0
-        n, n_z = ocp.horizon, model.n_x + model.n_h
-        padded = -(-n_z // 8) * 8
-        shapes: dict[str, tuple[int, ...]] = {
-            "x": (model.n_x,), "h": (model.n_h,), "d": (model.n_d,), "w": (model.n_w,), "plan_u": (n, ocp.n_u),
-            "plan_z": (n + 1, padded), "plan_w": (n, max(1, model.n_w)), "cost": (1,), "excess": (1,), "kkt": (1,),
-            "defect": (1,),
-        }  # fmt: skip
-        start = int(self._state.value or 0) - self._memory.ctypes.data
-        data = self._memory.view(np.uint8)
-        self._view = {
-            name: data[start + at : start + at + 8 * int(np.prod(shapes[name]))].view(np.float64).reshape(shapes[name])
-            for name, at in self._places.items()
-        }
-        self._steady_u = np.tile(model.u0, (n, 1))
 
     def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
         """See :meth:`~hybrid_mpc.control.rti.CondensedController.prepare`."""
         start = perf_counter()
         weight = None if weight is None else np.ascontiguousarray(self.problem.weights(weight))
         self._load(previous)
-        goal = _goal(weight=weight)
-        self._library.c.hmpc_prepare(self._state, ctypes.byref(goal))
+        goal = goal_of(weight=weight)
+        self._library.c.hmpc_prepare(self._state.at, ctypes.byref(goal))
         self._ticket += 1
         return Prepared(previous, weight, self._ticket, (perf_counter() - start) * 1e3)
 
@@ -115,7 +103,7 @@ class NativeController(SplitController):
             prepared = self.prepare(prepared.previous, prepared.weight)
         start = perf_counter()
         self._ticket += 1
-        view, m, problem = self._view, self.model, self.problem
+        view, m, problem = self._state.view, self.model, self.problem
         rows = np.ascontiguousarray(np.asarray(reference, dtype=np.float64))
         if rows.ndim != 2 or len(rows) < 1 or rows.shape[1] != m.n_x:
             problem.target(reference)  # says what is wrong
@@ -124,14 +112,14 @@ class NativeController(SplitController):
             view["w"][:] = estimate.w
         ahead = np.ascontiguousarray(problem.forecast(w, estimate)) if m.n_w else None
         bounds = (None, None) if limits is None else (limits.u_min, limits.u_max)
-        goal = _goal(rows, prepared.weight, *bounds)
+        goal = goal_of(rows, prepared.weight, *bounds)
         status = STATUS[
             self._library.c.hmpc_feedback(
-                self._state, ctypes.byref(goal), None if ahead is None else ahead.ctypes.data, self.ocp.horizon
+                self._state.at, ctypes.byref(goal), None if ahead is None else ahead.ctypes.data, self.ocp.horizon
             )
         ]
         spent = (perf_counter() - start) * 1e3
-        self._library.c.hmpc_complete(self._state)
+        self._library.c.hmpc_complete(self._state.at)
         z, u, n_x = view["plan_z"][:, : m.n_x + m.n_h].copy(), view["plan_u"].copy(), m.n_x
         n_w, d = m.n_w, estimate.d if status.ok else prepared.previous.d
         return Solution(
@@ -152,24 +140,48 @@ class NativeController(SplitController):
         z = np.hstack([plan.x, plan.h])
         w = plan.w if len(plan.w) else self.problem.forecast(None, None)
         given = [np.ascontiguousarray(v, dtype=np.float64) for v in (plan.u, z, plan.d, w if m.n_w else np.zeros(1))]
-        self._library.c.hmpc_load_plan(self._state, *(v.ctypes.data for v in given))
+        self._library.c.hmpc_load_plan(self._state.at, *(v.ctypes.data for v in given))
 
 
-def _goal(
+def goal_of(
     x: Array | None = None, weight: Array | None = None, u_min: Array | None = None, u_max: Array | None = None
-) -> _Goal:
+) -> Goal:
     def at(array: Array | None) -> int | None:
         return None if array is None else array.ctypes.data
 
-    return _Goal(at(x), 1 if x is None else len(x), at(weight), None, at(u_min), at(u_max))
+    return Goal(at(x), 1 if x is None else len(x), at(weight), None, at(u_min), at(u_max))
 
 
 @dataclass(frozen=True)
 class Library:
-    """A loaded library, and the places of the state's fields [bytes], its size first."""
+    """A loaded library, its sizes, and the places of the state's fields [bytes], the state's size first."""
 
     c: Any
+    sizes: Mapping[str, int]
     places: tuple[int, ...]
+
+
+class State:
+    """A ``hmpc_state`` in double precision, cleared; ``at`` is its address, ``view`` are arrays on some of its fields."""
+
+    def __init__(self, library: Library) -> None:
+        n = library.sizes
+        n_z, n_w = n["NX"] + n["NH"], n["NW"]
+        shapes: dict[str, tuple[int, ...]] = {
+            "x": (n["NX"],), "h": (n["NH"],), "d": (n["ND"],), "w": (n_w,), "plan_u": (n["N"], n["NU"]),
+            "plan_z": (n["N"] + 1, -(-n_z // 8) * 8), "plan_w": (n["N"], max(1, n_w)), "u": (n["NU"],),
+        }  # fmt: skip
+        size, *places = library.places
+        memory = np.zeros(size + 64, dtype=np.uint8)
+        start = -memory.ctypes.data % 64
+        self.at = ctypes.c_void_p(memory.ctypes.data + start)
+        self.view: dict[str, NDArray[Any]] = {}
+        for name, place in zip(FIELDS, places, strict=True):
+            kind = np.dtype(np.int32 if name in ("status", "source", "age") else np.float64)
+            shape = shapes.get(name, (1,))
+            field = memory[start + place :][: kind.itemsize * int(np.prod(shape))]
+            self.view[name] = field.view(kind).reshape(shape)
+        library.c.hmpc_clear(self.at)
 
 
 def load_library(sources: Sources, flags: Sequence[str] = FLAGS) -> Library:
@@ -180,12 +192,17 @@ def load_library(sources: Sources, flags: Sequence[str] = FLAGS) -> Library:
     signatures: dict[str, tuple[Any, ...]] = {
         "clear": (state,), "prepare": (state, pointer), "complete": (state,),
         "load_plan": (state, pointer, pointer, pointer, pointer), "feedback": (state, pointer, pointer, ctypes.c_int),
+        "decide": (state, pointer, pointer), "begin": (state, pointer, pointer),
     }  # fmt: skip
+    if sources.sizes["MODES"]:
+        signatures |= {name: (state, pointer, pointer, pointer, pointer) for name in ("start", "step")}
+        signatures |= {"estimate_start": (state, pointer, pointer), "finish": (state, pointer)}
+        signatures |= {"estimate_update": (state, pointer, pointer, pointer)}
     for name, given in signatures.items():
         f = getattr(c, f"hmpc_{name}")
         f.argtypes, f.restype = given, ctypes.c_int if name == "feedback" else None
     places = (ctypes.c_size_t * (len(FIELDS) + 1)).in_dll(c, "hmpc_places")
-    return Library(c, tuple(places))
+    return Library(c, sources.sizes, tuple(places))
 
 
 def one_file(texts: Mapping[str, str]) -> str:

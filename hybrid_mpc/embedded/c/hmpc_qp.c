@@ -33,6 +33,7 @@ static const real *soft_row(const hmpc_qp *qp, const hmpc_linear *linear, int ro
 #else
   *kind = 0;
   (void)qp;
+  (void)row;
   return linear->from_u[0][0];
 #endif
 }
@@ -277,8 +278,13 @@ static void primal(const hmpc_qp *qp, const hmpc_working *w, const real *start, 
 static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_working *w, const real *s, real *by) {
   unsigned char inside[SOFT_LOWER + HMPC_DIM(HMPC_SOFT)] = {0};
   int found = -1;
-  *by = HMPC_VIOLATED;
-  for (int k = 0; k < w->count; ++k) inside[w->id[k]] = 1;
+  real largest = R(1e3);
+  for (int k = 0; k < w->count; ++k) {
+    inside[w->id[k]] = 1;
+    largest = hmpc_max(largest, w->multiplier[k]);
+  }
+  /* rounding grows with the multipliers */
+  *by = hmpc_min(HMPC_VIOLATED * R(1e-3) * largest, R(0.5) * HMPC_BOUND_TOLERANCE);
   for (int i = 0; i < HMPC_NV; ++i) {
     const real before = i >= HMPC_NU ? s[i - HMPC_NU] : R(0.0);
     const real over[4] = {s[i] - qp->upper[i], qp->lower[i] - s[i], (s[i] - before) - qp->change_upper[i],
@@ -326,8 +332,7 @@ static hmpc_status checked(const hmpc_qp *qp, const hmpc_linear *linear, hmpc_wo
     largest = hmpc_max(largest, hmpc_min(hmpc_abs(w->multiplier[k]), hmpc_abs(room)));
     violation = hmpc_max(violation, -room);
   }
-  (void)worst(qp, linear, w, s, &by);
-  violation = hmpc_max(violation, by);
+  if (worst(qp, linear, w, s, &by) >= 0) violation = hmpc_max(violation, by);
   real sum = R(0.0); /* NaN where anything is */
   for (int i = 0; i < HMPC_NV; ++i) {
     largest = hmpc_max(largest, hmpc_abs(rest[i]));
