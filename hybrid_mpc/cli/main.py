@@ -19,7 +19,7 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
-from hybrid_mpc.cli import analyze, benchmark, check, control, data, monitor, new, run, scenarios, study, tune
+from hybrid_mpc.cli import analyze, benchmark, check, control, data, export, monitor, new, run, scenarios, study, tune
 from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.files import reason
 
@@ -56,6 +56,7 @@ app.command("tune", epilog=tune.EXAMPLES)(tune.tune)
 app.command("monitor", epilog=monitor.EXAMPLES)(monitor.monitor)
 app.command("scenarios")(scenarios.scenarios)
 app.add_typer(study.app, name="study")
+app.add_typer(export.app, name="export")
 for entry in entry_points(group="hybrid_mpc.commands"):  # commands of scenarios, e.g. `reproduce`
     command = entry.load()
     app.command(entry.name, epilog=sys.modules[entry.module].EXAMPLES)(command)

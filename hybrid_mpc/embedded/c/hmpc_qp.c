@@ -415,7 +415,12 @@ hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
       backward(w, at, row);
       real most = HMPC_HUGE;
       int first = -1, up = 0;
-      const real own = penalty(qp, w->id[at], &yields) - w->multiplier[at];
+      const real from_own = penalty(qp, w->id[at], &yields);
+      const real own = w->beyond[at] ? HMPC_HUGE : from_own - w->multiplier[at];
+      if (++w->iterations >= HMPC_QP_CAP) {
+        w->count = 0;
+        return HMPC_INACCURATE;
+      }
       for (int k = 0; k < at; ++k) {
         real other;
         const real from = penalty(qp, w->id[k], &other), low = w->beyond[k] ? from : R(0.0);
@@ -433,7 +438,7 @@ hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
         w->multiplier[at] += own;
         w->beyond[at] = 1;
       } else {
-        if (first < 0 || ++w->iterations >= HMPC_QP_CAP) {
+        if (first < 0) {
           w->count = 0;
           return HMPC_INFEASIBLE;
         }
