@@ -44,7 +44,7 @@ class Sources:
 
 def make_sources(
     model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
-    safe_input: Array | None = None, single: bool = False,
+    safe_input: Array | None = None, single: bool = False, targets: bool = False,
 ) -> Sources:  # fmt: skip
     """The generated files of a controller.
 
@@ -55,11 +55,12 @@ def make_sources(
         fallback: The prior, see :class:`~hybrid_mpc.control.safeguard.SafeController`. Default: none.
         safe_input: Likewise.
         single: Whether numbers are ``float``. Default: ``double``.
+        targets: Whether steady states for set-points of outputs are handed to it. Default: no.
 
     Raises:
         InputError: If something of them has no C, all at once, by name.
     """
-    refused = _refused(model, ocp, estimator)
+    refused = _refused(model, ocp, estimator, targets)
     parts: Cut | None = None
     try:
         parts = cut(model)
@@ -78,33 +79,33 @@ def make_sources(
         "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": states.size, "SOFT_E": expressions, "MODES": len(modes),
         "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": MAX_AGE, "FIRST": FIRST,
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
+        "OUTPUT_COST": int(ocp.n_y > 0), "SOFT_D": int(ocp.y_min.size > 0),
     }  # fmt: skip
-    code, model_sizes, operations = _expressions(model, parts, soft, fallback, ocp, bool(modes))
+    code, model_sizes, operations = _expressions(model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0)
     sizes |= model_sizes
     tables = _tables(model, ocp, problem, soft, states, fallback, safe_input, estimator)
     texts = {"hmpc_config.h": _config(sizes, single), "hmpc_tables.h": tables, "hmpc_expressions.h": code}
     return Sources(texts, operations, sizes)
 
 
-def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None) -> list[str]:
+def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, targets: bool) -> list[str]:
     """What of a controller has no C yet, in words."""
     cases = {
-        "weights on outputs (q_y), which need the target calculator": ocp.n_y > 0,
-        "bounds on outputs (y_min, y_max); give x_min, x_max or a SoftBound of (x, u)": ocp.y_min.size > 0,
+        "weights on outputs (q_y), which need the target calculator": ocp.n_y > 0 and not targets,
         "an economic stage cost": ocp.economic is not None,
-        "soft bounds of measured disturbances, (x, u, w)": any(b.expression.n_in() > 2 for b in ocp.soft),
         "several first plans (starts)": bool(ocp.starts),
         "a forecast of measured disturbances (preview_w)": ocp.preview_w and model.n_w > 0,
     }
     found = [what for what, wrong in cases.items() if wrong]
+    if estimator is not None or ocp.n_y:
+        found += _refused_outputs(model, estimator is not None)
     if estimator is not None:
-        found += _refused_outputs(model)
         if not all(isinstance(f, ExtendedKalmanFilter) for f in _modes(estimator)):
             found.append(f"the estimator {type(estimator).__name__}")
     return found
 
 
-def _refused_outputs(model: HybridModel) -> list[str]:
+def _refused_outputs(model: HybridModel, measured: bool) -> list[str]:
     slopes = output_with_jacobian(model)
     rng = np.random.default_rng(0)
     points = [(model.x0, model.u0, model.w)]
@@ -112,8 +113,8 @@ def _refused_outputs(model: HybridModel) -> list[str]:
     c, d = ([slopes(*p)[i].full() for p in points] for i in (1, 2))
     moved = max(float(np.max(np.abs(m - ms[0]), initial=0.0)) for ms in (c, d) for m in ms)
     if not moved <= 1e-12 * max(1.0, float(np.max(np.abs(c[0])))):
-        return ["an estimator whose outputs are not linear in state and input"]
-    if np.linalg.matrix_rank(c[0]) < model.n_y:
+        return ["outputs that are not linear in state and input, for an estimator or weights on them"]
+    if measured and np.linalg.matrix_rank(c[0]) < model.n_y:
         return ["an estimator with more sensors than states that they show"]
     return []
 
@@ -219,8 +220,8 @@ def _expressions(
         for name, by, width in (("by_x", x, n_x), ("by_u", u, n_u)):
             jacobian = ca.densify(ca.jacobian(value, by))
             outs += [(f"{name}[{i * width + j}]", jacobian[i, j]) for i in range(value.numel()) for j in range(width)]
-        arguments = ["const real *x", "const real *u", "const real *w", "real *value", "real *by_x", "real *by_u"]
-        add("soft_expressions", arguments, {"x": x, "u": u, "w": w}, outs)
+        arguments = [*(f"const real *{name}" for name in "xuwd"), *(f"real *{name}" for name in ("value", "by_x", "by_u"))]
+        add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d}, outs)
     if measured:
         y = _scalar("the output", model.output)(x, u, w, ca.DM(model.p))
         outs = [(f"y[{i}]", y[i]) for i in range(model.n_y)]
@@ -326,14 +327,17 @@ def _tables(
     if fallback is not None:
         gain = dare(*ocp.linear_quadratic(fallback))[1]
         reals["gain"] = gain[:, : ocp.n_x + fallback.delay_states]
+    if estimator is not None or ocp.n_y:
+        c, by_u = (m.full() for m in output_with_jacobian(model)(model.x0, model.u0, model.w)[1:])
+        reals |= {"output_x": c, "output_d": by_u @ on_u + on_y, "disturbs_y": on_y}
+        rest = model.output(model.x0, model.u0, model.w, model.p).full().ravel()
+        reals |= {"q_y": ocp.q_y * dt, "output_u": by_u, "y_rest": rest} if ocp.n_y else {}
     if estimator is not None:
         modes = _modes(estimator)
-        c, by_u = (m.full() for m in output_with_jacobian(model)(model.x0, model.u0, model.w)[1:])
         switching = isinstance(estimator, SwitchingFilter)
         reals |= {
-            "disturbs_y": on_y, "noise": np.array([f.noise[0] for f in modes]), "noise_y": modes[0].noise[1],
+            "noise": np.array([f.noise[0] for f in modes]), "noise_y": modes[0].noise[1],
             "first_variance": np.array([f.first for f in modes]), "lost_variance": np.array([f.most for f in modes]),
-            "output_x": c, "output_d": by_u @ on_u + on_y,
             "switches": estimator.transition if switching else np.ones((1, 1)),
             "first_probability": estimator.first_probability if switching else np.ones(1),
         }  # fmt: skip

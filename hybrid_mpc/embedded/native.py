@@ -46,7 +46,7 @@ class Goal(ctypes.Structure):
 
     _fields_ = (
         ("x", ctypes.c_void_p), ("rows", ctypes.c_int), ("weight", ctypes.c_void_p), ("u", ctypes.c_void_p),
-        ("u_min", ctypes.c_void_p), ("u_max", ctypes.c_void_p),
+        ("y", ctypes.c_void_p), ("u_min", ctypes.c_void_p), ("u_max", ctypes.c_void_p),
     )  # fmt: skip
 
 
@@ -80,7 +80,7 @@ class NativeController(SplitController):
 
     def __init__(self, model: HybridModel, ocp: OCP, *, flags: Sequence[str] = FLAGS) -> None:
         self.problem = Problem(model, ocp)
-        self._library = load_library(make_sources(model, ocp), flags)
+        self._library = load_library(make_sources(model, ocp, targets=True), flags)
         self._state = State(self._library)
         self._ticket = 0
 
@@ -104,15 +104,21 @@ class NativeController(SplitController):
         start = perf_counter()
         self._ticket += 1
         view, m, problem = self._state.view, self.model, self.problem
-        rows = np.ascontiguousarray(np.asarray(reference, dtype=np.float64))
-        if rows.ndim != 2 or len(rows) < 1 or rows.shape[1] != m.n_x:
-            problem.target(reference)  # says what is wrong
+        u = y = steady = None
+        if problem.targets is None:
+            rows = np.ascontiguousarray(np.asarray(reference, dtype=np.float64))
+            if rows.ndim != 2 or len(rows) < 1 or rows.shape[1] != m.n_x:
+                problem.target(reference)  # says what is wrong
+        else:
+            target = problem.target(reference, None, estimate, w, prepared.previous.steady)
+            rows, u, y = (np.ascontiguousarray(v) for v in (target.x, target.u, target.y))
+            steady = target.steady
         view["x"][:], view["h"][:], view["d"][:] = estimate.x, estimate.h, estimate.d
         if m.n_w:
             view["w"][:] = estimate.w
         ahead = np.ascontiguousarray(problem.forecast(w, estimate)) if m.n_w else None
         bounds = (None, None) if limits is None else (limits.u_min, limits.u_max)
-        goal = goal_of(rows, prepared.weight, *bounds)
+        goal = goal_of(rows, prepared.weight, *bounds, u=u, y=y)
         status = STATUS[
             self._library.c.hmpc_feedback(
                 self._state.at, ctypes.byref(goal), None if ahead is None else ahead.ctypes.data, self.ocp.horizon
@@ -120,12 +126,13 @@ class NativeController(SplitController):
         ]
         spent = (perf_counter() - start) * 1e3
         self._library.c.hmpc_complete(self._state.at)
-        z, u, n_x = view["plan_z"][:, : m.n_x + m.n_h].copy(), view["plan_u"].copy(), m.n_x
+        z, plan, n_x = view["plan_z"][:, : m.n_x + m.n_h].copy(), view["plan_u"].copy(), m.n_x
         n_w, d = m.n_w, estimate.d if status.ok else prepared.previous.d
         return Solution(
-            u, z[:, :n_x], z[:, n_x:], d, float(view["cost"][0]), status, float(view["kkt"][0]),
+            plan, z[:, :n_x], z[:, n_x:], d, float(view["cost"][0]), status, float(view["kkt"][0]),
             float(view["defect"][0]), {"prepare": prepared.milliseconds, "feedback": spent},
             float(view["excess"][0]), w=view["plan_w"][:, :n_w].copy(),
+            steady=steady if status.ok else prepared.previous.steady,
         )  # fmt: skip
 
     def solve(
@@ -144,12 +151,15 @@ class NativeController(SplitController):
 
 
 def goal_of(
-    x: Array | None = None, weight: Array | None = None, u_min: Array | None = None, u_max: Array | None = None
-) -> Goal:
+    x: Array | None = None, weight: Array | None = None, u_min: Array | None = None, u_max: Array | None = None,
+    *, u: Array | None = None, y: Array | None = None,
+) -> Goal:  # fmt: skip
+    """What a plan is to follow; the arrays, row by row, must outlive it."""
+
     def at(array: Array | None) -> int | None:
         return None if array is None else array.ctypes.data
 
-    return Goal(at(x), 1 if x is None else len(x), at(weight), None, at(u_min), at(u_max))
+    return Goal(at(x), 1 if x is None else len(x), at(weight), at(u), at(y), at(u_min), at(u_max))
 
 
 @dataclass(frozen=True)

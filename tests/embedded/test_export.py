@@ -47,8 +47,8 @@ int main(int count, char **words) {
     }
     for (int i = 0; i < HMPC_NU; ++i) u[i] = rubbish(s.u[i]);
     const real low[HMPC_NU] = {R(-0.1)}, high[HMPC_NU] = {R(0.1)};
-    const hmpc_goal goal = {x, k % 3 ? 1 : HMPC_N + 1, k % 11 ? (real *)0 : weight, (real *)0, k % 7 ? (real *)0 : low,
-                            k % 7 ? (real *)0 : high};
+    const hmpc_goal goal = {.x = x, .rows = k % 3 ? 1 : HMPC_N + 1, .weight = k % 11 ? (real *)0 : weight,
+                            .u_min = k % 7 ? (real *)0 : low, .u_max = k % 7 ? (real *)0 : high};
     if (k % 400 == 0) hmpc_start(&s, y, w, k % 800 ? u : (real *)0, &goal);
     else hmpc_step(&s, y, k % 2 ? w : (real *)0, k % 9 ? (real *)0 : u, &goal);
     if (k % 3) hmpc_finish(&s, k % 5 ? &goal : (hmpc_goal *)0);

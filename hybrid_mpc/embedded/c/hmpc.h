@@ -47,6 +47,7 @@ typedef struct {
   int rows;                /* of x */
   const hmpc_real *weight; /* factors on the states' weights, HMPC_N + 1 rows of HMPC_NX */
   const hmpc_real *u;      /* target inputs, HMPC_N rows of HMPC_NU */
+  const hmpc_real *y;      /* where outputs are weighed, their reference, HMPC_N rows of HMPC_NY */
   const hmpc_real *u_min;  /* tighter limits of the inputs, HMPC_NU */
   const hmpc_real *u_max;
 } hmpc_goal;

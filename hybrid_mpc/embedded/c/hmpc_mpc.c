@@ -115,6 +115,29 @@ static void add_product(real (*hessian)[HMPC_LD], real factor, const real *a, co
   for (int i = 0; i < n; ++i) hmpc_add(hessian[i], factor * a[i], b, i + 1);
 }
 
+#if HMPC_OUTPUT_COST
+/* Derivative of an output of period k by the unknowns; returned is how many of them it depends on. */
+static int output_row(const hmpc_linear *linear, int k, int i, real *row) {
+  const int first = block_of[k] * HMPC_NU;
+  memset(row, 0, sizeof(real) * HMPC_LD);
+  for (int j = 0; j < HMPC_NX; ++j) hmpc_add(row, output_x[i][j], linear->from_u[k][j], HMPC_NV);
+  for (int j = 0; j < HMPC_NU; ++j) row[first + j] += output_u[i][j] * u_scale[j];
+  return first + HMPC_NU;
+}
+
+/* Outputs of period k without a step, less their reference. */
+static void output_error(const hmpc_state *s, const hmpc_goal *goal, int k, real *error) {
+  real x[HMPC_NX], v[HMPC_NU];
+  for (int i = 0; i < HMPC_NX; ++i) x[i] = s->linear.z[k][i] + s->dz[k][i];
+  acting(s->linear.u[k], s->d, v);
+  outputs(x, v, s->linear.w[k], error);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    for (int j = 0; j < HMPC_ND; ++j) error[i] += disturbs_y[i][j] * s->d[j];
+    error[i] -= goal && goal->y ? goal->y[k * HMPC_NY + i] : y_rest[i];
+  }
+}
+#endif
+
 static void make_hessian(hmpc_state *s) {
   hmpc_linear *const linear = &s->linear;
   hmpc_qp *const qp = &s->qp;
@@ -126,6 +149,14 @@ static void make_hessian(hmpc_state *s) {
       if (factor < R(0.0) || factor > R(0.0))
         add_product(qp->hessian, factor, linear->from_u[k][i], linear->from_u[k][i], (block_of[k - 1] + 1) * HMPC_NU);
     }
+#if HMPC_OUTPUT_COST
+  for (int k = 0; k < HMPC_N; ++k)
+    for (int i = 0; i < HMPC_NY; ++i) {
+      real row[HMPC_LD];
+      const int m = output_row(linear, k, i, row);
+      if (q_y[i] > R(0.0)) add_product(qp->hessian, R(2.0) * q_y[i], row, row, m);
+    }
+#endif
   for (int i = 0; i < HMPC_NX; ++i) {
     real row[HMPC_LD] = {R(0.0)};
     for (int j = 0; j < HMPC_NX; ++j) hmpc_add(row, linear->terminal[i][j], linear->from_u[HMPC_N][j], HMPC_NV);
@@ -148,7 +179,8 @@ static void make_hessian(hmpc_state *s) {
   hmpc_qp_factor(qp);
 }
 
-static void make_soft(hmpc_state *s) {
+/* Soft bounds along the plan; those of outputs depend on the disturbances. */
+static void make_soft(hmpc_state *s, const real *d) {
 #if HMPC_SOFT > 0
   hmpc_linear *const linear = &s->linear;
   for (int k = 0; k < HMPC_N; ++k) {
@@ -158,7 +190,7 @@ static void make_soft(hmpc_state *s) {
 #if HMPC_SOFT_E > 0
     real value[HMPC_SOFT_E], by_u[HMPC_SOFT_E][HMPC_NU];
     memset(by_u, 0, sizeof by_u);
-    soft_expressions(linear->z[k], linear->u[k], linear->w[k], value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
+    soft_expressions(linear->z[k], linear->u[k], linear->w[k], d, value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
     for (int e = 0; e < HMPC_SOFT_E; ++e) {
       const int row = k * HMPC_SOFT_E + e;
       real *const slope = s->qp.slope[row];
@@ -172,6 +204,7 @@ static void make_soft(hmpc_state *s) {
 #else
   (void)s;
 #endif
+  (void)d;
 }
 
 static void set_weights(hmpc_linear *linear, const hmpc_goal *goal) {
@@ -205,7 +238,7 @@ static void linearize(hmpc_state *s, int append) {
   }
   condense(s);
   make_hessian(s);
-  make_soft(s);
+  make_soft(s, linear->d);
   s->prepared = 1;
 }
 
@@ -324,7 +357,7 @@ static void set_soft(hmpc_state *s) {
 }
 
 /* Cost of the plan that qp.step makes of the prepared one, and the largest violation of a soft bound. */
-static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_goal) {
+static void assess(hmpc_state *s, const hmpc_goal *goal_of, const real *x_goal, int rows, const real *u_goal) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
   real total = R(0.0), error[HMPC_NX], before[HMPC_NU];
@@ -345,6 +378,19 @@ static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_go
   }
   for (int i = 0; i < HMPC_NX; ++i)
     for (int j = 0; j < HMPC_NX; ++j) total += error[i] * linear->terminal[i][j] * error[j];
+#if HMPC_OUTPUT_COST
+  for (int k = 0; k < HMPC_N; ++k) {
+    real row[HMPC_LD], off[HMPC_NY];
+    output_error(s, goal_of, k, off);
+    for (int i = 0; i < HMPC_NY; ++i) {
+      const int m = output_row(linear, k, i, row);
+      const real all = off[i] + hmpc_dot(row, step, m);
+      if (q_y[i] > R(0.0)) total += q_y[i] * all * all;
+    }
+  }
+#else
+  (void)goal_of;
+#endif
   real excess = R(0.0);
 #if HMPC_SOFT > 0
   for (int row = 0; row < HMPC_SOFT; ++row) {
@@ -426,6 +472,16 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
       slope += linear->terminal[i][j] * (linear->z[HMPC_N][j] + s->dz[HMPC_N][j] - last[j]);
     hmpc_add(qp->gradient, R(2.0) * slope, linear->from_u[HMPC_N][i], HMPC_NV);
   }
+#if HMPC_OUTPUT_COST
+  for (int k = 0; k < HMPC_N; ++k) {
+    real row[HMPC_LD], error[HMPC_NY];
+    output_error(s, goal, k, error);
+    for (int i = 0; i < HMPC_NY; ++i) {
+      const int m = output_row(linear, k, i, row);
+      if (q_y[i] > R(0.0)) hmpc_add(qp->gradient, R(2.0) * q_y[i] * error[i], row, m);
+    }
+  }
+#endif
   for (int k = 0; k < HMPC_N; ++k)
     for (int j = 0; j < HMPC_NU; ++j) {
       const int i = block_of[k] * HMPC_NU + j;
@@ -436,6 +492,7 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
           R(2.0) * (r[j] * (u - goal_u) + r_delta[j] * ((u - before) - (after - u))) * u_scale[j];
     }
   for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
+  if (HMPC_SOFT_D && memcmp(linear->d, s->d, sizeof linear->d) != 0) make_soft(s, s->d);
   set_soft(s);
   set_bounds(s, goal);
   int fine = all_finite(qp->gradient, HMPC_NV) && all_finite(s->x, HMPC_NX) && all_finite(s->d, HMPC_ND) &&
@@ -444,7 +501,7 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
   if (!fine) return failed(s, HMPC_NOT_FINITE);
   const hmpc_status status = hmpc_qp_solve(qp, &s->working, linear);
   if (status != HMPC_SOLVED) return failed(s, status);
-  assess(s, x_goal, rows, u_goal);
+  assess(s, goal, x_goal, rows, u_goal);
   if (!hmpc_finite(s->plan.cost)) return failed(s, HMPC_NOT_FINITE);
   for (int k = 0; k < HMPC_N; ++k) {
     real low[HMPC_NU], high[HMPC_NU];

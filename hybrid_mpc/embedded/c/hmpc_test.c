@@ -7,7 +7,7 @@
 static hmpc_state state; /* 8-byte numbers at the machine's ease; the library itself has no such thing */
 
 int main(void) {
-  const hmpc_goal goal = {vector_goal[0], 1, (const real *)0, (const real *)0, (const real *)0, (const real *)0};
+  const hmpc_goal goal = {.x = vector_goal[0], .rows = 1};
   real largest = R(0.0);
   hmpc_clear(&state);
   for (int k = 0; k < VECTORS; ++k) {
