@@ -138,7 +138,7 @@ def _config(sizes: Mapping[str, int], single: bool) -> str:
         + names
         + "".join(f"#define HMPC_{name} R({value})\n" for name, value in tolerances)
         + f"#define HMPC_NEGLIGIBLE {NEGLIGIBLE!r}\n"
-        + "#define HMPC_QP_CAP (4 * HMPC_MOST + 100) /* iterations of the QP */\n#endif\n"
+        + "#define HMPC_QP_CAP (10 * HMPC_MOST + 100) /* iterations of the QP */\n#endif\n"
     )
 
 

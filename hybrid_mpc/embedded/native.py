@@ -32,12 +32,13 @@ _BRIDGE = """
 const size_t hmpc_places[] = {
   sizeof(hmpc_state), PLACE(x), PLACE(h), PLACE(d), PLACE(w), PLACE(plan.u), PLACE(plan.z), PLACE(plan.w),
   PLACE(plan.cost), PLACE(plan.excess), PLACE(working.kkt), PLACE(linear.largest_defect), PLACE(u), PLACE(status),
-  PLACE(source), PLACE(age)
+  PLACE(source), PLACE(age), PLACE(working.iterations)
 };
 """
 """What the state's fields are found by."""
 FIELDS = (
     "x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect", "u", "status", "source", "age",
+    "iterations",
 )  # fmt: skip
 
 
@@ -187,7 +188,7 @@ class State:
         self.at = ctypes.c_void_p(memory.ctypes.data + start)
         self.view: dict[str, NDArray[Any]] = {}
         for name, place in zip(FIELDS, places, strict=True):
-            kind = np.dtype(np.int32 if name in ("status", "source", "age") else np.float64)
+            kind = np.dtype(np.int32 if name in ("status", "source", "age", "iterations") else np.float64)
             shape = shapes.get(name, (1,))
             field = memory[start + place :][: kind.itemsize * int(np.prod(shape))]
             self.view[name] = field.view(kind).reshape(shape)

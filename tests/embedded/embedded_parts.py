@@ -37,9 +37,22 @@ def tanks():
     leak = (Disturbance("rate", "lower", 1e-4),)
     model = machines.two_tanks(disturbance_model=leak)
     span = 2 * machines.PUMP
+    x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("w")
+    flow = SoftBound(ca.Function("flow", [x, u, w], [(u + w) / span]), [-np.inf], [0.9], [3.0], [10.0])
     ocp = OCP(
         20, [0.0, 25.0], [1e3 / span**2 * 1e-3], [0.1 / span**2], [0.0], [span], du_max=[0.3 * span],
-        x_max=[model.x0[0] + 0.1, np.inf], x_min=[0.01, 0.01],
+        x_max=[model.x0[0] + 0.1, np.inf], x_min=[0.01, 0.01], soft=[flow],
+    )  # fmt: skip
+    return model, ocp
+
+
+def heaters():
+    """Two temperatures weighed and one bounded as outputs, offsets of a sensor and of a heater, references by set-point."""
+    offsets = (Disturbance("output", "t1", 5.0), Disturbance("input", "heater_2"))
+    model = machines.thermal(disturbance_model=offsets)
+    ocp = OCP(
+        25, [0.0, 0.0], [1e-3, 1e-3], [0.02, 0.02], [0.0, 0.0], [16.0, 12.0], du_max=[2.0, 2.0], q_y=[1.0, 0.5],
+        y_max=[model.x0[0] + 6.0, np.inf], y_min=[-np.inf, model.x0[1] - 4.0],
     )  # fmt: skip
     return model, ocp
 
