@@ -14,14 +14,18 @@ EXAMPLES = (
     "  hybrid-mpc export c runs/golf --task track --float --out controller"
 )
 
-app = typer.Typer(help="Write a trained controller for other machines.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(
+    help="Write a trained controller for other machines.", no_args_is_help=True, rich_markup_mode=None
+)
 
 
 @app.command("c", epilog=EXAMPLES)
 def c(
     model: ArtifactFolder,
     out: EmptyFolder,
-    name: Annotated[str, typer.Option("--model", help="Model that plans. Default: the recommended one.")] = "",
+    name: Annotated[
+        str, typer.Option("--model", help="Model that plans. Default: the recommended one.")
+    ] = "",
     task: Annotated[str, typer.Option(help="Whose control problem. Default: the common one.")] = "",
     single: Annotated[bool, typer.Option("--float", help="Numbers are float instead of double.")] = False,
 ) -> None:

@@ -19,7 +19,20 @@ except ImportError as missing:  # the online half installs without the command l
     ) from None
 
 from hybrid_mpc import __version__
-from hybrid_mpc.cli import analyze, benchmark, check, control, data, export, monitor, new, run, scenarios, study, tune
+from hybrid_mpc.cli import (
+    analyze,
+    benchmark,
+    check,
+    control,
+    data,
+    export,
+    monitor,
+    new,
+    run,
+    scenarios,
+    study,
+    tune,
+)
 from hybrid_mpc.errors import InputError, StorageError
 from hybrid_mpc.files import reason
 

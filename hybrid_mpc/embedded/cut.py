@@ -60,7 +60,9 @@ def cut(model: HybridModel) -> Cut:
     z_next = ca.vertcat(*inlined(model.step, [*point, ca.MX(ca.DM(model.p))]))
     whole = ca.Function("step", point, [z_next])
     calls = [
-        whole.instruction_MX(k) for k in range(whole.n_instructions()) if whole.instruction_id(k) == ca.OP_CALL
+        whole.instruction_MX(k)
+        for k in range(whole.n_instructions())
+        if whole.instruction_id(k) == ca.OP_CALL
     ]
     cells = [c for c in calls if c.which_function().name().endswith("_cell")]
     names = [c.which_function().name() for c in cells]
@@ -98,7 +100,9 @@ def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int:
     rows, value = (v.full() for v in slope(*given))
     first = int(np.argmax(rows[0]))
     wanted = np.eye(hidden.shape[0], model.n_h, first)
-    if not np.array_equal(rows, wanted) or not np.array_equal(value[:, 0], given[1][first : first + len(rows)]):
+    if not np.array_equal(rows, wanted) or not np.array_equal(
+        value[:, 0], given[1][first : first + len(rows)]
+    ):
         raise InputError(f"model {model.name}: its GRU goes on from something else than its own hidden state")
     return first
 
@@ -118,5 +122,7 @@ def _weights(cell: ca.Function) -> tuple[Array, Array, Array, Array]:
     reset, update = (0.5 + 0.5 * np.tanh(0.5 * (from_x[i] + from_h[i])) for i in range(2))
     n = np.tanh(from_x[2] + reset * from_h[2])
     wanted = cell(x, h).full().ravel()
-    assert np.allclose(n + update * (h - n), wanted, rtol=1e-12, atol=1e-12)  # else nn_export writes cells otherwise
+    assert np.allclose(
+        n + update * (h - n), wanted, rtol=1e-12, atol=1e-12
+    )  # else nn_export writes cells otherwise
     return w, r, b, c

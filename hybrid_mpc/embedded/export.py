@@ -103,12 +103,12 @@ def _noise(estimator: Filter) -> Array:
 
 
 def footprint(folder: Path) -> Footprint | None:
-    """Sizes by gcc -O2 for this machine; None where there is none."""
+    """Sizes by gcc -O3 for this machine; None where there is none."""
     gcc, size = shutil.which("gcc"), shutil.which("size")
     if gcc is None or size is None:
         return None
     with tempfile.TemporaryDirectory() as work:
-        flags = ["-std=c11", "-O2", "-ffp-contract=off", "-fstack-usage"]
+        flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
         sources = [str((folder / name).resolve()) for name in SOURCES]
         made = subprocess.run([gcc, *flags, "-c", *sources], cwd=work, capture_output=True, check=False)
         test = [str((folder / "hmpc_test.c").resolve()), *sources, "-lm", "-o", "test"]
@@ -119,7 +119,9 @@ def footprint(folder: Path) -> Footprint | None:
         table_of = subprocess.run([size, *objects], capture_output=True, text=True, check=True).stdout
         flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
         frames = [
-            int(line.split("\t")[1]) for p in Path(work).glob("hmpc_*.su") for line in p.read_text().splitlines()
+            int(line.split("\t")[1])
+            for p in Path(work).glob("hmpc_*.su")
+            for line in p.read_text().splitlines()
         ]
         told = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False).stderr
         state = re.search(r"the state has (\d+) bytes", told)
@@ -132,7 +134,9 @@ def operations(found: Sources) -> dict[str, int]:
     n_z, n_v, units = n["NX"] + n["NH"], n["BLOCKS"] * n["NU"], n["UNITS"]
     padded = -(-n_z // 8) * 8
     active = np.minimum(np.arange(1, n["N"]) * n["NU"], n_v)
-    stage = code.get("before_slope", 0) + code["after_slope"] + units * (6 * (n.get("FEATURES", 0) + units) + 110)
+    stage = (
+        code.get("before_slope", 0) + code["after_slope"] + units * (6 * (n.get("FEATURES", 0) + units) + 110)
+    )
     stage += units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) + 2 * n["HEAD"] * units * (padded + n["NU"])
     n_e = n_z + n["ND"]
     return {

@@ -1,4 +1,4 @@
-"""C of a controller: sizes, tables and scalar code beside the sources in ``c/``, which are the same for all machines."""
+"""C of a controller: sizes, tables and scalar code beside the sources in ``c/``, the same for all machines."""
 
 from __future__ import annotations
 
@@ -81,7 +81,9 @@ def make_sources(
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
         "OUTPUT_COST": int(ocp.n_y > 0), "SOFT_D": int(ocp.y_min.size > 0),
     }  # fmt: skip
-    code, model_sizes, operations = _expressions(model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0)
+    code, model_sizes, operations = _expressions(
+        model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0
+    )
     sizes |= model_sizes
     tables = _tables(model, ocp, problem, soft, states, fallback, safe_input, estimator)
     texts = {"hmpc_config.h": _config(sizes, single), "hmpc_tables.h": tables, "hmpc_expressions.h": code}
@@ -99,9 +101,6 @@ def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, targets: bo
     found = [what for what, wrong in cases.items() if wrong]
     if estimator is not None or ocp.n_y:
         found += _refused_outputs(model, estimator is not None)
-    if estimator is not None:
-        if not all(isinstance(f, ExtendedKalmanFilter) for f in _modes(estimator)):
-            found.append(f"the estimator {type(estimator).__name__}")
     return found
 
 
@@ -174,14 +173,25 @@ def _expressions(
         own = {i: k for i in range(n_z) for k in range(units) if ca.is_equal(z_next[i], g[k], 0)}
         first = min(own, default=0)
         if [own.get(first + k) for k in range(units)] != list(range(units)):
-            raise InputError(f"no C for model {model.name}: its GRU's new state is not its next hidden state as it is")
+            raise InputError(
+                f"no C for model {model.name}: its GRU's new state is not its next hidden state as it is"
+            )
         sizes |= {
             "FEATURES": seen.numel(), "SEEN_SLOPES": len(values), "HIDDEN": n_x + cell.first, "HIDDEN_NEXT": first,
         }  # fmt: skip
+        # the hidden state's weights row by row for the Jacobian, and column by column for the values
+        gates = -(-3 * units // 8) * 8
+        sizes["GATES"] = gates
         weights = {"input_weight": cell.input_weight, "hidden_weight": cell.hidden_weight}
-        weights |= {"input_bias": cell.input_bias, "hidden_bias": cell.hidden_bias}
+        for which, weight, bias in (
+            ("input", cell.input_weight, cell.input_bias), ("hidden", cell.hidden_weight, cell.hidden_bias)
+        ):  # fmt: skip
+            rest = ((0, gates - 3 * units), (0, 0))
+            weights |= {f"{which}_columns": np.pad(weight, rest).T, f"{which}_bias": np.pad(bias, rest[0])}
         texts += [table(name, value) for name, value in weights.items()]
-        texts.append(table("seen_row", rows, "int") + table("seen_column", [places[j] for j in columns], "int"))
+        texts.append(
+            table("seen_row", rows, "int") + table("seen_column", [places[j] for j in columns], "int")
+        )
         outs = [(f"seen[{i}]", seen[i]) for i in range(seen.numel())]
         add("before", [*point, "real *seen"], inputs, outs)
         slopes = [(f"by_v[{i}]", v) for i, v in enumerate(values)]
@@ -219,13 +229,25 @@ def _expressions(
         outs = [(f"value[{i}]", value[i]) for i in range(value.numel())]
         for name, by, width in (("by_x", x, n_x), ("by_u", u, n_u)):
             jacobian = ca.densify(ca.jacobian(value, by))
-            outs += [(f"{name}[{i * width + j}]", jacobian[i, j]) for i in range(value.numel()) for j in range(width)]
-        arguments = [*(f"const real *{name}" for name in "xuwd"), *(f"real *{name}" for name in ("value", "by_x", "by_u"))]
+            outs += [
+                (f"{name}[{i * width + j}]", jacobian[i, j])
+                for i in range(value.numel())
+                for j in range(width)
+            ]
+        arguments = [
+            *(f"const real *{name}" for name in "xuwd"),
+            *(f"real *{name}" for name in ("value", "by_x", "by_u")),
+        ]
         add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d}, outs)
     if measured:
         y = _scalar("the output", model.output)(x, u, w, ca.DM(model.p))
         outs = [(f"y[{i}]", y[i]) for i in range(model.n_y)]
-        add("outputs", ["const real *x", "const real *u", "const real *w", "real *y"], {"x": x, "u": u, "w": w}, outs)
+        add(
+            "outputs",
+            ["const real *x", "const real *u", "const real *w", "real *y"],
+            {"x": x, "u": u, "w": w},
+            outs,
+        )
     if fallback is not None:
         rates = _scalar("the prior", fallback.xdot)(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
         rates = np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0)) * rates

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -122,7 +120,10 @@ class NativeController(SplitController):
         goal = goal_of(rows, prepared.weight, *bounds, u=u, y=y)
         status = STATUS[
             self._library.c.hmpc_feedback(
-                self._state.at, ctypes.byref(goal), None if ahead is None else ahead.ctypes.data, self.ocp.horizon
+                self._state.at,
+                ctypes.byref(goal),
+                None if ahead is None else ahead.ctypes.data,
+                self.ocp.horizon,
             )
         ]
         spent = (perf_counter() - start) * 1e3
@@ -147,7 +148,10 @@ class NativeController(SplitController):
         m = self.model
         z = np.hstack([plan.x, plan.h])
         w = plan.w if len(plan.w) else self.problem.forecast(None, None)
-        given = [np.ascontiguousarray(v, dtype=np.float64) for v in (plan.u, z, plan.d, w if m.n_w else np.zeros(1))]
+        given = [
+            np.ascontiguousarray(v, dtype=np.float64)
+            for v in (plan.u, z, plan.d, w if m.n_w else np.zeros(1))
+        ]
         self._library.c.hmpc_load_plan(self._state.at, *(v.ctypes.data for v in given))
 
 
@@ -173,7 +177,7 @@ class Library:
 
 
 class State:
-    """A ``hmpc_state`` in double precision, cleared; ``at`` is its address, ``view`` are arrays on some of its fields."""
+    """A ``hmpc_state`` of doubles, cleared; ``at`` is its address, ``view`` has arrays on some of its fields."""
 
     def __init__(self, library: Library) -> None:
         n = library.sizes
@@ -206,7 +210,7 @@ def load_library(sources: Sources, flags: Sequence[str] = FLAGS) -> Library:
         "decide": (state, pointer, pointer), "begin": (state, pointer, pointer),
     }  # fmt: skip
     if sources.sizes["MODES"]:
-        signatures |= {name: (state, pointer, pointer, pointer, pointer) for name in ("start", "step")}
+        signatures |= dict.fromkeys(("start", "step"), (state, pointer, pointer, pointer, pointer))
         signatures |= {"estimate_start": (state, pointer, pointer), "finish": (state, pointer)}
         signatures |= {"estimate_update": (state, pointer, pointer, pointer)}
     for name, given in signatures.items():

@@ -107,7 +107,9 @@ def c_function(
             elif code in _LIBM:
                 text = f"HMPC_LIBM({_LIBM[code]})({', '.join(arguments_c)})"
             else:
-                raise InputError(f"{name}: no C for {_NAMES.get(code, code)}; write the prior with other operations")
+                raise InputError(
+                    f"{name}: no C for {_NAMES.get(code, code)}; write the prior with other operations"
+                )
             operations += 1
         register[given[0]] = f"t{k}"
         lines.append(f"const real t{k} = {text};")

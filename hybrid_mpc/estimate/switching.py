@@ -78,7 +78,9 @@ class SwitchingFilter:
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> SwitchingEstimate:
         """Estimate at rest at ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.start`."""
         empty = np.full(self.model.n_y, np.nan)
-        return _together([f.start(y, t, w=w) for f in self.filters], self.first_probability, empty, float("nan"))
+        return _together(
+            [f.start(y, t, w=w) for f in self.filters], self.first_probability, empty, float("nan")
+        )
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> SwitchingEstimate:

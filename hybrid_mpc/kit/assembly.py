@@ -59,7 +59,6 @@ observer makes of it; a backup that takes it for a heavier machine costs more th
 GAIN = "gain of "
 
 
-
 def native(model: HybridModel, ocp: OCP) -> Controller:
     """The real-time iteration as compiled C; without a compiler, with a ``RuntimeWarning``, that of Python.
 
@@ -70,7 +69,9 @@ def native(model: HybridModel, ocp: OCP) -> Controller:
         return NativeController(model, ocp)
     except CompileError as error:
         warnings.warn(
-            f"solver native: {error}; rti, which gives the same inputs, runs in Python instead", RuntimeWarning, stacklevel=2
+            f"solver native: {error}; rti, which gives the same inputs, runs in Python instead",
+            RuntimeWarning,
+            stacklevel=2,
         )
         return CondensedController(model, ocp)
 

@@ -19,7 +19,7 @@ QUICK = ("-std=c11", "-O1", "-ffp-contract=off")
 
 
 def coupled():
-    """Two inputs, two outputs, a hidden state; soft bounds on a state and on a product, move blocks, limited changes."""
+    """Two inputs and outputs, a hidden state; soft bounds on a state and on a product, move blocks, limited changes."""
     model, *_ = online_models.random_linear(4, n_x=3, n_u=2, n_y=2, n_h=2, radius=0.95)
     x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
     product = SoftBound(ca.Function("product", [x, u], [ca.vertcat(x[0] * x[1] + 0.3 * u[1], x[2])]),
@@ -33,7 +33,7 @@ def coupled():
 
 
 def tanks():
-    """A pump, two levels, a measured inflow, rest that is not zero, a leak as unmeasured rate; an upper level bounded."""
+    """A pump, two levels, a measured inflow, rest that is not zero, an unmeasured leak; the upper level is bounded."""
     leak = (Disturbance("rate", "lower", 1e-4),)
     model = machines.two_tanks(disturbance_model=leak)
     span = 2 * machines.PUMP
@@ -47,7 +47,7 @@ def tanks():
 
 
 def heaters():
-    """Two temperatures weighed and one bounded as outputs, offsets of a sensor and of a heater, references by set-point."""
+    """Two temperatures weighed and bounded as outputs, offsets of a sensor and of a heater, set-points."""
     offsets = (Disturbance("output", "t1", 5.0), Disturbance("input", "heater_2"))
     model = machines.thermal(disturbance_model=offsets)
     ocp = OCP(
@@ -93,7 +93,11 @@ class CLoop:
     def call(self, name, *given):
         self._kept = [np.ascontiguousarray(v, dtype=float) if isinstance(v, np.ndarray) else v for v in given]
         pointers = [
-            v.ctypes.data if isinstance(v, np.ndarray) else ctypes.byref(v) if isinstance(v, ctypes.Structure) else v
+            v.ctypes.data
+            if isinstance(v, np.ndarray)
+            else ctypes.byref(v)
+            if isinstance(v, ctypes.Structure)
+            else v
             for v in self._kept
         ]
         getattr(self.library.c, f"hmpc_{name}")(self.state.at, *pointers)
@@ -102,7 +106,13 @@ class CLoop:
         self.call("estimate_start", y, w)
         plan = first.solution
         self.state.view["u"][:] = first.u
-        self.call("load_plan", plan.u, np.hstack([plan.x, plan.h]), plan.d, plan.w if self.model.n_w else np.zeros(1))
+        self.call(
+            "load_plan",
+            plan.u,
+            np.hstack([plan.x, plan.h]),
+            plan.d,
+            plan.w if self.model.n_w else np.zeros(1),
+        )
         self.call("decide", goal, None)
 
 

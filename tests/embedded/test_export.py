@@ -19,7 +19,15 @@ from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, make_sourc
 from hybrid_mpc.embedded.scalar import c_function
 from hybrid_mpc.kit.assembly import make_controller
 
-STRICT = ["-std=c11", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror", "-ffp-contract=off"]
+STRICT = [
+    "-std=c11",
+    "-Wall",
+    "-Wextra",
+    "-Wconversion",
+    "-Wdouble-promotion",
+    "-Werror",
+    "-ffp-contract=off",
+]
 MACHINES = {"coupled": parts.coupled, "tanks": parts.tanks, "delayed": parts.delayed}
 RUBBISH = """
 #include <stdio.h>
@@ -64,7 +72,13 @@ int main(int count, char **words) {
 def written(folder, name, **options):
     model, ocp = MACHINES[name]()
     write_controller(
-        folder, model, ocp, estimator=parts.filters_of(model, ocp), fallback=model, safe_input=model.u0, **options
+        folder,
+        model,
+        ocp,
+        estimator=parts.filters_of(model, ocp),
+        fallback=model,
+        safe_input=model.u0,
+        **options,
     )
     return folder
 
@@ -76,7 +90,11 @@ def folder(request, tmp_path_factory):
 
 def built(folder, *words, main="hmpc_test.c", out="test"):
     done = subprocess.run(
-        ["cc", *words, *SOURCES, main, "-lm", "-o", out], cwd=folder, capture_output=True, text=True, check=False
+        ["cc", *words, *SOURCES, main, "-lm", "-o", out],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     return folder / out
@@ -112,8 +130,16 @@ def test_changed_vectors_are_noticed(folder, tmp_path):
 
 
 def rubbish(folder, periods):
-    (folder / "rubbish.c").write_text(RUBBISH.replace('"hmpc_math.h"', '"hmpc_math.h"\n#include "hmpc_tables.h"'))
-    sanitizers = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-ffp-contract=off"]
+    (folder / "rubbish.c").write_text(
+        RUBBISH.replace('"hmpc_math.h"', '"hmpc_math.h"\n#include "hmpc_tables.h"')
+    )
+    sanitizers = [
+        "-g",
+        "-O1",
+        "-fsanitize=address,undefined",
+        "-fno-sanitize-recover=all",
+        "-ffp-contract=off",
+    ]
     try:
         program = built(folder, "-std=c11", *sanitizers, main="rubbish.c", out="rubbish")
     except AssertionError as error:
@@ -145,7 +171,9 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
     model, ocp = parts.coupled()
     x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
     cost = ca.Function("cost", [x, u], [x[0] ** 2])
-    refused(model, ocp.changed(economic=cost, q_y=[1.0, 1.0]), r"weights on outputs \(q_y\).*economic stage cost")
+    refused(
+        model, ocp.changed(economic=cost, q_y=[1.0, 1.0]), r"weights on outputs \(q_y\).*economic stage cost"
+    )
     tank, tank_ocp = parts.tanks()
     refused(tank, tank_ocp.changed(preview_w=True), "preview_w")
     pendulum = online_models.pendulum_model()
@@ -178,7 +206,9 @@ def test_every_operation_gives_what_casadi_gives(tmp_path):
     f = ca.Function("f", [x], [ca.vertcat(*values)])
     outs = [(f"y[{i}]", v) for i, v in enumerate(values)]
     text, _ = c_function("evaluate", ["const real *x", "real *y"], {"x": x}, outs)
-    main = f'#include <stdio.h>\n#include "hmpc_math.h"\n{text}int main(void) {{ real x[3], y[{len(values)}];\n'
+    main = (
+        f'#include <stdio.h>\n#include "hmpc_math.h"\n{text}int main(void) {{ real x[3], y[{len(values)}];\n'
+    )
     main += 'while (scanf("%lf %lf %lf", x, x + 1, x + 2) == 3) { evaluate(x, y);'
     main += f'for (int i = 0; i < {len(values)}; ++i) printf("%.17g ", y[i]); }} return 0; }}\n'
     written(tmp_path, "coupled")
@@ -197,7 +227,7 @@ def test_every_operation_gives_what_casadi_gives(tmp_path):
 @needs_compiler
 def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     """``hybrid-mpc export c``, and the solver ``native`` of a kit beside ``rti``."""
-    code, out, err = call("export", "c", noisy_artifact, "--out", tmp_path / "none")
+    code, _, err = call("export", "c", noisy_artifact, "--out", tmp_path / "none")
     assert code == 2
     assert "without a control problem" in err
     golf = hm.load_scenario("golf_robot")
@@ -205,7 +235,9 @@ def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     with pytest.raises(InputError, match="not empty"):
         hm.generate_controller(kit, noisy_artifact)
     folder = hm.generate_controller(kit, tmp_path / "controller")
-    assert subprocess.run(["make", "-s", "-C", folder, "test"], capture_output=True, check=False).returncode == 0
+    assert (
+        subprocess.run(["make", "-s", "-C", folder, "test"], capture_output=True, check=False).returncode == 0
+    )
     task = golf.tasks[0]
     loops = [
         hm.simulate(

@@ -14,11 +14,11 @@ from hybrid_mpc.embedded.native import NativeController
 from hybrid_mpc.kit.assembly import disturbance_sizes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
-from golden_parts import frozen_estimates, machine, previews  # noqa: E402
+from golden_parts import frozen_estimates, machine, previews
 
 pytestmark = needs_compiler
 TOLERANCE = 1e-9
-"""Of an input's range. Both solve the same strictly convex QP exactly, in sums of another order: they differed by 4e-12."""
+"""Of an input's range. Both solve the same strictly convex QP, in sums of another order: they differed by 4e-12."""
 REPLAYS = (
     ("golf_robot", "track", TOLERANCE),
     pytest.param("golf_robot", "stroke", TOLERANCE, marks=pytest.mark.full),
@@ -64,7 +64,9 @@ def test_small_machines_with_everything(name):
     plan = python.initial(TrueState(model).start(np.concatenate([x, np.zeros(model.n_h)]), w=model.w))
     for k in range(60):
         x = model.x0 + (0.6 * (x - model.x0) + 0.5 * size * rng.standard_normal(model.n_x) * (k % 3 == 0))
-        z = np.concatenate([x, 0.1 * rng.standard_normal(model.n_h) + (model.u0[0] if model.delay_states else 0.0)])
+        z = np.concatenate(
+            [x, 0.1 * rng.standard_normal(model.n_h) + (model.u0[0] if model.delay_states else 0.0)]
+        )
         e = TrueState(model).start(z, w=model.w * (1 + 0.2 * (k % 5 == 4)))
         e = replace(e, d=0.05 * disturbance_sizes(model, ocp) * rng.standard_normal(model.n_d))
         reference = model.x0 + 0.5 * size * rng.standard_normal((k % 2 + 1, model.n_x))
@@ -78,7 +80,9 @@ def test_small_machines_with_everything(name):
         assert found.status is wanted.status, k
         assert np.max(np.abs(found.u - wanted.u) / ocp.input_range) < TOLERANCE, k
         for got, want in ((found.x, wanted.x), (found.h, wanted.h)):
-            np.testing.assert_allclose(got, want, atol=1e-8 * max(1.0, float(np.max(np.abs(want), initial=0.0))))
+            np.testing.assert_allclose(
+                got, want, atol=1e-8 * max(1.0, float(np.max(np.abs(want), initial=0.0)))
+            )
         assert found.cost == pytest.approx(wanted.cost, rel=1e-8)
         assert found.excess == pytest.approx(wanted.excess, abs=1e-8)
         seen["soft"] += wanted.excess > 1e-3
@@ -102,7 +106,9 @@ def test_a_period_of_c_is_a_period_of_the_loop(name):
     target, w, u = model.x0 + 0.5 * size, model.w, python.controller.problem.u_rest
     sources = set()
     for k in range(80):
-        y = model.output(z[: model.n_x], u, w, model.p).full().ravel() + 0.003 * rng.standard_normal(model.n_y)
+        y = model.output(z[: model.n_x], u, w, model.p).full().ravel() + 0.003 * rng.standard_normal(
+            model.n_y
+        )
         y[rng.uniform(size=model.n_y) < 0.2 * (20 < k < 30)] = np.nan
         reference = np.full_like(target, np.nan) if 40 <= k < 52 else target
         w_now = np.full_like(w, np.nan) if k == 12 else w
@@ -128,7 +134,9 @@ def test_a_period_of_c_is_a_period_of_the_loop(name):
             loop.finish()
             c.call("finish", given)
         u = decision.u
-        z = np.concatenate([v.full().ravel() for v in model.step(z[: model.n_x], z[model.n_x :], u, w, model.p)])
+        z = np.concatenate(
+            [v.full().ravel() for v in model.step(z[: model.n_x], z[model.n_x :], u, w, model.p)]
+        )
     assert sources == {"MPC", "PLAN", "FALLBACK"}
 
 
@@ -139,5 +147,7 @@ def test_what_was_prepared_for_another_plan_is_prepared_again():
     first = native.solve(native.initial(e), e, np.array([[0.3, 0.0]]))
     one, _ = native.prepare(first), native.prepare(native.initial(e))
     np.testing.assert_allclose(  # from another working set, so to rounding
-        native.finish(one, e, np.array([[0.3, 0.0]])).u, native.solve(first, e, np.array([[0.3, 0.0]])).u, atol=1e-12
+        native.finish(one, e, np.array([[0.3, 0.0]])).u,
+        native.solve(first, e, np.array([[0.3, 0.0]])).u,
+        atol=1e-12,
     )

@@ -156,8 +156,6 @@ void hmpc_model_slope(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w
 hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *working, const hmpc_linear *linear);
 void hmpc_qp_factor(hmpc_qp *qp);
 void hmpc_qp_shift(hmpc_working *working);
-void hmpc_multiply(const hmpc_real *a, int length, const hmpc_real *b, hmpc_real *c, int rows, int inner, int columns,
-                   int stride);
 #ifndef HMPC_N
 #error "hmpc_config.h lacks the sizes"
 #endif

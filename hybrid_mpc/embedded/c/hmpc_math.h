@@ -123,4 +123,38 @@ static inline void hmpc_add(real *to, real factor, const real *from, int n) {
   for (int i = 0; i < n; ++i) to[i] += factor * from[i];
 }
 
+enum { HMPC_ROWS = 2, HMPC_COLUMNS = 8 }; /* of the block of a product that stays in registers */
+
+/* c = a b for the first columns, rounded up to eight; rows of a are length apart, those of b and c stride. All but
+   columns are constants where it is called, so that it becomes vector code there. */
+static inline void hmpc_multiply(const real *restrict a, int length, const real *restrict b, real *restrict c, int rows,
+                                 int inner, int columns, int stride) {
+  for (int j = 0; j < columns; j += HMPC_COLUMNS) {
+    int i = 0;
+    for (; i + HMPC_ROWS <= rows; i += HMPC_ROWS) {
+      real sum[HMPC_ROWS][HMPC_COLUMNS];
+      for (int p = 0; p < HMPC_ROWS; ++p)
+        for (int q = 0; q < HMPC_COLUMNS; ++q) sum[p][q] = R(0.0);
+      for (int l = 0; l < inner; ++l) {
+        const real *const row = b + l * stride + j;
+        for (int p = 0; p < HMPC_ROWS; ++p) {
+          const real factor = a[(i + p) * length + l];
+          for (int q = 0; q < HMPC_COLUMNS; ++q) sum[p][q] += factor * row[q];
+        }
+      }
+      for (int p = 0; p < HMPC_ROWS; ++p)
+        for (int q = 0; q < HMPC_COLUMNS; ++q) c[(i + p) * stride + j + q] = sum[p][q];
+    }
+    if (i < rows) { /* the last of an odd number */
+      real sum[HMPC_COLUMNS];
+      for (int q = 0; q < HMPC_COLUMNS; ++q) sum[q] = R(0.0);
+      for (int l = 0; l < inner; ++l) {
+        const real factor = a[i * length + l];
+        for (int q = 0; q < HMPC_COLUMNS; ++q) sum[q] += factor * b[l * stride + j + q];
+      }
+      for (int q = 0; q < HMPC_COLUMNS; ++q) c[i * stride + j + q] = sum[q];
+    }
+  }
+}
+
 #endif

@@ -9,16 +9,28 @@ typedef struct {
   real g[HMPC_UNITS], a[HMPC_UNITS], b[HMPC_UNITS], br[HMPC_UNITS], keep[HMPC_UNITS]; /* factors of the rows */
 } cell;
 
+/* y = bias + columns x, eight sums at a time. */
+static inline void affine(const real (*columns)[HMPC_GATES], const real *bias, const real *x, int n, real *y) {
+  for (int i = 0; i < HMPC_GATES; i += 8) {
+    real sum[8];
+    for (int c = 0; c < 8; ++c) sum[c] = bias[i + c];
+    for (int j = 0; j < n; ++j)
+      for (int c = 0; c < 8; ++c) sum[c] += columns[j][i + c] * x[j];
+    for (int c = 0; c < 8; ++c) y[i + c] = sum[c];
+  }
+}
+
 static void gru(const real *seen, const real *h, cell *c) {
-  real sums[4][HMPC_UNITS];
-  for (int i = 0; i < HMPC_UNITS; ++i)
-    for (int k = 0; k < 3; ++k) {
-      const int row = k * HMPC_UNITS + i;
-      const real from_input = hmpc_dot(input_weight[row], seen, HMPC_FEATURES) + input_bias[row];
-      const real from_hidden = hmpc_dot(hidden_weight[row], h, HMPC_UNITS) + hidden_bias[row];
-      sums[k][i] = k < 2 ? R(0.5) * (from_input + from_hidden) : from_input;
-      sums[3][i] = from_hidden; /* of k = 2 in the end */
-    }
+  real from_input[HMPC_GATES], from_hidden[HMPC_GATES], sums[4][HMPC_UNITS];
+  affine(input_columns, input_bias, seen, HMPC_FEATURES, from_input);
+  affine(hidden_columns, hidden_bias, h, HMPC_UNITS, from_hidden);
+  for (int k = 0; k < 2; ++k)
+    for (int i = 0; i < HMPC_UNITS; ++i)
+      sums[k][i] = R(0.5) * (from_input[k * HMPC_UNITS + i] + from_hidden[k * HMPC_UNITS + i]);
+  for (int i = 0; i < HMPC_UNITS; ++i) {
+    sums[2][i] = from_input[2 * HMPC_UNITS + i];
+    sums[3][i] = from_hidden[2 * HMPC_UNITS + i];
+  }
   for (int i = 0; i < HMPC_UNITS; ++i) sums[0][i] = R(0.5) + R(0.5) * hmpc_tanh(sums[0][i]);
   for (int i = 0; i < HMPC_UNITS; ++i) sums[1][i] = R(0.5) + R(0.5) * hmpc_tanh(sums[1][i]);
   for (int i = 0; i < HMPC_UNITS; ++i) sums[2][i] = hmpc_tanh(sums[2][i] + sums[0][i] * sums[3][i]);
@@ -67,17 +79,21 @@ void hmpc_model_slope(const real *z, const real *u, const real *w, real *z_next,
     real *const row = slope + (HMPC_HIDDEN_NEXT + i) * HMPC_LJ, *const by_h = row + HMPC_HIDDEN;
     const real *const reset = hidden_weight[i], *const update = hidden_weight[HMPC_UNITS + i],
                      *const candidate = hidden_weight[2 * HMPC_UNITS + i];
-    const real g = c.g[i], a = c.a[i], b = c.b[i], br = c.br[i];
+    const real g = c.g[i], a = c.a[i], br = c.br[i];
     memset(row, 0, sizeof(real) * HMPC_LJ);
     for (int j = 0; j < HMPC_UNITS; ++j) by_h[j] = g * reset[j] + a * update[j] + br * candidate[j];
     by_h[i] += c.keep[i];
+  }
+  for (int i = 0; i < HMPC_UNITS; ++i) {
+    real *const row = slope + (HMPC_HIDDEN_NEXT + i) * HMPC_LJ;
     for (int k = 0; k < HMPC_SEEN_SLOPES; ++k) {
       const int f = seen_row[k];
-      row[seen_column[k]] += (g * input_weight[i][f] + a * input_weight[HMPC_UNITS + i][f] +
-                              b * input_weight[2 * HMPC_UNITS + i][f]) * by_v[k];
+      row[seen_column[k]] += (c.g[i] * input_weight[i][f] + c.a[i] * input_weight[HMPC_UNITS + i][f] +
+                              c.b[i] * input_weight[2 * HMPC_UNITS + i][f]) * by_v[k];
     }
-    for (int k = 0; k < HMPC_HEAD; ++k) hmpc_add(through[k], head[k][i], row, HMPC_LJ);
   }
+  for (int i = 0; i < HMPC_UNITS; ++i)
+    for (int k = 0; k < HMPC_HEAD; ++k) hmpc_add(through[k], head[k][i], slope + (HMPC_HIDDEN_NEXT + i) * HMPC_LJ, HMPC_LJ);
   reduce(c.next, out);
   after_slope(z, u, w, out, z_next, slope, &by_out[0][0]);
   memcpy(z_next + HMPC_HIDDEN_NEXT, c.next, sizeof c.next);

@@ -4,33 +4,6 @@
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
 
-enum { ROWS = 2, COLUMNS = 8 }; /* of the block of a product that stays in registers */
-
-/* c = a b for the first columns, rounded up to eight. a has rows of some length, b and c of a stride. */
-void hmpc_multiply(const real *restrict a, int length, const real *restrict b, real *restrict c, int rows, int inner,
-                   int columns, int stride) {
-  for (int j = 0; j < columns; j += COLUMNS) {
-    int i = 0;
-    for (; i + ROWS <= rows; i += ROWS) {
-      real sum[ROWS][COLUMNS] = {{R(0.0)}};
-      for (int l = 0; l < inner; ++l) {
-        const real *const row = b + l * stride + j;
-        for (int p = 0; p < ROWS; ++p) {
-          const real factor = a[(i + p) * length + l];
-          for (int q = 0; q < COLUMNS; ++q) sum[p][q] += factor * row[q];
-        }
-      }
-      for (int p = 0; p < ROWS; ++p) memcpy(c + (i + p) * stride + j, sum[p], sizeof sum[p]);
-    }
-    for (; i < rows; ++i) {
-      real sum[COLUMNS] = {R(0.0)};
-      for (int l = 0; l < inner; ++l)
-        for (int q = 0; q < COLUMNS; ++q) sum[q] += a[i * length + l] * b[l * stride + j + q];
-      memcpy(c + i * stride + j, sum, sizeof sum);
-    }
-  }
-}
-
 static int all_finite(const real *v, int n) {
   int fine = 1;
   for (int i = 0; i < n; ++i) fine &= hmpc_finite(v[i]);
