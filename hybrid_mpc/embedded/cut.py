@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -57,7 +58,7 @@ def cut(model: HybridModel) -> Cut:
     """
     sizes = model.n_x, model.n_h, model.n_u, model.n_w
     point = [ca.MX.sym(name, n) for name, n in zip("xhuw", sizes, strict=True)]
-    z_next = ca.vertcat(*inlined(model.step, [*point, ca.MX(ca.DM(model.p))]))
+    z_next: Any = ca.vertcat(*inlined(model.step, [*point, ca.MX(ca.DM(model.p))]))
     whole = ca.Function("step", point, [z_next])
     calls = [
         whole.instruction_MX(k)
@@ -72,7 +73,8 @@ def cut(model: HybridModel) -> Cut:
         )
     if not cells:
         return Cut(None, None, _scalar(model, "step", [*point, ca.MX.sym("units", 0)], z_next))
-    seen, hidden, new = cells[0].dep(0), cells[0].dep(1), cells[0].get_output(0)
+    seen: ca.MX = cells[0].dep(0)
+    hidden, new = cells[0].dep(1), cells[0].get_output(0)
     units = ca.MX.sym("units", new.shape[0])
     (behind,) = ca.graph_substitute([z_next], [new], [units])
     first = _place(model, point, hidden)

@@ -107,7 +107,7 @@ def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, targets: bo
 def _refused_outputs(model: HybridModel, measured: bool) -> list[str]:
     slopes = output_with_jacobian(model)
     rng = np.random.default_rng(0)
-    points = [(model.x0, model.u0, model.w)]
+    points: list[tuple[Array, ...]] = [(model.x0, model.u0, model.w)]
     points += [tuple(p + rng.standard_normal(p.size) for p in points[0]) for _ in range(3)]
     c, d = ([slopes(*p)[i].full() for p in points] for i in (1, 2))
     moved = max(float(np.max(np.abs(m - ms[0]), initial=0.0)) for ms in (c, d) for m in ms)
@@ -186,8 +186,11 @@ def _expressions(
         for which, weight, bias in (
             ("input", cell.input_weight, cell.input_bias), ("hidden", cell.hidden_weight, cell.hidden_bias)
         ):  # fmt: skip
-            rest = ((0, gates - 3 * units), (0, 0))
-            weights |= {f"{which}_columns": np.pad(weight, rest).T, f"{which}_bias": np.pad(bias, rest[0])}
+            more = (0, gates - 3 * units)
+            weights |= {
+                f"{which}_columns": np.pad(weight, (more, (0, 0))).T,
+                f"{which}_bias": np.pad(bias, more),
+            }
         texts += [table(name, value) for name, value in weights.items()]
         texts.append(
             table("seen_row", rows, "int") + table("seen_column", [places[j] for j in columns], "int")
@@ -250,15 +253,15 @@ def _expressions(
         )
     if fallback is not None:
         rates = _scalar("the prior", fallback.xdot)(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
-        rates = np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0)) * rates
+        rates = ca.DM(np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))) * rates
         by_u = ca.jacobian(rates, u)
         best = u - ca.solve(by_u.T @ by_u + 1e-12 * ca.DM.eye(n_u), by_u.T @ rates)
         best = ca.densify(ca.substitute(best, u, ca.DM(fallback.u0)))
         outs = [(f"best[{i}]", best[i]) for i in range(n_u)]
         add("equilibrium", ["const real *x", "const real *w", "real *best"], {"x": x, "w": w}, outs)
     guard = "HMPC_EXPRESSIONS_H"
-    head = f"/* Scalar code of this controller, generated. */\n#ifndef {guard}\n#define {guard}\n"
-    return head + "\n".join(texts) + "\n#endif\n", sizes, operations
+    opening = f"/* Scalar code of this controller, generated. */\n#ifndef {guard}\n#define {guard}\n"
+    return opening + "\n".join(texts) + "\n#endif\n", sizes, operations
 
 
 def _reduced(
@@ -356,12 +359,12 @@ def _tables(
         reals |= {"q_y": ocp.q_y * dt, "output_u": by_u, "y_rest": rest} if ocp.n_y else {}
     if estimator is not None:
         modes = _modes(estimator)
-        switching = isinstance(estimator, SwitchingFilter)
+        switching = estimator if isinstance(estimator, SwitchingFilter) else None
         reals |= {
             "noise": np.array([f.noise[0] for f in modes]), "noise_y": modes[0].noise[1],
             "first_variance": np.array([f.first for f in modes]), "lost_variance": np.array([f.most for f in modes]),
-            "switches": estimator.transition if switching else np.ones((1, 1)),
-            "first_probability": estimator.first_probability if switching else np.ones(1),
+            "switches": np.ones((1, 1)) if switching is None else switching.transition,
+            "first_probability": np.ones(1) if switching is None else switching.first_probability,
         }  # fmt: skip
     whole = {
         "block_of": np.repeat(np.arange(starts.size), lengths), "block_start": starts, "block_length": lengths,

@@ -88,7 +88,8 @@ def c_function(
             f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; networks must be a GRU of "
             "nn_export (torch's GRUCell, GRU)"
         )
-    lines, names, register = [], list(inputs), {}
+    lines, names = [], list(inputs)
+    register: dict[int, str] = {}
     operations = 0
     for k in range(f.n_instructions()):
         code, taken, given = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
