@@ -267,3 +267,19 @@ def test_nothing_is_compiled_by_default(monkeypatch, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_controller(model, model, ocp)
+
+
+@needs_compiler
+@pytest.mark.full
+@pytest.mark.parametrize("single", [False, True], ids=["double", "float"])
+def test_another_processor_gives_the_same_bits(tmp_path, single):
+    """aarch64 under qemu: no multiply-add is fused, and elementary functions are the controller's own."""
+    cross, qemu = shutil.which("aarch64-linux-gnu-gcc"), shutil.which("qemu-aarch64")
+    if cross is None or qemu is None:
+        pytest.skip("no aarch64-linux-gnu-gcc, or no qemu-aarch64")
+    folder = written(tmp_path / "c", "delayed", single=single)
+    here = subprocess.run([built(folder, "-O3", *STRICT)], capture_output=True, check=True).stdout
+    words = [cross, "-O3", *STRICT, "-static", *SOURCES, "hmpc_test.c", "-lm", "-o", "other"]
+    subprocess.run(words, cwd=folder, check=True)
+    there = subprocess.run([qemu, folder / "other"], capture_output=True, check=True).stdout
+    assert here == there

@@ -112,10 +112,10 @@ static inline real hmpc_cos(real x) { return hmpc_turned(x, 2); }
 /* Sum of products in eight partial sums, so that it becomes vector code and its order is the same everywhere. */
 static inline real hmpc_dot(const real *a, const real *b, int n) {
   real part[8] = {R(0.0)}, rest = R(0.0);
-  int i = 0;
-  for (; i + 8 <= n; i += 8)
+  const int whole = n / 8 * 8;
+  for (int i = 0; i < whole; i += 8)
     for (int c = 0; c < 8; ++c) part[c] += a[i + c] * b[i + c];
-  for (; i < n; ++i) rest += a[i] * b[i];
+  for (int i = whole; i < n; ++i) rest += a[i] * b[i];
   return ((part[0] + part[4]) + (part[2] + part[6])) + ((part[1] + part[5]) + (part[3] + part[7])) + rest;
 }
 
