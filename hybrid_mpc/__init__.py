@@ -113,6 +113,7 @@ if TYPE_CHECKING:
         make_ocp,
         make_resting_guard,
     )
+    from hybrid_mpc.kit.export_c import generate_controller
     from hybrid_mpc.loop.faults import Fault, check_plant_faults, corrupt_input, corrupt_measurement
     from hybrid_mpc.loop.guard import Guard, Mode
     from hybrid_mpc.loop.loop import Loop
@@ -262,6 +263,7 @@ __all__ = [
     "frequency_response",
     "friction_slopes",
     "gain_schedule",
+    "generate_controller",
     "gru_weights",
     "guard_monitor",
     "holding_input",
@@ -395,6 +397,7 @@ _ROOMS = {
         "make_adaptive_guard", "make_controller", "make_estimator", "make_monitor", "make_ocp",
         "make_resting_guard",
     ),
+    "kit.export_c": ("generate_controller",),
     "loop.faults": ("Fault", "check_plant_faults", "corrupt_input", "corrupt_measurement"),
     "loop.guard": ("Guard", "Mode"),
     "loop.loop": ("Loop",),

@@ -87,16 +87,46 @@ def compile_function(
     functions = [function]
     if derivatives:
         functions += [function.jacobian(), function.forward(1), function.reverse(1)]
-    source = _source(functions)
-    key = _key(source, command, flags)
-    place = _cache_folder() if folder is None else _named_folder(Path(folder))
-    library = _cached(place, key) or _build(source, place, key, [*command, *flags], timeout)
+    library = _library(_source(functions), command, flags, folder, timeout)
     try:
         return ca.external(function.name(), str(library.resolve()))
     except RuntimeError as error:
         raise CompileError(
             f"{library} cannot be loaded: {last_line(error)}; remove it or choose another folder"
         ) from error
+
+
+def compile_library(
+    source: str,
+    flags: Sequence[str] = ("-O3",),
+    *,
+    folder: str | Path | None = None,
+    compiler: str | None = None,
+    timeout: float = 600.0,
+) -> Path:
+    """Any C text as a shared library, cached as :func:`compile_function` says; arguments as there.
+
+    Raises:
+        CompileError: If there is no compiler, it fails or takes too long; if the folder named is another user's.
+
+    Example:
+        >>> with tempfile.TemporaryDirectory() as cache:
+        ...     library = compile_library("int one(void) { return 1; }", folder=cache)
+        >>> library.suffix == _SUFFIX
+        True
+    """
+    command = _compiler(compiler)
+    if command is None:
+        raise CompileError("no C compiler found (cc, gcc, clang or the variable CC); install one")
+    return _library(source, command, flags, folder, timeout).resolve()
+
+
+def _library(
+    source: str, command: list[str], flags: Sequence[str], folder: str | Path | None, timeout: float
+) -> Path:
+    key = _key(source, command, flags)
+    place = _cache_folder() if folder is None else _named_folder(Path(folder))
+    return _cached(place, key) or _build(source, place, key, [*command, *flags], timeout)
 
 
 @dataclass(frozen=True)

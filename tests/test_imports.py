@@ -22,11 +22,12 @@ ROOMS = {
     "model": "nn_export errors machine",
     "estimate": "errors model",
     "control": "nn_export errors records model estimate",
+    "embedded": "nn_export errors model estimate control",
     "loop": "errors model estimate control",
     "scenario": "errors machine model control loop",
     "monitor": "errors data model",
     "analyze": "nn_export errors data model estimate control loop",
-    "kit": "nn_export errors records files machine data model estimate control loop scenario monitor",
+    "kit": "nn_export errors records files machine data model estimate control embedded loop scenario monitor",
     "identify": "nn_export errors files machine data model kit",
     "plots": "errors files machine monitor",
     "report": "errors files plots",
@@ -68,7 +69,7 @@ TORCH = (
     "scenarios/paper/step.py",
 )
 # rooms that run beside a machine and so must not even import torch lazily
-ONLINE = ("model", "estimate", "control", "loop", "monitor", "analyze", "kit", "plots", "report")
+ONLINE = ("model", "estimate", "control", "embedded", "loop", "monitor", "analyze", "kit", "plots", "report")
 
 
 @cache

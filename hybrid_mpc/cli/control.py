@@ -41,7 +41,7 @@ def control(
             help="A controller; may be repeated. Default: prior_observer (not with --guard) and hybrid_observer."
         ),
     ] = None,
-    solver: Annotated[str, typer.Option(help="rti, sqp or ipopt.")] = "rti",
+    solver: Annotated[str, typer.Option(help="rti, native, sqp or ipopt.")] = "rti",
     seeds: Annotated[int, typer.Option(help="Loops of each task and controller.", min=1)] = 10,
     seed: Annotated[int, typer.Option(help="Seed of the loops.", min=0, max=MOST_SEED)] = 0,
     fault: Annotated[

@@ -26,6 +26,7 @@ from hybrid_mpc.cli import (
     control,
     data,
     doctor,
+    export,
     monitor,
     new,
     predict,
@@ -73,6 +74,7 @@ app.command("monitor", epilog=monitor.EXAMPLES)(monitor.monitor)
 app.command("scenarios")(scenarios.scenarios)
 app.command("doctor")(doctor.doctor)
 app.add_typer(study.app, name="study")
+app.add_typer(export.app, name="export")
 for entry in entry_points(group="hybrid_mpc.commands"):  # commands of scenarios, e.g. `reproduce`
     command = entry.load()
     app.command(entry.name, epilog=sys.modules[entry.module].EXAMPLES)(command)

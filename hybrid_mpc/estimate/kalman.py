@@ -151,6 +151,16 @@ class ExtendedKalmanFilter:
         """Variances of the process noise of ``(x, h, d)`` a period ``(n,)``, and of the measurement ``(n_y,)``."""
         return self._noise.copy(), self._noise_y.copy()
 
+    @property
+    def first(self) -> Array:
+        """Variances of the first ``(x, h, d)`` ``(n,)``."""
+        return self._first.copy()
+
+    @property
+    def most(self) -> float:
+        """Variance beyond which nothing is known any more."""
+        return float(self._lost)
+
     def lost(self, estimate: Estimate) -> bool:
         """Whether an estimate is not finite, or so uncertain that nothing is known any more."""
         return not (estimate.finite and np.max(np.diag(estimate.P)) <= self._lost)

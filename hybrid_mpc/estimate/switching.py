@@ -72,12 +72,15 @@ class SwitchingFilter:
                 f"transition: probabilities of shape {(m, m)} whose rows sum to 1 needed, got {p.tolist()}"
             )
         self.model, self.filters, self.transition = filters[0].model, tuple(filters), p
-        self._first = _stationary(p)
+        self.first_probability = _stationary(p)
+        """Probability ``(m,)`` of each mode at the start."""
 
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> SwitchingEstimate:
         """Estimate at rest at ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.start`."""
         empty = np.full(self.model.n_y, np.nan)
-        return _together([f.start(y, t, w=w) for f in self.filters], self._first, empty, float("nan"))
+        return _together(
+            [f.start(y, t, w=w) for f in self.filters], self.first_probability, empty, float("nan")
+        )
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> SwitchingEstimate:

@@ -73,7 +73,7 @@ class LoopSpec:
         model: Label of the model on the bench.
         task: Name of the task.
         controller: Name in :data:`~hybrid_mpc.job.controllers.CONTROLLERS`.
-        solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
+        solver: ``"rti"``, ``"native"``, ``"sqp"`` or ``"ipopt"``.
         horizon: Periods. Default: the task's own.
         monitor: Name in :data:`MONITORS`; without a hybrid there is none. Default: ``"own"``, or ``"guard"`` with a
             guard.

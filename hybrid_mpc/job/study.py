@@ -182,7 +182,7 @@ class Study:
         models: Artifact folders (or folders of runs) by label; a single folder gets the label ``"model"``.
         tasks: Names of tasks, or their beginnings. Default: all.
         controllers: Names in :data:`~hybrid_mpc.job.controllers.CONTROLLERS`. Default: prior and hybrid, with observer.
-        solvers: ``"rti"``, ``"sqp"``, ``"ipopt"``. Default: the first.
+        solvers: ``"rti"``, ``"native"``, ``"sqp"``, ``"ipopt"``. Default: the first.
         horizons: Periods; None for the task's own, which is the default.
         monitors: Names in :data:`~hybrid_mpc.job.loops.MONITORS`. Default: ``"own"``, without thresholds.
         faults: Sets of faults, each one text (``"plant_friction=2@1.5 + input_gain=0.8"``; ``"none"``), a

@@ -624,7 +624,7 @@ class Kit:
         Args:
             model: Name of the model that plans. Default: the recommended one.
             task: Whose control problem it solves. Default: the common one.
-            solver: ``"rti"``, ``"sqp"`` or ``"ipopt"``.
+            solver: ``"rti"``, ``"native"`` (the same as compiled C), ``"sqp"`` or ``"ipopt"``.
             iterations: Linearizations a period of ``rti``. Default: one.
 
         Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
@@ -16,6 +17,7 @@ from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.embedded.native import NativeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
@@ -29,6 +31,7 @@ from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
 from hybrid_mpc.monitor.residuals import check_model
 from hybrid_mpc.records import known
+from nn_export.errors import CompileError
 
 if TYPE_CHECKING:  # reading recordings takes half a second to import, and no controller does
     from hybrid_mpc.data.trajectories import Trajectory
@@ -54,13 +57,33 @@ PATIENCE_S = 0.8
 """[The machine's seconds.] A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the
 observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
 GAIN = "gain of "
+
+
+def native(model: HybridModel, ocp: OCP) -> Controller:
+    """The real-time iteration as compiled C; without a compiler, with a ``RuntimeWarning``, that of Python.
+
+    Raises:
+        InputError: If something of model or problem has no C, by name.
+    """
+    try:
+        return NativeController(model, ocp)
+    except CompileError as error:
+        warnings.warn(
+            f"solver native: {error}; rti, which gives the same inputs, runs in Python instead",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return CondensedController(model, ocp)
+
+
 SOLVERS: Mapping[str, Callable[..., Controller]] = {
     "rti": CondensedController,
+    "native": native,
     "sqp": SQPController,
     "ipopt": IpoptController,
 }
-"""By the name that commands and settings take: the condensed real-time iteration; sequential quadratic programs to
-convergence; the same by IPOPT."""
+"""By the name that commands and settings take: the condensed real-time iteration; the same as compiled C; sequential
+quadratic programs to convergence; the same by IPOPT."""
 
 
 class LoopAssumptions(Protocol):

@@ -1,0 +1,39 @@
+"""``hybrid-mpc export``: a trained controller for other machines."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc export c runs/golf --out controller\n\n"
+    "  hybrid-mpc export c runs/golf --task track --float --out controller"
+)
+
+app = typer.Typer(
+    help="Write a trained controller for other machines.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+@app.command("c", epilog=EXAMPLES)
+def c(
+    model: ArtifactFolder,
+    out: EmptyFolder,
+    name: Annotated[
+        str, typer.Option("--model", help="Model that plans. Default: the recommended one.")
+    ] = "",
+    task: Annotated[str, typer.Option(help="Whose control problem. Default: the common one.")] = "",
+    single: Annotated[bool, typer.Option("--float", help="Numbers are float instead of double.")] = False,
+) -> None:
+    """Estimator, real-time iteration and safeguards as self-contained C11, with a test program."""
+    from hybrid_mpc.files import check_folder
+    from hybrid_mpc.kit.artifact import load
+    from hybrid_mpc.kit.export_c import generate_controller
+
+    check_folder(out)
+    folder = generate_controller(load(model), out, model=name, task=task, single=single)
+    print(f"C in {folder.resolve()}; README.md has the sizes. Next: make -C {folder} test")

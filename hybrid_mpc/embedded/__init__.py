@@ -1,0 +1,1 @@
+"""The controller as self-contained C: generated from a kit, or run from Python behind the same interface."""

@@ -1,0 +1,162 @@
+/* A model predictive controller with its estimator: no heap, no globals, static sizes.
+
+   A period, as hybrid_mpc's Loop has it:
+
+     hmpc_start(&s, y, w, NULL, &goal)   once, while the machine rests; s.u is the first input
+     every period: write s.u; hmpc_finish(&s, &goal) while it acts; hmpc_step(&s, y, w, NULL, &goal)
+
+   Numbers never stop it: s.u is within its limits whatever samples, references and the model say.
+   All matrices are row by row. Everything of a controller is in one hmpc_state. */
+#ifndef HMPC_H
+#define HMPC_H
+
+#include "hmpc_config.h" /* sizes, and the type hmpc_real */
+
+#define HMPC_DIM(n) ((n) > 0 ? (n) : 1) /* C has no empty arrays */
+#define HMPC_ROUND(n) (((n) + 7) / 8 * 8)
+#define HMPC_NZ (HMPC_NX + HMPC_NH)          /* state and hidden state */
+#define HMPC_NV (HMPC_BLOCKS * HMPC_NU)      /* unknowns of the QP: inputs of the move blocks */
+#define HMPC_LD HMPC_ROUND(HMPC_NV)          /* length of a row over the unknowns */
+#define HMPC_LZ HMPC_ROUND(HMPC_NZ)          /* length of a row over z, the rest zero */
+#define HMPC_LJ (HMPC_LZ + HMPC_NU)          /* row of a stage's Jacobian: by z, then by u */
+#define HMPC_SOFT (HMPC_N * (HMPC_SOFT_X + HMPC_SOFT_E)) /* rows of soft bounds: a period's states, then expressions */
+#define HMPC_MOST (HMPC_NV + HMPC_SOFT)      /* most active bounds */
+#define HMPC_NE (HMPC_NZ + HMPC_ND)          /* what the estimator estimates: x, h, d */
+#define HMPC_LE HMPC_ROUND(HMPC_NE)
+
+typedef enum {
+  HMPC_INITIAL,    /* a first plan, not optimised */
+  HMPC_SOLVED,     /* the QP was solved and its solution checked */
+  HMPC_NOT_FINITE, /* estimate, reference, model or plan hold a value that is not finite */
+  HMPC_INFEASIBLE, /* the solution violates an input bound or the limit of its change */
+  HMPC_INACCURATE  /* the solution fails the KKT check, or the iterations ended */
+} hmpc_status;
+
+typedef enum {
+  HMPC_MPC,      /* the checked solution */
+  HMPC_PLAN,     /* the previous plan, shifted: the solve failed */
+  HMPC_FALLBACK, /* the stabilising feedback on the prior: the plan is used up */
+  HMPC_SAFE,     /* the declared safe input */
+  HMPC_HELD      /* the last input: no safe input is declared; or none was decided yet */
+} hmpc_source;
+
+/* What a plan is to follow. Rows are periods from now on, the last one holds; NULL: the operating point, factors 1,
+   the problem's own limits. */
+typedef struct {
+  const hmpc_real *x;      /* reference of the states, rows of HMPC_NX */
+  int rows;                /* of x */
+  const hmpc_real *weight; /* factors on the states' weights, HMPC_N + 1 rows of HMPC_NX */
+  const hmpc_real *u;      /* target inputs, HMPC_N rows of HMPC_NU */
+  const hmpc_real *y;      /* where outputs are weighed, their reference, HMPC_N rows of HMPC_NY */
+  const hmpc_real *u_min;  /* tighter limits of the inputs, HMPC_NU */
+  const hmpc_real *u_max;
+} hmpc_goal;
+
+/* The working set of the QP, and the Cholesky factor of its rows' products. */
+typedef struct {
+  int count;
+  int id[HMPC_MOST];            /* bounds, see hmpc_qp.c */
+  int beyond[HMPC_MOST];        /* a soft bound whose slack is in use */
+  hmpc_real multiplier[HMPC_MOST];
+  hmpc_real row[HMPC_MOST][HMPC_LD];
+  hmpc_real factor[HMPC_MOST * (HMPC_MOST + 1) / 2];
+  int iterations;
+  hmpc_real kkt;
+} hmpc_working;
+
+/* min 1/2 s'Hs + g's over scaled input steps s. */
+typedef struct {
+  hmpc_real hessian[HMPC_NV][HMPC_LD];
+  hmpc_real lower_factor[HMPC_NV][HMPC_LD]; /* L, of which H = L L' */
+  hmpc_real inverse[HMPC_NV][HMPC_LD]; /* of L, transposed: row i is L^-1 e_i */
+  hmpc_real size;                      /* what H was divided by */
+  int definite;
+  hmpc_real gradient[HMPC_LD];
+  hmpc_real lower[HMPC_LD], upper[HMPC_LD], change_lower[HMPC_LD], change_upper[HMPC_LD];
+  hmpc_real value[HMPC_DIM(HMPC_SOFT)];                  /* soft bounds: values without a step, */
+  hmpc_real slope[HMPC_DIM(HMPC_SOFT_E) * HMPC_N][HMPC_LD]; /* and derivatives of those that are expressions */
+  hmpc_real step[HMPC_LD];
+} hmpc_qp;
+
+/* What is linearized along the plan, shifted by one period. */
+typedef struct {
+  hmpc_real u[HMPC_N][HMPC_NU], z[HMPC_N + 1][HMPC_LZ], d[HMPC_DIM(HMPC_ND)], w[HMPC_N][HMPC_DIM(HMPC_NW)];
+  hmpc_real u_prev[HMPC_NU];
+  hmpc_real slope[HMPC_N][HMPC_NZ][HMPC_LJ], defect[HMPC_N][HMPC_LZ];
+  hmpc_real from_u[HMPC_N + 1][HMPC_NX][HMPC_LD]; /* of the states by the scaled unknowns */
+  hmpc_real weight[HMPC_N + 1][HMPC_NX], terminal[HMPC_NX][HMPC_NX];
+  hmpc_real by_x[HMPC_DIM(HMPC_SOFT_E) * HMPC_N][HMPC_NX]; /* of soft expressions */
+  hmpc_real soft[HMPC_DIM(HMPC_SOFT)];
+  hmpc_real largest_defect;
+} hmpc_linear;
+
+typedef struct {
+  hmpc_real u[HMPC_N][HMPC_NU], z[HMPC_N + 1][HMPC_LZ], d[HMPC_DIM(HMPC_ND)], w[HMPC_N][HMPC_DIM(HMPC_NW)];
+  hmpc_real cost, excess;
+} hmpc_plan;
+
+#if HMPC_MODES > 0
+typedef struct {
+  hmpc_real z[HMPC_LE];
+  hmpc_real p[HMPC_NE][HMPC_LE]; /* covariance */
+  hmpc_real nis, likelihood;
+} hmpc_filter;
+#endif
+
+typedef struct {
+  /* to be read */
+  hmpc_real u[HMPC_NU]; /* the input to apply */
+  hmpc_status status;   /* how the last solve ended */
+  hmpc_source source;   /* where u came from */
+  int age;              /* periods since the last successful solve */
+  hmpc_real x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)]; /* the estimate */
+  hmpc_plan plan;
+  /* its own */
+  int prepared, pending;
+  hmpc_linear linear;
+  hmpc_qp qp;
+  hmpc_working working;
+  hmpc_real dz[HMPC_N + 1][HMPC_LZ], scratch[2][HMPC_NZ][HMPC_LD];
+#if HMPC_MODES > 0
+  hmpc_filter filter[HMPC_MODES], predicted[HMPC_MODES], mixed;
+  hmpc_real probability[HMPC_MODES];
+  hmpc_real transition[HMPC_NE][HMPC_LE], product[HMPC_NE][HMPC_LE], stage[HMPC_NZ][HMPC_LJ];
+#endif
+} hmpc_state;
+
+#if HMPC_MODES > 0
+/* Begin: first estimate, first plan (which may take its time), first input. y: outputs, what is not finite is missing;
+   w: measured disturbances, NULL or not finite: the last ones; applied: the input that acted until now, NULL: the
+   operating point's, in hmpc_step the one decided last. */
+void hmpc_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
+void hmpc_step(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
+/* The part of the next step that needs no sample; hmpc_step calls it if nobody did. Of the goal it takes the weights. */
+void hmpc_finish(hmpc_state *s, const hmpc_goal *goal);
+
+/* The estimator alone: s->x, h, d, w. */
+void hmpc_estimate_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w);
+void hmpc_estimate_update(hmpc_state *s, const hmpc_real *y, const hmpc_real *u_prev, const hmpc_real *w);
+#endif
+
+/* The controller alone, on an estimate in s->x, h, d, w. */
+void hmpc_clear(hmpc_state *s);
+void hmpc_run_free(hmpc_state *s, const hmpc_real *u, int rows); /* plan: the model on inputs u, the last row holds */
+void hmpc_prepare(hmpc_state *s, const hmpc_goal *goal);         /* shift the plan, linearize, condense */
+void hmpc_linearize(hmpc_state *s, const hmpc_goal *goal);       /* at s->linear as it is */
+void hmpc_load_plan(hmpc_state *s, const hmpc_real *u, const hmpc_real *z, const hmpc_real *d, const hmpc_real *w);
+hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const hmpc_real *w, int w_rows); /* w NULL: s->w held */
+void hmpc_complete(hmpc_state *s); /* hidden states of the plan; hmpc_prepare calls it */
+void hmpc_begin(hmpc_state *s, const hmpc_real *applied, const hmpc_goal *goal); /* the first plan and input */
+void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const hmpc_real *applied); /* s->u */
+
+/* The model: a period, and its Jacobian (HMPC_NZ rows of HMPC_LJ; entries that are always zero are not written). */
+void hmpc_model(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *z_next);
+void hmpc_model_slope(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *z_next, hmpc_real *slope);
+
+hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *working, const hmpc_linear *linear);
+void hmpc_qp_factor(hmpc_qp *qp);
+void hmpc_qp_shift(hmpc_working *working);
+#ifndef HMPC_N
+#error "hmpc_config.h lacks the sizes"
+#endif
+#endif

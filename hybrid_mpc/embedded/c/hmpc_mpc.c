@@ -1,0 +1,588 @@
+/* The real-time iteration: shift, linearize and condense; then embed the estimate, solve the QP, check it; and the
+   safeguards, so that there is an input in every period. */
+#include "hmpc_math.h"
+#include "hmpc_tables.h"
+#include "hmpc_expressions.h"
+
+static int all_finite(const real *v, int n) {
+  int fine = 1;
+  for (int i = 0; i < n; ++i) fine &= hmpc_finite(v[i]);
+  return fine;
+}
+
+/* What acts: inputs with what the unmeasured disturbances add to them. */
+static void acting(const real *u, const real *d, real *v) {
+  for (int i = 0; i < HMPC_NU; ++i) {
+    v[i] = u[i];
+    for (int j = 0; j < HMPC_ND; ++j) v[i] += disturbs_u[i][j] * d[j];
+  }
+}
+
+static void disturb_state(const real *d, real *z_next) {
+  for (int i = 0; i < HMPC_NX; ++i)
+    for (int j = 0; j < HMPC_ND; ++j) z_next[i] += disturbs_x[i][j] * d[j];
+}
+
+void hmpc_clear(hmpc_state *s) {
+  memset(s, 0, sizeof *s);
+  for (int i = 0; i < HMPC_NU; ++i) s->u[i] = hmpc_clip(u_rest[i], u_min[i], u_max[i]);
+  memcpy(s->x, x_rest, sizeof s->x);
+  memcpy(s->w, w_rest, sizeof s->w);
+  s->source = HMPC_HELD;
+}
+
+void hmpc_run_free(hmpc_state *s, const real *u, int rows) {
+  hmpc_plan *const plan = &s->plan;
+  real v[HMPC_NU];
+  memset(plan->z[0], 0, sizeof plan->z[0]);
+  memcpy(plan->z[0], s->x, sizeof s->x);
+  if (HMPC_NH > 0) memcpy(plan->z[0] + HMPC_NX, s->h, sizeof s->h);
+  memcpy(plan->d, s->d, sizeof plan->d);
+  int fine = 1;
+  for (int k = 0; k < HMPC_N; ++k) {
+    const int row = k < rows ? k : rows - 1;
+    for (int i = 0; i < HMPC_NU; ++i) plan->u[k][i] = hmpc_clip(u[row * HMPC_NU + i], u_min[i], u_max[i]);
+    memcpy(plan->w[k], s->w, sizeof plan->w[k]);
+    acting(plan->u[k], plan->d, v);
+    memset(plan->z[k + 1], 0, sizeof plan->z[k + 1]);
+    hmpc_model(plan->z[k], v, plan->w[k], plan->z[k + 1]);
+    disturb_state(plan->d, plan->z[k + 1]);
+    fine &= all_finite(plan->z[k + 1], HMPC_NZ);
+  }
+  for (int k = 0; k < HMPC_N && !fine; ++k) memcpy(plan->z[k + 1], plan->z[0], sizeof plan->z[0]);
+  plan->cost = R(NAN);
+  plan->excess = R(NAN);
+  s->prepared = 0;
+  s->pending = 0;
+}
+
+void hmpc_load_plan(hmpc_state *s, const real *u, const real *z, const real *d, const real *w) {
+  memcpy(s->plan.u, u, sizeof s->plan.u);
+  for (int k = 0; k <= HMPC_N; ++k) memcpy(s->plan.z[k], z + k * HMPC_NZ, sizeof(real) * HMPC_NZ);
+  if (HMPC_ND > 0) memcpy(s->plan.d, d, sizeof s->plan.d);
+  if (HMPC_NW > 0) memcpy(s->plan.w, w, sizeof s->plan.w);
+  s->prepared = 0;
+  s->pending = 0;
+}
+
+/* ---- preparation */
+
+static void condense(hmpc_state *s) {
+  hmpc_linear *const linear = &s->linear;
+  int active = 0;
+  memset(s->scratch, 0, sizeof s->scratch);
+  memset(linear->from_u[0], 0, sizeof linear->from_u[0]);
+  for (int k = 0; k < HMPC_N; ++k) {
+    real(*const before)[HMPC_LD] = s->scratch[k & 1], (*const after)[HMPC_LD] = s->scratch[~k & 1];
+    const int first = block_of[k] * HMPC_NU;
+    hmpc_multiply(linear->slope[k][0], HMPC_LJ, before[0], after[0], HMPC_NZ, HMPC_NZ, active, HMPC_LD);
+    active = first + HMPC_NU;
+    for (int i = 0; i < HMPC_NZ; ++i)
+      for (int j = 0; j < HMPC_NU; ++j) after[i][first + j] += linear->slope[k][i][HMPC_LZ + j] * u_scale[j];
+    memcpy(linear->from_u[k + 1], after[0], sizeof linear->from_u[k + 1]);
+  }
+}
+
+/* hessian += factor a b', where b are combinations of rows like a, so that the sum of all is symmetric */
+static void add_product(real (*hessian)[HMPC_LD], real factor, const real *a, const real *b, int n) {
+  for (int i = 0; i < n; ++i) hmpc_add(hessian[i], factor * a[i], b, i + 1);
+}
+
+#if HMPC_OUTPUT_COST
+/* Derivative of an output of period k by the unknowns; returned is how many of them it depends on. */
+static int output_row(const hmpc_linear *linear, int k, int i, real *row) {
+  const int first = block_of[k] * HMPC_NU;
+  memset(row, 0, sizeof(real) * HMPC_LD);
+  for (int j = 0; j < HMPC_NX; ++j) hmpc_add(row, output_x[i][j], linear->from_u[k][j], HMPC_NV);
+  for (int j = 0; j < HMPC_NU; ++j) row[first + j] += output_u[i][j] * u_scale[j];
+  return first + HMPC_NU;
+}
+
+/* Outputs of period k without a step, less their reference. */
+static void output_error(const hmpc_state *s, const hmpc_goal *goal, int k, real *error) {
+  real x[HMPC_NX], v[HMPC_NU];
+  for (int i = 0; i < HMPC_NX; ++i) x[i] = s->linear.z[k][i] + s->dz[k][i];
+  acting(s->linear.u[k], s->d, v);
+  outputs(x, v, s->linear.w[k], error);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    for (int j = 0; j < HMPC_ND; ++j) error[i] += disturbs_y[i][j] * s->d[j];
+    error[i] -= goal && goal->y ? goal->y[k * HMPC_NY + i] : y_rest[i];
+  }
+}
+#endif
+
+static void make_hessian(hmpc_state *s) {
+  hmpc_linear *const linear = &s->linear;
+  hmpc_qp *const qp = &s->qp;
+  real size = R(0.0);
+  memset(qp->hessian, 0, sizeof qp->hessian);
+  for (int k = 1; k < HMPC_N; ++k)
+    for (int i = 0; i < HMPC_NX; ++i) {
+      const real factor = R(2.0) * linear->weight[k][i] * q[i];
+      if (factor < R(0.0) || factor > R(0.0))
+        add_product(qp->hessian, factor, linear->from_u[k][i], linear->from_u[k][i], (block_of[k - 1] + 1) * HMPC_NU);
+    }
+#if HMPC_OUTPUT_COST
+  for (int k = 0; k < HMPC_N; ++k)
+    for (int i = 0; i < HMPC_NY; ++i) {
+      real row[HMPC_LD];
+      const int m = output_row(linear, k, i, row);
+      if (q_y[i] > R(0.0)) add_product(qp->hessian, R(2.0) * q_y[i], row, row, m);
+    }
+#endif
+  for (int i = 0; i < HMPC_NX; ++i) {
+    real row[HMPC_LD] = {R(0.0)};
+    for (int j = 0; j < HMPC_NX; ++j) hmpc_add(row, linear->terminal[i][j], linear->from_u[HMPC_N][j], HMPC_NV);
+    add_product(qp->hessian, R(2.0), row, linear->from_u[HMPC_N][i], HMPC_NV);
+  }
+  for (int b = 0; b < HMPC_BLOCKS; ++b)
+    for (int j = 0; j < HMPC_NU; ++j) {
+      const int i = b * HMPC_NU + j;
+      const real scale = u_scale[j] * u_scale[j], changes = b + 1 < HMPC_BLOCKS ? R(2.0) : R(1.0);
+      qp->hessian[i][i] += R(2.0) * (r[j] * R(block_length[b]) + r_delta[j] * changes) * scale;
+      if (b > 0) qp->hessian[i][i - HMPC_NU] -= R(2.0) * r_delta[j] * scale;
+    }
+  for (int i = 0; i < HMPC_NV; ++i) size = hmpc_max(size, qp->hessian[i][i]);
+  qp->size = size;
+  for (int i = 0; i < HMPC_NV; ++i)
+    for (int j = 0; j <= i; ++j) {
+      qp->hessian[i][j] /= size;
+      qp->hessian[j][i] = qp->hessian[i][j];
+    }
+  hmpc_qp_factor(qp);
+}
+
+/* Soft bounds along the plan; those of outputs depend on the disturbances. */
+static void make_soft(hmpc_state *s, const real *d) {
+#if HMPC_SOFT > 0
+  hmpc_linear *const linear = &s->linear;
+  for (int k = 0; k < HMPC_N; ++k) {
+#if HMPC_SOFT_X > 0
+    for (int i = 0; i < HMPC_SOFT_X; ++i) linear->soft[k * HMPC_SOFT_X + i] = linear->z[k + 1][soft_state[i]];
+#endif
+#if HMPC_SOFT_E > 0
+    real value[HMPC_SOFT_E], by_u[HMPC_SOFT_E][HMPC_NU];
+    memset(by_u, 0, sizeof by_u);
+    soft_expressions(linear->z[k], linear->u[k], linear->w[k], d, value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
+    for (int e = 0; e < HMPC_SOFT_E; ++e) {
+      const int row = k * HMPC_SOFT_E + e;
+      real *const slope = s->qp.slope[row];
+      linear->soft[HMPC_N * HMPC_SOFT_X + row] = value[e];
+      memset(slope, 0, sizeof(real) * HMPC_LD);
+      for (int i = 0; i < HMPC_NX; ++i) hmpc_add(slope, linear->by_x[row][i], linear->from_u[k][i], HMPC_NV);
+      for (int j = 0; j < HMPC_NU; ++j) slope[block_of[k] * HMPC_NU + j] += by_u[e][j] * u_scale[j];
+    }
+#endif
+  }
+#else
+  (void)s;
+#endif
+  (void)d;
+}
+
+static void set_weights(hmpc_linear *linear, const hmpc_goal *goal) {
+  const real *const given = goal ? goal->weight : (const real *)0;
+  for (int k = 0; k <= HMPC_N; ++k)
+    for (int i = 0; i < HMPC_NX; ++i) {
+      const real factor = given ? given[k * HMPC_NX + i] : R(1.0);
+      linear->weight[k][i] = factor >= R(0.0) && hmpc_finite(factor) ? factor : R(NAN);
+    }
+  for (int i = 0; i < HMPC_NX; ++i)
+    for (int j = 0; j < HMPC_NX; ++j)
+      linear->terminal[i][j] =
+          terminal[i][j] * hmpc_sqrt(linear->weight[HMPC_N][i]) * hmpc_sqrt(linear->weight[HMPC_N][j]);
+}
+
+/* Jacobians along linear->u, z, d, w; with append, the last state is where the model goes. */
+static void linearize(hmpc_state *s, int append) {
+  hmpc_linear *const linear = &s->linear;
+  real v[HMPC_NU], z_next[HMPC_LZ] = {R(0.0)};
+  linear->largest_defect = R(0.0);
+  for (int k = 0; k < HMPC_N; ++k) {
+    acting(linear->u[k], linear->d, v);
+    hmpc_model_slope(linear->z[k], v, linear->w[k], z_next, linear->slope[k][0]);
+    disturb_state(linear->d, z_next);
+    if (append && k == HMPC_N - 1) memcpy(linear->z[HMPC_N], z_next, sizeof z_next);
+    for (int i = 0; i < HMPC_NZ; ++i) {
+      linear->defect[k][i] = z_next[i] - linear->z[k + 1][i];
+      const real size = hmpc_abs(linear->defect[k][i]);
+      if (!(size <= linear->largest_defect)) linear->largest_defect = size;
+    }
+  }
+  condense(s);
+  make_hessian(s);
+  make_soft(s, linear->d);
+  s->prepared = 1;
+}
+
+void hmpc_linearize(hmpc_state *s, const hmpc_goal *goal) {
+  set_weights(&s->linear, goal);
+  linearize(s, 0);
+}
+
+void hmpc_prepare(hmpc_state *s, const hmpc_goal *goal) {
+  hmpc_linear *const linear = &s->linear;
+  hmpc_plan *const plan = &s->plan;
+  hmpc_complete(s);
+  for (int k = 0; k < HMPC_N; ++k) {
+    const int held = block_start[block_of[k]], next = held + 1 < HMPC_N ? held + 1 : HMPC_N - 1;
+    memcpy(linear->u[k], plan->u[next], sizeof linear->u[k]);
+    memcpy(linear->z[k], plan->z[k + 1], sizeof linear->z[k]);
+    memcpy(linear->w[k], plan->w[k + 1 < HMPC_N ? k + 1 : HMPC_N - 1], sizeof linear->w[k]);
+  }
+  memcpy(linear->d, plan->d, sizeof linear->d);
+  memcpy(linear->u_prev, plan->u[0], sizeof linear->u_prev);
+  set_weights(linear, goal);
+  linearize(s, 1);
+  hmpc_qp_shift(&s->working);
+}
+
+/* ---- feedback */
+
+/* dz of all periods from dz[0], with what the disturbances' change and, with a step, the inputs add. */
+static void propagate(hmpc_state *s, const real *step) {
+  const hmpc_linear *const linear = &s->linear;
+  real change[HMPC_DIM(HMPC_ND)], v[HMPC_NU];
+  for (int j = 0; j < HMPC_ND; ++j) change[j] = s->plan.d[j] - linear->d[j];
+  for (int k = 0; k < HMPC_N; ++k) {
+    for (int i = 0; i < HMPC_NU; ++i) v[i] = step ? step[block_of[k] * HMPC_NU + i] * u_scale[i] : R(0.0);
+    acting(v, change, v);
+    for (int i = 0; i < HMPC_NZ; ++i) {
+      real next = hmpc_dot(linear->slope[k][i], s->dz[k], HMPC_LZ) + linear->defect[k][i];
+      for (int j = 0; j < HMPC_NU; ++j) next += linear->slope[k][i][HMPC_LZ + j] * v[j];
+      s->dz[k + 1][i] = next;
+    }
+    disturb_state(change, s->dz[k + 1]);
+  }
+}
+
+void hmpc_complete(hmpc_state *s) {
+  if (!s->pending) return;
+  s->pending = 0;
+  propagate(s, s->qp.step);
+  for (int k = 0; k <= HMPC_N; ++k)
+    for (int i = 0; i < HMPC_NZ; ++i) s->plan.z[k][i] = s->linear.z[k][i] + s->dz[k][i];
+}
+
+static const real *row_of(const real *rows, int count, int k, int width) {
+  return rows + (k < count ? k : count - 1) * width;
+}
+
+/* Limits of the inputs as those of the steps. Where the limit of the change keeps an input from being within tighter
+   limits at once, they go there as fast as it lets them. */
+static void limits_of(const hmpc_goal *goal, const real *u_prev, int k, real *low, real *high) {
+  for (int i = 0; i < HMPC_NU; ++i) {
+    low[i] = u_min[i];
+    high[i] = u_max[i];
+    if (goal && goal->u_min && goal->u_max) {
+      low[i] = hmpc_clip(goal->u_min[i], u_min[i], u_max[i]);
+      high[i] = hmpc_clip(goal->u_max[i], u_min[i], u_max[i]);
+      if (HMPC_CHANGES) {
+        const real most = R(k + 1) * du_max[i];
+        low[i] = hmpc_clip(hmpc_min(low[i], u_prev[i] + most), u_min[i], u_max[i]);
+        high[i] = hmpc_clip(hmpc_max(high[i], u_prev[i] - most), u_min[i], u_max[i]);
+      }
+    }
+  }
+}
+
+static void set_bounds(hmpc_state *s, const hmpc_goal *goal) {
+  const hmpc_linear *const linear = &s->linear;
+  hmpc_qp *const qp = &s->qp;
+  for (int b = 0; b < HMPC_BLOCKS; ++b) {
+    const real *const u = linear->u[block_start[b]];
+    const real *const before = b > 0 ? linear->u[block_start[b - 1]] : linear->u_prev;
+    real low[HMPC_NU], high[HMPC_NU];
+    limits_of(goal, linear->u_prev, b, low, high);
+    for (int j = 0; j < HMPC_NU; ++j) {
+      const int i = b * HMPC_NU + j;
+      qp->lower[i] = (low[j] - u[j]) / u_scale[j];
+      qp->upper[i] = (high[j] - u[j]) / u_scale[j];
+      qp->change_lower[i] = (-du_max[j] - (u[j] - before[j])) / u_scale[j];
+      qp->change_upper[i] = (du_max[j] - (u[j] - before[j])) / u_scale[j];
+      if (b == 0) { /* the first change is the first input */
+        qp->lower[i] = hmpc_max(qp->lower[i], qp->change_lower[i]);
+        qp->upper[i] = hmpc_min(qp->upper[i], qp->change_upper[i]);
+        qp->change_lower[i] = -R(INFINITY);
+        qp->change_upper[i] = R(INFINITY);
+      }
+    }
+  }
+}
+
+static void set_soft(hmpc_state *s) {
+#if HMPC_SOFT > 0
+  const hmpc_linear *const linear = &s->linear;
+#if HMPC_SOFT_X > 0
+  for (int row = 0; row < HMPC_N * HMPC_SOFT_X; ++row)
+    s->qp.value[row] = linear->soft[row] + s->dz[row / HMPC_SOFT_X + 1][soft_state[row % HMPC_SOFT_X]];
+#endif
+#if HMPC_SOFT_E > 0
+  for (int row = 0; row < HMPC_N * HMPC_SOFT_E; ++row) {
+    real value = linear->soft[HMPC_N * HMPC_SOFT_X + row];
+    for (int i = 0; i < HMPC_NX; ++i) value += linear->by_x[row][i] * s->dz[row / HMPC_SOFT_E][i];
+    s->qp.value[HMPC_N * HMPC_SOFT_X + row] = value;
+  }
+#endif
+#else
+  (void)s;
+#endif
+}
+
+/* Cost of the plan that qp.step makes of the prepared one, and the largest violation of a soft bound. */
+static void assess(hmpc_state *s, const hmpc_goal *goal_of, const real *x_goal, int rows, const real *u_goal) {
+  const hmpc_linear *const linear = &s->linear;
+  const real *const step = s->qp.step;
+  real total = R(0.0), error[HMPC_NX], before[HMPC_NU];
+  memcpy(before, linear->u_prev, sizeof before);
+  for (int k = 0; k <= HMPC_N; ++k) {
+    const int m = k > 0 ? (block_of[k - 1] + 1) * HMPC_NU : 0;
+    const real *const goal = row_of(x_goal, rows, k, HMPC_NX);
+    for (int i = 0; i < HMPC_NX; ++i)
+      error[i] = linear->z[k][i] + s->dz[k][i] + hmpc_dot(linear->from_u[k][i], step, m) - goal[i];
+    if (k == HMPC_N) break;
+    for (int i = 0; i < HMPC_NX; ++i) total += linear->weight[k][i] * q[i] * error[i] * error[i];
+    for (int j = 0; j < HMPC_NU; ++j) {
+      const real u = linear->u[k][j] + step[block_of[k] * HMPC_NU + j] * u_scale[j];
+      const real off = u - (u_goal ? u_goal[k * HMPC_NU + j] : u_rest[j]), change = u - before[j];
+      total += r[j] * off * off + r_delta[j] * change * change;
+      before[j] = u;
+    }
+  }
+  for (int i = 0; i < HMPC_NX; ++i)
+    for (int j = 0; j < HMPC_NX; ++j) total += error[i] * linear->terminal[i][j] * error[j];
+#if HMPC_OUTPUT_COST
+  for (int k = 0; k < HMPC_N; ++k) {
+    real row[HMPC_LD], off[HMPC_NY];
+    output_error(s, goal_of, k, off);
+    for (int i = 0; i < HMPC_NY; ++i) {
+      const int m = output_row(linear, k, i, row);
+      const real all = off[i] + hmpc_dot(row, step, m);
+      if (q_y[i] > R(0.0)) total += q_y[i] * all * all;
+    }
+  }
+#else
+  (void)goal_of;
+#endif
+  real excess = R(0.0);
+#if HMPC_SOFT > 0
+  for (int row = 0; row < HMPC_SOFT; ++row) {
+#if HMPC_SOFT_X > 0 && HMPC_SOFT_E > 0
+    const int states = row < HMPC_N * HMPC_SOFT_X;
+#else
+    const int states = HMPC_SOFT_X > 0;
+#endif
+    int kind;
+    const real *slope;
+    if (states) {
+      kind = row % HMPC_DIM(HMPC_SOFT_X);
+      slope = linear->from_u[row / HMPC_DIM(HMPC_SOFT_X) + 1][soft_state[kind]];
+    } else {
+      const int e = row - HMPC_N * HMPC_SOFT_X;
+      kind = HMPC_SOFT_X + e % HMPC_DIM(HMPC_SOFT_E);
+      slope = s->qp.slope[e];
+    }
+    const real value = s->qp.value[row] + hmpc_dot(slope, step, HMPC_NV);
+    const real over = hmpc_max(R(0.0), hmpc_max(value - soft_upper[kind], soft_lower[kind] - value));
+    excess = hmpc_max(excess, over);
+    total += (soft_linear[kind] + R(0.5) * soft_quadratic[kind] / soft_scale[kind] * over) * over / soft_scale[kind];
+  }
+#endif
+  s->plan.cost = total;
+  s->plan.excess = excess;
+}
+
+/* The prepared plan, where no solution may be applied. */
+static hmpc_status failed(hmpc_state *s, hmpc_status status) {
+  const hmpc_linear *const linear = &s->linear;
+  memcpy(s->plan.u, linear->u, sizeof s->plan.u);
+  memcpy(s->plan.z, linear->z, sizeof s->plan.z);
+  memcpy(s->plan.d, linear->d, sizeof s->plan.d);
+  memcpy(s->plan.w, linear->w, sizeof s->plan.w);
+  s->plan.cost = R(NAN);
+  s->plan.excess = R(NAN);
+  s->pending = 0;
+  s->working.count = 0;
+  return s->status = status;
+}
+
+hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows) {
+  hmpc_linear *const linear = &s->linear;
+  hmpc_qp *const qp = &s->qp;
+  const real *const u_goal = goal ? goal->u : (const real *)0;
+  const real *const x_goal = goal && goal->x ? goal->x : x_rest;
+  const int rows = goal && goal->x ? goal->rows : 1;
+  if (!s->prepared) hmpc_prepare(s, goal);
+#if HMPC_NW > 0
+  int other = 0;
+  for (int k = 0; k < HMPC_N; ++k) {
+    const real *const now = w ? row_of(w, w_rows, k, HMPC_NW) : s->w;
+    other |= memcmp(linear->w[k], now, sizeof(real) * HMPC_NW) != 0;
+    memcpy(linear->w[k], now, sizeof(real) * HMPC_NW);
+  }
+  if (other) linearize(s, 0);
+#else
+  (void)w;
+  (void)w_rows;
+#endif
+  s->prepared = 0;
+  memcpy(s->plan.d, s->d, sizeof s->plan.d);
+  for (int i = 0; i < HMPC_NX; ++i) s->dz[0][i] = s->x[i] - linear->z[0][i];
+  for (int i = 0; i < HMPC_NH; ++i) s->dz[0][HMPC_NX + i] = s->h[i] - linear->z[0][HMPC_NX + i];
+  propagate(s, (const real *)0);
+  memset(qp->gradient, 0, sizeof qp->gradient);
+  for (int k = 1; k < HMPC_N; ++k) {
+    const real *const x = row_of(x_goal, rows, k, HMPC_NX);
+    const int m = (block_of[k - 1] + 1) * HMPC_NU;
+    for (int i = 0; i < HMPC_NX; ++i)
+      hmpc_add(qp->gradient, R(2.0) * linear->weight[k][i] * q[i] * (linear->z[k][i] + s->dz[k][i] - x[i]),
+               linear->from_u[k][i], m);
+  }
+  const real *const last = row_of(x_goal, rows, HMPC_N, HMPC_NX);
+  for (int i = 0; i < HMPC_NX; ++i) {
+    real slope = R(0.0);
+    for (int j = 0; j < HMPC_NX; ++j)
+      slope += linear->terminal[i][j] * (linear->z[HMPC_N][j] + s->dz[HMPC_N][j] - last[j]);
+    hmpc_add(qp->gradient, R(2.0) * slope, linear->from_u[HMPC_N][i], HMPC_NV);
+  }
+#if HMPC_OUTPUT_COST
+  for (int k = 0; k < HMPC_N; ++k) {
+    real row[HMPC_LD], error[HMPC_NY];
+    output_error(s, goal, k, error);
+    for (int i = 0; i < HMPC_NY; ++i) {
+      const int m = output_row(linear, k, i, row);
+      if (q_y[i] > R(0.0)) hmpc_add(qp->gradient, R(2.0) * q_y[i] * error[i], row, m);
+    }
+  }
+#endif
+  for (int k = 0; k < HMPC_N; ++k)
+    for (int j = 0; j < HMPC_NU; ++j) {
+      const int i = block_of[k] * HMPC_NU + j;
+      const real u = linear->u[k][j], before = k > 0 ? linear->u[k - 1][j] : linear->u_prev[j];
+      const real after = k + 1 < HMPC_N ? linear->u[k + 1][j] : u;
+      const real goal_u = u_goal ? u_goal[k * HMPC_NU + j] : u_rest[j];
+      qp->gradient[i] +=
+          R(2.0) * (r[j] * (u - goal_u) + r_delta[j] * ((u - before) - (after - u))) * u_scale[j];
+    }
+  for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
+  if (HMPC_SOFT_D && memcmp(linear->d, s->d, sizeof linear->d) != 0) make_soft(s, s->d);
+  set_soft(s);
+  set_bounds(s, goal);
+  int fine = all_finite(qp->gradient, HMPC_NV) && all_finite(s->x, HMPC_NX) && all_finite(s->d, HMPC_ND) &&
+             all_finite(s->h, HMPC_NH) && all_finite(qp->value, HMPC_SOFT);
+  for (int k = 0; k <= HMPC_N; ++k) fine = fine && all_finite(row_of(x_goal, rows, k, HMPC_NX), HMPC_NX);
+  if (!fine) return failed(s, HMPC_NOT_FINITE);
+  const hmpc_status status = hmpc_qp_solve(qp, &s->working, linear);
+  if (status != HMPC_SOLVED) return failed(s, status);
+  assess(s, goal, x_goal, rows, u_goal);
+  if (!hmpc_finite(s->plan.cost)) return failed(s, HMPC_NOT_FINITE);
+  for (int k = 0; k < HMPC_N; ++k) {
+    real low[HMPC_NU], high[HMPC_NU];
+    limits_of(goal, linear->u_prev, block_of[k], low, high);
+    for (int j = 0; j < HMPC_NU; ++j)
+      s->plan.u[k][j] =
+          hmpc_clip(linear->u[k][j] + qp->step[block_of[k] * HMPC_NU + j] * u_scale[j], low[j], high[j]);
+  }
+  memcpy(s->plan.w, linear->w, sizeof s->plan.w);
+  s->pending = 1;
+  return s->status = HMPC_SOLVED;
+}
+
+/* ---- safeguards */
+
+static void saturate(const hmpc_goal *goal, const real *u, const real *held, real *to) {
+  real low[HMPC_NU], high[HMPC_NU];
+  limits_of(goal, held, 0, low, high);
+  for (int i = 0; i < HMPC_NU; ++i) {
+    const real near = HMPC_CHANGES ? hmpc_clip(u[i], held[i] - du_max[i], held[i] + du_max[i]) : u[i];
+    to[i] = hmpc_clip(near, low[i], high[i]);
+  }
+}
+
+/* The stabilising feedback on the prior, around what holds the goal best; 0 if it is not finite. */
+static int fallback(const hmpc_state *s, const hmpc_goal *goal, real *u) {
+#if HMPC_FALLBACK_GAIN
+  const real *target = goal && goal->x ? goal->x : x_rest;
+  real best[HMPC_NU];
+  if (!all_finite(target, HMPC_NX)) target = x_rest;
+  equilibrium(target, s->w, best);
+  for (int i = 0; i < HMPC_NU; ++i)
+    for (int j = 0; j < HMPC_ND; ++j) best[i] -= disturbs_u[i][j] * s->d[j];
+  for (int i = 0; i < HMPC_NU; ++i) {
+    u[i] = best[i];
+    for (int j = 0; j < HMPC_NX; ++j) u[i] -= gain[i][j] * (s->x[j] - target[j]);
+    for (int j = 0; j < HMPC_DELAYED; ++j) u[i] -= gain[i][HMPC_NX + j] * (s->h[j] - best[j % HMPC_NU]);
+  }
+  return all_finite(u, HMPC_NU);
+#else
+  (void)s;
+  (void)goal;
+  (void)u;
+  return 0;
+#endif
+}
+
+void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const real *applied) {
+  real held[HMPC_NU], u[HMPC_NU];
+  for (int i = 0; i < HMPC_NU; ++i) held[i] = applied && hmpc_finite(applied[i]) ? applied[i] : s->u[i];
+  if (memcmp(held, s->plan.u[0], sizeof held) != 0) {
+    hmpc_complete(s);
+    memcpy(s->plan.u[0], held, sizeof held);
+    s->prepared = 0;
+  }
+  const hmpc_status status = hmpc_feedback(s, goal, (const real *)0, 0);
+  if (status == HMPC_SOLVED) {
+    saturate(goal, s->plan.u[0], held, s->u);
+    memcpy(s->plan.u[0], s->u, sizeof s->u);
+    s->source = HMPC_MPC;
+    s->age = 0;
+    return;
+  }
+  const int known = all_finite(s->x, HMPC_NX) && all_finite(s->h, HMPC_NH) && all_finite(s->d, HMPC_ND) &&
+                    all_finite(s->w, HMPC_NW);
+  if (s->age < 1000000) ++s->age;
+  if (s->age <= HMPC_MAX_AGE && all_finite(s->plan.u[0], HMPC_NU)) {
+    memcpy(u, s->plan.u[0], sizeof u);
+    s->source = HMPC_PLAN;
+  } else if (known && fallback(s, goal, u)) {
+    s->source = HMPC_FALLBACK;
+  } else {
+    s->source = HMPC_SAFE_INPUT ? HMPC_SAFE : HMPC_HELD;
+    memcpy(u, HMPC_SAFE_INPUT ? safe_input : held, sizeof u);
+  }
+  saturate(goal, u, held, s->u);
+  memcpy(s->plan.u[0], s->u, sizeof s->u);
+  for (int k = 0; k < HMPC_N; ++k)
+    for (int i = 0; i < HMPC_NU; ++i)
+      if (!hmpc_finite(s->plan.u[k][i])) s->plan.u[k][i] = s->u[i];
+  if (known) {
+    real inputs[HMPC_N][HMPC_NU];
+    memcpy(inputs, s->plan.u, sizeof inputs);
+    hmpc_run_free(s, inputs[0], HMPC_N);
+  }
+}
+
+void hmpc_begin(hmpc_state *s, const real *applied, const hmpc_goal *goal) {
+  real inputs[HMPC_N][HMPC_NU];
+  for (int i = 0; i < HMPC_NU; ++i)
+    s->u[i] = hmpc_clip(applied && hmpc_finite(applied[i]) ? applied[i] : u_rest[i], u_min[i], u_max[i]);
+  s->source = HMPC_HELD;
+  s->age = 0;
+  s->working.count = 0;
+  hmpc_run_free(s, s->u, 1);
+  for (int i = 0; i < HMPC_FIRST; ++i) { /* the first plan has no predecessor: it is iterated */
+    /* one period earlier, with the held input in it: the preparation shifts it */
+    for (int k = HMPC_N; k > 0; --k) memcpy(s->plan.z[k], s->plan.z[k - 1], sizeof s->plan.z[k]);
+    for (int k = HMPC_N - 1; k > 0; --k) memcpy(inputs[k], s->plan.u[k - 1], sizeof inputs[k]);
+    memcpy(inputs[0], s->u, sizeof inputs[0]);
+    memcpy(s->plan.u, inputs, sizeof inputs);
+    s->prepared = 0;
+    if (i == HMPC_FIRST - 1) break;
+    if (hmpc_feedback(s, goal, (const real *)0, 0) != HMPC_SOLVED) {
+      hmpc_run_free(s, s->u, 1);
+      break;
+    }
+    hmpc_complete(s);
+  }
+  hmpc_decide(s, goal, (const real *)0);
+}

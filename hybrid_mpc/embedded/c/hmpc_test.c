@@ -1,0 +1,38 @@
+/* Replays hmpc_vectors.h, what the Python controller decided: samples in, inputs and estimates compared.
+   Exit status 0 if all agree. */
+#include <stdio.h>
+#include "hmpc_math.h"
+#include "hmpc_vectors.h"
+
+static hmpc_state state; /* 8-byte numbers at the machine's ease; the library itself has no such thing */
+
+int main(void) {
+  const hmpc_goal goal = {.x = vector_goal[0], .rows = 1};
+  real largest = R(0.0);
+  hmpc_clear(&state);
+  for (int k = 0; k < VECTORS; ++k) {
+#if HMPC_MODES > 0
+    if (k == 0) {
+      hmpc_estimate_start(&state, vector_y[k], vector_w[k]);
+    } else {
+      hmpc_estimate_update(&state, vector_y[k], state.u, vector_w[k]);
+    }
+    for (int i = 0; i < HMPC_NX; ++i)
+      largest = hmpc_max(largest, hmpc_abs(state.x[i] - vector_x[k][i]) / vector_x_size[i]);
+#else
+    memcpy(state.x, vector_x[k], sizeof state.x);
+    if (HMPC_NH > 0) memcpy(state.h, vector_h[k], sizeof state.h);
+    if (HMPC_NW > 0) memcpy(state.w, vector_w[k], sizeof state.w);
+#endif
+    if (k == 0) hmpc_run_free(&state, state.u, 1);
+    hmpc_decide(&state, &goal, (const real *)0);
+    for (int i = 0; i < HMPC_NU; ++i) {
+      largest = hmpc_max(largest, hmpc_abs(state.u[i] - vector_u[k][i]) / vector_u_size[i]);
+      printf("%.17g%c", (double)state.u[i], i + 1 < HMPC_NU ? ' ' : '\n');
+    }
+    hmpc_prepare(&state, &goal);
+  }
+  fprintf(stderr, "%d periods, largest deviation %.3g, at most %.3g expected; the state has %lu bytes\n", VECTORS,
+          (double)largest, (double)VECTOR_TOLERANCE, (unsigned long)sizeof state);
+  return largest <= VECTOR_TOLERANCE ? 0 : 1;
+}

@@ -1,0 +1,130 @@
+"""A model's step cut at its GRU: scalar code before it, the cell's weights, scalar code behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.model import HybridModel, inlined
+from nn_export.errors import last_line
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Weights of a GRU in torch's form, gates r, z, n one below the other, and its first state's place in ``h``."""
+
+    input_weight: Array
+    hidden_weight: Array
+    input_bias: Array
+    hidden_bias: Array
+    first: int
+
+    @property
+    def units(self) -> int:
+        """Number of units."""
+        return int(self.hidden_weight.shape[1])
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A step in scalars. ``before`` ``(x, h, u, w) -> features`` and ``cell`` are None without a network; ``after``
+    ``(x, h, u, w, units) -> z_next`` takes the cell's new state.
+    """
+
+    before: ca.Function | None
+    cell: Cell | None
+    after: ca.Function
+
+
+def cut(model: HybridModel) -> Cut:
+    """The step of a model, its parameters at their values.
+
+    Raises:
+        InputError: If it holds another network than one GRU cell, by name.
+
+    Example:
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.SX.sym("x"), ca.SX.sym("u"), (Signal("x", "m"),)
+        >>> tank = HybridModel.of("tank", 1.0, level, (Signal("u", "m/s"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> cut(tank).cell is None
+        True
+    """
+    sizes = model.n_x, model.n_h, model.n_u, model.n_w
+    point = [ca.MX.sym(name, n) for name, n in zip("xhuw", sizes, strict=True)]
+    z_next: Any = ca.vertcat(*inlined(model.step, [*point, ca.MX(ca.DM(model.p))]))
+    whole = ca.Function("step", point, [z_next])
+    calls = [
+        whole.instruction_MX(k)
+        for k in range(whole.n_instructions())
+        if whole.instruction_id(k) == ca.OP_CALL
+    ]
+    cells = [c for c in calls if c.which_function().name().endswith("_cell")]
+    names = [c.which_function().name() for c in cells]
+    if names not in ([], ["gru_cell"]):
+        raise InputError(
+            f"model {model.name}: its network has the cells {', '.join(names)}; C is generated for one GRU cell"
+        )
+    if not cells:
+        return Cut(None, None, _scalar(model, "step", [*point, ca.MX.sym("units", 0)], z_next))
+    seen: ca.MX = cells[0].dep(0)
+    hidden, new = cells[0].dep(1), cells[0].get_output(0)
+    units = ca.MX.sym("units", new.shape[0])
+    (behind,) = ca.graph_substitute([z_next], [new], [units])
+    first = _place(model, point, hidden)
+    weights = _weights(cells[0].which_function())
+    return Cut(
+        _scalar(model, "features", point, seen), Cell(*weights, first),
+        _scalar(model, "step", [*point, units], behind),
+    )  # fmt: skip
+
+
+def _scalar(model: HybridModel, name: str, point: list[ca.MX], value: ca.MX) -> ca.Function:
+    f = ca.Function(name, point, [ca.densify(value)])
+    try:
+        return f.expand()
+    except RuntimeError as error:
+        raise InputError(f"model {model.name}: its {name} is no scalar code: {last_line(error)}") from error
+
+
+def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int:
+    """Place in ``h`` of the first state that the cell goes on from."""
+    h = point[1]
+    slope = ca.Function("slope", point, [ca.densify(ca.jacobian(hidden, h)), hidden])
+    rng = np.random.default_rng(0)
+    given = [rng.standard_normal(s.numel()) for s in point]
+    rows, value = (v.full() for v in slope(*given))
+    first = int(np.argmax(rows[0]))
+    wanted = np.eye(hidden.shape[0], model.n_h, first)
+    if not np.array_equal(rows, wanted) or not np.array_equal(
+        value[:, 0], given[1][first : first + len(rows)]
+    ):
+        raise InputError(f"model {model.name}: its GRU goes on from something else than its own hidden state")
+    return first
+
+
+def _weights(cell: ca.Function) -> tuple[Array, Array, Array, Array]:
+    """Weights and biases of the input and of the hidden state, read off the cell's two products."""
+    found = {}
+    for k in range(cell.n_instructions()):
+        if cell.instruction_id(k) == ca.OP_MTIMES:
+            product = cell.instruction_MX(k)
+            bias, weight, by = (product.dep(i) for i in range(3))
+            found[by.name()] = weight.to_DM().full(), bias.to_DM().full().ravel()
+    (w, b), (r, c) = found["x"], found["h"]
+    rng = np.random.default_rng(0)
+    x, h = rng.standard_normal(w.shape[1]), rng.standard_normal(r.shape[1])
+    from_x, from_h = np.split(w @ x + b, 3), np.split(r @ h + c, 3)
+    reset, update = (0.5 + 0.5 * np.tanh(0.5 * (from_x[i] + from_h[i])) for i in range(2))
+    n = np.tanh(from_x[2] + reset * from_h[2])
+    wanted = cell(x, h).full().ravel()
+    assert np.allclose(
+        n + update * (h - n), wanted, rtol=1e-12, atol=1e-12
+    )  # else nn_export writes cells otherwise
+    return w, r, b, c

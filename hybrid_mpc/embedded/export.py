@@ -1,0 +1,173 @@
+"""A folder with the C of a controller: sources, vectors that a test program replays, and a README with its sizes."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.rti import CondensedController
+from hybrid_mpc.control.safeguard import SafeController
+from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, Sources, make_sources, template
+from hybrid_mpc.embedded.scalar import table
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+VECTORS = 25
+"""Periods that the test program replays."""
+TOLERANCE = {False: 1e-9, True: 1e-3}
+"""Of inputs by their range and of states by their size; of single precision what its seven digits leave of a QP."""
+OTHERS = ("hmpc_test.c", "Makefile", "CMakeLists.txt")
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What a compiler makes of a controller [bytes]: code and tables, the state, and all frames of its functions."""
+
+    flash: int
+    state: int
+    stack: int
+
+
+def write_controller(
+    folder: Path, model: HybridModel, ocp: OCP, *, estimator: Filter | None = None,
+    fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
+) -> Sources:  # fmt: skip
+    """Write the C of a controller, its test and its README; arguments as :func:`make_sources` takes them.
+
+    Raises:
+        InputError: If something has no C, by name, before anything is written.
+    """
+    found = make_sources(
+        model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input, single=single
+    )
+    safe = SafeController(CondensedController(model, ocp), fallback, safe_input=safe_input)
+    texts = {name: template(name) for name in (*HEADERS, *SOURCES, *OTHERS)} | dict(found.texts)
+    texts["hmpc_vectors.h"] = _vectors(safe, estimator, single)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    (folder / "README.md").write_text(_readme(model, found, footprint(folder), single))
+    return found
+
+
+def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> str:
+    """A short loop from the operating point towards a set-point beside it, on the model itself."""
+    model, ocp = safe.controller.model, safe.controller.ocp
+    size = safe.controller.problem.state_sizes
+    goal = model.x0 + np.where(ocp.q > 0, size, 0.0)
+    rng = np.random.default_rng(0)
+    z, n_x = np.concatenate([model.x0, np.zeros(model.n_h)]), model.n_x
+    sigma = np.zeros(model.n_y) if estimator is None else np.sqrt(_noise(estimator))
+    estimate: Estimate | None = None
+    decision, rows = None, []
+    for _ in range(VECTORS):
+        u = safe.controller.problem.u_rest if decision is None else decision.u
+        y = model.output(z[:n_x], u, model.w, model.p).full().ravel() + sigma * rng.standard_normal(model.n_y)
+        if estimator is None:
+            empty = np.zeros(model.n_d)
+            estimate = Estimate(0.0, z[:n_x], z[n_x:], empty, np.zeros((0, 0)), y, 0.0, w=model.w)
+        elif estimate is None:
+            estimate = estimator.start(y, w=model.w)
+        else:
+            estimate = estimator.update(estimate, y, u, w=model.w)
+        decision = safe.initial(estimate) if decision is None else decision
+        decision = safe.decide(decision, estimate, goal[None])
+        rows.append((y, model.w, estimate.x, estimate.h, decision.u))
+        step = model.step(z[:n_x], z[n_x:], decision.u, model.w, model.p)
+        z = np.concatenate([v.full().ravel() for v in step])
+    columns = zip("ywxhu", (np.array(c) for c in zip(*rows, strict=True)), strict=True)
+    tables = [table(f"vector_{name}", values) for name, values in columns]
+    tables += [table("vector_goal", goal[None]), table("vector_x_size", size)]
+    tables.append(table("vector_u_size", ocp.input_range))
+    head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({TOLERANCE[single]!r})\n"
+    return (
+        "/* What the Python controller decided in a short loop, generated. */\n"
+        f"#ifndef HMPC_VECTORS_H\n#define HMPC_VECTORS_H\n{head}{''.join(tables)}#endif\n"
+    )
+
+
+def _noise(estimator: Filter) -> Array:
+    first = estimator.filters[0] if hasattr(estimator, "filters") else estimator
+    return first.noise[1]
+
+
+def footprint(folder: Path) -> Footprint | None:
+    """Sizes by gcc -O3 for this machine; None where there is none."""
+    gcc, size = shutil.which("gcc"), shutil.which("size")
+    if gcc is None or size is None:
+        return None
+    with tempfile.TemporaryDirectory() as work:
+        flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
+        sources = [str((folder / name).resolve()) for name in SOURCES]
+        made = subprocess.run([gcc, *flags, "-c", *sources], cwd=work, capture_output=True, check=False)
+        test = [str((folder / "hmpc_test.c").resolve()), *sources, "-lm", "-o", "test"]
+        linked = subprocess.run([gcc, *flags[:3], *test], cwd=work, capture_output=True, check=False)
+        if made.returncode or linked.returncode:
+            return None
+        objects = sorted(str(p) for p in Path(work).glob("*.o"))
+        table_of = subprocess.run([size, *objects], capture_output=True, text=True, check=True).stdout
+        flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
+        frames = [
+            int(line.split("\t")[1])
+            for p in Path(work).glob("hmpc_*.su")
+            for line in p.read_text().splitlines()
+        ]
+        told = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False).stderr
+        state = re.search(r"the state has (\d+) bytes", told)
+        return Footprint(flash, int(state[1]) if state else 0, sum(frames))
+
+
+def operations(found: Sources) -> dict[str, int]:
+    """Additions and multiplications of a period, by part; of the QP for one iteration."""
+    n, code = found.sizes, found.operations
+    n_z, n_v, units = n["NX"] + n["NH"], n["BLOCKS"] * n["NU"], n["UNITS"]
+    padded = -(-n_z // 8) * 8
+    active = np.minimum(np.arange(1, n["N"]) * n["NU"], n_v)
+    stage = (
+        code.get("before_slope", 0) + code["after_slope"] + units * (6 * (n.get("FEATURES", 0) + units) + 110)
+    )
+    stage += units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) + 2 * n["HEAD"] * units * (padded + n["NU"])
+    n_e = n_z + n["ND"]
+    return {
+        "prepare: stages' Jacobians": n["N"] * stage,
+        "prepare: condensing": int(2 * n_z**2 * np.sum(-(-active // 8) * 8)),
+        "prepare: Hessian and its factor": int(n["NX"] * np.sum(active**2)) + n_v**3,
+        "step: estimator": n["MODES"] * (stage + 4 * n_e * padded * n_e + 2 * n["MODES"] * n_e**2),
+        "step: free response, gradient, bounds": 2 * n["N"] * n_z * padded + 6 * n["N"] * n["NX"] * n_v,
+        "step: QP, an iteration": 4 * n_v**2 + 2 * n_v * n["N"] * (n["SOFT_X"] + n["SOFT_E"]),
+    }
+
+
+def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single: bool) -> str:
+    n = found.sizes
+    rows = "".join(f"| {name} | {count:,} |\n" for name, count in operations(found).items())
+    if sizes is None:
+        memory = "Not measured: no gcc was found where this was generated. `make test` prints the size of the state.\n"
+    else:
+        memory = (
+            "| | bytes |\n| --- | ---: |\n"
+            f"| flash: code and tables | {sizes.flash:,} |\n| RAM: one `hmpc_state` | {sizes.state:,} |\n"
+            f"| stack: all frames, an upper bound (nothing recurses) | {sizes.stack:,} |\n"
+        )
+    values: Mapping[str, object] = {
+        "NAME": model.name, "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
+        "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
+        "DT": model.dt, "TOLERANCE": TOLERANCE[single],
+        "ESTIMATOR": f"{n['MODES']} Kalman filters side by side" if n["MODES"] else "none: it is given an estimate",
+        "FILES": ", ".join(f"`{name}`" for name in GENERATED),
+    }  # fmt: skip
+    text = template("README.md")
+    for name, value in values.items():
+        text = text.replace(f"@{name}@", str(value))
+    return text

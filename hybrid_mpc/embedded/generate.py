@@ -1,0 +1,389 @@
+"""C of a controller: sizes, tables and scalar code beside the sources in ``c/``, the same for all machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.problem import Problem, SoftRows
+from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
+from hybrid_mpc.embedded.cut import Cut, cut
+from hybrid_mpc.embedded.scalar import c_function, table
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimate.switching import NEGLIGIBLE, Filter, SwitchingFilter
+from hybrid_mpc.model.model import HybridModel, output_with_jacobian
+from hybrid_mpc.model.riccati import dare
+from nn_export.errors import last_line
+
+Array = NDArray[np.float64]
+SOURCES = ("hmpc_model.c", "hmpc_qp.c", "hmpc_mpc.c", "hmpc_estimator.c")
+HEADERS = ("hmpc.h", "hmpc_math.h")
+GENERATED = ("hmpc_config.h", "hmpc_tables.h", "hmpc_expressions.h")
+FIRST = 25
+"""Iterations of the first plan: an RTI step halves what is left, or better."""
+MAX_AGE = 5
+"""Periods a plan is followed without a successful solve, as :class:`~hybrid_mpc.control.safeguard.SafeController`."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """C of a controller: the generated files' texts by name, and how many scalar operations they hold by function."""
+
+    texts: Mapping[str, str]
+    operations: Mapping[str, int]
+    sizes: Mapping[str, int]
+
+
+def make_sources(
+    model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
+    safe_input: Array | None = None, single: bool = False, targets: bool = False,
+) -> Sources:  # fmt: skip
+    """The generated files of a controller.
+
+    Args:
+        model: The model that plans, and estimates.
+        ocp: The control problem.
+        estimator: Default: none; the C then starts from an estimate that is handed to it.
+        fallback: The prior, see :class:`~hybrid_mpc.control.safeguard.SafeController`. Default: none.
+        safe_input: Likewise.
+        single: Whether numbers are ``float``. Default: ``double``.
+        targets: Whether steady states for set-points of outputs are handed to it. Default: no.
+
+    Raises:
+        InputError: If something of them has no C, all at once, by name.
+    """
+    refused = _refused(model, ocp, estimator, targets)
+    parts: Cut | None = None
+    try:
+        parts = cut(model)
+    except InputError as error:
+        refused.append(str(error))
+    if refused or parts is None:
+        raise InputError("no C for this controller: " + "; ".join(refused))
+    problem = Problem(model, ocp)
+    soft = SoftRows(ocp, model)
+    states = np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))
+    expressions = sum(int(f.numel_out(0)) for f in soft.functions)
+    modes = () if estimator is None else _modes(estimator)
+    starts = ocp.block_starts
+    sizes = {
+        "NX": model.n_x, "NH": model.n_h, "NU": model.n_u, "NY": model.n_y, "NW": model.n_w, "ND": model.n_d,
+        "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": states.size, "SOFT_E": expressions, "MODES": len(modes),
+        "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": MAX_AGE, "FIRST": FIRST,
+        "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
+        "OUTPUT_COST": int(ocp.n_y > 0), "SOFT_D": int(ocp.y_min.size > 0),
+    }  # fmt: skip
+    code, model_sizes, operations = _expressions(
+        model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0
+    )
+    sizes |= model_sizes
+    tables = _tables(model, ocp, problem, soft, states, fallback, safe_input, estimator)
+    texts = {"hmpc_config.h": _config(sizes, single), "hmpc_tables.h": tables, "hmpc_expressions.h": code}
+    return Sources(texts, operations, sizes)
+
+
+def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, targets: bool) -> list[str]:
+    """What of a controller has no C yet, in words."""
+    cases = {
+        "weights on outputs (q_y), which need the target calculator": ocp.n_y > 0 and not targets,
+        "an economic stage cost": ocp.economic is not None,
+        "several first plans (starts)": bool(ocp.starts),
+        "a forecast of measured disturbances (preview_w)": ocp.preview_w and model.n_w > 0,
+    }
+    found = [what for what, wrong in cases.items() if wrong]
+    if estimator is not None or ocp.n_y:
+        found += _refused_outputs(model, estimator is not None)
+    return found
+
+
+def _refused_outputs(model: HybridModel, measured: bool) -> list[str]:
+    slopes = output_with_jacobian(model)
+    rng = np.random.default_rng(0)
+    points: list[tuple[Array, ...]] = [(model.x0, model.u0, model.w)]
+    points += [tuple(p + rng.standard_normal(p.size) for p in points[0]) for _ in range(3)]
+    c, d = ([slopes(*p)[i].full() for p in points] for i in (1, 2))
+    moved = max(float(np.max(np.abs(m - ms[0]), initial=0.0)) for ms in (c, d) for m in ms)
+    if not moved <= 1e-12 * max(1.0, float(np.max(np.abs(c[0])))):
+        return ["outputs that are not linear in state and input, for an estimator or weights on them"]
+    if measured and np.linalg.matrix_rank(c[0]) < model.n_y:
+        return ["an estimator with more sensors than states that they show"]
+    return []
+
+
+def _modes(estimator: Filter) -> tuple[ExtendedKalmanFilter, ...]:
+    return estimator.filters if isinstance(estimator, SwitchingFilter) else (estimator,)
+
+
+def _config(sizes: Mapping[str, int], single: bool) -> str:
+    names = "".join(f"#define HMPC_{name} {value}\n" for name, value in sizes.items())
+    # A float has seven digits: the QP is as exact as that allows.
+    exact = ("2e-5", "1e-4", "2e-3", "1e-3") if single else (
+        "1e-10", "1e-12", repr(KKT_TOLERANCE), repr(BOUND_TOLERANCE)
+    )  # fmt: skip
+    tolerances = zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE"), exact, strict=True)
+    return (
+        "/* Sizes of this controller, generated. */\n#ifndef HMPC_CONFIG_H\n#define HMPC_CONFIG_H\n"
+        + ("#define HMPC_FLOAT\n" if single else "")
+        + "#ifdef HMPC_FLOAT\ntypedef float hmpc_real;\n#define HMPC_HUGE 3.402823466e+38F\n#else\n"
+        + "typedef double hmpc_real;\n#define HMPC_HUGE 1.7976931348623157e308\n#endif\n"
+        + names
+        + "".join(f"#define HMPC_{name} R({value})\n" for name, value in tolerances)
+        + f"#define HMPC_NEGLIGIBLE {NEGLIGIBLE!r}\n"
+        + "#define HMPC_QP_CAP (10 * HMPC_MOST + 100) /* iterations of the QP */\n#endif\n"
+    )
+
+
+def _expressions(
+    model: HybridModel, parts: Cut, soft: SoftRows, fallback: HybridModel | None, ocp: OCP, measured: bool
+) -> tuple[str, dict[str, int], dict[str, int]]:
+    """The scalar code, sizes that follow from it, and its operations by function."""
+    n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
+    n_z = n_x + n_h
+    padded = -(-n_z // 8) * 8
+    row = padded + n_u
+    z, u, w = ca.SX.sym("z", n_z), ca.SX.sym("u", n_u), ca.SX.sym("w", model.n_w)
+    inputs = {"z": z, "u": u, "w": w}
+    point = ["const real *z", "const real *u", "const real *w"]
+    texts, operations = ['#include "hmpc_math.h"\n'], {}
+    places = [*range(n_z), *range(padded, padded + n_u)]
+
+    def add(name: str, *given: object) -> None:
+        text, operations[name] = c_function(name, *given)  # type: ignore[arg-type]
+        texts.append(text)
+
+    cell, units = parts.cell, 0 if parts.cell is None else parts.cell.units
+    g = ca.SX.sym("g", units)
+    x, h = z[:n_x], z[n_x:]
+    z_next = parts.after(x, h, u, w, g)
+    own: dict[int, int] = {}
+    sizes = {"UNITS": units}
+    if cell is not None and parts.before is not None:
+        seen = parts.before(x, h, u, w)
+        slope = ca.jacobian(seen, ca.vertcat(z, u))
+        rows, columns = slope.sparsity().get_triplet()
+        values = [slope[i, j] for i, j in zip(rows, columns, strict=True)]
+        own = {i: k for i in range(n_z) for k in range(units) if ca.is_equal(z_next[i], g[k], 0)}
+        first = min(own, default=0)
+        if [own.get(first + k) for k in range(units)] != list(range(units)):
+            raise InputError(
+                f"no C for model {model.name}: its GRU's new state is not its next hidden state as it is"
+            )
+        sizes |= {
+            "FEATURES": seen.numel(), "SEEN_SLOPES": len(values), "HIDDEN": n_x + cell.first, "HIDDEN_NEXT": first,
+        }  # fmt: skip
+        # the hidden state's weights row by row for the Jacobian, and column by column for the values
+        gates = -(-3 * units // 8) * 8
+        sizes["GATES"] = gates
+        weights = {"input_weight": cell.input_weight, "hidden_weight": cell.hidden_weight}
+        for which, weight, bias in (
+            ("input", cell.input_weight, cell.input_bias), ("hidden", cell.hidden_weight, cell.hidden_bias)
+        ):  # fmt: skip
+            more = (0, gates - 3 * units)
+            weights |= {
+                f"{which}_columns": np.pad(weight, (more, (0, 0))).T,
+                f"{which}_bias": np.pad(bias, more),
+            }
+        texts += [table(name, value) for name, value in weights.items()]
+        texts.append(
+            table("seen_row", rows, "int") + table("seen_column", [places[j] for j in columns], "int")
+        )
+        outs = [(f"seen[{i}]", seen[i]) for i in range(seen.numel())]
+        add("before", [*point, "real *seen"], inputs, outs)
+        slopes = [(f"by_v[{i}]", v) for i, v in enumerate(values)]
+        add("before_slope", [*point, "real *seen", "real *by_v"], inputs, outs + slopes)
+    rest = [i for i in range(n_z) if i not in own]
+    head, out, z_next = _reduced(parts, model, rest, z, u, w) if units else (np.zeros((0, 0)), g, z_next)
+    sizes["HEAD"] = len(head)
+    texts.append(table("head", head))
+    inputs = {**inputs, "out": out}
+    point.append("const real *out")
+    outs = [(f"z_next[{i}]", z_next[i]) for i in rest]
+    add("after", [*point, "real *z_next"], inputs, outs)
+    by_out, by_v = ca.jacobian(z_next, out), ca.jacobian(z_next, ca.vertcat(z, u))
+    corrected = [i for i in rest if units and by_out[i, :].nnz()]
+    outs += [
+        (f"slope[{i * row + places[j]}]", by_v[i, j])
+        for i in rest
+        for j in by_v[i, :].sparsity().get_triplet()[1]
+    ]
+    outs += [
+        (f"by_out[{k * len(head) + j}]", ca.densify(by_out[i, j]))
+        for k, i in enumerate(corrected)
+        for j in range(len(head))
+    ]
+    cleared = [f"memset(slope + {i * row}, 0, sizeof(real) * HMPC_LJ);" for i in corrected]
+    add("after_slope", [*point, "real *z_next", "real *slope", "real *by_out"], inputs, outs, cleared)
+    sizes["CORRECTED"] = len(corrected)
+    texts.append(table("corrected", np.array(corrected, dtype=float), "int"))
+    x, d = ca.SX.sym("x", n_x), ca.SX.sym("d", model.n_d)
+    if soft.functions:
+        values, e = [], ca.vertcat(d, w)
+        for f in soft.functions:
+            values.append(_scalar(f"soft bound {f.name()}", f)(x, u, e))
+        value = ca.densify(ca.vertcat(*values))
+        outs = [(f"value[{i}]", value[i]) for i in range(value.numel())]
+        for name, by, width in (("by_x", x, n_x), ("by_u", u, n_u)):
+            jacobian = ca.densify(ca.jacobian(value, by))
+            outs += [
+                (f"{name}[{i * width + j}]", jacobian[i, j])
+                for i in range(value.numel())
+                for j in range(width)
+            ]
+        arguments = [
+            *(f"const real *{name}" for name in "xuwd"),
+            *(f"real *{name}" for name in ("value", "by_x", "by_u")),
+        ]
+        add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d}, outs)
+    if measured:
+        y = _scalar("the output", model.output)(x, u, w, ca.DM(model.p))
+        outs = [(f"y[{i}]", y[i]) for i in range(model.n_y)]
+        add(
+            "outputs",
+            ["const real *x", "const real *u", "const real *w", "real *y"],
+            {"x": x, "u": u, "w": w},
+            outs,
+        )
+    if fallback is not None:
+        rates = _scalar("the prior", fallback.xdot)(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
+        rates = ca.DM(np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))) * rates
+        by_u = ca.jacobian(rates, u)
+        best = u - ca.solve(by_u.T @ by_u + 1e-12 * ca.DM.eye(n_u), by_u.T @ rates)
+        best = ca.densify(ca.substitute(best, u, ca.DM(fallback.u0)))
+        outs = [(f"best[{i}]", best[i]) for i in range(n_u)]
+        add("equilibrium", ["const real *x", "const real *w", "real *best"], {"x": x, "w": w}, outs)
+    guard = "HMPC_EXPRESSIONS_H"
+    opening = f"/* Scalar code of this controller, generated. */\n#ifndef {guard}\n#define {guard}\n"
+    return opening + "\n".join(texts) + "\n#endif\n", sizes, operations
+
+
+def _reduced(
+    parts: Cut, model: HybridModel, rest: list[int], z: ca.SX, u: ca.SX, w: ca.SX
+) -> tuple[Array, ca.SX, ca.SX]:
+    """What the step sees of the cell's new state: ``head`` ``(k, units)``, symbols of the k combinations, and the step
+    with them in place of the units.
+
+    A linear layer behind the cell lets through as many as it has outputs: the row space of the Jacobian, the same at
+    all points. Writing it out unit by unit would make scalar code that grows with the network.
+    """
+    assert parts.cell is not None
+    units, n_x = parts.cell.units, model.n_x
+    g = ca.SX.sym("g", units)
+    step = parts.after(z[:n_x], z[n_x:], u, w, g)
+    slope = ca.Function("slope", [z, u, w, g], [ca.densify(ca.jacobian(step[rest], g))])
+    value = ca.Function("value", [z, u, w, g], [step[rest]])
+    rng = np.random.default_rng(0)
+
+    def point() -> list[Array]:
+        z_k = np.concatenate([model.x0, np.zeros(model.n_h)])
+        near = [v + 0.3 * (np.abs(v) + 1.0) * rng.uniform(-1, 1, v.size) for v in (z_k, model.u0)]
+        return [*near, model.w, rng.uniform(-1, 1, units)]
+
+    found = np.vstack([slope(*point()).full() for _ in range(8)])
+    found = found[np.all(np.isfinite(found), axis=1)]
+    sizes, basis = np.linalg.svd(found)[1:] if len(found) else (np.zeros(0), np.zeros((0, units)))
+    rank = int(np.sum(sizes > 1e-10 * max(1e-300, float(np.max(sizes, initial=0.0)))))
+    pivots = _pivots(basis[:rank])
+    head = np.linalg.solve(basis[:rank][:, pivots], basis[:rank]) if rank else np.zeros((0, units))
+    out, chosen = ca.SX.sym("out", rank), ca.SX.zeros(units)
+    for k, place in enumerate(pivots):
+        chosen[place] = out[k]
+    reduced = parts.after(z[:n_x], z[n_x:], u, w, chosen)
+    again = ca.Function("again", [z, u, w, out], [reduced[rest]])
+    for _ in range(4):
+        *given, units_k = point()
+        wanted, got = value(*given, units_k).full(), again(*given, head @ units_k).full()
+        if not np.allclose(got, wanted, rtol=1e-11, atol=1e-11 * float(np.max(np.abs(wanted), initial=1e-9))):
+            return np.eye(units), g, step
+    return head, out, reduced
+
+
+def _pivots(rows: Array) -> list[int]:
+    """Columns of full rank of ``(k, n)`` rows of full rank."""
+    left, chosen = rows.copy(), []
+    for _ in range(len(rows)):
+        sizes = np.linalg.norm(left, axis=0)
+        chosen.append(int(np.argmax(sizes)))
+        direction = left[:, chosen[-1]] / sizes[chosen[-1]]
+        left = left - np.outer(direction, direction @ left)
+    return chosen
+
+
+def _scalar(what: str, f: ca.Function) -> ca.Function:
+    try:
+        return f.expand()
+    except RuntimeError as error:
+        raise InputError(f"no C for this controller: {what} is no scalar code: {last_line(error)}") from error
+
+
+def _tables(
+    model: HybridModel, ocp: OCP, problem: Problem, soft: SoftRows, states: NDArray[np.int64],
+    fallback: HybridModel | None, safe_input: Array | None, estimator: Filter | None,
+) -> str:  # fmt: skip
+    """All numbers of the problem and the estimator."""
+    dt, n = model.dt, ocp.horizon
+    on_u, on_x, on_y = model.disturbed
+    starts = ocp.block_starts
+    lengths = np.diff(np.append(starts, n))
+    per_period = len(states)
+    # the rows of one period: of the states' bounds, then of each expression's
+    kinds, at = [*range(per_period)], n * per_period
+    for f in soft.functions:
+        kinds += range(at, at + f.numel_out(0))
+        at += n * f.numel_out(0)
+    scale, linear, quadratic = (v[kinds] for v in (soft.scale, soft.linear, soft.quadratic))
+    reals: dict[str, Array] = {
+        "u_min": ocp.u_min, "u_max": ocp.u_max, "u_scale": ocp.input_scale, "u_rest": model.u0, "x_rest": model.x0,
+        "w_rest": model.w, "du_max": np.full(model.n_u, np.inf) if ocp.du_max is None else ocp.du_max,
+        "q": ocp.q * dt, "r": ocp.r * dt, "r_delta": ocp.r_delta * dt, "terminal": problem.terminal,
+        "disturbs_u": on_u, "disturbs_x": on_x,
+        "soft_lower": soft.lower[kinds], "soft_upper": soft.upper[kinds],
+        "soft_scale": scale if scale.size else np.ones(1),
+        "soft_linear": dt * linear * scale, "soft_quadratic": 2 * dt * quadratic * scale**2,
+        "safe_input": np.zeros(model.n_u) if safe_input is None else safe_input,
+    }  # fmt: skip
+    if fallback is not None:
+        gain = dare(*ocp.linear_quadratic(fallback))[1]
+        reals["gain"] = gain[:, : ocp.n_x + fallback.delay_states]
+    if estimator is not None or ocp.n_y:
+        c, by_u = (m.full() for m in output_with_jacobian(model)(model.x0, model.u0, model.w)[1:])
+        reals |= {"output_x": c, "output_d": by_u @ on_u + on_y, "disturbs_y": on_y}
+        rest = model.output(model.x0, model.u0, model.w, model.p).full().ravel()
+        reals |= {"q_y": ocp.q_y * dt, "output_u": by_u, "y_rest": rest} if ocp.n_y else {}
+    if estimator is not None:
+        modes = _modes(estimator)
+        switching = estimator if isinstance(estimator, SwitchingFilter) else None
+        reals |= {
+            "noise": np.array([f.noise[0] for f in modes]), "noise_y": modes[0].noise[1],
+            "first_variance": np.array([f.first for f in modes]), "lost_variance": np.array([f.most for f in modes]),
+            "switches": np.ones((1, 1)) if switching is None else switching.transition,
+            "first_probability": np.ones(1) if switching is None else switching.first_probability,
+        }  # fmt: skip
+    whole = {
+        "block_of": np.repeat(np.arange(starts.size), lengths), "block_start": starts, "block_length": lengths,
+        "soft_state": states,
+    }  # fmt: skip
+    text = "".join(table(name, value) for name, value in reals.items())
+    text += "".join(table(name, value, "int") for name, value in whole.items())
+    return f"/* Numbers of this controller, generated. */\n#ifndef HMPC_TABLES_H\n#define HMPC_TABLES_H\n{text}#endif\n"
+
+
+def template(name: str) -> str:
+    """A source that is the same for all controllers."""
+    return (files("hybrid_mpc.embedded") / "c" / name).read_text()
+
+
+def write_sources(found: Sources, folder: Path) -> None:
+    """Write all that is to be compiled."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (*SOURCES, *HEADERS):
+        (folder / name).write_text(template(name))
+    for name, text in found.texts.items():
+        (folder / name).write_text(text)

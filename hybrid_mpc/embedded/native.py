@@ -1,0 +1,240 @@
+"""The generated C behind the interface of the Python controller: compiled once, cached, called through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import OCP, Limits
+from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status
+from hybrid_mpc.embedded.generate import SOURCES, Sources, make_sources, template
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.model import HybridModel
+from nn_export.codegen import compile_library
+
+Array = NDArray[np.float64]
+FLAGS = ("-std=c11", "-O3", "-march=native", "-ffp-contract=off")
+"""Binds the library to this processor; a fused multiply-add would give other bits than the generated C elsewhere."""
+STATUS = (Status.INITIAL, Status.SOLVED, Status.NOT_FINITE, Status.INFEASIBLE, Status.INACCURATE)
+_BRIDGE = """
+#include "hmpc.h"
+#include <stddef.h>
+#include <stdlib.h>
+#define PLACE(field) offsetof(hmpc_state, field)
+const size_t hmpc_places[] = {
+  sizeof(hmpc_state), PLACE(x), PLACE(h), PLACE(d), PLACE(w), PLACE(plan.u), PLACE(plan.z), PLACE(plan.w),
+  PLACE(plan.cost), PLACE(plan.excess), PLACE(working.kkt), PLACE(linear.largest_defect), PLACE(u), PLACE(status),
+  PLACE(source), PLACE(age), PLACE(working.iterations)
+};
+"""
+"""What the state's fields are found by."""
+FIELDS = (
+    "x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect", "u", "status", "source", "age",
+    "iterations",
+)  # fmt: skip
+
+
+class Goal(ctypes.Structure):
+    """``hmpc_goal``."""
+
+    _fields_ = (
+        ("x", ctypes.c_void_p), ("rows", ctypes.c_int), ("weight", ctypes.c_void_p), ("u", ctypes.c_void_p),
+        ("y", ctypes.c_void_p), ("u_min", ctypes.c_void_p), ("u_max", ctypes.c_void_p),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What :meth:`NativeController.prepare` was given; ``ticket`` says whether the C state still holds its result."""
+
+    previous: Solution
+    weight: Array | None
+    ticket: int
+    milliseconds: float
+
+
+class NativeController(SplitController):
+    """The real-time iteration as compiled C: :class:`~hybrid_mpc.control.rti.CondensedController` in every respect but
+    time.
+
+    The library is compiled when the object is made, unless the cache folder has it. Not for several threads at once.
+
+    Args:
+        model: The deployed model.
+        ocp: The problem.
+        flags: Options of the compiler. Default: :data:`FLAGS`.
+
+    Raises:
+        InputError: If something of the two has no C, by name.
+        CompileError: If there is no compiler, or it fails.
+    """
+
+    converges = False
+
+    def __init__(self, model: HybridModel, ocp: OCP, *, flags: Sequence[str] = FLAGS) -> None:
+        self.problem = Problem(model, ocp)
+        self._library = load_library(make_sources(model, ocp, targets=True), flags)
+        self._state = State(self._library)
+        self._ticket = 0
+
+    def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
+        """See :meth:`~hybrid_mpc.control.rti.CondensedController.prepare`."""
+        start = perf_counter()
+        weight = None if weight is None else np.ascontiguousarray(self.problem.weights(weight))
+        self._load(previous)
+        goal = goal_of(weight=weight)
+        self._library.c.hmpc_prepare(self._state.at, ctypes.byref(goal))
+        self._ticket += 1
+        return Prepared(previous, weight, self._ticket, (perf_counter() - start) * 1e3)
+
+    def finish(
+        self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
+        w: Array | None = None,
+    ) -> Solution:  # fmt: skip
+        """See :meth:`~hybrid_mpc.control.rti.CondensedController.feedback`."""
+        if prepared.ticket != self._ticket:  # it has prepared something else since
+            prepared = self.prepare(prepared.previous, prepared.weight)
+        start = perf_counter()
+        self._ticket += 1
+        view, m, problem = self._state.view, self.model, self.problem
+        u = y = steady = None
+        if problem.targets is None:
+            rows = np.ascontiguousarray(np.asarray(reference, dtype=np.float64))
+            if rows.ndim != 2 or len(rows) < 1 or rows.shape[1] != m.n_x:
+                problem.target(reference)  # says what is wrong
+        else:
+            target = problem.target(reference, None, estimate, w, prepared.previous.steady)
+            rows, u, y = (np.ascontiguousarray(v) for v in (target.x, target.u, target.y))
+            steady = target.steady
+        view["x"][:], view["h"][:], view["d"][:] = estimate.x, estimate.h, estimate.d
+        if m.n_w:
+            view["w"][:] = estimate.w
+        ahead = np.ascontiguousarray(problem.forecast(w, estimate)) if m.n_w else None
+        bounds = (None, None) if limits is None else (limits.u_min, limits.u_max)
+        goal = goal_of(rows, prepared.weight, *bounds, u=u, y=y)
+        status = STATUS[
+            self._library.c.hmpc_feedback(
+                self._state.at,
+                ctypes.byref(goal),
+                None if ahead is None else ahead.ctypes.data,
+                self.ocp.horizon,
+            )
+        ]
+        spent = (perf_counter() - start) * 1e3
+        self._library.c.hmpc_complete(self._state.at)
+        z, plan, n_x = view["plan_z"][:, : m.n_x + m.n_h].copy(), view["plan_u"].copy(), m.n_x
+        n_w, d = m.n_w, estimate.d if status.ok else prepared.previous.d
+        return Solution(
+            plan, z[:, :n_x], z[:, n_x:], d, float(view["cost"][0]), status, float(view["kkt"][0]),
+            float(view["defect"][0]), {"prepare": prepared.milliseconds, "feedback": spent},
+            float(view["excess"][0]), w=view["plan_w"][:, :n_w].copy(),
+            steady=steady if status.ok else prepared.previous.steady,
+        )  # fmt: skip
+
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None, w: Array | None = None,
+    ) -> Solution:  # fmt: skip
+        """:meth:`prepare` and :meth:`finish`."""
+        return self.finish(self.prepare(previous, weight), estimate, reference, limits, w)
+
+    def _load(self, plan: Solution) -> None:
+        m = self.model
+        z = np.hstack([plan.x, plan.h])
+        w = plan.w if len(plan.w) else self.problem.forecast(None, None)
+        given = [
+            np.ascontiguousarray(v, dtype=np.float64)
+            for v in (plan.u, z, plan.d, w if m.n_w else np.zeros(1))
+        ]
+        self._library.c.hmpc_load_plan(self._state.at, *(v.ctypes.data for v in given))
+
+
+def goal_of(
+    x: Array | None = None, weight: Array | None = None, u_min: Array | None = None, u_max: Array | None = None,
+    *, u: Array | None = None, y: Array | None = None,
+) -> Goal:  # fmt: skip
+    """What a plan is to follow; the arrays, row by row, must outlive it."""
+
+    def at(array: Array | None) -> int | None:
+        return None if array is None else array.ctypes.data
+
+    return Goal(at(x), 1 if x is None else len(x), at(weight), at(u), at(y), at(u_min), at(u_max))
+
+
+@dataclass(frozen=True)
+class Library:
+    """A loaded library, its sizes, and the places of the state's fields [bytes], the state's size first."""
+
+    c: Any
+    sizes: Mapping[str, int]
+    places: tuple[int, ...]
+
+
+class State:
+    """A ``hmpc_state`` of doubles, cleared; ``at`` is its address, ``view`` has arrays on some of its fields."""
+
+    def __init__(self, library: Library) -> None:
+        n = library.sizes
+        n_z, n_w = n["NX"] + n["NH"], n["NW"]
+        shapes: dict[str, tuple[int, ...]] = {
+            "x": (n["NX"],), "h": (n["NH"],), "d": (n["ND"],), "w": (n_w,), "plan_u": (n["N"], n["NU"]),
+            "plan_z": (n["N"] + 1, -(-n_z // 8) * 8), "plan_w": (n["N"], max(1, n_w)), "u": (n["NU"],),
+        }  # fmt: skip
+        size, *places = library.places
+        memory = np.zeros(size + 64, dtype=np.uint8)
+        start = -memory.ctypes.data % 64
+        self.at = ctypes.c_void_p(memory.ctypes.data + start)
+        self.view: dict[str, NDArray[Any]] = {}
+        for name, place in zip(FIELDS, places, strict=True):
+            kind = np.dtype(np.int32 if name in ("status", "source", "age", "iterations") else np.float64)
+            shape = shapes.get(name, (1,))
+            field = memory[start + place :][: kind.itemsize * int(np.prod(shape))]
+            self.view[name] = field.view(kind).reshape(shape)
+        library.c.hmpc_clear(self.at)
+
+
+def load_library(sources: Sources, flags: Sequence[str] = FLAGS) -> Library:
+    """The C compiled, or the cached library, loaded."""
+    path = compile_library(one_file(sources.texts), flags)
+    c = ctypes.CDLL(str(path))
+    state, pointer = ctypes.c_void_p, ctypes.c_void_p
+    signatures: dict[str, tuple[Any, ...]] = {
+        "clear": (state,), "prepare": (state, pointer), "complete": (state,),
+        "load_plan": (state, pointer, pointer, pointer, pointer), "feedback": (state, pointer, pointer, ctypes.c_int),
+        "decide": (state, pointer, pointer), "begin": (state, pointer, pointer),
+    }  # fmt: skip
+    if sources.sizes["MODES"]:
+        signatures |= dict.fromkeys(("start", "step"), (state, pointer, pointer, pointer, pointer))
+        signatures |= {"estimate_start": (state, pointer, pointer), "finish": (state, pointer)}
+        signatures |= {"estimate_update": (state, pointer, pointer, pointer)}
+    for name, given in signatures.items():
+        f = getattr(c, f"hmpc_{name}")
+        f.argtypes, f.restype = given, ctypes.c_int if name == "feedback" else None
+    places = (ctypes.c_size_t * (len(FIELDS) + 1)).in_dll(c, "hmpc_places")
+    return Library(c, sources.sizes, tuple(places))
+
+
+def one_file(texts: Mapping[str, str]) -> str:
+    """All sources as one text, headers once and in place."""
+    own = {name: template(name) for name in ("hmpc.h", "hmpc_math.h", *SOURCES)} | dict(texts)
+    seen: set[str] = set()
+
+    def written(text: str) -> str:
+        lines = []
+        for line in text.splitlines():
+            name = line.split('"')[1] if line.startswith('#include "') else ""
+            if not name:
+                lines.append(line)
+            elif name not in seen:
+                seen.add(name)
+                lines.append(written(own[name]))
+        return "\n".join(lines)
+
+    parts = [written(own[name]) for name in SOURCES]
+    return "\n".join([*parts, written(_BRIDGE)]) + "\n"

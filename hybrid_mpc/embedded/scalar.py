@@ -1,0 +1,119 @@
+"""Scalar expressions of CasADi as C statements, and numbers as C tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hybrid_mpc.errors import InputError
+
+MOST = 30_000
+"""Operations of an expression beyond which it is no scalar code any more: dense layers that are no GRU."""
+_BINARY = {
+    ca.OP_ADD: "{} + {}", ca.OP_SUB: "{} - {}", ca.OP_MUL: "{} * {}", ca.OP_DIV: "{} / {}",
+    ca.OP_FMIN: "hmpc_min({}, {})", ca.OP_FMAX: "hmpc_max({}, {})",
+    ca.OP_LT: "{} < {} ? R(1.0) : R(0.0)", ca.OP_LE: "{} <= {} ? R(1.0) : R(0.0)",
+    ca.OP_EQ: "hmpc_same({}, {})", ca.OP_NE: "R(1.0) - hmpc_same({}, {})",
+    ca.OP_AND: "hmpc_true({0}) * hmpc_true({1})",
+    ca.OP_OR: "hmpc_max(hmpc_true({0}), hmpc_true({1}))", ca.OP_IF_ELSE_ZERO: "hmpc_if({}, {})",
+    ca.OP_ASSIGN: "{}", ca.OP_NEG: "-{}", ca.OP_SQ: "{0} * {0}", ca.OP_TWICE: "{0} + {0}", ca.OP_INV: "R(1.0) / {}",
+    ca.OP_NOT: "R(1.0) - hmpc_true({})", ca.OP_FABS: "hmpc_abs({})", ca.OP_SQRT: "hmpc_sqrt({})",
+    ca.OP_EXP: "hmpc_exp({})", ca.OP_LOG: "hmpc_log({})", ca.OP_TANH: "hmpc_tanh({})", ca.OP_SIN: "hmpc_sin({})",
+    ca.OP_COS: "hmpc_cos({})", ca.OP_TAN: "hmpc_sin({0}) / hmpc_cos({0})", ca.OP_SIGN: "hmpc_sign({})",
+}  # fmt: skip
+_LIBM = {
+    ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow", ca.OP_ASIN: "asin", ca.OP_ACOS: "acos", ca.OP_ATAN: "atan",
+    ca.OP_ATAN2: "atan2", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_ASINH: "asinh", ca.OP_ACOSH: "acosh",
+    ca.OP_ATANH: "atanh", ca.OP_ERF: "erf", ca.OP_HYPOT: "hypot", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
+    ca.OP_FMOD: "fmod", ca.OP_COPYSIGN: "copysign", ca.OP_LOG1P: "log1p", ca.OP_EXPM1: "expm1",
+}  # fmt: skip
+"""Functions that come from the C library, whose last bits differ from one to the next."""
+_NAMES = {code: name for name, code in vars(ca).items() if name.startswith("OP_")}
+
+
+def number(value: float) -> str:
+    """A number as C.
+
+    Example:
+        >>> number(0.5), number(float("-inf"))
+        ('R(0.5)', '-R(INFINITY)')
+    """
+    if math.isfinite(value):
+        return f"R({float(value)!r})"
+    return "R(NAN)" if math.isnan(value) else "R(INFINITY)" if value > 0 else "-R(INFINITY)"
+
+
+def table(name: str, values: ArrayLike, kind: str = "real") -> str:
+    """A constant array of one or two axes; an empty axis has one element, since C has no empty arrays."""
+    array = np.asarray(values)
+    full = np.zeros([max(1, n) for n in array.shape])
+    full[tuple(slice(n) for n in array.shape)] = array
+    show = number if kind == "real" else lambda v: str(int(v))
+    rows = [", ".join(map(show, row)) for row in np.atleast_2d(full)]
+    inner = rows[0] if full.ndim == 1 else ",\n  ".join(f"{{{row}}}" for row in rows)
+    size = "".join(f"[{n}]" for n in full.shape)
+    return f"static const {kind} {name}{size} = {{\n  {inner}\n}};\n"
+
+
+def c_function(
+    name: str, arguments: Sequence[str], inputs: Mapping[str, ca.SX], results: Sequence[tuple[str, ca.SX]],
+    before: Sequence[str] = (),
+) -> tuple[str, int]:  # fmt: skip
+    """A C function of scalar statements, and how many operations it has.
+
+    Args:
+        name: Its name.
+        arguments: Its parameters, e.g. ``"const real *x"``.
+        inputs: What CasADi's symbols are in C: ``{"x": symbol}`` for ``x[0], x[1], ...``.
+        results: Where each scalar expression goes, e.g. ``("y[0]", expression)``.
+        before: Statements before the first one.
+
+    Raises:
+        InputError: If an operation has no C, or there are too many.
+
+    Example:
+        >>> x = ca.SX.sym("x", 2)
+        >>> text, operations = c_function("f", ["const real *x", "real *y"], {"x": x}, [("y[0]", x[0] * x[1])])
+        >>> operations, "t2 = t0 * t1" in text
+        (1, True)
+    """
+    values = ca.densify(ca.vertcat(*(v for _, v in results))) if results else ca.SX(0, 1)
+    f = ca.Function("f", list(inputs.values()), [values], {"cse": True})
+    if f.n_instructions() > MOST:
+        raise InputError(
+            f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; networks must be a GRU of "
+            "nn_export (torch's GRUCell, GRU)"
+        )
+    lines, names = [], list(inputs)
+    register: dict[int, str] = {}
+    operations = 0
+    for k in range(f.n_instructions()):
+        code, taken, given = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        if code == ca.OP_OUTPUT:
+            lines.append(f"{results[given[1]][0]} = {register[taken[0]]};")
+            continue
+        if code == ca.OP_INPUT:
+            text = f"{names[taken[0]]}[{taken[1]}]"
+        elif code == ca.OP_CONST:
+            register[given[0]] = number(f.instruction_constant(k))
+            continue
+        else:
+            arguments_c = [register[i] for i in taken]
+            if code in _BINARY:
+                text = _BINARY[code].format(*arguments_c)
+            elif code in _LIBM:
+                text = f"HMPC_LIBM({_LIBM[code]})({', '.join(arguments_c)})"
+            else:
+                raise InputError(
+                    f"{name}: no C for {_NAMES.get(code, code)}; write the prior with other operations"
+                )
+            operations += 1
+        register[given[0]] = f"t{k}"
+        lines.append(f"const real t{k} = {text};")
+    unused = [f"(void){a.split('*')[-1].strip()};" for a in arguments]
+    body = "".join(f"  {line}\n" for line in (*unused, *before, *lines))
+    return f"static inline void {name}({', '.join(arguments)}) {{\n{body}}}\n", operations

@@ -1,0 +1,127 @@
+"""Problems that C is generated for, and a C loop driven through ctypes."""
+
+import ctypes
+import shutil
+
+import casadi as ca
+import machines
+import numpy as np
+import online_models
+import pytest
+
+from hybrid_mpc import OCP, Disturbance, ExtendedKalmanFilter, SoftBound, SwitchingFilter, with_input_delay
+from hybrid_mpc.embedded.generate import make_sources
+from hybrid_mpc.embedded.native import FLAGS, State, goal_of, load_library
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+SOURCES = ("MPC", "PLAN", "FALLBACK", "SAFE", "HELD")
+QUICK = ("-std=c11", "-O1", "-ffp-contract=off")
+
+
+def coupled():
+    """Two inputs and outputs, a hidden state; soft bounds on a state and on a product, move blocks, limited changes."""
+    model, *_ = online_models.random_linear(4, n_x=3, n_u=2, n_y=2, n_h=2, radius=0.95)
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+    product = SoftBound(ca.Function("product", [x, u], [ca.vertcat(x[0] * x[1] + 0.3 * u[1], x[2])]),
+                        [-np.inf, -0.6], [0.5, np.inf], [20.0, 0.0], [5.0, 40.0])  # fmt: skip
+    ocp = OCP(
+        12, [3.0, 0.0, 1.0], [0.2, 0.1], [0.0, 0.3], [-1.0, -0.5], [1.5, 0.5], du_max=[0.4, 0.3],
+        x_max=[0.7, np.inf, np.inf], slack_linear=[8.0, 0.0, 0.0], slack_quadratic=[2.0, 1.0, 1.0],
+        soft=[product], blocks=(1, 1, 2, 3, 5),
+    )  # fmt: skip
+    return model, ocp
+
+
+def tanks():
+    """A pump, two levels, a measured inflow, rest that is not zero, an unmeasured leak; the upper level is bounded."""
+    leak = (Disturbance("rate", "lower", 1e-4),)
+    model = machines.two_tanks(disturbance_model=leak)
+    span = 2 * machines.PUMP
+    x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("w")
+    flow = SoftBound(ca.Function("flow", [x, u, w], [(u + w) / span]), [-np.inf], [0.9], [3.0], [10.0])
+    ocp = OCP(
+        20, [0.0, 25.0], [1e3 / span**2 * 1e-3], [0.1 / span**2], [0.0], [span], du_max=[0.3 * span],
+        x_max=[model.x0[0] + 0.1, np.inf], x_min=[0.01, 0.01], soft=[flow],
+    )  # fmt: skip
+    return model, ocp
+
+
+def heaters():
+    """Two temperatures weighed and bounded as outputs, offsets of a sensor and of a heater, set-points."""
+    offsets = (Disturbance("output", "t1", 5.0), Disturbance("input", "heater_2"))
+    model = machines.thermal(disturbance_model=offsets)
+    ocp = OCP(
+        25, [0.0, 0.0], [1e-3, 1e-3], [0.02, 0.02], [0.0, 0.0], [16.0, 12.0], du_max=[2.0, 2.0], q_y=[1.0, 0.5],
+        y_max=[model.x0[0] + 6.0, np.inf], y_min=[-np.inf, model.x0[1] - 4.0],
+    )  # fmt: skip
+    return model, ocp
+
+
+def delayed():
+    """The pendulum with a GRU written in scalars, whose torque acts one and a half periods later."""
+    model = with_input_delay(online_models.pendulum_model(z=4, seed=1), 0.03)
+    return model, OCP(15, [40.0, 0.5], [1.0], [0.5], [-0.4], [0.4], working_point=([0.0, 1.0], [0.0]))
+
+
+def filters_of(model, ocp):
+    """A switching filter of three modes."""
+    span = ocp.input_range if model.disturbance_model is None else np.array([1e-4])
+    size = np.where(model.x0 != 0, np.abs(model.x0), 0.3)
+    modes = [
+        ExtendedKalmanFilter(
+            model, sigma_y=np.full(model.n_y, 0.01), sigma_x=scale * 0.01 * size, sigma_x0=0.1 * size,
+            sigma_d=step * span, sigma_d0=0.01 * span,
+        )
+        for scale, step in ((1.0, 1e-3), (10.0, 1e-3), (1.0, 0.05))
+    ]  # fmt: skip
+    return SwitchingFilter(modes, ((0.97, 0.02, 0.01), (0.5, 0.49, 0.01), (0.45, 0.05, 0.5)))
+
+
+class CLoop:
+    """The loop of the generated C: ``start`` on a given first plan, ``step``, ``finish``."""
+
+    def __init__(self, model, ocp, estimator, fallback=None, safe_input=None, flags=QUICK):
+        found = make_sources(model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input)
+        self.library = load_library(found, flags)
+        self.state, self.model = State(self.library), model
+        self._kept = None
+
+    def __getattr__(self, name):
+        found = self.state.view[name]
+        return SOURCES[found[0]] if name == "source" else found
+
+    def call(self, name, *given):
+        self._kept = [np.ascontiguousarray(v, dtype=float) if isinstance(v, np.ndarray) else v for v in given]
+        pointers = [
+            v.ctypes.data
+            if isinstance(v, np.ndarray)
+            else ctypes.byref(v)
+            if isinstance(v, ctypes.Structure)
+            else v
+            for v in self._kept
+        ]
+        getattr(self.library.c, f"hmpc_{name}")(self.state.at, *pointers)
+
+    def start(self, y, w, first, goal):
+        self.call("estimate_start", y, w)
+        plan = first.solution
+        self.state.view["u"][:] = first.u
+        self.call(
+            "load_plan",
+            plan.u,
+            np.hstack([plan.x, plan.h]),
+            plan.d,
+            plan.w if self.model.n_w else np.zeros(1),
+        )
+        self.call("decide", goal, None)
+
+
+def goal(reference, weight=None, limits=None):
+    """A goal whose arrays live as long as it."""
+    arrays = [None if v is None else np.ascontiguousarray(v, dtype=float) for v in (reference, weight)]
+    found = goal_of(*arrays, *((None, None) if limits is None else (limits.u_min, limits.u_max)))
+    found.kept = arrays, limits
+    return found
+
+
+__all__ = ["FLAGS"]

@@ -1,0 +1,285 @@
+"""The folder of C: compiles without a warning, replays its vectors, survives rubbish; what has no C is refused."""
+
+import re
+import shutil
+import subprocess
+import warnings
+
+import casadi as ca
+import embedded_parts as parts
+import numpy as np
+import online_models
+import pytest
+from embedded_parts import needs_compiler
+
+import hybrid_mpc as hm
+from hybrid_mpc import OCP, CondensedController, InputError
+from hybrid_mpc.embedded.export import OTHERS, TOLERANCE, write_controller
+from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, make_sources
+from hybrid_mpc.embedded.scalar import c_function
+from hybrid_mpc.kit.assembly import make_controller
+
+STRICT = [
+    "-std=c11",
+    "-Wall",
+    "-Wextra",
+    "-Wconversion",
+    "-Wdouble-promotion",
+    "-Werror",
+    "-ffp-contract=off",
+]
+MACHINES = {"coupled": parts.coupled, "tanks": parts.tanks, "delayed": parts.delayed}
+RUBBISH = """
+#include <stdio.h>
+#include "hmpc_math.h"
+static hmpc_state s;
+static uint32_t seed = 1;
+static uint32_t draw(void) { seed = seed * 1664525u + 1013904223u; return seed >> 8; }
+static real rubbish(real usual) {
+  const real odd[] = {R(NAN), R(INFINITY), -R(INFINITY), HMPC_HUGE, R(-1e30), R(1e-30), R(0.0), R(1e6)};
+  const uint32_t which = draw() % 24;
+  return which < 8 ? odd[which] : usual * R(draw() % 1000) / R(500.0);
+}
+int main(int count, char **words) {
+  real y[HMPC_NY], w[HMPC_DIM(HMPC_NW)], x[(HMPC_N + 1) * HMPC_NX], weight[(HMPC_N + 1) * HMPC_NX], u[HMPC_NU];
+  long periods = 0;
+  int outside = 0, solved = 0;
+  (void)count;
+  sscanf(words[1], "%ld", &periods);
+  for (long k = 0; k < periods; ++k) {
+    for (int i = 0; i < HMPC_NY; ++i) y[i] = k % 50 < 25 ? R(0.1) : rubbish(R(0.3));
+    for (int i = 0; i < HMPC_DIM(HMPC_NW); ++i) w[i] = rubbish(R(1e-4));
+    for (int i = 0; i < (HMPC_N + 1) * HMPC_NX; ++i) {
+      x[i] = k % 50 < 25 ? R(0.1) : rubbish(R(0.3));
+      weight[i] = rubbish(R(1.0));
+    }
+    for (int i = 0; i < HMPC_NU; ++i) u[i] = rubbish(s.u[i]);
+    const real low[HMPC_NU] = {R(-0.1)}, high[HMPC_NU] = {R(0.1)};
+    const hmpc_goal goal = {.x = x, .rows = k % 3 ? 1 : HMPC_N + 1, .weight = k % 11 ? (real *)0 : weight,
+                            .u_min = k % 7 ? (real *)0 : low, .u_max = k % 7 ? (real *)0 : high};
+    if (k % 400 == 0) hmpc_start(&s, y, w, k % 800 ? u : (real *)0, &goal);
+    else hmpc_step(&s, y, k % 2 ? w : (real *)0, k % 9 ? (real *)0 : u, &goal);
+    if (k % 3) hmpc_finish(&s, k % 5 ? &goal : (hmpc_goal *)0);
+    solved += s.status == HMPC_SOLVED;
+    for (int i = 0; i < HMPC_NU; ++i) outside += !(s.u[i] >= u_min[i] && s.u[i] <= u_max[i]);
+  }
+  printf("%d %d\\n", outside, solved);
+  return outside != 0;
+}
+"""
+
+
+def written(folder, name, **options):
+    model, ocp = MACHINES[name]()
+    write_controller(
+        folder,
+        model,
+        ocp,
+        estimator=parts.filters_of(model, ocp),
+        fallback=model,
+        safe_input=model.u0,
+        **options,
+    )
+    return folder
+
+
+@pytest.fixture(scope="module", params=MACHINES)
+def folder(request, tmp_path_factory):
+    return written(tmp_path_factory.mktemp(request.param) / "c", request.param)
+
+
+def built(folder, *words, main="hmpc_test.c", out="test"):
+    done = subprocess.run(
+        ["cc", *words, *SOURCES, main, "-lm", "-o", out],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / out
+
+
+@needs_compiler
+def test_vectors_of_the_python_controller_and_no_warning(folder):
+    program = built(folder, "-O2", *STRICT)
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in folder.iterdir()} == {
+        *SOURCES, *HEADERS, *GENERATED, *OTHERS, "hmpc_vectors.h", "README.md", "test"
+    }  # fmt: skip
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", MACHINES)
+def test_single_precision(tmp_path, name):
+    """No warning either, and inputs within the tolerance that the README states."""
+    program = built(written(tmp_path, name, single=True), "-O2", *STRICT)
+    assert subprocess.run([program], check=False).returncode == 0
+    assert f"agree with Python's to {TOLERANCE[True]} of their range" in (tmp_path / "README.md").read_text()
+
+
+@needs_compiler
+def test_changed_vectors_are_noticed(folder, tmp_path):
+    changed = shutil.copytree(folder, tmp_path / "c")
+    text = (changed / "hmpc_vectors.h").read_text()
+    found = re.search(r"(vector_u\[\d+\]\[\d+\] = \{\s*\{R\()([^)]+)", text)
+    moved = f"{found[1]}{float(found[2]) * 1.0001 + 1e-12!r}"
+    (changed / "hmpc_vectors.h").write_text(text[: found.start()] + moved + text[found.end() :])
+    assert subprocess.run([built(changed, "-O1")], capture_output=True, check=False).returncode == 1
+
+
+def rubbish(folder, periods):
+    (folder / "rubbish.c").write_text(
+        RUBBISH.replace('"hmpc_math.h"', '"hmpc_math.h"\n#include "hmpc_tables.h"')
+    )
+    sanitizers = [
+        "-g",
+        "-O1",
+        "-fsanitize=address,undefined",
+        "-fno-sanitize-recover=all",
+        "-ffp-contract=off",
+    ]
+    try:
+        program = built(folder, "-std=c11", *sanitizers, main="rubbish.c", out="rubbish")
+    except AssertionError as error:
+        pytest.skip(f"no sanitizers: {str(error)[-200:]}")
+    done = subprocess.run([program, str(periods)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+    outside, solved = map(int, done.stdout.split())
+    assert outside == 0
+    assert periods / 20 < solved < periods  # it saw good times and bad
+
+
+@needs_compiler
+def test_rubbish(folder, tmp_path):
+    rubbish(shutil.copytree(folder, tmp_path / "c"), 1500)
+
+
+@needs_compiler
+@pytest.mark.full
+def test_rubbish_for_long(folder, tmp_path):
+    rubbish(shutil.copytree(folder, tmp_path / "c"), 100_000)
+
+
+def refused(model, ocp, match, **options):
+    with pytest.raises(InputError, match=match):
+        make_sources(model, ocp, **options)
+
+
+def test_what_has_no_c_is_refused_by_name_all_at_once():
+    model, ocp = parts.coupled()
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+    cost = ca.Function("cost", [x, u], [x[0] ** 2])
+    refused(
+        model, ocp.changed(economic=cost, q_y=[1.0, 1.0]), r"weights on outputs \(q_y\).*economic stage cost"
+    )
+    tank, tank_ocp = parts.tanks()
+    refused(tank, tank_ocp.changed(preview_w=True), "preview_w")
+    pendulum = online_models.pendulum_model()
+    curved = hm.HybridModel(
+        "curved", pendulum.dt, pendulum.states, pendulum.inputs, pendulum.outputs, pendulum.step, pendulum.xdot,
+        ca.Function("y", pendulum.output.mx_in(), [ca.sin(pendulum.output.mx_in()[0][0])]),
+    )  # fmt: skip
+    plain = OCP(9, [40.0, 0.5], [1.0], [0.5], [-2.0], [2.0], working_point=([0.0, 1.0], [0.0]))
+    refused(curved, plain, "outputs that are not linear", estimator=parts.filters_of(curved, plain))
+
+
+def test_an_operation_without_c_is_named():
+    x = ca.SX.sym("x")
+    with pytest.raises(InputError, match=r"no C for OP_ERFINV"):
+        c_function("f", ["const real *x", "real *y"], {"x": x}, [("y[0]", ca.erfinv(x))])
+
+
+@needs_compiler
+def test_every_operation_gives_what_casadi_gives(tmp_path):
+    """All functions with a form in C, at random points."""
+    x = ca.SX.sym("x", 3)
+    a, b, c = x[0], x[1], x[2]
+    one = ca.if_else(a > b, ca.sin(a), ca.cos(b)) + ca.fmin(a, c) * ca.fmax(b, c) - ca.sign(a) * ca.fabs(b)
+    values = [
+        one, ca.tanh(3 * a), ca.exp(a - b), ca.log(1 + a * a), ca.sqrt(ca.fabs(c)), ca.tan(0.3 * a), a**2, 2 * b,
+        1 / (2 + a * a), ca.logic_and(a > 0, b > 0), ca.logic_or(a > 0, b > 0), ca.logic_not(a > 0), a / (b**2 + 1),
+        ca.atan2(a, b), ca.fabs(a) ** 1.7, ca.sinh(a), ca.cosh(a), ca.floor(3 * a), ca.hypot(a, b), a == b, a != b,
+        ca.asin(0.1 * a), ca.acos(0.1 * a), ca.atan(a), ca.erf(a), ca.exp(-300 * a * a), ca.sin(1e3 * a),
+    ]  # fmt: skip
+    f = ca.Function("f", [x], [ca.vertcat(*values)])
+    outs = [(f"y[{i}]", v) for i, v in enumerate(values)]
+    text, _ = c_function("evaluate", ["const real *x", "real *y"], {"x": x}, outs)
+    main = (
+        f'#include <stdio.h>\n#include "hmpc_math.h"\n{text}int main(void) {{ real x[3], y[{len(values)}];\n'
+    )
+    main += 'while (scanf("%lf %lf %lf", x, x + 1, x + 2) == 3) { evaluate(x, y);'
+    main += f'for (int i = 0; i < {len(values)}; ++i) printf("%.17g ", y[i]); }} return 0; }}\n'
+    written(tmp_path, "coupled")
+    (tmp_path / "evaluate.c").write_text(main)
+    program = built(tmp_path, "-O2", "-std=c11", "-ffp-contract=off", main="evaluate.c")
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points[0] = 0.0
+    given = "\n".join(" ".join(map(repr, row.tolist())) for row in points)
+    told = subprocess.run([program], input=given, capture_output=True, text=True, check=True).stdout
+    found = np.array(told.split(), dtype=float).reshape(len(points), -1)
+    wanted = np.array([f(row).full().ravel() for row in points])
+    # a few units in the last place of each function
+    np.testing.assert_allclose(found, wanted, rtol=4e-15, atol=4e-15)
+
+
+@needs_compiler
+def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
+    """``hybrid-mpc export c``, and the solver ``native`` of a kit beside ``rti``."""
+    code, _, err = call("export", "c", noisy_artifact, "--out", tmp_path / "none")
+    assert code == 2
+    assert "without a control problem" in err
+    golf = hm.load_scenario("golf_robot")
+    kit = hm.load(noisy_artifact).on(golf)
+    with pytest.raises(InputError, match="not empty"):
+        hm.generate_controller(kit, noisy_artifact)
+    folder = hm.generate_controller(kit, tmp_path / "controller")
+    assert (
+        subprocess.run(["make", "-s", "-C", folder, "test"], capture_output=True, check=False).returncode == 0
+    )
+    task = golf.tasks[0]
+    loops = [
+        hm.simulate(
+            golf.plant(), kit.observer(), kit.controller(solver=solver), task.reference, dt=0.02, duration=0.6,
+            x0=np.array(task.x0), seed=3,
+        )
+        for solver in ("rti", "native")
+    ]  # fmt: skip
+    # rounding that a loop of 30 periods on a well damped arm does not let grow
+    np.testing.assert_allclose(loops[1].u, loops[0].u, atol=1e-7)
+    assert set(loops[1].source) == {"MPC"}
+
+
+def test_without_a_compiler_python_solves(monkeypatch, tmp_path):
+    model, ocp = parts.delayed()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    with pytest.warns(RuntimeWarning, match=r"no C compiler found.*rti") as told:
+        safe = make_controller(model, model, ocp, solver="native")
+    assert isinstance(safe.controller, CondensedController)
+    assert len(told) == 1
+
+
+def test_nothing_is_compiled_by_default(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    model, ocp = parts.delayed()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_controller(model, model, ocp)
+
+
+@needs_compiler
+@pytest.mark.full
+@pytest.mark.parametrize("single", [False, True], ids=["double", "float"])
+def test_another_processor_gives_the_same_bits(tmp_path, single):
+    """aarch64 under qemu: no multiply-add is fused, and elementary functions are the controller's own."""
+    cross, qemu = shutil.which("aarch64-linux-gnu-gcc"), shutil.which("qemu-aarch64")
+    if cross is None or qemu is None:
+        pytest.skip("no aarch64-linux-gnu-gcc, or no qemu-aarch64")
+    folder = written(tmp_path / "c", "delayed", single=single)
+    here = subprocess.run([built(folder, "-O3", *STRICT)], capture_output=True, check=True).stdout
+    words = [cross, "-O3", *STRICT, "-static", *SOURCES, "hmpc_test.c", "-lm", "-o", "other"]
+    subprocess.run(words, cwd=folder, check=True)
+    there = subprocess.run([qemu, folder / "other"], capture_output=True, check=True).stdout
+    assert here == there

@@ -1,0 +1,153 @@
+"""The generated C gives the inputs that Python gives: plans replayed period by period, whole loops, safeguards."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import embedded_parts as parts
+import numpy as np
+import pytest
+from embedded_parts import CLoop, goal, needs_compiler
+
+from hybrid_mpc import CondensedController, Limits, Loop, SafeController, TrueState
+from hybrid_mpc.embedded.native import NativeController
+from hybrid_mpc.kit.assembly import disturbance_sizes
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
+from golden_parts import frozen_estimates, machine, previews
+
+pytestmark = needs_compiler
+TOLERANCE = 1e-9
+"""Of an input's range. Both solve the same strictly convex QP, in sums of another order: they differed by 4e-12."""
+REPLAYS = (
+    ("golf_robot", "track", TOLERANCE),
+    pytest.param("golf_robot", "stroke", TOLERANCE, marks=pytest.mark.full),
+    pytest.param("unbalanced_disk", "swing_up", TOLERANCE, marks=pytest.mark.full),
+    # the Hessian's condition is 7e7, so that rounding alone moves its answer by 1e-8: 4e-8 was found
+    pytest.param("unbalanced_disk", "sway", 1e-7, marks=pytest.mark.full),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "problem", "tolerance"), REPLAYS)
+def test_a_stored_machine_replayed(name, problem, tolerance):
+    m = machine(name)
+    replay = next(key for key, value in m.data["replays"].items() if value["problem"] == problem)
+    known = frozen_estimates(m, replay)[: m.data["replays"][replay]["decided"]]
+    safe, preview = m.safe_controller(problem), previews(m, problem)
+    native = NativeController(m.hybrid, m.problem(problem), flags=parts.QUICK)
+    decision, active = safe.initial(known[0], None, *preview(0.0)), 0
+    for k, estimate in enumerate(known):
+        before = decision.solution
+        decision = safe.decide(decision, estimate, *preview(k * m.dt))
+        found, wanted = native.solve(before, estimate, *preview(k * m.dt)), decision.solution
+        assert found.status is wanted.status
+        u = np.abs(found.u[0] - np.clip(wanted.u[0], safe.controller.ocp.u_min, safe.controller.ocp.u_max))
+        assert np.max(u / safe.controller.ocp.input_range) < tolerance
+        assert found.cost == pytest.approx(wanted.cost, rel=1e-9)
+        active += int(found.excess > 0) + int(np.any(np.abs(found.u) >= 0.999 * safe.controller.ocp.u_max))
+    assert active > 10 or name == "unbalanced_disk"  # bounds were at work
+
+
+PROBLEMS = {"coupled": parts.coupled, "tanks": parts.tanks, "delayed": parts.delayed}
+SOLVED = {**PROBLEMS, "heaters": parts.heaters}
+"""Set-points of outputs have no C of their own yet; Python hands their steady states to it."""
+
+
+@pytest.mark.parametrize("name", SOLVED)
+def test_small_machines_with_everything(name):
+    """Solves in a row from states that jump: bounds, soft bounds, blocks, delays, disturbances, limits, weights."""
+    model, ocp = SOLVED[name]()
+    python, native = CondensedController(model, ocp), NativeController(model, ocp, flags=parts.QUICK)
+    rng, size = np.random.default_rng(2), python.problem.state_sizes
+    seen = {"soft": 0, "limit": 0}
+    x = model.x0 + 0.2 * size
+    plan = python.initial(TrueState(model).start(np.concatenate([x, np.zeros(model.n_h)]), w=model.w))
+    for k in range(60):
+        x = model.x0 + (0.6 * (x - model.x0) + 0.5 * size * rng.standard_normal(model.n_x) * (k % 3 == 0))
+        z = np.concatenate(
+            [x, 0.1 * rng.standard_normal(model.n_h) + (model.u0[0] if model.delay_states else 0.0)]
+        )
+        e = TrueState(model).start(z, w=model.w * (1 + 0.2 * (k % 5 == 4)))
+        e = replace(e, d=0.05 * disturbance_sizes(model, ocp) * rng.standard_normal(model.n_d))
+        reference = model.x0 + 0.5 * size * rng.standard_normal((k % 2 + 1, model.n_x))
+        if ocp.n_y:
+            reference = model.x0 + 6.0 * rng.standard_normal((k % 2 + 1, 2))
+        weight = None if k % 4 else rng.uniform(0.2, 2.0, (ocp.horizon + 1, model.n_x))
+        middle, half = model.u0, 0.3 * ocp.input_range
+        limits = Limits(middle - half, middle + half) if k % 6 == 5 else None
+        wanted = python.solve(plan, e, reference, weight, limits=limits)
+        found = native.solve(plan, e, reference, weight, limits=limits)
+        assert found.status is wanted.status, k
+        assert np.max(np.abs(found.u - wanted.u) / ocp.input_range) < TOLERANCE, k
+        for got, want in ((found.x, wanted.x), (found.h, wanted.h)):
+            np.testing.assert_allclose(
+                got, want, atol=1e-8 * max(1.0, float(np.max(np.abs(want), initial=0.0)))
+            )
+        assert found.cost == pytest.approx(wanted.cost, rel=1e-8)
+        assert found.excess == pytest.approx(wanted.excess, abs=1e-8)
+        seen["soft"] += wanted.excess > 1e-3
+        seen["limit"] += bool(np.any(np.isclose(wanted.u, ocp.u_max) | np.isclose(wanted.u, ocp.u_min)))
+        plan = wanted
+        np.testing.assert_allclose(found.w, wanted.w)
+        assert (found.steady is None) == (not ocp.n_y)
+    assert seen["limit"] > 5
+    assert seen["soft"] > 3 or name == "delayed"
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_period_of_c_is_a_period_of_the_loop(name):
+    """Estimator, controller and safeguards, samples missing, references that are not finite, an operator's input."""
+    model, ocp = PROBLEMS[name]()
+    estimator, safe_input = parts.filters_of(model, ocp), model.u0
+    python = SafeController(CondensedController(model, ocp), model, safe_input=safe_input)
+    loop, rng = Loop(estimator, python), np.random.default_rng(1)
+    c = CLoop(model, ocp, estimator, model, safe_input)
+    z, size = np.concatenate([model.x0, np.zeros(model.n_h)]), python.controller.problem.state_sizes
+    target, w, u = model.x0 + 0.5 * size, model.w, python.controller.problem.u_rest
+    sources = set()
+    for k in range(80):
+        y = model.output(z[: model.n_x], u, w, model.p).full().ravel() + 0.003 * rng.standard_normal(
+            model.n_y
+        )
+        y[rng.uniform(size=model.n_y) < 0.2 * (20 < k < 30)] = np.nan
+        reference = np.full_like(target, np.nan) if 40 <= k < 52 else target
+        w_now = np.full_like(w, np.nan) if k == 12 else w
+        applied = 0.5 * (u + model.u0) if k == 60 else None
+        given = goal(reference[None])
+        if k == 0:
+            first = python.initial(estimator.start(y, w=w_now))
+            loop.start(y, w_now if model.n_w else None, reference=np.full_like(target, np.nan))
+            loop._state = loop._first_state(y, estimator.start(y, w=w_now), first)
+            loop._decide(first, reference[None], None, None)
+            c.start(y, w_now, first, given)
+        else:
+            loop.step(y, w_now if model.n_w else None, reference=reference, applied=applied)
+            c.call("step", y, w_now, applied, given)
+        estimate, decision = loop.estimate, loop.decision
+        scale = np.maximum(size, np.abs(estimate.x))
+        assert np.max(np.abs(c.x - estimate.x) / scale) < TOLERANCE, k
+        np.testing.assert_allclose(c.d, estimate.d, atol=1e-9 * float(np.max(ocp.input_range)))
+        assert np.max(np.abs(c.u - decision.u) / ocp.input_range) < 1e-7, k  # of plans that go their own ways
+        assert (c.source, c.age[0]) == (decision.source.name, decision.age), k
+        sources.add(c.source)
+        if k % 2:  # left to the next step else
+            loop.finish()
+            c.call("finish", given)
+        u = decision.u
+        z = np.concatenate(
+            [v.full().ravel() for v in model.step(z[: model.n_x], z[model.n_x :], u, w, model.p)]
+        )
+    assert sources == {"MPC", "PLAN", "FALLBACK"}
+
+
+def test_what_was_prepared_for_another_plan_is_prepared_again():
+    model, ocp = parts.delayed()
+    native = NativeController(model, ocp, flags=parts.QUICK)
+    e = TrueState(model).start(np.zeros(model.n_x + model.n_h))
+    first = native.solve(native.initial(e), e, np.array([[0.3, 0.0]]))
+    one, _ = native.prepare(first), native.prepare(native.initial(e))
+    np.testing.assert_allclose(  # from another working set, so to rounding
+        native.finish(one, e, np.array([[0.3, 0.0]])).u,
+        native.solve(first, e, np.array([[0.3, 0.0]])).u,
+        atol=1e-12,
+    )
