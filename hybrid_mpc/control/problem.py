@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
 from hybrid_mpc.control.soft import SoftBound, output_bounds
 from hybrid_mpc.control.targets import Steady, Targets, state_sizes
@@ -64,6 +65,7 @@ class Solution:
             hidden state's hardly matter, that ``sqp`` starts its next solve with; None from other solvers.
         w: Measured disturbances ``(N, n_w)`` that the prediction assumes.
         steady: The steady state for the first row of an outputs' reference; None where references are the states'.
+        active: Rows of the QP that act: where the next solve begins. None: it begins without.
     """
 
     u: Array
@@ -80,6 +82,7 @@ class Solution:
     curvature: Array | None = None
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
     steady: Steady | None = None
+    active: Active | None = None
 
     @property
     def following(self) -> Array:
@@ -98,7 +101,9 @@ class Solution:
         x, h, w = (np.vstack([v[:1], v[:-1]]) for v in (self.x, self.h, self.w))
         c = self.curvature
         c = None if c is None else np.concatenate([c[:1], c[:-1]])
-        return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c)
+        return replace(
+            self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c, active=None
+        )
 
 
 class SoftRows:
@@ -111,6 +116,8 @@ class SoftRows:
 
     stage: NDArray[np.int64]
     """State ``(M,)`` of the trajectory that a row looks at."""
+    later: NDArray[np.int64]
+    """The row ``(M,)`` of the same value a period later; the last rows are their own."""
     parametric: bool
     """Whether a bounded value depends on ``e``."""
 
@@ -135,6 +142,13 @@ class SoftRows:
         stages = [np.repeat(np.arange(1, n + 1), chosen.size)]
         stages += [np.repeat(np.arange(n), b[1].size) for b in bounds]
         self.stage = np.concatenate(stages)
+        sizes = [chosen.size, *(b[1].size for b in bounds)]
+        ends = np.cumsum([0, *(n * size for size in sizes)])
+        later = [
+            np.minimum(np.arange(n * size) + size, np.arange(n * size) % max(size, 1) + (n - 1) * size) + end
+            for size, end in zip(sizes, ends, strict=False)
+        ]
+        self.later = np.concatenate(later)
         half = 0.5 * (self.upper - self.lower)
         # One-sided bounds have no range: the violation that costs as much quadratically as linearly, or 1.
         other = np.where(self.linear > 0, self.linear / self.quadratic, 1.0)

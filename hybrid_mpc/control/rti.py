@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemv
 
+from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP
@@ -52,6 +53,7 @@ class Prepared:
     milliseconds: float
     w: Array
     steady: Steady | None = None
+    active: Active | None = None
 
 
 class Condenser:
@@ -212,19 +214,22 @@ class CondensedController(SplitController):
         derivatives = self.stages.at(z, self.model.acting(u, d, w))
         z = np.vstack([z, derivatives[0][-1:]])  # the appended period starts without a defect
         weight = self.problem.weights(weight)
-        return self.condense(u, z, d, previous.u[0], weight, derivatives, start, w=w, steady=previous.steady)
+        return self.condense(
+            u, z, d, previous.u[0], weight, derivatives, start, w=w, steady=previous.steady,
+            active=self.qp.later(previous.active),
+        )  # fmt: skip
 
     @np.errstate(over="ignore", invalid="ignore")
     def linearize(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, w: Array | None = None,
-        steady: Steady | None = None,
+        steady: Steady | None = None, active: Active | None = None,
     ) -> Prepared:  # fmt: skip
         """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``, ``w`` ``(N,
         n_w)``.
         """
         start, w = perf_counter(), self.problem.forecast(w, None)
         derivatives = self.stages.at(z[:-1], self.model.acting(u, d, w))
-        return self.condense(u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady)
+        return self.condense(u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady, active=active)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(
@@ -248,6 +253,7 @@ class CondensedController(SplitController):
                 prepared.weight,
                 target.w,
                 prepared.steady,
+                prepared.active,
             )
         hessian, economic = self._at_parameters(prepared, target)
         if not target.ok or not np.all(np.isfinite(hessian)):
@@ -271,7 +277,7 @@ class CondensedController(SplitController):
         soft = self._soft_rows(prepared, free, target)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        answer = self.qp.solve(hessian, gradient, prepared.u, prepared.u_prev, soft, limits)
+        answer = self.qp.solve(hessian, gradient, prepared.u, prepared.u_prev, soft, limits, prepared.active)
         step = answer.step
         if not answer.status.ok:
             return self._failed(prepared, answer.status, start, answer.kkt)
@@ -286,6 +292,7 @@ class CondensedController(SplitController):
         return Solution(
             u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
             self._timing(prepared, start), float(np.max(excess, initial=0.0)), w=target.w, steady=target.steady,
+            active=answer.active,
         )  # fmt: skip
 
     def solve(
@@ -307,8 +314,9 @@ class CondensedController(SplitController):
             spent = solution.timing
             z = np.hstack([solution.x, solution.h])
             again = self.linearize(
-                solution.u, z, solution.d, prepared.u_prev, prepared.weight, solution.w, solution.steady
-            )
+                solution.u, z, solution.d, prepared.u_prev, prepared.weight, solution.w, solution.steady,
+                solution.active,
+            )  # fmt: skip
             solution = self.feedback(again, estimate, reference, limits, w)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)
@@ -317,7 +325,7 @@ class CondensedController(SplitController):
     def condense(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
         derivatives: Derivatives, start: float, p: Array | None = None, *, w: Array | None = None,
-        steady: Steady | None = None,
+        steady: Steady | None = None, active: Active | None = None,
     ) -> Prepared:  # fmt: skip
         """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began.
 
@@ -348,7 +356,7 @@ class CondensedController(SplitController):
         spent = (perf_counter() - start) * 1e3
         return Prepared(
             u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent, w,
-            steady,
+            steady, active,
         )  # fmt: skip
 
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
