@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,7 @@ class InputQP:
         later = np.concatenate([later, later + n]) if len(rows) else later
         self._later, self._after, self._before = later, np.arange(hard), np.arange(hard)
         self._linear, self._give = np.full(hard, np.inf), np.zeros(hard)
+        self._gives_way = np.zeros(0, dtype=np.int64)
         if soft is not None and len(soft):
             scale, before = soft.scale, np.arange(len(soft))
             moved = np.flatnonzero(soft.later != before)
@@ -66,6 +67,7 @@ class InputQP:
             self._before = np.concatenate([self._before, hard + before])
             self._linear = np.concatenate([self._linear, dt * soft.linear * scale])
             self._give = np.concatenate([self._give, 0.5 / (dt * soft.quadratic * scale**2)])
+            self._gives_way = hard + np.flatnonzero(soft.hard)
             self._soft_scale, self._lower, self._upper = scale, soft.lower / scale, soft.upper / scale
 
     def by_blocks(self, slopes: Array) -> Array:
@@ -85,12 +87,13 @@ class InputQP:
 
     def solve(
         self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None,
-        limits: Limits | None = None, active: Active | None = None,
+        limits: Limits | None = None, active: Active | None = None, *, strict: bool = False,
     ) -> Answer:  # fmt: skip
         """Solve from a plan ``u`` ``(N, n_u)``, with ``u_prev`` held before, and check the answer.
 
         The Hessian is symmetric positive definite. ``soft`` are the values of the soft bounds without a step ``(M,)``,
-        and their derivatives by it ``(M, N n_u)``. ``active`` are rows to begin with. Default: none.
+        and their derivatives by it ``(M, N n_u)``. ``active`` are rows to begin with. Default: none. ``strict``: hard
+        bounds among them give way only if there is no answer that keeps them, whatever that costs.
         """
         scale, u = self.scale, u[self._starts]
         lower, upper = (
@@ -123,6 +126,14 @@ class InputQP:
         qp = RowQP(h / size, g / size, a, lower, upper, linear, give)
         s, multipliers, active = ActiveSet(qp, self._after[:rows], self._before[:rows]).solve(active)
         status, kkt = self._check(qp, s, multipliers)
+        ways = self._gives_way if soft is not None else self._gives_way[:0]
+        if strict and np.any(np.abs(active[ways]) == 2):
+            never = qp.linear.copy(), qp.give.copy()
+            never[0][ways], never[1][ways] = np.inf, 0.0
+            kept = replace(qp, linear=never[0], give=never[1])
+            found = ActiveSet(kept, self._after, self._before).solve(np.sign(active) * (np.abs(active) == 1))
+            if (checked := self._check(kept, *found[:2]))[0].ok:
+                (s, multipliers, active), (status, kkt) = found, checked
         step = (s * scale).reshape(u.shape)
         if self._ocp.blocks is not None:
             step = np.repeat(step, self._ocp.blocks, axis=0)

@@ -458,6 +458,7 @@ class SQPController(Controller):
         excess = self.problem.soft.excess(at.soft[0])
         return Solution(
             at.u, at.z[:, :n_x], at.z[:, n_x:], case.d, at.cost, descent.status, descent.kkt, 0.0,
-            {"solve": (perf_counter() - start) * 1e3}, float(np.max(excess, initial=0.0)), descent.count,
+            {"solve": (perf_counter() - start) * 1e3}, self.problem.soft.largest(excess), descent.count,
             descent.curvature, w=case.target.w, steady=case.target.steady, active=descent.active,
+            given_way=self.problem.soft.given_way(excess),
         )  # fmt: skip
