@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.control.problem import Status
     from hybrid_mpc.control.rti import CondensedController
     from hybrid_mpc.control.safeguard import SafeController
-    from hybrid_mpc.control.soft import SoftBound
+    from hybrid_mpc.control.soft import HardBound, SoftBound
     from hybrid_mpc.control.sqp import SQPController
     from hybrid_mpc.control.targets import Steady, Targets
     from hybrid_mpc.data.differentiate import (
@@ -181,6 +181,7 @@ __all__ = [
     "FirstStates",
     "GRUNetwork",
     "Guard",
+    "HardBound",
     "HybridModel",
     "HybridStep",
     "InputError",
@@ -348,7 +349,7 @@ _ROOMS = {
     "control.problem": ("Status",),
     "control.rti": ("CondensedController",),
     "control.safeguard": ("SafeController",),
-    "control.soft": ("SoftBound",),
+    "control.soft": ("HardBound", "SoftBound"),
     "control.sqp": ("SQPController",),
     "control.targets": ("Steady", "Targets"),
     "data.differentiate": (

@@ -101,20 +101,25 @@ class IpoptController(Controller):
         z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
         added = self.model.acting(np.zeros_like(u), estimate.d, target.w)
         rows = (added, target.x, target.weight, target.u)
-        bounds = self._limited(self.ocp.bounds(u_prev, limits))
         failed = self._plan(u, z, target, NAN, Status.NOT_FINITE, NAN, start, 0)
         if not (target.ok and all(np.all(np.isfinite(v)) for v in (*rows, z, u, u_prev))):
             return failed
-        given = np.concatenate([z[0], u_prev, *(v.ravel() for v in rows), target.e.ravel(), target.p.ravel()])
+        p = target.p[:, : problem.economic.n_p]
+        given = np.concatenate([z[0], u_prev, *(v.ravel() for v in rows), target.e.ravel(), p.ravel()])
         slack = problem.soft.excess(problem.soft.values(z[:, : self.ocp.n_x], u, target.e))
         guess = np.concatenate([u.ravel(), z.ravel(), slack]) / self._scale
-        answer = self._solver(x0=guess, p=given, **bounds)
-        stats = self._solver.stats()
-        found, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
-        if not all(np.all(np.isfinite(v)) for v in (found, lam_g, lam_x)):
-            return failed
-        violated, kkt = self._check(found, given, lam_g, lam_x, bounds)
-        count = stats["iter_count"]
+        count = 0
+        for gives_way in (False, True) if np.any(problem.soft.hard) else (True,):
+            bounds = self._limited(self.ocp.bounds(u_prev, limits), gives_way)
+            answer = self._solver(x0=guess, p=given, **bounds)
+            stats = self._solver.stats()
+            found, lam_g, lam_x = (answer[key].full().ravel() for key in ("x", "lam_g", "lam_x"))
+            count += stats["iter_count"]
+            if not all(np.all(np.isfinite(v)) for v in (found, lam_g, lam_x)):
+                return failed
+            violated, kkt = self._check(found, given, lam_g, lam_x, bounds)
+            if violated <= FEASIBLE:
+                break
         if not violated <= FEASIBLE:
             return self._plan(u, z, target, NAN, Status.NLP_FAILED, kkt, start, count)
         status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
@@ -124,11 +129,13 @@ class IpoptController(Controller):
         cost = problem.cost(z, u, u_prev, target)
         return self._plan(u, z, target, cost, status, kkt, start, count)
 
-    def _limited(self, of_inputs: tuple[Array, Array]) -> dict[str, Array]:
-        """Bounds of unknowns and rows with those of the inputs put in."""
+    def _limited(self, of_inputs: tuple[Array, Array], gives_way: bool) -> dict[str, Array]:
+        """Bounds of unknowns and rows with those of the inputs; hard bounds have slacks only if they give way."""
         lower, upper = self._bounds["lbx"].copy(), self._bounds["ubx"].copy()
         n = of_inputs[0].size
         lower[:n], upper[:n] = (bound.ravel() / self._scale[:n] for bound in of_inputs)
+        if not gives_way:
+            upper[upper.size - len(self.problem.soft) :][self.problem.soft.hard] = 0.0
         return {**self._bounds, "lbx": lower, "ubx": upper}
 
     def _check(
@@ -158,7 +165,6 @@ class IpoptController(Controller):
         after = self._step(z[:-1].T, self.model.acting(u, d, target.w).T).full().T
         defect = float(np.max(np.abs(after - z[1:])))
         spent = {"solve": (perf_counter() - start) * 1e3}
-        largest = float(np.max(excess, initial=0.0))
         return Solution(
             u,
             z[:, :n_x],
@@ -169,10 +175,11 @@ class IpoptController(Controller):
             kkt,
             defect,
             spent,
-            largest,
+            soft.largest(excess),
             i,
             w=target.w,
             steady=target.steady,
+            given_way=soft.given_way(excess),
         )
 
     def _formulate(self) -> dict[str, ca.MX]:
@@ -183,7 +190,7 @@ class IpoptController(Controller):
         u, z, s = ca.MX.sym("u", n_u, n), ca.MX.sym("z", n_z, n + 1), ca.MX.sym("s", len(soft))
         z0, added, u_prev = ca.MX.sym("z0", n_z), ca.MX.sym("added", model.n_v, n), ca.MX.sym("u_prev", n_u)
         x_ref, weight = ca.MX.sym("x_ref", n_x, n + 1), ca.MX.sym("weight", n_x, n + 1)
-        u_ref, e = ca.MX.sym("u_ref", n_u, n), ca.MX.sym("e", model.n_d + model.n_w, n)
+        u_ref, e = ca.MX.sym("u_ref", n_u, n), ca.MX.sym("e", model.n_d + model.n_w + ocp.n_p, n)
         p = ca.MX.sym("p", self.problem.economic.n_p, n + 1)
         self._step = stage_step(model).map(n)
         z_next = self._step(z[:, :-1], ca.vertcat(u + added[:n_u, :], added[n_u:, :]))
@@ -233,7 +240,7 @@ class IpoptController(Controller):
     def _soft_rows(self, u: ca.MX, z: ca.MX, s: ca.MX, e: ca.MX) -> list[Rows]:
         """Constraints of the bounded values, in the order of the problem's rows."""
         ocp, soft, rows = self.ocp, self.problem.soft, []
-        states = [int(i) for i in np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))]
+        states = soft.states.tolist()
         values = [ca.vec(z[states, 1:])] if states else []
         values += [ca.vec(f.map(ocp.horizon)(z[: ocp.n_x, :-1], u, e)) for f in soft.functions]
         value = ca.vertcat(*values)

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.soft import (
+    HardBound,
     SoftBound,
     fixed,
     number_content,
     output_bounds,
     same_expression,
     state_bounds,
+    tightest,
 )
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.limits import input_limits, numbers
@@ -63,7 +65,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class OCP:
-    """A quadratic tracking problem with bounded inputs and softly bounded states and outputs.
+    """A quadratic tracking problem with bounded inputs, and soft and hard bounds on states and outputs.
 
     The cost of a plan is ``sum_k stage_k dt + (x_N - x_ref_N)' P (x_N - x_ref_N)`` with
     ``stage_k = (x_k - x_ref_k)' diag(q) (x_k - x_ref_k) + (y_k - y_ref_k)' diag(q_y) (y_k - y_ref_k) +
@@ -105,7 +107,7 @@ class OCP:
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
         slack_quadratic: Penalties ``(n_x,)`` [cost/s/unit^2], positive. Default: ``1000 q``. Where ``q`` is
             zero, 1 stands for it in both.
-        soft: Soft bounds on expressions of ``(x, u)``, or of ``(x, u, w)``. Default: none.
+        soft: Soft bounds on expressions of ``(x, u)``, ``(x, u, w)`` or ``(x, u, w, p)``. Default: none.
         blocks: Move blocking: numbers of periods over which the input is held, one block after the other,
             e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now. Default: none.
         economic: A further stage cost per second, ``(x, u) -> scalar``, twice differentiable, of ``(x_0, u_0) ..
@@ -119,6 +121,8 @@ class OCP:
         y_min: Soft lower bounds of the outputs ``y_0 .. y_{N-1}`` ``(n_y,)``; ``-inf`` for none. A violation costs what
             it does of a state, by ``q_y``. Default: none.
         y_max: Soft upper bounds of the outputs ``(n_y,)``; ``inf`` for none. Default: none.
+        hard: Hard bounds on states, outputs and expressions; only where they cannot all be kept, they give way, in the
+            order of their priorities. Default: none.
         preview: Whether a loop knows references and weights ahead, or holds those of the instant. Default: ahead.
         preview_w: Whether a loop knows the measured disturbances ahead, where it is given a forecast, or holds those
             measured last. Default: it holds them.
@@ -156,6 +160,7 @@ class OCP:
     q_y: Array = field(default_factory=lambda: np.zeros(0))
     y_min: Array = field(default_factory=lambda: np.zeros(0))
     y_max: Array = field(default_factory=lambda: np.zeros(0))
+    hard: tuple[HardBound, ...] = ()
     preview: bool = True
     preview_w: bool = False
 
@@ -181,6 +186,7 @@ class OCP:
         q_y: ArrayLike = (),
         y_min: ArrayLike = (),
         y_max: ArrayLike = (),
+        hard: Sequence[HardBound] = (),
         preview: bool = True,
         preview_w: bool = False,
     ) -> None:
@@ -204,6 +210,13 @@ class OCP:
         low, up, linear, quadratic = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
         if wrong := [bound for bound in soft if not isinstance(bound, SoftBound)]:
             raise InputError(f"soft: {wrong[0]!r} given; needed: SoftBound(expression, lower, upper, ...)")
+        _check_hard(hard, n_x, outputs.size)
+        parametric = _parametric(soft, hard)
+        own = {economic.numel_in(2)} if isinstance(economic, ca.Function) and economic.n_in() > 2 else set()
+        if len(given := own | {f.numel_in(3) for f in parametric}) > 1:
+            raise InputError(
+                f"parameters p of {sorted(given)} numbers given; all costs and bounds that have some share them"
+            )
         if economic is not None and not _is_stage_cost(economic):
             raise InputError(f"economic: {economic} given; needed: a function (x, u) or (x, u, p) -> scalar")
         fields = {
@@ -215,7 +228,8 @@ class OCP:
             "soft": tuple(soft), "blocks": None if blocks is None else _block_lengths(blocks, int(horizon)),
             "economic": economic,
             "starts": tuple(input_plan(s, int(horizon), n_u, f"starts[{i}]") for i, s in enumerate(starts)),
-            "q_y": outputs, "y_min": y_low, "y_max": y_up, "preview": bool(preview), "preview_w": bool(preview_w),
+            "q_y": outputs, "y_min": y_low, "y_max": y_up, "hard": tuple(hard),
+            "preview": bool(preview), "preview_w": bool(preview_w),
         }  # fmt: skip
         for name, value in fields.items():
             for array in value if isinstance(value, tuple) else (value,):
@@ -266,8 +280,19 @@ class OCP:
 
     @property
     def n_p(self) -> int:
-        """Number of parameters of the economic stage cost: the last columns of a reference."""
-        return int(self.economic.numel_in(2)) if self.economic is not None and self.economic.n_in() > 2 else 0
+        """Number of parameters of the economic stage cost and of bounds: the last columns of a reference."""
+        if self.economic is not None and self.economic.n_in() > 2:
+            return int(self.economic.numel_in(2))
+        return max((int(f.numel_in(3)) for f in _parametric(self.soft, self.hard)), default=0)
+
+    @property
+    def state_range(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the states ``(n_x,)`` each, soft or hard, whichever are tighter."""
+        return tightest(self.x_min, self.x_max, self.hard, "x", self.n_x)
+
+    def output_range(self, n_y: int) -> tuple[Array, Array]:
+        """Likewise of the ``n_y`` outputs."""
+        return tightest(self.y_min, self.y_max, self.hard, "y", n_y)
 
     @property
     def penalties(self) -> tuple[Array, Array]:
@@ -382,6 +407,21 @@ class OCP:
             c = output_with_jacobian(model)(x, u, model.w)[1].full()
             q[: self.n_x, : self.n_x] += (c.T * self.q_y) @ c * model.dt
         return a, b, q, np.diag(self.r + self.r_delta) * model.dt
+
+
+def _check_hard(hard: Sequence[HardBound], n_x: int, n_y: int) -> None:
+    for bound in hard:
+        if not isinstance(bound, HardBound):
+            raise InputError(f"hard: {bound!r} given; needed: HardBound(what, lower, upper, ...)")
+        needed = {"x": n_x, "y": n_y}.get(bound.what if isinstance(bound.what, str) else "", 0)
+        if needed and bound.lower.size != needed:
+            raise InputError(f"hard bound on {bound.what}: {bound.lower.size} values given, {needed} needed")
+
+
+def _parametric(soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> list[ca.Function]:
+    """The bounded expressions that have parameters."""
+    given = [bound.expression for bound in soft] + [b.what for b in hard if not isinstance(b.what, str)]
+    return [f for f in given if f.n_in() > 3]
 
 
 def _whole(value: object) -> bool:

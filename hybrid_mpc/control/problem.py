@@ -11,16 +11,19 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
-from hybrid_mpc.control.soft import SoftBound, output_bounds
+from hybrid_mpc.control.soft import GIVES_WAY, HIGHER, HardBound, output_bounds
 from hybrid_mpc.control.targets import Steady, Targets, state_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.stages import free_run
+from hybrid_mpc.model.stages import free_run, stage_step
 
 Array = NDArray[np.float64]
+KEPT = 1e-7
+"""Share of its size by which a hard bound may be exceeded and counts as kept: solvers keep it to their tolerance."""
 KNOTS = 8
 """Most set-points of one preview that get a steady state of their own. Of a reference that moves all the time so many
 rows are taken, and between them steady states are interpolated."""
@@ -64,6 +67,9 @@ class Solution:
             hidden state's hardly matter, that ``sqp`` starts its next solve with; None from other solvers.
         w: Measured disturbances ``(N, n_w)`` that the prediction assumes.
         steady: The steady state for the first row of an outputs' reference; None where references are the states'.
+        active: Rows of the QP that act: where the next solve begins. None: it begins without.
+        given_way: Hard bounds that the plan exceeds, since none keeps them all: largest violation by name. A state is
+            named as in the model, an output ``output`` and its name, an expression by its function's name.
     """
 
     u: Array
@@ -80,6 +86,8 @@ class Solution:
     curvature: Array | None = None
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
     steady: Steady | None = None
+    active: Active | None = None
+    given_way: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def following(self) -> Array:
@@ -98,50 +106,87 @@ class Solution:
         x, h, w = (np.vstack([v[:1], v[:-1]]) for v in (self.x, self.h, self.w))
         c = self.curvature
         c = None if c is None else np.concatenate([c[:1], c[:-1]])
-        return replace(self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c)
+        return replace(
+            self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c, active=None
+        )
 
 
 class SoftRows:
-    """The M soft bounds of a problem along a trajectory, one row a bound and period.
+    """The M soft and hard bounds of a problem along a trajectory, one row a bound and period.
 
     Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), those on outputs and expressions for ``(x_0, u_0) ..
-    (x_{N-1}, u_{N-1})``. Outputs and expressions of ``w`` depend on more, ``e`` ``(N, n_d + n_w)``: the unmeasured and
-    the measured disturbances of each period; without it they are zero. ``model`` is needed for them alone.
+    (x_{N-1}, u_{N-1})``. Outputs and expressions of ``w`` or ``p`` depend on more, ``e`` ``(N, n_d + n_w + n_p)``: the
+    unmeasured and the measured disturbances and the parameters of each period; without it they are zero. ``model`` is
+    needed for them and for hard bounds.
+
+    Hard bounds are rows with exact penalties, a factor of :data:`~hybrid_mpc.control.soft.HIGHER` apart from one
+    priority to the next. Rows that no input reaches have no bounds.
     """
 
     stage: NDArray[np.int64]
     """State ``(M,)`` of the trajectory that a row looks at."""
+    later: NDArray[np.int64]
+    """The row ``(M,)`` of the same value a period later; the last rows are their own."""
+    hard: NDArray[np.bool_]
+    """Which rows ``(M,)`` are hard bounds."""
+    names: tuple[str, ...]
+    """Names of the rows ``(M,)``."""
     parametric: bool
     """Whether a bounded value depends on ``e``."""
 
     def __init__(self, ocp: OCP, model: HybridModel | None = None) -> None:
         n = ocp.horizon
         self._n_x, self._n_u, self._horizon = ocp.n_x, ocp.n_u, n
-        self._n_e = 0 if model is None else model.n_d + model.n_w
-        bounds = [(_of_point(b, ocp, model), b.lower, b.upper, b.linear, b.quadratic) for b in ocp.soft]
-        if ocp.y_min.size and model is not None:
-            bounds.append((_outputs(model), *output_bounds(ocp.q_y, ocp.y_min, ocp.y_max)))
-        self.parametric = bool(ocp.y_min.size) or any(b.expression.n_in() > 2 for b in ocp.soft)
-        self.functions: tuple[ca.Function, ...] = tuple(b[0] for b in bounds)
-        """The bounded expressions ``(x, u, e) -> column``, as the rows of :attr:`lower` after the states'."""
-        self._states = np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))
-        chosen = self._states
-        self._expressions = [BufferedFunction(_with_slopes(f).map(n)) for f in self.functions]
-        columns = [[np.tile(v[chosen], n) for v in (ocp.x_min, ocp.x_max, *ocp.penalties)]]
-        columns += [[np.tile(v, n) for v in b[1:]] for b in bounds]
-        self.lower, self.upper, self.linear, self.quadratic = (
-            np.concatenate([c[i] for c in columns]) for i in range(4)
+        self._n_e = ocp.n_p + (0 if model is None else model.n_d + model.n_w)
+        groups = _bounded(ocp, model)
+        self.parametric = any(
+            f is not None and f.jac_sparsity(0, 2).nnz() > 0 for f in (g.function for g in groups)
         )
-        stages = [np.repeat(np.arange(1, n + 1), chosen.size)]
-        stages += [np.repeat(np.arange(n), b[1].size) for b in bounds]
-        self.stage = np.concatenate(stages)
-        half = 0.5 * (self.upper - self.lower)
+        self.functions: tuple[ca.Function, ...] = tuple(g.function for g in groups if g.function is not None)
+        """The bounded expressions ``(x, u, e) -> column``, as the rows of :attr:`lower` after the states'."""
+        self.states: NDArray[np.int64] = np.concatenate([g.states for g in groups]).astype(np.int64)
+        """The bounded states, in the order of a period's rows of them; one may be there twice."""
+        self._expressions = [BufferedFunction(_with_slopes(f).map(n)) for f in self.functions]
+        blocks = [[g for g in groups if g.function is None], *([g] for g in groups if g.function is not None)]
+        each = [
+            np.hstack([g.rows for g in block]) for block in blocks
+        ]  # of a period; rows go period by period
+        lower, upper, self.linear, self.quadratic, hard = np.hstack([np.tile(rows, n) for rows in each])
+        sizes = [rows.shape[1] for rows in each]
+        self.hard = hard > 0
+        self.stage = np.concatenate(
+            [np.repeat(np.arange(n) + (b == 0), size) for b, size in enumerate(sizes)]
+        )
+        move = [np.repeat([size] * (n - 1) + [0], size) for size in sizes]
+        self.later = np.arange(self.stage.size) + np.concatenate(move)
+        self.names = tuple(name for block in blocks for name in n * sum((g.names for g in block), ()))
+        if ocp.hard and model is not None:
+            lower, upper = self._reached(model, lower, upper)
+        self.lower, self.upper = lower, upper
+        half = 0.5 * (upper - lower)
         # One-sided bounds have no range: the violation that costs as much quadratically as linearly, or 1.
         other = np.where(self.linear > 0, self.linear / self.quadratic, 1.0)
         self.scale: Array = np.where(np.isfinite(half), half, other)
+        kept = np.where(self.hard, KEPT * self.scale, 0.0)
+        self._kept = lower - kept, upper + kept
 
     def __len__(self) -> int:
         return int(self.stage.size)
+
+    def _reached(self, model: HybridModel, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Bounds without those of hard rows that no input reaches; InputError if there is no other row of a name."""
+        n = self._horizon
+        states, values = _first_stages(model, self.functions)
+        out = self.hard & (
+            self.stage < np.concatenate([np.tile(states[self.states], n), *(np.tile(v, n) for v in values)])
+        )
+        kept = {self.names[row] for row in np.flatnonzero(self.hard & ~out)}
+        if lost := {self.names[row] for row in np.flatnonzero(out)} - kept:
+            raise InputError(
+                f"hard bound on {', '.join(sorted(lost))}: no input of the plan reaches it; needed: a value that "
+                "inputs change within the horizon"
+            )
+        return np.where(out, -np.inf, lower), np.where(out, np.inf, upper)
 
     def values(self, x: Array, u: Array, e: Array | None = None) -> Array:
         """Bounded values ``(M,)`` along states ``(N + 1, n_x)`` and inputs ``(N, n_u)``."""
@@ -150,8 +195,8 @@ class SoftRows:
     def linearize(self, x: Array, u: Array, e: Array | None = None) -> tuple[Array, Array, Array]:
         """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and input ``(M, n_u)``."""
         n = self._horizon
-        by_x = np.tile(np.eye(self._n_x)[self._states], (n, 1))
-        rows = [(x[1:, self._states].ravel(), by_x, np.zeros((by_x.shape[0], self._n_u)))]
+        by_x = np.tile(np.eye(self._n_x)[self.states], (n, 1))
+        rows = [(x[1:, self.states].ravel(), by_x, np.zeros((by_x.shape[0], self._n_u)))]
         for f in self._expressions:
             f.inputs[0][:], f.inputs[1][:] = x[:-1].ravel(), u.ravel()
             f.inputs[2][:] = 0.0 if e is None else e.ravel()
@@ -186,37 +231,127 @@ class SoftRows:
 
     def excess(self, values: Array) -> Array:
         """Violations ``(M,)``, zero where a bound is kept."""
-        return np.asarray(np.maximum(0.0, np.maximum(values - self.upper, self.lower - values)))
+        return np.asarray(np.maximum(0.0, np.maximum(values - self._kept[1], self._kept[0] - values)))
+
+    def given_way(self, excess: Array) -> dict[str, float]:
+        """Largest violation of each hard bound that violations ``(M,)`` have, by name."""
+        found: dict[str, float] = {}
+        for row in np.flatnonzero(self.hard & (excess > 0)):
+            found[self.names[row]] = max(found.get(self.names[row], 0.0), float(excess[row]))
+        return found
+
+    def largest(self, excess: Array) -> float:
+        """Largest violation of a soft bound among violations ``(M,)``."""
+        return float(np.max(excess[~self.hard], initial=0.0))
 
     def penalty(self, excess: Array) -> float:
         """Cost per second of violations ``(M,)``, summed."""
         return float(self.linear @ excess + self.quadratic @ excess**2)
 
 
-def _of_point(bound: SoftBound, ocp: OCP, model: HybridModel | None) -> ca.Function:
-    """A bound's expression as a function of ``(x, u, e)``."""
-    f, n_w = bound.expression, 0 if model is None else model.n_w
-    n_e = 0 if model is None else model.n_d + n_w
-    wanted = [(ocp.n_x, 1), (ocp.n_u, 1), (n_w, 1)][: f.n_in()]
+@dataclass(frozen=True)
+class _Bounded:
+    """What is bounded in a period: states, or the values of a function ``(x, u, e)``.
+
+    ``rows`` ``(5, n)`` are lower and upper bounds, linear and quadratic penalties, and 1 for hard bounds.
+    """
+
+    function: ca.Function | None
+    states: NDArray[np.int64]
+    rows: Array
+    names: tuple[str, ...]
+
+
+def _bounded(ocp: OCP, model: HybridModel | None) -> list[_Bounded]:
+    """All that a problem bounds besides its inputs; states first."""
+    x_names = [s.name for s in model.states] if model is not None else [f"x[{i}]" for i in range(ocp.n_x)]
+    y_names = tuple(f"output {s.name}" for s in model.outputs) if model is not None else ()
+    none = np.zeros(0, dtype=np.int64)
+
+    def states(*rows: Array) -> _Bounded:
+        chosen = np.flatnonzero(np.isfinite(rows[0]) | np.isfinite(rows[1]))
+        return _Bounded(None, chosen, np.array(rows)[:, chosen], tuple(x_names[i] for i in chosen))
+
+    def values(f: ca.Function, *rows: Array) -> _Bounded:
+        n = rows[0].size
+        names = (f.name(),) if n == 1 else tuple(f"{f.name()}[{i}]" for i in range(n))
+        return _Bounded(_of_point(f, ocp, model), none, np.array(rows), names)
+
+    def outputs(model: HybridModel, *rows: Array) -> _Bounded:
+        return _Bounded(_outputs(model, ocp.n_p), none, np.array(rows), y_names)
+
+    found = [states(ocp.x_min, ocp.x_max, *ocp.penalties, np.zeros(ocp.n_x))]
+    found += [
+        states(*_hard_rows(b, ocp, ocp.q)) for b in ocp.hard if isinstance(b.what, str) and b.what == "x"
+    ]
+    for b in ocp.soft:
+        found.append(values(b.expression, b.lower, b.upper, b.linear, b.quadratic, np.zeros(b.lower.size)))
+    if ocp.y_min.size and model is not None:
+        found.append(outputs(model, *output_bounds(ocp.q_y, ocp.y_min, ocp.y_max), np.zeros(ocp.y_min.size)))
+    for hard in ocp.hard:
+        if not isinstance(hard.what, str):
+            found.append(values(hard.what, *_hard_rows(hard, ocp)))
+        elif hard.what == "y" and model is not None:
+            found.append(outputs(model, *_hard_rows(hard, ocp, ocp.q_y)))
+    return found
+
+
+def _hard_rows(bound: HardBound, ocp: OCP, weights: Array | None = None) -> list[Array]:
+    """Bounds of a hard bound, the penalties by which it gives way, and that it is hard ``(n,)`` each."""
+    ranks = sorted({b.priority for b in ocp.hard})
+    size, range_ = bound.sizes, ocp.input_range
+    cost = np.full(size.size, max(1.0, float(np.max((ocp.r + ocp.r_delta) * range_**2))))
+    if weights is not None and weights.size:
+        cost = np.maximum(cost, weights * size**2)
+    linear = GIVES_WAY * HIGHER ** ranks.index(bound.priority) * cost / size
+    return [bound.lower, bound.upper, linear, linear / size, np.ones(size.size)]
+
+
+def _first_stages(model: HybridModel, functions: tuple[ca.Function, ...]) -> tuple[Array, list[Array]]:
+    """The first stage of each state, and of each value of functions ``(x, u, e)``, that an input of the plan reaches.
+
+    By the structure of the model's equations; infinite where there is none.
+    """
+    step = stage_step(model)
+    by_z, by_v = (np.array(ca.DM(step.jac_sparsity(0, i), 1).full(), dtype=bool) for i in (0, 1))
+    first, reached = np.full(by_z.shape[0], np.inf), np.zeros(by_z.shape[0], dtype=bool)
+    for stage in range(1, by_z.shape[0] + 1):
+        reached = by_z @ reached | np.any(by_v[:, : model.n_u], axis=1)
+        first[reached & np.isinf(first)] = stage
+    states, rows = first[: model.n_x], []
+    for f in functions:
+        by_x, by_u = (np.array(ca.DM(f.jac_sparsity(0, i), 1).full(), dtype=bool) for i in (0, 1))
+        shown = np.min(np.where(by_x, states, np.inf), axis=1)
+        rows.append(np.where(np.any(by_u, axis=1), 0.0, shown))
+    return states, rows
+
+
+def _of_point(f: ca.Function, ocp: OCP, model: HybridModel | None) -> ca.Function:
+    """A bounded expression as a function of ``(x, u, e)``."""
+    n_w, n_p = 0 if model is None else model.n_w, ocp.n_p
+    n_e = n_p + (0 if model is None else model.n_d + n_w)
+    wanted = [(ocp.n_x, 1), (ocp.n_u, 1), (n_w, 1), (n_p, 1)][: f.n_in()]
     if [f.size_in(i) for i in range(f.n_in())] != wanted:
         raise InputError(
             f"soft bound: expression {f} does not take (x, u) of {ocp.n_x} states and {ocp.n_u} inputs, nor these "
-            f"and w of {n_w} measured disturbances"
+            f"and w of {n_w} measured disturbances, nor these and p"
         )
     # in scalar code where the expression is some
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     x, u, e = kind.sym("x", ocp.n_x), kind.sym("u", ocp.n_u), kind.sym("e", n_e)
-    given = (x, u) if f.n_in() == 2 else (x, u, e[n_e - n_w :])
-    return ca.Function("bounded", [x, u, e], [f(*given)])
+    given = (x, u, e[n_e - n_p - n_w : n_e - n_p], e[n_e - n_p :])
+    return ca.Function("bounded", [x, u, e], [f(*given[: f.n_in()])])
 
 
-def _outputs(model: HybridModel) -> ca.Function:
-    """Outputs of a model as a function of ``(x, u, e)``, with what unmeasured disturbances add."""
+def _outputs(model: HybridModel, n_p: int = 0) -> ca.Function:
+    """Outputs of a model as a function of ``(x, u, e)``, with what unmeasured disturbances add.
+
+    The last ``n_p`` of ``e`` do not matter.
+    """
     on_u, _, on_y = (ca.DM(m) for m in model.disturbed)
-    x, u, e = (
-        ca.MX.sym(k, n) for k, n in zip("xue", (model.n_x, model.n_u, model.n_d + model.n_w), strict=True)
-    )
-    d, w = e[: model.n_d], e[model.n_d :]
+    n_e = model.n_d + model.n_w + n_p
+    x, u, e = (ca.MX.sym(k, n) for k, n in zip("xue", (model.n_x, model.n_u, n_e), strict=True))
+    d, w = e[: model.n_d], e[model.n_d : model.n_d + model.n_w]
     y = model.output(x, u + on_u @ d, w, ca.DM(model.p)) + on_y @ d
     return ca.Function("outputs", [x, u, e], [ca.densify(y)])
 
@@ -306,7 +441,7 @@ class EconomicCost:
 
     def _fill(self, f: BufferedFunction, x: Array, u: Array, p: Array | None) -> None:
         f.inputs[0][:], f.inputs[1][:] = x[: self._n].ravel(), u.ravel()
-        if p is not None:
+        if p is not None and self.n_p:
             f.inputs[2][:] = p[: self._n].ravel()
 
 
@@ -323,6 +458,7 @@ class Target:
         d: Unmeasured disturbances ``(n_d,)``.
         y: Reference of the outputs ``(N + 1, n_y)``, or the nearest that can be reached; no columns where references
             are the states'.
+        e: What bounded values depend on beside state and input, see :class:`SoftRows`: ``(N, n_d + n_w + n_p)``.
         steady: Steady state of the first row of such a reference.
     """
 
@@ -333,12 +469,8 @@ class Target:
     w: Array
     d: Array
     y: Array
+    e: Array
     steady: Steady | None = None
-
-    @property
-    def e(self) -> Array:
-        """Unmeasured and measured disturbances of each period ``(N, n_d + n_w)``."""
-        return np.hstack([np.tile(self.d, (len(self.w), 1)), self.w])
 
     @property
     def ok(self) -> bool:
@@ -369,6 +501,11 @@ class Problem:
             if values.size not in (0, model.n_y):
                 raise InputError(
                     f"{name} has {values.size} values, model {model.name} {model.n_y} outputs; give one each"
+                )
+        for bound in ocp.hard:
+            if isinstance(bound.what, str) and bound.what == "y" and bound.lower.size != model.n_y:
+                raise InputError(
+                    f"hard bound on y: {bound.lower.size} values given, model {model.name} has {model.n_y} outputs"
                 )
         self.model, self.ocp = model, ocp
         self.targets = Targets(model, ocp) if ocp.n_y else None
@@ -417,18 +554,28 @@ class Problem:
         p, weights = rows[:, ocp.columns - ocp.n_p :], self.weights(weight)
         d = np.zeros(m.n_d) if estimate is None else estimate.d
         ahead = self.forecast(w, estimate)
+        e = self.around(d, ahead, p)
         if self.targets is None:
             u = np.tile(m.u0, (n, 1))
-            return Target(rows[:, : ocp.n_x], weights, p, u, ahead, d, np.zeros((n + 1, 0)))
+            return Target(rows[:, : ocp.n_x], weights, p, u, ahead, d, np.zeros((n + 1, 0)), e)
         y_ref = np.where(ocp.q_y > 0, rows[:, : ocp.n_y], 0.0)
         along = np.vstack([ahead, ahead[-1:]])
         if not all(np.all(np.isfinite(v)) for v in (y_ref, d, along)):
             return Target(
-                np.full((n + 1, ocp.n_x), np.nan), weights, p, np.tile(m.u0, (n, 1)), ahead, d, y_ref
+                np.full((n + 1, ocp.n_x), np.nan), weights, p, np.tile(m.u0, (n, 1)), ahead, d, y_ref, e
             )
         x, u, y, steady = self._steady(y_ref, d, along, start)
         own = np.hstack([p, y, np.tile(d, (n + 1, 1)), along])
-        return Target(x, weights, own, u[:-1], ahead, d, y, steady)
+        return Target(x, weights, own, u[:-1], ahead, d, y, e, steady)
+
+    def around(self, d: Array, w: Array, p: Array | None = None) -> Array:
+        """What bounded values depend on besides ``(x, u)``: ``(N, n_d + n_w + n_p)``; ``p`` has a row more, or is 0."""
+        n, n_d, n_w = len(w), d.size, w.shape[1]
+        e = np.zeros((n, n_d + n_w + self.ocp.n_p))
+        e[:, :n_d], e[:, n_d : n_d + n_w] = d, w
+        if p is not None:
+            e[:, n_d + n_w :] = p[:-1]
+        return e
 
     def standing(self) -> Array:
         """The reference ``(1, columns)`` that is the operating point; the economic cost's parameters are zero."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemv
 
+from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP
@@ -33,7 +34,8 @@ class Prepared:
     defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
     ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is ``from_u`` times the state weights.
     ``soft`` is what :meth:`SoftRows.condensed` gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the
-    economic stage costs and their convex second ones; None where there are none.
+    economic stage costs and their convex second ones; None where there are none. ``e`` is what bounded values depend on
+    besides state and input.
     """
 
     u: Array
@@ -51,7 +53,9 @@ class Prepared:
     economic: tuple[Array, Array] | None
     milliseconds: float
     w: Array
+    e: Array
     steady: Steady | None = None
+    active: Active | None = None
 
 
 class Condenser:
@@ -212,19 +216,22 @@ class CondensedController(SplitController):
         derivatives = self.stages.at(z, self.model.acting(u, d, w))
         z = np.vstack([z, derivatives[0][-1:]])  # the appended period starts without a defect
         weight = self.problem.weights(weight)
-        return self.condense(u, z, d, previous.u[0], weight, derivatives, start, w=w, steady=previous.steady)
+        return self.condense(
+            u, z, d, previous.u[0], weight, derivatives, start, w=w, steady=previous.steady,
+            active=self.qp.later(previous.active),
+        )  # fmt: skip
 
     @np.errstate(over="ignore", invalid="ignore")
     def linearize(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, w: Array | None = None,
-        steady: Steady | None = None,
+        steady: Steady | None = None, active: Active | None = None,
     ) -> Prepared:  # fmt: skip
         """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``, ``w`` ``(N,
         n_w)``.
         """
         start, w = perf_counter(), self.problem.forecast(w, None)
         derivatives = self.stages.at(z[:-1], self.model.acting(u, d, w))
-        return self.condense(u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady)
+        return self.condense(u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady, active=active)
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def feedback(
@@ -248,6 +255,7 @@ class CondensedController(SplitController):
                 prepared.weight,
                 target.w,
                 prepared.steady,
+                prepared.active,
             )
         hessian, economic = self._at_parameters(prepared, target)
         if not target.ok or not np.all(np.isfinite(hessian)):
@@ -271,21 +279,28 @@ class CondensedController(SplitController):
         soft = self._soft_rows(prepared, free, target)
         if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        answer = self.qp.solve(hessian, gradient, prepared.u, prepared.u_prev, soft, limits)
+        answer = self.qp.solve(
+            hessian, gradient, prepared.u, prepared.u_prev, soft, limits, prepared.active, strict=True
+        )
         step = answer.step
         if not answer.status.ok:
             return self._failed(prepared, answer.status, start, answer.kkt)
         u = (u_bar + step).reshape(prepared.u.shape)
         drift += (prepared.b @ step.reshape(len(u), -1, 1))[:, :, 0]
         z = prepared.z + propagate(matrices, drift, dz0)
-        excess = np.zeros(0) if soft is None else self.problem.soft.excess(soft[0] + soft[1] @ step)
+        excess = (
+            np.zeros(len(self.problem.soft))
+            if soft is None
+            else self.problem.soft.excess(soft[0] + soft[1] @ step)
+        )
         cost = self.problem.cost(z, u, prepared.u_prev, target, excess)
         if not np.isfinite(cost):
             return self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
         u = np.clip(u, *self.ocp.bounds(prepared.u_prev, limits))  # the QP keeps them to its tolerance only
         return Solution(
             u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
-            self._timing(prepared, start), float(np.max(excess, initial=0.0)), w=target.w, steady=target.steady,
+            self._timing(prepared, start), self.problem.soft.largest(excess), w=target.w, steady=target.steady,
+            active=answer.active, given_way=self.problem.soft.given_way(excess),
         )  # fmt: skip
 
     def solve(
@@ -307,8 +322,9 @@ class CondensedController(SplitController):
             spent = solution.timing
             z = np.hstack([solution.x, solution.h])
             again = self.linearize(
-                solution.u, z, solution.d, prepared.u_prev, prepared.weight, solution.w, solution.steady
-            )
+                solution.u, z, solution.d, prepared.u_prev, prepared.weight, solution.w, solution.steady,
+                solution.active,
+            )  # fmt: skip
             solution = self.feedback(again, estimate, reference, limits, w)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)
@@ -317,7 +333,7 @@ class CondensedController(SplitController):
     def condense(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
         derivatives: Derivatives, start: float, p: Array | None = None, *, w: Array | None = None,
-        steady: Steady | None = None,
+        steady: Steady | None = None, active: Active | None = None,
     ) -> Prepared:  # fmt: skip
         """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began.
 
@@ -337,7 +353,7 @@ class CondensedController(SplitController):
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
         w = self.problem.forecast(w, None)
-        e = np.hstack([np.tile(d, (n, 1)), w])
+        e = self.problem.around(d, w, None if p is None else p[:, : self.ocp.n_p])
         soft = self.problem.soft.condensed(z[:, :n_x], u, from_u, e)
         known = self.problem.economic.function is not None and (
             p is not None or not self.problem.economic.n_p
@@ -347,8 +363,8 @@ class CondensedController(SplitController):
             hessian += condense_hessians(economic[1], from_u, n_x)
         spent = (perf_counter() - start) * 1e3
         return Prepared(
-            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent, w,
-            steady,
+            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent, w, e,
+            steady, active,
         )  # fmt: skip
 
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
@@ -363,7 +379,7 @@ class CondensedController(SplitController):
     def _soft_rows(self, prepared: Prepared, free: Array, target: Target) -> tuple[Array, Array] | None:
         """Values of the soft bounds before a step, and their derivatives by it."""
         value, by_x, slope = prepared.soft
-        if self.problem.soft.parametric and not np.array_equal(target.d, prepared.d):
+        if self.problem.soft.parametric and not np.array_equal(target.e, prepared.e):
             x = prepared.z[:, : self._n_x]
             value, by_x, slope = self.problem.soft.condensed(x, prepared.u, prepared.from_u, target.e)
         if not value.size:

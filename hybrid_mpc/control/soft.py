@@ -1,7 +1,8 @@
-"""Soft bounds on states and on expressions of state and input, as plain data that can be compared."""
+"""Soft and hard bounds on states, outputs and expressions of them, as plain data that can be compared."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -18,10 +19,17 @@ PENALTY = 1e3
 """Default penalty of a bound's violation, in multiples of what the tolerated deviation ``1 / sqrt(q)`` costs."""
 
 
+GIVES_WAY = 1e5
+"""Penalty of a hard bound's violation by its size, where it cannot be kept, in multiples of what inputs over their
+whole range, or states off by that size, cost: far above the multipliers of a bound that can."""
+HIGHER = 1e2
+"""Factor of that penalty from one priority to the next."""
+
+
 @dataclass(frozen=True, eq=False)
 class SoftBound:
-    """``lower <= expression(x, u) <= upper`` (or of ``(x, u, w)``) in every period of the horizon, as a penalty on its
-    violation.
+    """``lower <= expression(x, u) <= upper`` (or of ``(x, u, w)`` or ``(x, u, w, p)``) in every period of the horizon,
+    as a penalty on its violation.
 
     A violation ``s`` costs ``linear s + quadratic s^2`` per second. With ``linear`` above the largest multiplier of
     the hard bound (cost per second and unit by which the bound is moved) the penalty is exact: where the
@@ -30,7 +38,9 @@ class SoftBound:
     Two bounds are equal if their numbers are and their expressions state the same program.
 
     Args:
-        expression: ``(x, u) -> e``, a column of ``n_e``; ``(x, u, w) -> e`` where measured disturbances matter.
+        expression: ``(x, u) -> e``, a column of ``n_e``; ``(x, u, w) -> e`` where measured disturbances matter,
+            ``(x, u, w, p) -> e`` where the bound moves: ``p`` are further columns of the reference, as those of an
+            economic stage cost.
         lower: ``(n_e,)``; ``-inf`` for none.
         upper: ``(n_e,)``; ``inf`` for none.
         linear: Penalties ``(n_e,)`` [cost/s/unit], not negative.
@@ -62,14 +72,9 @@ class SoftBound:
         linear: ArrayLike,
         quadratic: ArrayLike,
     ) -> None:
-        if (
-            not isinstance(expression, ca.Function)
-            or expression.n_in() not in (2, 3)
-            or expression.n_out() != 1
-            or expression.size2_out(0) != 1
-        ):
+        if not _is_expression(expression):
             raise InputError(
-                f"soft bound: {expression} given; needed: a function (x, u) or (x, u, w) -> column"
+                f"soft bound: {expression} given; needed: a function (x, u), (x, u, w) or (x, u, w, p) -> column"
             )
         object.__setattr__(self, "expression", expression)
         n = int(expression.size1_out(0))
@@ -86,6 +91,96 @@ class SoftBound:
 
     def __hash__(self) -> int:
         return hash(number_content(self))
+
+
+@dataclass(frozen=True, eq=False)
+class HardBound:
+    """``lower <= what <= upper`` in every period of the horizon that an input can reach, kept wherever it can be.
+
+    States are bounded in ``x_1 .. x_N``, outputs and expressions in periods ``0 .. N-1``, from the first period on in
+    which an input shows there. Where no plan keeps all hard bounds, those of the lowest priority give way first, and as
+    little as can be: the plan says which, in :attr:`~hybrid_mpc.control.problem.Solution.given_way`. Limits of inputs
+    and of their changes never do.
+
+    Two bounds are equal if their numbers are and their expressions state the same program.
+
+    Args:
+        what: ``"x"`` for all states, ``"y"`` for all outputs, or an expression as :class:`SoftBound` takes it, e.g. one
+            of ``(x, u, w, p)`` for an obstacle that moves.
+        lower: ``(n,)``; ``-inf`` for none.
+        upper: ``(n,)``; ``inf`` for none.
+        priority: Bounds with a higher one are kept longer. Default: 0.
+
+    Raises:
+        InputError: If shapes do not fit, bounds cross, or the priority is no whole number.
+
+    Example:
+        >>> level = HardBound("x", [0.0, 0.0], [0.5, np.inf])
+        >>> level.upper, level.priority
+        (array([0.5,  inf]), 0)
+    """
+
+    what: str | ca.Function
+    lower: Array
+    upper: Array
+    priority: int
+
+    def __init__(
+        self, what: str | ca.Function, lower: ArrayLike, upper: ArrayLike, priority: int = 0
+    ) -> None:
+        if what not in ("x", "y") if isinstance(what, str) else not _is_expression(what):
+            raise InputError(
+                f"hard bound: {what!r} given; needed: 'x', 'y', or a function (x, u), (x, u, w) or (x, u, w, p) -> "
+                "column"
+            )
+        if not isinstance(priority, int) or isinstance(priority, bool):
+            raise InputError(f"hard bound: priority must be a whole number, got {priority!r}")
+        low, up = numbers(lower, "hard bound: lower"), numbers(upper, "hard bound: upper")
+        n = low.size if isinstance(what, str) else int(what.size1_out(0))
+        one = np.ones(n)
+        low, up = _checked("hard bound", n, low, up, one, one)[:2]
+        for name, value in (
+            ("what", what),
+            ("lower", fixed(low)),
+            ("upper", fixed(up)),
+            ("priority", priority),
+        ):
+            object.__setattr__(self, name, value)
+
+    @property
+    def sizes(self) -> Array:
+        """What counts as one violation ``(n,)``: half the range, else the bound's value, else 1."""
+        half = 0.5 * (self.upper - self.lower)
+        value = np.abs(np.where(np.isfinite(self.upper), self.upper, self.lower))
+        return np.where(np.isfinite(half), half, np.where(np.isfinite(value) & (value > 0), value, 1.0))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, HardBound):
+            return NotImplemented
+        mine, theirs = self.what, other.what
+        if isinstance(mine, str) or isinstance(theirs, str):
+            same = isinstance(mine, str) and isinstance(theirs, str) and mine == theirs
+        else:
+            same = same_expression(mine, theirs)
+        return same and number_content(self) == number_content(other)
+
+    def __hash__(self) -> int:
+        return hash(number_content(self))
+
+
+def _is_expression(f: object) -> bool:
+    """Whether ``f`` is a function ``(x, u)``, ``(x, u, w)`` or ``(x, u, w, p)`` to a column."""
+    return isinstance(f, ca.Function) and f.n_in() in (2, 3, 4) and f.n_out() == 1 and f.size2_out(0) == 1
+
+
+def tightest(lower: Array, upper: Array, hard: Sequence[HardBound], what: str, n: int) -> tuple[Array, Array]:
+    """Bounds ``(n,)`` of states or outputs, soft ones (which may be empty) and hard ones."""
+    low = lower.copy() if lower.size else np.full(n, -np.inf)
+    up = upper.copy() if upper.size else np.full(n, np.inf)
+    for bound in hard:
+        if isinstance(bound.what, str) and bound.what == what:
+            low, up = np.maximum(low, bound.lower), np.minimum(up, bound.upper)
+    return low, up
 
 
 def state_bounds(

@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.curvature import StageCurvature, convex
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Controller, Solution, Status, Target
@@ -183,10 +184,11 @@ class Descent:
     """The steps of one solve, from a first point on, whose cost is finite."""
 
     def __init__(
-        self, cost: ReducedCost, case: Case, at: Point, curvature: Array | None, tolerance: float
-    ) -> None:
+        self, cost: ReducedCost, case: Case, at: Point, curvature: Array | None, tolerance: float,
+        active: Active | None = None,
+    ) -> None:  # fmt: skip
         self._cost, self._case, self._tolerance = cost, case, tolerance
-        self.at, self.curvature = at, curvature
+        self.at, self.curvature, self.active = at, curvature, active
         self.count, self.status, self.kkt, self.ended = 0, Status.STOPPED, NAN, False
         self._stale, self._fresh, self._plain, self._taken = curvature is None, False, False, 0
         self._soft = np.zeros(at.run.soft[0].size)  # multipliers
@@ -216,7 +218,7 @@ class Descent:
         wrong = self._residual(hessian, change - hessian @ answer.step)
         left = change - found.hessian @ answer.step
         after = max(answer.kkt, self._residual(hessian, left))
-        self.at, self.kkt, self._soft = new, after, answer.multipliers
+        self.at, self.kkt, self._soft, self.active = new, after, answer.multipliers, answer.active
         self._stale, self._fresh, self._plain = wrong > SLOW * before, False, False
         self.ended = after <= KKT and self._promise(hessian, left) <= self._enough
         self.status = Status.SOLVED if self.ended else Status.STOPPED
@@ -278,7 +280,9 @@ class Descent:
     def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
         soft = (value, slope) if value.size else None
         case = self._case
-        return self._cost.inner.qp.solve(hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits)
+        return self._cost.inner.qp.solve(
+            hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits, self.active
+        )
 
     def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
         """By how much the convex model falls along a step."""
@@ -422,7 +426,8 @@ class SQPController(Controller):
         u = self._admissible(previous.following, case)
         run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
         at = self._cost.at(run, case)
-        descent = Descent(self._cost, case, at, self._shifted(previous), self._tolerance)
+        active = self._cost.inner.qp.later(previous.active)
+        descent = Descent(self._cost, case, at, self._shifted(previous), self._tolerance, active)
         if not (np.isfinite(run.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
             descent.status, descent.ended = Status.NOT_FINITE, True
         while descent.count < self._iterations and not descent.ended:
@@ -453,6 +458,7 @@ class SQPController(Controller):
         excess = self.problem.soft.excess(at.soft[0])
         return Solution(
             at.u, at.z[:, :n_x], at.z[:, n_x:], case.d, at.cost, descent.status, descent.kkt, 0.0,
-            {"solve": (perf_counter() - start) * 1e3}, float(np.max(excess, initial=0.0)), descent.count,
-            descent.curvature, w=case.target.w, steady=case.target.steady,
+            {"solve": (perf_counter() - start) * 1e3}, self.problem.soft.largest(excess), descent.count,
+            descent.curvature, w=case.target.w, steady=case.target.steady, active=descent.active,
+            given_way=self.problem.soft.given_way(excess),
         )  # fmt: skip

@@ -130,10 +130,9 @@ class Targets:
         self._root = np.sqrt(ocp.q_y[self._tracked])
         self._scale = np.concatenate([state_sizes(model, ocp), np.ones(model.n_h), ocp.input_scale])
         ranges = [np.array([(s.lower, s.upper) for s in group]).T for group in (model.states, model.outputs)]
-        y_min, y_max = (
-            b if b.size else np.full(model.n_y, s) for b, s in ((ocp.y_min, -np.inf), (ocp.y_max, np.inf))
-        )
-        self._x_range = np.maximum(ocp.x_min, ranges[0][0]), np.minimum(ocp.x_max, ranges[0][1])
+        x_min, x_max = ocp.state_range
+        y_min, y_max = ocp.output_range(model.n_y)
+        self._x_range = np.maximum(x_min, ranges[0][0]), np.minimum(x_max, ranges[0][1])
         self._y_range = np.maximum(y_min, ranges[1][0]), np.minimum(y_max, ranges[1][1])
 
     def at(

@@ -324,7 +324,7 @@ def state_range(model: HybridModel, control: OCP | None = None) -> Array:
     either side of the operating point.
     """
     none = np.full(model.n_x, np.inf)
-    lower, upper = (-none, none) if control is None else (control.x_min, control.x_max)
+    lower, upper = (-none, none) if control is None else control.state_range
     sides = zip(model.states, lower.tolist(), upper.tolist(), model.x0.tolist(), strict=True)
     return np.array([_within(s, np.pi if s.periodic else 1.0, low, high, at) for s, low, high, at in sides])
 

@@ -337,7 +337,7 @@ def _structure(control: Any) -> tuple[Any, ...]:
     if not isinstance(control, OCP):
         return ()
     bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())
-    expressions = control.soft, id(control.economic)
+    expressions = control.soft, control.hard, id(control.economic)
     return control.horizon, control.blocks, control.du_max is None, bounded, expressions
 
 
@@ -495,7 +495,7 @@ def _check_task(
                 raise InputError(
                     f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
                     + (
-                        f"; the last {n_p} for the economic cost's parameters"
+                        f"; the last {n_p} for the parameters of the economic cost and of bounds"
                         if columns > len(signals)
                         else ""
                     )

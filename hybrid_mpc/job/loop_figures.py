@@ -47,6 +47,6 @@ def loop_figure(
     return closed_loops(
         title, some["t"], results={name: Motion(a["t"], a["x"], a["u"], a["y"]) for name, a in loops.items()},
         states=machine.states, inputs=machine.inputs, limits=(problem.u_min, problem.u_max), outputs=machine.outputs,
-        state_limits=(problem.x_min, problem.x_max), output_limits=(problem.y_min, problem.y_max),
+        state_limits=problem.state_range, output_limits=problem.output_range(len(machine.outputs)),
         disturbances=machine.disturbances, w=some["w"], **references,
     )  # fmt: skip

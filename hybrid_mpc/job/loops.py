@@ -563,14 +563,16 @@ def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[s
         used[signal.name] = share_used(r.u[:, i], control.u_min[i], control.u_max[i], rest[i])
         if control.du_max is not None:
             used[f"change of {signal.name}"] = float(np.max(changes[:, i] / control.du_max[i]))
+    low, high = control.state_range
     for i, signal in enumerate(model.states):
-        if np.isfinite(control.x_min[i]) or np.isfinite(control.x_max[i]):
-            used[signal.name] = share_used(r.x[:, i], control.x_min[i], control.x_max[i], model.x0[i])
-    for i, signal in enumerate(model.outputs if control.y_min.size else ()):
-        if np.isfinite(control.y_min[i]) or np.isfinite(control.y_max[i]):
+        if np.isfinite(low[i]) or np.isfinite(high[i]):
+            used[signal.name] = share_used(r.x[:, i], low[i], high[i], model.x0[i])
+    low, high = control.output_range(model.n_y)
+    for i, signal in enumerate(model.outputs):
+        if np.isfinite(low[i]) or np.isfinite(high[i]):
             seen = r.y[np.isfinite(r.y[:, i]), i]
             rest_y = model.output(model.x0, model.u0, model.w, model.p).full()[i, 0]
-            used[f"output {signal.name}"] = share_used(seen, control.y_min[i], control.y_max[i], rest_y)
+            used[f"output {signal.name}"] = share_used(seen, low[i], high[i], rest_y)
     return used
 
 
@@ -580,11 +582,13 @@ def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, f
     """
     beyond = np.maximum(r.u - control.u_max, control.u_min - r.u)
     over = {s.label: v for s, v in zip(model.inputs, beyond.T, strict=True)}
-    if np.any(np.isfinite([control.x_min, control.x_max])):
-        beyond = np.maximum(r.x - control.x_max, control.x_min - r.x)
+    low, high = control.state_range
+    if np.any(np.isfinite([low, high])):
+        beyond = np.maximum(r.x - high, low - r.x)
         over |= {s.label: v for s, v in zip(model.states, beyond.T, strict=True)}
-    if np.any(np.isfinite([control.y_min, control.y_max])):
-        beyond = np.where(np.isfinite(r.y), np.maximum(r.y - control.y_max, control.y_min - r.y), -np.inf)
+    low, high = control.output_range(model.n_y)
+    if np.any(np.isfinite([low, high])):
+        beyond = np.where(np.isfinite(r.y), np.maximum(r.y - high, low - r.y), -np.inf)
         over |= {f"output {s.label}": v for s, v in zip(model.outputs, beyond.T, strict=True)}
     if control.du_max is not None:
         rest = np.clip(model.u0, control.u_min, control.u_max)

@@ -70,7 +70,7 @@ def test_bounds_and_limits_of_the_change(n_u, du_max, seed):
     assert plan.status is Status.SOLVED
     g, h = constraints(ocp, u_prev)
     assert np.min(h - g @ want.ravel()) < 1e-9  # bounds are active: the case is not a free one
-    # DAQP takes constraints into its active set from 1e-9 of half a range on, in its own scaling; NNLS rounds.
+    # Both are exact but for rounding; that of NNLS is the larger.
     np.testing.assert_allclose(plan.u, want, atol=1e-8)
 
 
@@ -140,7 +140,7 @@ def test_on_a_linear_model_the_first_guess_does_not_matter():
     controller = CondensedController(model, linear_problem(1, 10, bound=0.5))
     e, start = estimate_of(model, [1.0, -1.0, 0.5, 0.2, 0.1]), np.full((10, 1), 0.3)
     u = plan_of(controller, e, np.zeros((1, 3)), start=start).u
-    np.testing.assert_allclose(u, plan_of(controller, e, np.zeros((1, 3))).u, atol=1e-8)  # DAQP's tolerance
+    np.testing.assert_allclose(u, plan_of(controller, e, np.zeros((1, 3))).u, atol=1e-8)  # rounding
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ def test_converged_iterations_are_ipopts_answer(z, bound, du_max, x0):
     for k in range(25):  # ... the model's run on u + d ...
         x, _ = model.step(plan.x[k], plan.h[k], plan.u[k] + e.d, model.w, model.p)
         np.testing.assert_allclose(plan.x[k + 1], x.full().ravel(), atol=1e-8)
-    # ... and the inputs are the NLP's to DAQP's tolerance of 1e-6 of half the range, times ten.
+    # ... and the inputs are the NLP's to IPOPT's tolerance of the cost, its root.
     np.testing.assert_allclose(plan.u, u, atol=1e-5 * bound)
     assert plan.cost == pytest.approx(cost, rel=1e-6)  # at a minimum the cost is flat: better than u's
     change = np.abs(np.diff(u, axis=0, prepend=0.0))

@@ -38,7 +38,7 @@ def test_random_problems_are_solved_as_by_ipopt(seed, penalty):
     assert got.status is Status.SOLVED
     x = states(want, a, b, ocp, z, d)
     assert np.any(np.maximum(x - ocp.x_max, ocp.x_min - x) > -1e-6)  # a soft bound matters
-    # DAQP takes constraints into its active set from 1e-6 of half a range on, IPOPT ends within 1e-11 of the cost.
+    # IPOPT ends within 1e-11 of the cost, the plan is good to the root of it.
     np.testing.assert_allclose(got.u, want, atol=1e-5)
     assert got.cost == pytest.approx(cost, rel=1e-6)
     beyond = np.maximum(x - ocp.x_max, ocp.x_min - x)

@@ -16,6 +16,7 @@ from hybrid_mpc import (
     DataSpec,
     Disturbance,
     Fault,
+    HardBound,
     InputError,
     MechanicalPrior,
     OperatingPoint,
@@ -310,6 +311,13 @@ WRONG = {
     "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["first_sigma needs 1 standard deviations", "(phi_dot)"]),
     "zero du_max": (control(du_max=(0,)), ["du_max"]),
     "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["state bounds cross"]),
+    "hard bounds of too many outputs": (
+        control(hard=[HardBound("y", (-1.0,) * 3, (1.0,) * 3)]), ["controller: hard bound on y: 3 values given"]
+    ),
+    "hard bound out of reach": (
+        control(hard=[HardBound(ca.Function("one", [ca.SX.sym("x", 2), ca.SX.sym("u")], [ca.SX(1)]), [0.0], [2.0])]),
+        ["hard bound on one: no input of the plan reaches it"],
+    ),
     "working point of one": (control(working_point=((0.0,), (0.0,))), ["working_point x: 1 values given, 2 needed"]),
     "starts of another shape": (control(starts=(((0.0,),),)), ["starts[0]: shape (1, 1) given", "(10, 1)"]),
     # tasks
@@ -444,7 +452,7 @@ def test_a_problem_with_prices_asks_for_them_in_the_reference():
         GOOD, control=CONTROL.changed(economic=ca.Function("f", [x, u, p], [p * u**2]))
     )
     with pytest.raises(
-        InputError, match=r"\(50, 3\) for 50 times, got \(50, 2\); the last 1 for the economic"
+        InputError, match=r"\(50, 3\) for 50 times, got \(50, 2\); the last 1 for the parameters"
     ):
         check_scenario(priced)
     told = dataclasses.replace(TASK, reference=lambda t: np.ones((len(t), 3)))

@@ -1,0 +1,285 @@
+"""Convex quadratic programs with few unknowns and many rows, hard or penalised, by active sets that start warm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+
+Array = NDArray[np.float64]
+Active = NDArray[np.int8]
+"""Where the rows of a QP are: 1 on the upper bound, -1 on the lower, 2 and -2 beyond a penalised one, 0 between."""
+
+PRIMAL_TOLERANCE = 1e-9
+"""By which a row is exceeded before it acts."""
+CHANGES = 25
+"""Most changes of the whole set; from the last plan's it takes 1 to 10."""
+STEPS = 10
+"""Most steps of the method that changes a row at a time, for each unknown."""
+DEPENDENT = 1e-12
+"""Share of a row's size in the dual below which its pivot says that it depends on the others."""
+
+
+@dataclass(frozen=True)
+class RowQP:
+    """``min 1/2 s'hs + g's + penalties`` with the rows ``v = (s, a s)``, ``lower <= v <= upper``.
+
+    A violation ``e`` of a row costs ``linear e + e^2 / (2 give)``. Hard rows have an infinite ``linear`` and a ``give``
+    of zero. ``h`` ``(n, n)`` is symmetric positive definite, ``a`` has any number of rows; the unknowns come first in
+    all other arrays ``(R,)``.
+    """
+
+    h: Array
+    g: Array
+    a: Array
+    lower: Array
+    upper: Array
+    linear: Array
+    give: Array
+
+    def values(self, s: Array) -> Array:
+        """Values ``(R,)`` of all rows."""
+        return np.concatenate([s, self.a @ s]) if len(self.a) else s.copy()
+
+    @np.errstate(invalid="ignore")  # what is not finite is told by the result
+    def residuals(self, s: Array, multipliers: Array) -> tuple[float, float, float]:
+        """What unknowns and multipliers ``(R,)`` lack of the optimum: stationarity, penalties, violation of hard rows.
+
+        A multiplier must be a slope of its row's penalty: to push the row's value by it and to step back under the
+        penalty (a proximal point) changes nothing only there.
+        """
+        value, n = self.values(s), s.size
+        slope = self.h @ s + self.g + multipliers[:n]
+        if len(self.a):
+            slope += multipliers[n:] @ self.a
+        pushed = value + multipliers
+        inside = np.minimum(np.maximum(pushed, self.lower), self.upper)
+        out = pushed - inside
+        beyond = np.maximum(np.abs(out) - self.linear, 0.0) * (self.give / (1.0 + self.give))
+        wrong = np.abs(value - inside - np.copysign(beyond, out))
+        outside = np.maximum(self.lower - value, value - self.upper)[np.isinf(self.linear)]
+        largest = float(np.maximum(np.max(outside, initial=0.0), 0.0))
+        return float(np.max(np.abs(slope))), float(np.max(wrong)), largest
+
+
+class Found(NamedTuple):
+    """Unknowns, multipliers of all rows, and the rows that act."""
+
+    s: Array
+    multipliers: Array
+    active: Active
+
+
+class _On(NamedTuple):
+    """Acting rows: which, on which side, their rows in the dual, its Cholesky factor and diagonal, multipliers."""
+
+    rows: NDArray[np.int64]
+    side: Active
+    chosen: Array
+    pivots: Array
+    own: Array
+    push: Array
+
+
+class ActiveSet:
+    """The method for one QP: ``ActiveSet(qp).solve(active)``.
+
+    A row that does not act costs no more than the look whether it does. :meth:`all_at_once` changes the whole set until
+    the answer on it keeps all other rows and pushes against all of its own: the semismooth Newton method on the KKT
+    conditions, fast where the set is nearly right. A penalised row needs no slack: it does not act, or is met with a
+    multiplier of up to its linear penalty, or is exceeded, in proportion to what its multiplier is beyond that. Where
+    this does not end (rows that depend on each other, a cycle), :meth:`one_at_a_time` ascends the dual, which always
+    ends: the worst row's multiplier grows until the row is kept, while rows whose multipliers come to zero or to their
+    penalty leave the set or give way.
+
+    Args:
+        qp: The problem.
+        later: For every row that of the same value a period later, itself if there is none: of a stretch of time that
+            exceeds a bound anew, only the worst row joins the set at once. Default: all join.
+        earlier: Likewise.
+
+    Source: Hintermüller, Ito, Kunisch, *The primal-dual active set strategy as a semismooth Newton method*, SIAM J.
+    Optim. 13 (2002); Goldfarb and Idnani, *A numerically stable dual method for solving strictly convex quadratic
+    programs*, Math. Program. 27 (1983).
+
+    Example:
+        >>> one, none = np.ones(1), np.zeros(1)
+        >>> qp = RowQP(np.eye(1), np.array([-3.0]), np.zeros((0, 1)), -one, one, np.array([np.inf]), none)
+        >>> found = ActiveSet(qp).solve()
+        >>> found.s, found.multipliers, found.active
+        (array([1.]), array([2.]), array([1], dtype=int8))
+    """
+
+    def __init__(
+        self, qp: RowQP, later: NDArray[np.int64] | None = None, earlier: NDArray[np.int64] | None = None
+    ) -> None:
+        self._qp, self._later, self._earlier = qp, later, earlier
+        factor, bad = dpotrf(qp.h, lower=1)
+        self._factored = not bad
+        self._free = -dpotrs(factor, qp.g, lower=1)[0]
+        self._inverse, _ = dtrtri(factor, lower=1)
+        self._at_free = qp.values(self._free)
+        self._n, rows = qp.g.size, qp.lower.size
+        self._reduced, self._known = np.empty((rows, self._n)), np.zeros(rows, dtype=bool)
+
+    def solve(self, active: Active | None = None) -> Found:
+        """The answer, whose residuals are to be looked at; ``active`` are rows to begin with."""
+        none = np.zeros(self._qp.lower.size, dtype=np.int8)
+        if not self._factored:
+            return Found(np.full(self._n, np.nan), np.full(none.size, np.nan), none)
+        start = none if active is None or active.size != none.size else active
+        return (
+            self.all_at_once(start)
+            or self.one_at_a_time(start)
+            or self.one_at_a_time(none)
+            or Found(self._free, np.zeros(none.size), none)
+        )
+
+    def all_at_once(self, active: Active) -> Found | None:
+        """The answer by changes of the whole set; None where they do not end."""
+        qp, seen = self._qp, set()
+        for _ in range(CHANGES):
+            on = self._on(active)
+            if on is None:
+                return None
+            self._last = active
+            found = self._answer(active, on)
+            pushed = qp.values(found.s)
+            pushed[on.rows] += on.own * on.push
+            over, under = pushed - qp.upper, qp.lower - pushed
+            after = (over > PRIMAL_TOLERANCE).astype(np.int8) - (under > PRIMAL_TOLERANCE).astype(np.int8)
+            if self._later is not None and self._earlier is not None:
+                excess = np.where(active == 0, np.maximum(over, under), 0.0)
+                after[(active == 0) & ((excess < excess[self._later]) | (excess < excess[self._earlier]))] = 0
+            if on.rows.size:
+                after[on.rows] = np.where((on.push > 0) == (on.side > 0), np.sign(on.side), after[on.rows])
+                after[np.abs(found.multipliers) > qp.linear] *= 2
+            if np.array_equal(after, active):
+                return found
+            key = after.tobytes()
+            if key in seen:
+                return None
+            seen.add(key)
+            active = after
+        return None
+
+    def one_at_a_time(self, active: Active) -> Found | None:
+        """The answer by steps up the dual; None where rounding stands in the way."""
+        start = self._dual_feasible(active)
+        if start is None:
+            return None
+        qp, size = self._qp, np.sqrt(np.maximum(np.sum(self._rows() ** 2, axis=1), 1e-300))
+        multipliers, active = start.multipliers.copy(), start.active.copy()
+        row, sign = -1, 0.0
+        for _ in range(STEPS * self._n):
+            acts = np.flatnonzero(multipliers)
+            s = self._free - (multipliers[acts] @ self._reduced[acts]) @ self._inverse
+            values = qp.values(s)
+            excess = np.maximum(values - qp.upper, qp.lower - values)
+            if row < 0:
+                worst = np.where((active == 0) & (excess > PRIMAL_TOLERANCE), excess / size, 0.0)
+                row = int(np.argmax(worst))
+                if worst[row] <= 0:
+                    return Found(s, multipliers, active)
+                sign = 1.0 if values[row] > qp.upper[row] else -1.0
+            on = self._on(active)
+            if on is None:
+                return None
+            own = self._reduced[row]
+            change = -sign * dpotrs(on.pivots, on.chosen @ own, lower=1)[0] if on.rows.size else np.zeros(0)
+            rate = float(own @ own + sign * change @ (on.chosen @ own))
+            rate = rate if rate > DEPENDENT * size[row] ** 2 else 0.0
+            given = abs(multipliers[row]) - qp.linear[row]
+            left = float(excess[row])
+            if given >= 0:
+                rate, left = rate + qp.give[row], left - given * qp.give[row]
+            length = left / rate if rate > 0 else np.inf
+            event, to = -1, 0
+            if -given < length and given < 0:
+                length, event = -given, row
+            if on.rows.size:
+                grows, now, beyond = (
+                    change * np.sign(on.side),
+                    np.abs(multipliers[on.rows]),
+                    np.abs(on.side) > 1,
+                )
+                goal = np.where(grows > 0, qp.linear[on.rows], np.where(beyond, qp.linear[on.rows], 0.0))
+                meets = (grows < 0) | ((grows > 0) & ~beyond & np.isfinite(goal))
+                lengths = np.full(now.size, np.inf)
+                lengths[meets] = np.maximum((goal - now)[meets] / grows[meets], 0.0)
+                i = int(np.argmin(lengths))
+                if lengths[i] < length:
+                    length, event = float(lengths[i]), int(on.rows[i])
+                    to = 1 if beyond[i] else 2 if grows[i] > 0 else 0
+            if not np.isfinite(length):
+                return Found(s, multipliers, active)  # hard rows that contradict each other
+            multipliers[on.rows] += length * change
+            multipliers[row] += sign * length
+            if event < 0:
+                active[row], row = int(sign) * (1 if given < 0 else 2), -1
+            elif event == row:
+                multipliers[row] = sign * qp.linear[row]
+            else:
+                side = np.sign(active[event])
+                multipliers[event] = side * qp.linear[event] if to else 0.0
+                active[event] = side * to
+        return None
+
+    def _dual_feasible(self, active: Active) -> Found | None:
+        """The answer on those rows of a set that push the right way, whatever other rows it violates."""
+        for _ in range(CHANGES):
+            on = self._on(active)
+            if on is None:
+                return None
+            if not on.rows.size:
+                return self._answer(active, on)
+            right = (on.push > 0) == (on.side > 0)
+            beyond = np.where(np.abs(on.push) > self._qp.linear[on.rows], 2, 1)
+            after = np.where(right, np.sign(on.side) * beyond, 0)
+            if np.array_equal(after, on.side):
+                return self._answer(active, on)
+            active = active.copy()
+            active[on.rows] = after
+        return None
+
+    def _on(self, active: Active) -> _On | None:
+        """Multipliers of acting rows if they are met and all others forgotten; None where they depend on each other."""
+        rows, qp = np.flatnonzero(active), self._qp
+        side = active[rows]
+        if rows.size > self._n and np.count_nonzero(np.abs(side) == 1) > self._n:
+            return None
+        if not rows.size:
+            none = np.zeros(0)
+            return _On(rows, side, np.zeros((0, self._n)), np.zeros((0, 0)), none, none)
+        chosen = self._rows(rows)[rows]
+        dual = chosen @ chosen.T
+        own = dual.diagonal().copy()
+        off = self._at_free[rows] - np.where(side > 0, qp.upper[rows], qp.lower[rows])
+        beyond = np.flatnonzero(np.abs(side) > 1)
+        if beyond.size:
+            place = rows[beyond]
+            dual[beyond, beyond] += qp.give[place]
+            off[beyond] += np.sign(side[beyond]) * qp.linear[place] * qp.give[place]
+        pivots, bad = dpotrf(dual, lower=1)
+        if bad or not np.min(pivots.diagonal() ** 2 / dual.diagonal()) > DEPENDENT:
+            return None
+        return _On(rows, side, chosen, pivots, own, dpotrs(pivots, off, lower=1)[0])
+
+    def _rows(self, rows: NDArray[np.int64] | None = None) -> Array:
+        """Rows in the dual, of which those asked for are there. Default: all."""
+        new = np.flatnonzero(~self._known) if rows is None else rows[~self._known[rows]]
+        if new.size:
+            bound, row = new[new < self._n], new[new >= self._n]
+            self._reduced[bound] = self._inverse.T[bound]
+            self._reduced[row] = self._qp.a[row - self._n] @ self._inverse.T
+            self._known[new] = True
+        return self._reduced
+
+    def _answer(self, active: Active, on: _On) -> Found:
+        multipliers = np.zeros(active.size)
+        multipliers[on.rows] = on.push
+        s = self._free - (on.push @ on.chosen) @ self._inverse if on.rows.size else self._free
+        return Found(s, multipliers, active)
