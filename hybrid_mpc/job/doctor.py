@@ -58,10 +58,10 @@ def _packages() -> Iterator[Finding]:
         return
     extras: dict[str, list[str]] = {"": []}
     for line in needed:
-        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", line)
+        marker = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", line)
         named = re.match(r"[\w.-]+", line)
         if named and named[0].lower().replace("_", "-") != PACKAGE:
-            extras.setdefault(extra[1] if extra else "", []).append(named[0])
+            extras.setdefault(marker[1] if marker else "", []).append(named[0])
     for extra, names in extras.items():
         there = {name: _version(name) for name in dict.fromkeys(names)}
         told = ", ".join(f"{name} {found or 'absent'}" for name, found in there.items())
