@@ -159,7 +159,7 @@ def test_rubbish(folder, tmp_path):
 @needs_compiler
 @pytest.mark.full
 def test_rubbish_for_long(folder, tmp_path):
-    rubbish(shutil.copytree(folder, tmp_path / "c"), 100_000)
+    rubbish(shutil.copytree(folder, tmp_path / "c"), 34_000)  # 102,000 on the three machines
 
 
 def refused(model, ocp, match, **options):
