@@ -1,6 +1,7 @@
 """The benchmarks run, and the routes that they time agree."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -54,3 +55,12 @@ def test_solvers_find_the_same_plan(tmp_path):
 )
 def test_the_others_run(name, words, tmp_path):
     assert rows(tmp_path / "out.json", name, words)
+
+
+@pytest.mark.full
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_the_controller_in_c_solves_what_python_solves(tmp_path):
+    found = rows(tmp_path / "out.json", "native", "--sizes 4 --rounds 1")
+    assert [row["solver"] for row in found] == ["rti, Python", "native, -O3 -march=native", "native, -O3"]
+    # the same QP in another order of operations
+    assert max(row["input differs"] for row in found) < 1e-11
