@@ -123,7 +123,7 @@ class ActiveSet:
         self, qp: RowQP, later: NDArray[np.int64] | None = None, earlier: NDArray[np.int64] | None = None
     ) -> None:
         self._qp, self._later, self._earlier = qp, later, earlier
-        self._factor, bad = dpotrf(qp.h.T, 1)  # lower; column by column in memory, as LAPACK has it
+        self._factor, bad = dpotrf(qp.h, 1)
         self._factored = not bad
         self._free = -dpotrs(self._factor, qp.g, 1)[0]
         self._at_free = qp.values(self._free)
@@ -269,9 +269,8 @@ class ActiveSet:
             place = rows[beyond]
             dual[beyond, beyond] += qp.give[place]
             off[beyond] += np.sign(side[beyond]) * qp.linear[place] * qp.give[place]
-        size = dual.diagonal().copy()
-        pivots, bad = dpotrf(dual.T, 1, 0, 1)  # lower, the rest as it is, in place
-        if bad or not (pivots.diagonal() ** 2 / size).min() > DEPENDENT:
+        pivots, bad = dpotrf(dual, 1)
+        if bad or not (pivots.diagonal() ** 2 / dual.diagonal()).min() > DEPENDENT:
             return None
         return _On(rows, side, chosen, pivots, own, dpotrs(pivots, off, 1)[0])
 
