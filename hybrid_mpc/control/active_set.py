@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -27,9 +28,9 @@ DEPENDENT = 1e-12
 class RowQP:
     """``min 1/2 s'hs + g's + penalties`` with the rows ``v = (s, a s)``, ``lower <= v <= upper``.
 
-    A violation ``e`` of a row costs ``linear e + e^2 / (2 give)``. Hard rows have an infinite ``linear`` and a ``give``
-    of zero. ``h`` ``(n, n)`` is symmetric positive definite, ``a`` has any number of rows; the unknowns come first in
-    all other arrays ``(R,)``.
+    A violation ``e`` of a row costs ``linear e + e^2 / (2 give)``. Hard rows, and they alone, have an infinite
+    ``linear`` and a ``give`` of zero. ``h`` ``(n, n)`` is symmetric positive definite, ``a`` any number of rows; the
+    unknowns come first in all other arrays ``(R,)``.
     """
 
     h: Array
@@ -44,6 +45,10 @@ class RowQP:
         """Values ``(R,)`` of all rows."""
         return np.concatenate([s, self.a @ s]) if len(self.a) else s.copy()
 
+    def excess(self, values: Array) -> Array:
+        """By how much values ``(R,)`` are beyond their bounds, negative where they are not."""
+        return np.maximum(values - self.upper, self.lower - values)
+
     @np.errstate(invalid="ignore")  # what is not finite is told by the result
     def residuals(self, s: Array, multipliers: Array) -> tuple[float, float, float]:
         """What unknowns and multipliers ``(R,)`` lack of the optimum: stationarity, penalties, violation of hard rows.
@@ -57,12 +62,13 @@ class RowQP:
             slope += multipliers[n:] @ self.a
         pushed = value + multipliers
         inside = np.minimum(np.maximum(pushed, self.lower), self.upper)
-        out = pushed - inside
-        beyond = np.maximum(np.abs(out) - self.linear, 0.0) * (self.give / (1.0 + self.give))
-        wrong = np.abs(value - inside - np.copysign(beyond, out))
-        outside = np.maximum(self.lower - value, value - self.upper)[np.isinf(self.linear)]
-        largest = float(np.maximum(np.max(outside, initial=0.0), 0.0))
-        return float(np.max(np.abs(slope))), float(np.max(wrong)), largest
+        wrong = value - inside
+        if len(self.a):
+            out = pushed - inside
+            beyond = np.maximum(np.abs(out) - self.linear, 0.0) * (self.give / (1.0 + self.give))
+            wrong -= np.copysign(beyond, out)
+        outside = np.where(self.give == 0, self.excess(value), 0.0)
+        return float(np.abs(slope).max()), float(np.abs(wrong).max()), max(float(outside.max()), 0.0)
 
 
 class Found(NamedTuple):
@@ -117,13 +123,11 @@ class ActiveSet:
         self, qp: RowQP, later: NDArray[np.int64] | None = None, earlier: NDArray[np.int64] | None = None
     ) -> None:
         self._qp, self._later, self._earlier = qp, later, earlier
-        factor, bad = dpotrf(qp.h, lower=1)
+        self._factor, bad = dpotrf(qp.h, 1)
         self._factored = not bad
-        self._free = -dpotrs(factor, qp.g, lower=1)[0]
-        self._inverse, _ = dtrtri(factor, lower=1)
+        self._free = -dpotrs(self._factor, qp.g, 1)[0]
         self._at_free = qp.values(self._free)
-        self._n, rows = qp.g.size, qp.lower.size
-        self._reduced, self._known = np.empty((rows, self._n)), np.zeros(rows, dtype=bool)
+        self._n = qp.g.size
 
     def solve(self, active: Active | None = None) -> Found:
         """The answer, whose residuals are to be looked at; ``active`` are rows to begin with."""
@@ -131,6 +135,8 @@ class ActiveSet:
         if not self._factored:
             return Found(np.full(self._n, np.nan), np.full(none.size, np.nan), none)
         start = none if active is None or active.size != none.size else active
+        if not np.any(start) and np.max(self._qp.excess(self._at_free)) <= PRIMAL_TOLERANCE:
+            return Found(self._free, np.zeros(none.size), none)
         return (
             self.all_at_once(start)
             or self.one_at_a_time(start)
@@ -178,7 +184,7 @@ class ActiveSet:
             acts = np.flatnonzero(multipliers)
             s = self._free - (multipliers[acts] @ self._reduced[acts]) @ self._inverse
             values = qp.values(s)
-            excess = np.maximum(values - qp.upper, qp.lower - values)
+            excess = qp.excess(values)
             if row < 0:
                 worst = np.where((active == 0) & (excess > PRIMAL_TOLERANCE), excess / size, 0.0)
                 row = int(np.argmax(worst))
@@ -189,7 +195,7 @@ class ActiveSet:
             if on is None:
                 return None
             own = self._reduced[row]
-            change = -sign * dpotrs(on.pivots, on.chosen @ own, lower=1)[0] if on.rows.size else np.zeros(0)
+            change = -sign * dpotrs(on.pivots, on.chosen @ own, 1)[0] if on.rows.size else np.zeros(0)
             rate = float(own @ own + sign * change @ (on.chosen @ own))
             rate = rate if rate > DEPENDENT * size[row] ** 2 else 0.0
             given = abs(multipliers[row]) - qp.linear[row]
@@ -263,10 +269,24 @@ class ActiveSet:
             place = rows[beyond]
             dual[beyond, beyond] += qp.give[place]
             off[beyond] += np.sign(side[beyond]) * qp.linear[place] * qp.give[place]
-        pivots, bad = dpotrf(dual, lower=1)
-        if bad or not np.min(pivots.diagonal() ** 2 / dual.diagonal()) > DEPENDENT:
+        pivots, bad = dpotrf(dual, 1)
+        if bad or not (pivots.diagonal() ** 2 / dual.diagonal()).min() > DEPENDENT:
             return None
-        return _On(rows, side, chosen, pivots, own, dpotrs(pivots, off, lower=1)[0])
+        return _On(rows, side, chosen, pivots, own, dpotrs(pivots, off, 1)[0])
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """Inverse of the Hessian's Cholesky factor; not needed where no row acts."""
+        return np.asarray(dtrtri(self._factor, 1)[0])
+
+    @cached_property
+    def _reduced(self) -> Array:
+        """Rows in the dual ``(R, n)``; which are :attr:`_known` are there."""
+        return np.empty((self._qp.lower.size, self._n))
+
+    @cached_property
+    def _known(self) -> NDArray[np.bool_]:
+        return np.zeros(self._qp.lower.size, dtype=bool)
 
     def _rows(self, rows: NDArray[np.int64] | None = None) -> Array:
         """Rows in the dual, of which those asked for are there. Default: all."""

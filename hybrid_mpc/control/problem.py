@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
-from hybrid_mpc.control.soft import GIVES_WAY, HIGHER, HardBound, output_bounds
+from hybrid_mpc.control.soft import GIVES_WAY, HIGHER, HardBound, fixed, output_bounds
 from hybrid_mpc.control.targets import Steady, Targets, state_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
@@ -517,6 +517,11 @@ class Problem:
         self._rows = np.arange(ocp.horizon + 1)
         self.state_sizes = state_sizes(model, ocp)
         """By what solvers scale the states ``(n_x,)``."""
+        self._u0 = fixed(np.tile(model.u0, (ocp.horizon, 1)))
+        self._even = fixed(np.ones((ocp.horizon + 1, ocp.n_x)))
+        self._even_stages = fixed(np.tile(ocp.q * model.dt, (ocp.horizon, 1)))
+        self._no_w, self._no_y = fixed(np.zeros((ocp.horizon, 0))), fixed(np.zeros((ocp.horizon + 1, 0)))
+        self._no_e = fixed(np.zeros((ocp.horizon, model.n_d + model.n_w + ocp.n_p)))
         self.u_rest: Array = np.clip(model.u0, ocp.u_min, ocp.u_max)
         """Input ``(n_u,)`` of the operating point, within the limits."""
 
@@ -556,8 +561,7 @@ class Problem:
         ahead = self.forecast(w, estimate)
         e = self.around(d, ahead, p)
         if self.targets is None:
-            u = np.tile(m.u0, (n, 1))
-            return Target(rows[:, : ocp.n_x], weights, p, u, ahead, d, np.zeros((n + 1, 0)), e)
+            return Target(rows[:, : ocp.n_x], weights, p, self._u0, ahead, d, self._no_y, e)
         y_ref = np.where(ocp.q_y > 0, rows[:, : ocp.n_y], 0.0)
         along = np.vstack([ahead, ahead[-1:]])
         if not all(np.all(np.isfinite(v)) for v in (y_ref, d, along)):
@@ -569,7 +573,12 @@ class Problem:
         return Target(x, weights, own, u[:-1], ahead, d, y, e, steady)
 
     def around(self, d: Array, w: Array, p: Array | None = None) -> Array:
-        """What bounded values depend on besides ``(x, u)``: ``(N, n_d + n_w + n_p)``; ``p`` has a row more, or is 0."""
+        """What bounded values depend on besides ``(x, u)``: ``(N, n_d + n_w + n_p)``; ``p`` has a row more, or is 0.
+
+        Zeros where none depends on it.
+        """
+        if not self.soft.parametric:
+            return self._no_e
         n, n_d, n_w = len(w), d.size, w.shape[1]
         e = np.zeros((n, n_d + n_w + self.ocp.n_p))
         e[:, :n_d], e[:, n_d : n_d + n_w] = d, w
@@ -622,6 +631,8 @@ class Problem:
     def forecast(self, w: ArrayLike | None, estimate: Estimate | None) -> Array:
         """Measured disturbances ``(N, n_w)`` from ``(m, n_w)``, the last ones held; None: those of the estimate."""
         n, n_w = self.ocp.horizon, self.model.n_w
+        if w is None and not n_w:
+            return self._no_w
         if w is None:
             known = estimate is not None and estimate.w.size == n_w
             held = estimate.w if known and estimate is not None else self.model.w
@@ -631,19 +642,29 @@ class Problem:
     def weights(self, weight: ArrayLike | None) -> Array:
         """Weight factors ``(N + 1, n_x)`` from ``(m, n_x)``, the last value held. Default: 1."""
         if weight is None:
-            return np.ones((self.ocp.horizon + 1, self.ocp.n_x))
+            return self._even
+        if isinstance(weight, np.ndarray) and self.is_even(weight):
+            return weight
         return self._preview(weight, "weight", self.ocp.n_x)
 
     def _preview(self, values: ArrayLike, name: str, columns: int) -> Array:
         array = np.asarray(values, dtype=float)
         if array.ndim != 2 or len(array) < 1 or array.shape[1] != columns:
             raise InputError(f"{name}: shape {array.shape} given, (m, {columns}) with m > 0 needed")
+        if len(array) == self._rows.size:
+            return array.copy()
         return np.asarray(array[np.minimum(self._rows, len(array) - 1)])
 
     def state_weights(self, weight: Array) -> tuple[Array, Array]:
         """Weights of the stages ``(N, n_x)`` and the terminal matrix for weight factors ``(N + 1, n_x)``."""
+        if self.is_even(weight):
+            return self._even_stages, self.terminal
         root = np.sqrt(weight[-1])
         return weight[:-1] * (self.ocp.q * self.model.dt), self.terminal * root * root[:, None]
+
+    def is_even(self, weight: Array) -> bool:
+        """Whether these are the factors of 1 that :meth:`weights` gives where there are no others."""
+        return weight is self._even
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def cost(self, z: Array, u: Array, u_prev: Array, target: Target, excess: Array | None = None) -> float:
@@ -651,13 +672,15 @@ class Problem:
 
         ``excess`` ``(M,)`` are the violations of the soft bounds. Default: those of the trajectory.
         """
-        x = z[:, : self.ocp.n_x]
-        du = u - np.vstack([u_prev, u[:-1]])
-        stages, terminal = self.state_weights(target.weight)
+        ocp, x = self.ocp, z[:, : self.ocp.n_x]
+        du, off = u.copy(), u - target.u
+        du[1:] -= u[:-1]
+        du[0] -= u_prev
         error = x - target.x
-        stage = np.sum(error[:-1] ** 2 * stages)
-        stage += self.model.dt * np.sum((u - target.u) ** 2 @ self.ocp.r + du**2 @ self.ocp.r_delta)
-        total = float(stage + error[-1] @ terminal @ error[-1]) + self.economic.value(x, u, target.p)
+        stages, terminal = self.state_weights(target.weight)
+        last, inputs = error[-1], np.sum(off**2 @ ocp.r) + np.sum(du**2 @ ocp.r_delta)
+        total = float(np.vdot(stages, error[:-1] ** 2) + self.model.dt * inputs + last @ terminal @ last)
+        total += self.economic.value(x, u, target.p)
         if len(self.soft):
             excess = self.soft.excess(self.soft.values(x, u, target.e)) if excess is None else excess
             total += self.model.dt * self.soft.penalty(excess)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +48,13 @@ class InputQP:
         self._starts, n_u = ocp.block_starts, ocp.n_u
         n = self._starts.size * n_u
         self._ocp, self._n = ocp, n
+        self._own_bounds = ocp.bounds(ocp.u_min)  # without limits of a solve they depend on no input
         self.scale: Array = np.tile(ocp.input_scale, self._starts.size)
         """What 1 means in the scaled QP, by the blocks' inputs ``(M n_u,)`` [input units]."""
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._changes = rows * self.scale / self.scale[:, None] if len(rows) else rows
-        hard = n + len(rows)
+        self._products = self.scale * self.scale[:, None]
+        hard = self._hard = n + len(rows)
         own = np.arange(n)
         later = own if ocp.blocks is not None else np.where(own < n - n_u, own + n_u, own)
         later = np.concatenate([later, later + n]) if len(rows) else later
@@ -67,6 +70,7 @@ class InputQP:
             self._before = np.concatenate([self._before, hard + before])
             self._linear = np.concatenate([self._linear, dt * soft.linear * scale])
             self._give = np.concatenate([self._give, 0.5 / (dt * soft.quadratic * scale**2)])
+            self._soft_products = self.scale / scale[:, None]
             self._gives_way = hard + np.flatnonzero(soft.hard)
             self._soft_scale, self._lower, self._upper = scale, soft.lower / scale, soft.upper / scale
 
@@ -95,39 +99,31 @@ class InputQP:
         and their derivatives by it ``(M, N n_u)``. ``active`` are rows to begin with. Default: none. ``strict``: hard
         bounds among them give way only if there is no answer that keeps them, whatever that costs.
         """
-        scale, u = self.scale, u[self._starts]
-        lower, upper = (
-            (bound[self._starts] - u).ravel() / scale for bound in self._ocp.bounds(u_prev, limits)
-        )
-        h = self.blocked_hessian(hessian) * scale * scale[:, None]
-        g, size, a, rows = (
-            self.by_blocks(gradient) * scale,
-            float(h.diagonal().max()),
-            self._changes,
-            self._later.size,
-        )
+        scale, hard = self.scale, self._hard
+        own = self._own_bounds if limits is None else self._ocp.bounds(u_prev, limits)
+        if self._ocp.blocks is not None:
+            own, u = (own[0][self._starts], own[1][self._starts]), u[self._starts]
+        lower, upper = (own[0] - u).ravel() / scale, (own[1] - u).ravel() / scale
+        h = self.blocked_hessian(hessian) * self._products
+        size, a = float(h.diagonal().max()), self._changes
+        h /= size
+        linear, give = self._linear[:hard], self._give[:hard]
         if self._ocp.du_max is not None:
             du = np.diff(u, axis=0, prepend=u_prev[None])
             lower = np.concatenate([lower, (-self._ocp.du_max - du).ravel() / scale])
             upper = np.concatenate([upper, (self._ocp.du_max - du).ravel() / scale])
-        if soft is None:
-            rows = lower.size
-        else:
-            value, slope = (
-                soft[0] / self._soft_scale,
-                self.by_blocks(soft[1]) * (scale / self._soft_scale[:, None]),
-            )
+        if soft is not None:
+            value, slope = soft[0] / self._soft_scale, self.by_blocks(soft[1]) * self._soft_products
             a = np.vstack([a, slope]) if len(a) else slope
-            lower, upper = (
-                np.concatenate([lower, self._lower - value]),
-                np.concatenate([upper, self._upper - value]),
-            )
-        linear, give = self._linear[:rows] / size, self._give[:rows] * size
-        qp = RowQP(h / size, g / size, a, lower, upper, linear, give)
+            lower = np.concatenate([lower, self._lower - value])
+            upper = np.concatenate([upper, self._upper - value])
+            linear, give = self._linear / size, self._give * size
+        rows = lower.size
+        qp = RowQP(h, self.by_blocks(gradient) * scale / size, a, lower, upper, linear, give)
         s, multipliers, active = ActiveSet(qp, self._after[:rows], self._before[:rows]).solve(active)
         status, kkt = self._check(qp, s, multipliers)
-        ways = self._gives_way if soft is not None else self._gives_way[:0]
-        if strict and np.any(np.abs(active[ways]) == 2):
+        ways = self._gives_way
+        if strict and ways.size and np.any(np.abs(active[ways]) == 2):
             never = qp.linear.copy(), qp.give.copy()
             never[0][ways], never[1][ways] = np.inf, 0.0
             kept = replace(qp, linear=never[0], give=never[1])
@@ -137,7 +133,6 @@ class InputQP:
         step = (s * scale).reshape(u.shape)
         if self._ocp.blocks is not None:
             step = np.repeat(step, self._ocp.blocks, axis=0)
-        hard = self._n + len(self._changes)
         of_soft = np.zeros(0) if soft is None else size * multipliers[hard:] / self._soft_scale
         return Answer(step.ravel(), status, kkt, of_soft, active)
 
@@ -145,7 +140,7 @@ class InputQP:
         """What an answer is worth, and its KKT residual, relative to the inputs' gradient."""
         slope, wrong, violation = qp.residuals(s, multipliers)
         kkt = max(slope, wrong) / max(1.0, float(np.max(np.abs(qp.g))))
-        if not (np.isfinite(slope) and np.isfinite(wrong) and np.isfinite(violation)):
+        if not all(map(isfinite, (slope, wrong, violation))):
             return Status.NOT_FINITE, float("nan")
         if violation > BOUND_TOLERANCE:
             return Status.INFEASIBLE, kkt

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -32,8 +31,9 @@ class Prepared:
 
     With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
     defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
-    ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is ``from_u`` times the state weights.
-    ``soft`` is what :meth:`SoftRows.condensed` gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the
+    ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is it times the state weights, ``direct``
+    the gradient of the costs of inputs and changes, targets left out; ``call`` tells which of the condenser's calls it
+    was. ``soft`` is what :meth:`SoftRows.condensed` gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the
     economic stage costs and their convex second ones; None where there are none. ``e`` is what bounded values depend on
     besides state and input.
     """
@@ -47,11 +47,13 @@ class Prepared:
     defects: Array
     from_u: Array
     weighted: Array
+    direct: Array
     hessian: Array
     weight: Array
     soft: tuple[Array, Array, Array]
     economic: tuple[Array, Array] | None
     milliseconds: float
+    call: int
     w: Array
     e: Array
     steady: Steady | None = None
@@ -61,39 +63,48 @@ class Prepared:
 class Condenser:
     """Derivative of the states by the inputs, on scratch memory of its own: not for several threads at once.
 
-    The products run transposed, on contiguous memory: a period's array is written by one product from the one before.
-    They cost ``N^2 n_u n_z^2`` operations. The states are the first ``n_x`` of z.
+    A period's array is written by one product from the one before. They cost ``N^2 n_u n_z^2`` operations. The states
+    are the first ``n_x`` of z.
     """
 
     by_inputs: Array
-    """Derivatives ``(N + 1, N n_u, n_z)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
+    """Derivatives ``(N + 1, n_z, N n_u)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
+    calls: int = 0
+    """How often it was called: what tells whether :attr:`by_inputs` is still of a call."""
 
     def __init__(self, n: int, n_z: int, n_u: int, n_x: int) -> None:
-        self.by_inputs = np.zeros((n + 1, n * n_u, n_z))  # later inputs' rows stay zero
-        self._newest = self.by_inputs[1:].reshape(n, n, n_u, n_z)
+        self.by_inputs = np.zeros((n + 1, n_z, n * n_u))  # by later inputs they stay zero
+        self._newest = self.by_inputs[1:].reshape(n, n_z, n, n_u)
         self._stages = np.arange(n)
-        self._before = [self.by_inputs[k, : k * n_u] for k in range(1, n)]
-        self._after = [self.by_inputs[k + 1, : k * n_u] for k in range(1, n)]
-        self._states = self.by_inputs[:, :, :n_x].transpose(0, 2, 1)
+        self._before = [self.by_inputs[k, :, : k * n_u] for k in range(1, n)]
+        self._after = [self.by_inputs[k + 1, :, : k * n_u] for k in range(1, n)]
+        self._states = self.by_inputs[:, :n_x]
         self._shape = (n + 1) * n_x, n * n_u
 
     def __call__(self, a_t: Array, b: Array) -> Array:
         """``((N + 1) n_x, N n_u)`` from transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
-        self._newest[self._stages, self._stages] = b.transpose(0, 2, 1)
-        for before, a, after in zip(self._before, a_t[1:], self._after, strict=True):
-            np.dot(before, a, out=after)
+        self.calls += 1
+        self._newest[self._stages, :, self._stages] = b
+        for a, before, after in zip(a_t[1:].transpose(0, 2, 1), self._before, self._after, strict=True):
+            np.matmul(a, before, after)
         return np.array(self._states, order="C").reshape(self._shape)  # outlives the next call
 
 
-def propagate(a: Sequence[Array], drift: Array, dz0: Array) -> Array:
-    """``dz_{k+1} = A_k dz_k + drift_k`` from ``dz0``: ``(N + 1, n_z)``.
+def _columns(a_t: Array) -> tuple[list[Array], int]:
+    """Matrices that are column by column in memory, and whether they are transposed ``A_k`` (1) or ``A_k`` (0)."""
+    if a_t.flags.c_contiguous:
+        return list(a_t.transpose(0, 2, 1)), 0
+    return list(a_t), 1
 
-    ``A_k`` column by column in memory is fastest.
-    """
+
+def propagate(a_t: Array, drift: Array, dz0: Array) -> Array:
+    """``dz_{k+1} = A_k dz_k + drift_k`` from ``dz0``: ``(N + 1, n_z)``; transposed ``A_k`` ``(N, n_z, n_z)``."""
     dz = np.concatenate([dz0[None], drift])
     rows = list(dz)
-    for matrix, before, after in zip(a, rows[:-1], rows[1:], strict=True):
-        dgemv(1.0, matrix, before, 1.0, after, overwrite_y=1)  # in place: half the time of numpy's two calls
+    matrices, transposed = _columns(a_t)
+    for matrix, before, after in zip(matrices, rows[:-1], rows[1:], strict=True):
+        # in place, arguments by position: half the time of numpy's two calls, and of names
+        dgemv(1.0, matrix, before, 1.0, after, 0, 1, 0, 1, transposed, 1)
     return dz
 
 
@@ -106,9 +117,10 @@ def adjoint(a_t: Array, last: Array, stages: Array) -> Array:
     multipliers = np.zeros((len(a_t), a_t.shape[1]))
     multipliers[:-1, :n_x] = stages[1:]
     multipliers[-1, :n_x] = last
-    backwards = a_t.transpose(0, 2, 1)[:0:-1], multipliers[:0:-1], multipliers[-2::-1]
-    for a, after, before in zip(*backwards, strict=True):
-        dgemv(1.0, a, after, 1.0, before, trans=1, overwrite_y=1)
+    matrices, transposed = _columns(a_t)
+    backwards = matrices[:0:-1], multipliers[:0:-1], multipliers[-2::-1]
+    for matrix, after, before in zip(*backwards, strict=True):
+        dgemv(1.0, matrix, after, 1.0, before, 0, 1, 0, 1, 1 - transposed, 1)
     return multipliers
 
 
@@ -128,7 +140,7 @@ def condense_hessians(stages: Array, from_u: Array, n_x: int) -> Array:
 def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
     """Second derivatives by the stages' ``(x, u, h)`` ``(N, n, n)`` as those by the inputs ``(N n_u, N n_u)``.
 
-    ``by_inputs`` ``(N + 1, N n_u, n_z)`` are the derivatives of states and hidden states by the inputs.
+    ``by_inputs`` ``(N + 1, n_z, N n_u)`` are the derivatives of states and hidden states by the inputs.
     """
     n, few = len(stages), n_x + n_u
     z = np.r_[:n_x, few : stages.shape[1]]
@@ -137,7 +149,7 @@ def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
     for first in range(1, n, GROUP):  # the first state knows no input, later ones only those before them
         last = min(first + GROUP, n)
         m = (last - 1) * n_u
-        states = np.ascontiguousarray(by_inputs[first:last, :m].transpose(0, 2, 1))
+        states = np.ascontiguousarray(by_inputs[first:last, :, :m])
         flat = states.reshape(-1, m)
         total[:m, :m] += flat.T @ (by_z[first:last] @ states).reshape(-1, m)
         one_sided[first * n_u : last * n_u, :m] = (mixed[first:last] @ states).reshape(-1, m)
@@ -193,7 +205,9 @@ class CondensedController(SplitController):
         self.stages = stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
         r, r_delta = np.tile(ocp.r, n) * model.dt, np.tile(ocp.r_delta, n) * model.dt
+        self._by_input, self._by_change = 2 * model.dt * ocp.r, 2 * model.dt * ocp.r_delta
         self._on_u, self._on_x, _ = model.disturbed
+        self._moves, self._own_bounds = bool(np.any(self._on_x)), ocp.bounds(ocp.u_min)
         self._input_hessian = 2 * (np.diag(r) + (difference.T * r_delta) @ difference)
         self.qp = InputQP(ocp, self.problem.soft, model.dt)
         self.condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
@@ -244,8 +258,7 @@ class CondensedController(SplitController):
         previous plan. Where measured disturbances are others than those that were prepared for, it linearizes anew.
         """
         start = perf_counter()
-        target = self.problem.target(reference, None, estimate, w, prepared.steady)
-        target = replace(target, weight=prepared.weight)
+        target = self.problem.target(reference, prepared.weight, estimate, w, prepared.steady)
         if not np.array_equal(target.w, prepared.w):
             prepared = self.linearize(
                 prepared.u,
@@ -258,18 +271,15 @@ class CondensedController(SplitController):
                 prepared.active,
             )
         hessian, economic = self._at_parameters(prepared, target)
-        if not target.ok or not np.all(np.isfinite(hessian)):
-            return self._failed(prepared, Status.NOT_FINITE, start)
         n_x = self._n_x
         dz0 = np.concatenate([estimate.x, estimate.h]) - prepared.z[0]
-        drift = prepared.defects + prepared.b @ (self._on_u @ (estimate.d - prepared.d))
-        drift[:, :n_x] += self._on_x @ (estimate.d - prepared.d)
-        matrices = list(prepared.a_t.transpose(0, 2, 1))
-        free = propagate(matrices, drift, dz0)
+        drift = prepared.defects + self._of_inputs(prepared.b, self._on_u @ (estimate.d - prepared.d))
+        if self._moves:
+            drift[:, :n_x] += self._on_x @ (estimate.d - prepared.d)
+        free = propagate(prepared.a_t, drift, dz0)
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
         u_bar = prepared.u.ravel()
-        direct = self.input_gradient(u_bar, prepared.u_prev, target.u)
-        gradient = 2 * error.ravel() @ prepared.weighted + direct
+        gradient = 2 * error.ravel() @ prepared.weighted + prepared.direct - self._of_targets(target.u)
         if economic is not None:
             slope, curvature = economic
             slope = slope + (curvature[:, :, :n_x] @ free[:-1, :n_x, None])[:, :, 0]
@@ -286,21 +296,20 @@ class CondensedController(SplitController):
         if not answer.status.ok:
             return self._failed(prepared, answer.status, start, answer.kkt)
         u = (u_bar + step).reshape(prepared.u.shape)
-        drift += (prepared.b @ step.reshape(len(u), -1, 1))[:, :, 0]
-        z = prepared.z + propagate(matrices, drift, dz0)
-        excess = (
-            np.zeros(len(self.problem.soft))
-            if soft is None
-            else self.problem.soft.excess(soft[0] + soft[1] @ step)
-        )
+        z = prepared.z + free + self._response(prepared, step)
+        excess, largest, given_way = None, 0.0, {}
+        if soft is not None:
+            excess = self.problem.soft.excess(soft[0] + soft[1] @ step)
+            largest, given_way = self.problem.soft.largest(excess), self.problem.soft.given_way(excess)
         cost = self.problem.cost(z, u, prepared.u_prev, target, excess)
         if not np.isfinite(cost):
             return self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
-        u = np.clip(u, *self.ocp.bounds(prepared.u_prev, limits))  # the QP keeps them to its tolerance only
+        lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
+        u = np.minimum(np.maximum(u, lower), upper)  # the QP keeps them to its tolerance only
         return Solution(
             u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
-            self._timing(prepared, start), self.problem.soft.largest(excess), w=target.w, steady=target.steady,
-            active=answer.active, given_way=self.problem.soft.given_way(excess),
+            self._timing(prepared, start), largest, w=target.w, steady=target.steady,
+            active=answer.active, given_way=given_way,
         )  # fmt: skip
 
     def solve(
@@ -343,16 +352,16 @@ class CondensedController(SplitController):
         """
         n, n_x = self.ocp.horizon, self._n_x
         z_next, a_t, b = derivatives
-        from_u = self.condenser(a_t, b)
-        if weights_ok(weight):
+        from_u, call = self.condenser(a_t, b), self.condenser.calls
+        if self.problem.is_even(weight) or weights_ok(weight):
             by_stage, terminal = self.problem.state_weights(weight)
             weighted = np.empty_like(from_u)
             np.multiply(from_u[: n * n_x], by_stage.reshape(-1, 1), out=weighted[: n * n_x])
-            weighted[n * n_x :] = terminal @ from_u[n * n_x :]
+            np.matmul(terminal, from_u[n * n_x :], out=weighted[n * n_x :])
         else:
             weighted = np.full_like(from_u, np.nan)
         hessian = 2 * from_u.T @ weighted + self._input_hessian
-        w = self.problem.forecast(w, None)
+        w = self.problem.forecast(None, None) if w is None else w
         e = self.problem.around(d, w, None if p is None else p[:, : self.ocp.n_p])
         soft = self.problem.soft.condensed(z[:, :n_x], u, from_u, e)
         known = self.problem.economic.function is not None and (
@@ -363,9 +372,23 @@ class CondensedController(SplitController):
             hessian += condense_hessians(economic[1], from_u, n_x)
         spent = (perf_counter() - start) * 1e3
         return Prepared(
-            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, hessian, weight, soft, economic, spent, w, e,
-            steady, active,
+            u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, self._direct(u.ravel(), u_prev), hessian, weight,
+            soft, economic, spent, call, w, e, steady, active,
         )  # fmt: skip
+
+    def _of_inputs(self, b: Array, u: Array) -> Array:
+        """What inputs ``(n_u,)``, the same in every period, or ``(N, n_u)`` add to the next states ``(N, n_z)``."""
+        if b.shape[2] == 1:
+            return np.asarray(b[:, :, 0] * u)
+        return np.asarray(np.einsum("kij,j->ki" if u.ndim == 1 else "kij,kj->ki", b, u))
+
+    def _response(self, prepared: Prepared, step: Array) -> Array:
+        """By how much a step of the inputs changes states and hidden states ``(N + 1, n_z)``."""
+        if prepared.call == self.condenser.calls:  # nothing was condensed since
+            by_inputs = self.condenser.by_inputs
+            return np.asarray((by_inputs.reshape(-1, step.size) @ step).reshape(by_inputs.shape[:2]))
+        inputs = step.reshape(len(prepared.b), -1)
+        return propagate(prepared.a_t, self._of_inputs(prepared.b, inputs), np.zeros(prepared.z.shape[1]))
 
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
         """Hessian and economic derivatives, those that wait for the parameters' values included."""
@@ -396,11 +419,15 @@ class CondensedController(SplitController):
 
     def input_gradient(self, u: Array, u_prev: Array, u_ref: Array) -> Array:
         """Gradient of the input costs at the plan ``u`` ``(N n_u,)`` with the target inputs ``u_ref`` ``(N, n_u)``."""
+        return self._direct(u, u_prev) - self._of_targets(u_ref)
+
+    def _direct(self, u: Array, u_prev: Array) -> Array:
         gradient: Array = self._input_hessian @ u
-        if np.any(u_ref):
-            gradient -= 2 * self.model.dt * (u_ref * self.ocp.r).ravel()
-        gradient[: u_prev.size] -= 2 * self.model.dt * self.ocp.r_delta * u_prev
+        gradient[: u_prev.size] -= self._by_change * u_prev
         return gradient
+
+    def _of_targets(self, u_ref: Array) -> Array:
+        return np.asarray((u_ref * self._by_input).ravel())
 
     def _failed(self, prepared: Prepared, status: Status, start: float, kkt: float = NAN) -> Solution:
         x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]

@@ -96,6 +96,8 @@ def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, targets: bo
         "weights on outputs (q_y), which need the target calculator": ocp.n_y > 0 and not targets,
         "an economic stage cost": ocp.economic is not None,
         "several first plans (starts)": bool(ocp.starts),
+        "hard bounds": bool(ocp.hard),
+        "bounds that move with the reference (p)": ocp.economic is None and ocp.n_p > 0,
         "a forecast of measured disturbances (preview_w)": ocp.preview_w and model.n_w > 0,
     }
     found = [what for what, wrong in cases.items() if wrong]

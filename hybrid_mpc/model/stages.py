@@ -105,7 +105,7 @@ class VectorisedStages:
         x_next, h_next, a, b = self._at(*self._point(z, v, self._held))
         if v.shape[1] > more:
             x_next = x_next + v[:, more:]
-        return np.hstack([x_next, h_next]), np.ascontiguousarray(a.transpose(0, 2, 1)), b
+        return np.hstack([x_next, h_next]), a.transpose(0, 2, 1), b
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
         """See :class:`Linearization`."""

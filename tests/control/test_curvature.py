@@ -126,12 +126,12 @@ def test_penalties_and_their_multipliers_bound_each_other():
 @pytest.mark.parametrize(("n", "n_u"), [(1, 1), (5, 2), (23, 1)])
 def test_condensing_with_hidden_states_is_condensing(n, n_u):
     rng = np.random.default_rng(n)
-    by_inputs = rng.normal(size=(n + 1, n * n_u, 3))
+    by_inputs = rng.normal(size=(n + 1, 3, n * n_u))
     for k in range(n + 1):
-        by_inputs[k, k * n_u :] = 0.0  # later inputs do not reach back
+        by_inputs[k, :, k * n_u :] = 0.0  # later inputs do not reach back
     stages = rng.normal(size=(n, 3 + n_u, 3 + n_u))
     stages += stages.transpose(0, 2, 1)
-    from_u = by_inputs.transpose(0, 2, 1).reshape(-1, n * n_u)
+    from_u = by_inputs.reshape(-1, n * n_u)
     # Three states or two and a hidden one: the order is x, u, h.
     order = [0, 1, *range(3, 3 + n_u), 2]
     got = condense_all(stages[:, order][:, :, order], by_inputs, 2, n_u)

@@ -91,19 +91,18 @@ def test_plans_are_the_same_either_way(kind):
     assert kind is CondensedController or plans[0].defect == 0.0  # it is a run of the model itself
 
 
+@pytest.mark.parametrize("rows", ["transposed", "as they are"])  # in memory
 @pytest.mark.parametrize(("n", "n_u"), [(1, 1), (5, 1), (4, 2)])
-def test_condensing_and_its_adjoint_are_sums_of_products(n, n_u):
+def test_condensing_and_its_adjoint_are_sums_of_products(n, n_u, rows):
     rng = np.random.default_rng(n)
     a, b, condenser = rng.normal(size=(n, 3, 3)), rng.normal(size=(n, 3, n_u)), Condenser(n, 3, n_u, 2)
-    a_t = np.ascontiguousarray(a.transpose(0, 2, 1))
+    a_t = np.ascontiguousarray(a.transpose(0, 2, 1)) if rows == "transposed" else a.transpose(0, 2, 1)
     condenser(np.full_like(a_t, np.nan), np.full_like(b, np.nan))  # nothing of a call stays for the next
     from_u, step = condenser(a_t, b), rng.normal(size=(n, n_u))
     drift, z = (b @ step[:, :, None])[:, :, 0], [np.zeros(3)]
     for k in range(n):
         z.append(a[k] @ z[k] + drift[k])
-    np.testing.assert_allclose(
-        propagate(list(a_t.transpose(0, 2, 1)), drift, np.zeros(3)), z, rtol=1e-12, atol=1e-12
-    )
+    np.testing.assert_allclose(propagate(a_t, drift, np.zeros(3)), z, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(from_u @ step.ravel(), np.array(z)[:, :2].ravel(), rtol=1e-12, atol=1e-12)
     weights = rng.normal(size=(n + 1, 2))
     multipliers = adjoint(a_t, weights[-1], weights[:-1])
@@ -130,3 +129,21 @@ def test_without_a_compiler_compiled_is_refused_and_the_default_works(monkeypatc
     with pytest.raises(InputError, match="leave compiled out"):
         CondensedController(model, OCP_, compiled=True)
     assert CondensedController(model, OCP_).ocp is OCP_
+
+
+def test_what_was_prepared_outlives_what_is_prepared_after_it():
+    """The condenser's memory is shared; a plan made of an older preparation is the same but for rounding."""
+    model = pendulum_model(z=3)
+    controller, e, goal = (
+        CondensedController(model, OCP_),
+        estimate_of(model, [0.4, 0.0]),
+        np.array([[0.2, 0.0]]),
+    )
+    plan = controller.solve(controller.initial(e), e, goal)
+    prepared = controller.prepare(plan)
+    want = controller.feedback(prepared, e, goal)
+    controller.prepare(controller.initial(e, np.full((OCP_.horizon, 1), 0.3)))
+    got = controller.feedback(prepared, e, goal)
+    for name in ("u", "x", "h"):
+        np.testing.assert_allclose(getattr(got, name), getattr(want, name), rtol=1e-11, atol=1e-12)
+    assert got.cost == pytest.approx(want.cost, rel=1e-11)
