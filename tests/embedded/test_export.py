@@ -182,7 +182,11 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
     refused(tank, tank_ocp.changed(hard=[away]), "hard bounds")
     u, w, p = ca.SX.sym("u", tank.n_u), ca.SX.sym("w", tank.n_w), ca.SX.sym("p")
     moving = ca.Function("moving", [ca.SX.sym("x", tank.n_x), u, w, p], [u[0] - p])
-    refused(tank, tank_ocp.changed(soft=[hm.SoftBound(moving, upper=[1.0])]), "move with the reference")
+    refused(
+        tank,
+        tank_ocp.changed(soft=[hm.SoftBound(moving, [-np.inf], [1.0], [1.0], [1.0])]),
+        "move with the reference",
+    )
     pendulum = online_models.pendulum_model()
     curved = hm.HybridModel(
         "curved", pendulum.dt, pendulum.states, pendulum.inputs, pendulum.outputs, pendulum.step, pendulum.xdot,
