@@ -32,10 +32,9 @@ class Prepared:
     With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
     defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
     ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is it times the state weights, ``direct``
-    the gradient of the costs of inputs and changes, targets left out; ``call`` tells which of the condenser's calls it
-    was. ``soft`` is what :meth:`SoftRows.condensed` gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the
-    economic stage costs and their convex second ones; None where there are none. ``e`` is what bounded values depend on
-    besides state and input.
+    the gradient of the costs of inputs and changes, targets left out. ``soft`` is what :meth:`SoftRows.condensed`
+    gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second
+    ones; None where there are none. ``e`` is what bounded values depend on besides state and input.
     """
 
     u: Array
@@ -53,7 +52,6 @@ class Prepared:
     soft: tuple[Array, Array, Array]
     economic: tuple[Array, Array] | None
     milliseconds: float
-    call: int
     w: Array
     e: Array
     steady: Steady | None = None
@@ -69,8 +67,6 @@ class Condenser:
 
     by_inputs: Array
     """Derivatives ``(N + 1, n_z, N n_u)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
-    calls: int = 0
-    """How often it was called: what tells whether :attr:`by_inputs` is still of a call."""
 
     def __init__(self, n: int, n_z: int, n_u: int, n_x: int) -> None:
         self.by_inputs = np.zeros((n + 1, n_z, n * n_u))  # by later inputs they stay zero
@@ -83,7 +79,6 @@ class Condenser:
 
     def __call__(self, a_t: Array, b: Array) -> Array:
         """``((N + 1) n_x, N n_u)`` from transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
-        self.calls += 1
         self._newest[self._stages, :, self._stages] = b
         for a, before, after in zip(a_t[1:].transpose(0, 2, 1), self._before, self._after, strict=True):
             np.matmul(a, before, after)
@@ -352,7 +347,7 @@ class CondensedController(SplitController):
         """
         n, n_x = self.ocp.horizon, self._n_x
         z_next, a_t, b = derivatives
-        from_u, call = self.condenser(a_t, b), self.condenser.calls
+        from_u = self.condenser(a_t, b)
         if self.problem.is_even(weight) or weights_ok(weight):
             by_stage, terminal = self.problem.state_weights(weight)
             weighted = np.empty_like(from_u)
@@ -373,7 +368,7 @@ class CondensedController(SplitController):
         spent = (perf_counter() - start) * 1e3
         return Prepared(
             u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, self._direct(u.ravel(), u_prev), hessian, weight,
-            soft, economic, spent, call, w, e, steady, active,
+            soft, economic, spent, w, e, steady, active,
         )  # fmt: skip
 
     def _of_inputs(self, b: Array, u: Array) -> Array:
@@ -384,9 +379,6 @@ class CondensedController(SplitController):
 
     def _response(self, prepared: Prepared, step: Array) -> Array:
         """By how much a step of the inputs changes states and hidden states ``(N + 1, n_z)``."""
-        if prepared.call == self.condenser.calls:  # nothing was condensed since
-            by_inputs = self.condenser.by_inputs
-            return np.asarray((by_inputs.reshape(-1, step.size) @ step).reshape(by_inputs.shape[:2]))
         inputs = step.reshape(len(prepared.b), -1)
         return propagate(prepared.a_t, self._of_inputs(prepared.b, inputs), np.zeros(prepared.z.shape[1]))
 

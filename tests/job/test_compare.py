@@ -20,7 +20,7 @@ from hybrid_mpc.job.tasks import tasks_of
 GOLF = load_scenario("golf_robot")
 SIGNALS = SimpleNamespace(
     inputs=(Signal("tau", "N m"),), states=(Signal("phi", "rad"), Signal("phi_dot", "rad/s")),
-    x0=np.zeros(2), u0=np.zeros(1),
+    outputs=(Signal("phi", "rad"),), x0=np.zeros(2), u0=np.zeros(1), n_y=1,
 )  # fmt: skip
 
 

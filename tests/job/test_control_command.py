@@ -157,7 +157,7 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, run_folder, tmp_path):
         (["--adapt", "--controller", "prior"], ["controller prior has another model", "hybrid_observer"]),
         (["--task", "golf"], ["no task 'golf'", "track_sine", "stroke_1.4"]),
         (["--controller", "pid"], ["no controller 'pid'", "hybrid_observer"]),
-        (["--solver", "newton"], ["no solver 'newton'", "rti, sqp, ipopt"]),
+        (["--solver", "newton"], ["no solver 'newton'", "rti, native, sqp, ipopt"]),
         (["--controller", "oracle", "--solver", "sqp"], ["oracle", "solver of its own"]),
         (["--fault", "fire=1"], ["'fire'", "measurement_offset"]),
         (["--fault", "plant_fire=1@1"], ["plant_fire", "plant_friction"]),

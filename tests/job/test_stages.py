@@ -60,7 +60,11 @@ def own(machine, finished, arguments, tmp_path, monkeypatch):
     ("pattern", "put", "stages"),
     [
         (r'title="[^"]*"|"My machine[^"]*"', None, ["report"]),
-        (r"q=\(", "q=(2.0 * ", ["control", "residuals", "monitor", "guard", "analysis", "report"]),
+        (
+            r"q=\(",
+            "q=(2.0 * ",
+            ["control", "on_model", "residuals", "monitor", "guard", "analysis", "report"],
+        ),
         ("$", "\n# a remark\n", []),
     ],
     ids=["title", "weight", "comment"],
