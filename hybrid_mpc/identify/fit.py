@@ -69,6 +69,10 @@ CONVERGED = 0.01
 far less than a standard error."""
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
+BEYOND = 0.05
+"""Share of a state's own span by which it may leave its range: a smoother overshoots."""
+HARDLY = 0.98
+"""Share of the nominal values' error from which on a fit counts as none."""
 DIFFERENCE = 1e-5
 """Of the differences for the slopes of predictions, in sizes of the parameters: far above rounding."""
 PREDICTIONS = 12
@@ -867,7 +871,8 @@ def fit_prior(
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     on_progress(total, total, "done")
     return PriorFit(
-        fit.values(chosen.theta), _errors(fit, chosen), _warnings(fit, chosen, answered), stages,
+        fit.values(chosen.theta), _errors(fit, chosen),
+        _warnings(fit, chosen, answered, min(scores) / max(scores[0], 1e-300)), stages,
         _correlations(fit, chosen), fit.delay(chosen.theta), smoother.sigma, smoother.walk, smoother.sizes,
         smoother.fading, smoother.substeps,
     )  # fmt: skip
@@ -908,6 +913,24 @@ def smoothed(
 ) -> list[Trajectory]:
     """Trajectories with the inputs that act and the states that the fitted prior smooths: what networks train on."""
     return fit.smoother(make(fit.values), dt).smooth(shifted(trajectories, fit.delay))
+
+
+def beyond_ranges(prior: Prior, smoothed: Sequence[Trajectory]) -> tuple[str, ...]:
+    """A warning for each state that leaves its declared range where the prior smooths recordings.
+
+    Example:
+        >>> from scenarios.pendulum.data import exact_runs
+        >>> from scenarios.pendulum.prior import PendulumPrior
+        >>> beyond_ranges(PendulumPrior(), exact_runs("train", 1))
+        ()
+    """
+    x = np.concatenate([t.x for t in smoothed])
+    return tuple(
+        f"{s.label} goes from {low:.4g} to {high:.4g} with the fitted values, beyond its range [{s.lower:g}, "
+        f"{s.upper:g}]: the range is wrong, or the prior lacks what keeps it within"
+        for s, low, high in zip(prior.states, x.min(0), x.max(0), strict=True)
+        if low < s.lower - BEYOND * (high - low) or high > s.upper + BEYOND * (high - low)
+    )
 
 
 def parameter_variance(
@@ -1019,7 +1042,8 @@ def _correlations(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
     }
 
 
-def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0) -> tuple[str, ...]:
+def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0, gained: float = 0.0) -> tuple[str, ...]:
+    """What is doubtful about a fit; ``gained`` is its error over that of the nominal values."""
     warnings = []
     if answered > 1.0:
         warnings.append(
@@ -1028,6 +1052,11 @@ def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0) -> tuple[st
         )
     if not len(chosen.covariance):
         return (*warnings, "no fit improved on the nominal parameters") if fit.free else ()
+    if gained > HARDLY:
+        warnings.append(
+            f"the fit hardly improves on the nominal parameters (its error is {gained:.3f} of theirs): they are right, "
+            "or the prior lacks something that no parameter stands for"
+        )
     if chosen.unidentified:
         warnings.append(f"the data cannot tell apart: {', '.join(chosen.unidentified)}")
     for p, value, low, high in zip(fit.free, chosen.theta, fit.lower, fit.upper, strict=False):

@@ -9,7 +9,7 @@ from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, Parameter, Prior, Signal, Trajectory, fit_prior
-from hybrid_mpc.identify.fit import OutputFit, Shooting, cut_outputs, refit, smoothed
+from hybrid_mpc.identify.fit import OutputFit, Shooting, beyond_ranges, cut_outputs, refit, smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import Simulation, rest_of
 
@@ -525,3 +525,26 @@ def test_a_refit_goes_on_from_an_earlier_fit(fit):
     assert [row["stage"] for row in again.stages] == ["free runs of 0.5 s", "free runs of 1 s"]
     assert (again.sigma, again.walk, again.sizes) == (fit.sigma, fit.walk, fit.sizes)
     assert set(again.standard_errors) == set(TRUTH)
+
+
+class Narrow(Pendulum):
+    states = (Signal("phi", "rad", -0.01, 0.01), Pendulum.states[1])
+
+
+def test_a_state_beyond_its_range_is_named(noisy_runs, fit):
+    runs = smoothed(Pendulum, fit, noisy_runs, DT)
+    (line,) = beyond_ranges(Narrow(), runs)
+    assert line.startswith("phi [rad] goes from -")
+    assert "beyond its range [-0.01, 0.01]" in line
+    assert beyond_ranges(Pendulum(), runs) == ()
+
+
+def test_a_fit_that_hardly_improves_says_so(noisy_runs, fit):
+    class Known(Pendulum):
+        parameters = tuple(replace(p, value=TRUTH[p.name]) for p in Pendulum.parameters)
+
+    again = fitted(Known, noisy_runs)
+    assert any(
+        line.startswith(("no fit improved on", "the fit hardly improves on")) for line in again.warnings
+    )
+    assert not any("improve" in line for line in fit.warnings)  # from wrong nominal values

@@ -13,7 +13,7 @@ from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
-from hybrid_mpc.identify.fit import fit_prior, smoothed
+from hybrid_mpc.identify.fit import beyond_ranges, fit_prior, smoothed
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
@@ -197,6 +197,7 @@ def prior_stage(context: Context) -> PriorResult:
         on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
     )  # fmt: skip
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
+    fit = replace(fit, warnings=(*fit.warnings, *beyond_ranges(make(fit.values), every)))
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     return PriorResult(
