@@ -121,12 +121,12 @@ def cell(name: str, scenario: Scenario, files: list[Path], fold: int, seed: int,
         said = bring_up_to_date(context, stage)
         print(f"  {name} fold {fold} seed {seed}: {stage.name} {said}", file=sys.stderr)
     choice, found = context.read(CHOICE).choice, context.read(EVALUATION)
-    prior = found.scores["phy"].best.error
-    hybrids = {n: found.scores[n].best.error for n in choice.candidates if n != "phy"}
+    prior = found.scores["phy"].model.error
+    hybrids = {n: found.scores[n].model.error for n in choice.candidates if n != "phy"}
     band = found.bands[choice.recommended]
     share = [b / c for b, c in zip(band.score.values(), band.score_of_constant.values(), strict=True)]
     made = Cell(
-        name, fold, seed, choice.recommended, found.scores[choice.recommended].best.error / prior,
+        name, fold, seed, choice.recommended, found.scores[choice.recommended].model.error / prior,
         min(hybrids.values(), default=math.nan) / prior, band.coverage, float(np.mean(share)), choice.reason,
     )  # fmt: skip
     write_json(note, asdict(made))

@@ -91,8 +91,9 @@ class Budget:
     """Effort of one run of the main job.
 
     Args:
-        hidden: Hidden units z of the networks.
-        networks: Networks trained per model; the best on validation free runs is deployed.
+        hidden: Hidden units of each network.
+        networks: Networks trained per model, each without another part of the data. Their mean is deployed: one network
+            of ``networks * hidden`` hidden units z, on which the time of a control step depends.
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
         seeds: Closed loops per task and controller.
@@ -119,8 +120,8 @@ class Budget:
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {
-    "quick": Budget(hidden=16, networks=2, teacher_steps=200, free_run_steps=200, seeds=2),
-    "full": Budget(hidden=32, networks=4, teacher_steps=2500, free_run_steps=800, seeds=10),
+    "quick": Budget(hidden=8, networks=4, teacher_steps=200, free_run_steps=200, seeds=2),
+    "full": Budget(hidden=8, networks=4, teacher_steps=2500, free_run_steps=800, seeds=10),
 }
 """Budgets of a scenario that names none: a first look in minutes, and one that is worth reporting."""
 

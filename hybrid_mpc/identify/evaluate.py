@@ -125,7 +125,7 @@ def unseen_runs(
     validation: Sequence[Trajectory],
     smoother: Smoother,
     length: float | None = None,
-) -> list[tuple[int, list[Trajectory]]]:
+) -> list[tuple[int | None, list[Trajectory]]]:
     """Trajectories that judge a training by what its networks did not see: the validation, and the parts left out.
 
     Args:
@@ -136,10 +136,11 @@ def unseen_runs(
         length: As in :func:`evaluation_trajectories`.
 
     Returns:
-        Pairs of the network that is to run, -1 for the best, and what over. There is no pair without trajectories.
+        Pairs of the network that is to run alone, None for the mean of all, and what over. There is no pair without
+        trajectories.
     """
     pieces, part = in_parts(training, settings.parts, settings.shortest)
-    unseen = [(-1, list(validation))]
+    unseen: list[tuple[int | None, list[Trajectory]]] = [(None, list(validation))]
     unseen += [
         (i, [t for t, own in zip(pieces, part, strict=True) if own == i]) for i in range(settings.networks)
     ]

@@ -114,6 +114,40 @@ class StackedGRU(nn.Module):
         network.load_state_dict({n: w[i].T if "weight" in n else w[i, 0] for n, w in stacked.items()})
         return network
 
+    def joined(self) -> GRUNetwork:
+        """All networks as one, whose output is the mean of theirs; its hidden state is theirs, one after the other.
+
+        Its recurrent weights are block-diagonal: the networks do not see each other.
+
+        Example:
+            >>> stack = StackedGRU(2, 3, 4, 1, seed=0).requires_grad_(False)
+            >>> s, h = torch.ones(3, dtype=torch.float64), torch.zeros(4, dtype=torch.float64)
+            >>> each = [stack.member(i)(s, h)[0] for i in range(2)]
+            >>> out, h = stack.joined()(s, torch.zeros(8, dtype=torch.float64))
+            >>> bool(torch.allclose(out, sum(each) / 2)), tuple(h.shape)
+            (True, (8,))
+        """
+        m, z = self.networks, self.n_h
+        network = GRUNetwork(self.n_in, m * z, self.n_out)
+
+        def rows(weight: Tensor) -> Tensor:
+            """Gates of each network ``(m, n, 3 z)`` as gates of all, each gate whole ``(3 m z, n)``."""
+            return weight.mT.unflatten(1, (3, z)).transpose(0, 1).reshape(3 * m * z, -1)
+
+        of = torch.arange(m).repeat_interleave(z)  # which network a unit is of
+        recurrent = rows(self.w_hh).repeat(1, m) * (of.repeat(3)[:, None] == of)
+        network.load_state_dict(
+            {
+                "cell.weight_ih": rows(self.w_ih),
+                "cell.weight_hh": recurrent,
+                "cell.bias_ih": rows(self.b_ih)[:, 0],
+                "cell.bias_hh": rows(self.b_hh)[:, 0],
+                "head.weight": self.w_out.flatten(0, 1).T / m,
+                "head.bias": self.b_out.mean(0)[0],
+            }
+        )
+        return network
+
     def _cell(self, gate_in: Tensor, h: Tensor) -> Tensor:
         gate_h = torch.baddbmm(self.b_hh, h, self.w_hh)
         n = 2 * self.n_h

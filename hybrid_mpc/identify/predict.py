@@ -122,15 +122,15 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     (start,) = smoother.smooth([acting.part(slice(0, warm + 1))])
     shown = slice(warm, None)
     u, w, t = acting.u[shown], acting.w[shown], acting.t[shown]
-    networks = [chosen, *(kit.members.values() if name == "hybrid" else ())]
-    states = [_free_run(one, trajectory, start.x, lost, warm) for one in networks]
+    networks = [*kit.members.values()] if name == "hybrid" else []
+    states = [_free_run(one, trajectory, start.x, lost, warm) for one in (chosen, *networks)]
     outputs = np.stack([_outputs(prior, x, u, w) for x in states])
     half = np.full(outputs[0].shape, np.nan)
     bands = held.bands.get(name)
     if bands is not None:
         parts = run_variance(
-            prior, np.array(chosen.covariance), outputs, (states[0][0], u, w), t - t[0], np.array(held.sigma),
-            np.array(held.sizes.y), dt=dt, substeps=held.substeps, longest=held.longest or np.inf,
+            prior, np.array(chosen.covariance), outputs[1:] if networks else outputs, (states[0][0], u, w), t - t[0],
+            np.array(held.sigma), np.array(held.sizes.y), dt=dt, substeps=held.substeps, longest=held.longest or np.inf,
         )  # fmt: skip
         half = bands.half_width(parts)
     y = acting.y[shown]

@@ -44,7 +44,8 @@ class TrainingSettings:
             (:func:`~hybrid_mpc.identify.dataset.fitting_horizon`).
         batch: Windows a step.
         decay: Weight decay of AdamW times the number of training samples: the more data there are, the less it counts.
-        learning_rates: Start and end of the cosine schedule, teacher forcing then free runs.
+        learning_rates: Start and end of the cosine schedule, teacher forcing then free runs. The default suits networks
+            of 8 units; larger ones want half of it.
         every: Steps between evaluations (bounds, validation, checkpoint).
         validation_horizon: Most scored periods of a validation window. Default: two thirds of a usual validation
             recording, at most 1000 (:func:`~hybrid_mpc.identify.dataset.validation_horizon`). Trainings can be compared
@@ -79,7 +80,7 @@ class TrainingSettings:
     horizon: int = 50
     batch: int = 32
     decay: float = 300.0
-    learning_rates: tuple[float, float, float, float] = (1e-2, 1e-3, 5e-3, 1e-4)
+    learning_rates: tuple[float, float, float, float] = (2e-2, 2e-3, 1e-2, 5e-4)
     every: int = 25
     validation_horizon: int | None = None
     objectives: tuple[str, ...] = ("output", "balances")

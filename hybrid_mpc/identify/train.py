@@ -160,20 +160,28 @@ class Trained:
         own = self.settings.parts and self.settings.use_prior and np.isfinite(first).all()
         return np.argsort(self.validation / first if own else self.validation, kind="stable")
 
-    def step(self, prior: Prior, dt: float, i: int | None = None) -> RecurrentStep:
-        """The step of network ``i`` (default: the best), around the prior's parameters that were trained with it.
+    @property
+    def usable(self) -> list[int]:
+        """Networks whose validation is finite; all, if that of none is."""
+        finite = np.flatnonzero(np.isfinite(self.validation))
+        return (finite if finite.size else np.arange(len(self.validation))).tolist()
 
-        ``prior`` is the fitted one: its energy balance and output are the step's.
+    def step(self, prior: Prior, dt: float, i: int | None = None) -> RecurrentStep:
+        """The model: the mean of all usable networks' corrections as one network; or network ``i`` alone.
+
+        Each network has left out another part of the data, so each errs elsewhere, and the mean errs less than the one
+        that validation ranks first. It is around the prior's parameters that were trained along, or their mean.
+        ``prior`` is the fitted one: its balances and output are the step's.
         """
-        i = self.best if i is None else i
         values = self.prior_values(i)
         shift = shift_to(prior, values) if values else None
-        own = {name: torch.tensor(w) for name, w in self.weights.items() if not name.startswith(PREFIX)}
-        return self._step(prior, dt, own, lambda stack: stack.member(i), shift)
+        which = self.usable if i is None else [i]
+        own = {n: torch.tensor(w[which]) for n, w in self.weights.items() if not n.startswith(PREFIX)}
+        return self._step(prior, dt, own, lambda stack: stack.joined(), shift)
 
-    def steps(self, prior: Prior, dt: float, first: int = -1) -> list[RecurrentStep]:
-        """The steps of all networks, that of number ``first`` first (default: the best), then in their ranking."""
-        return [self.step(prior, dt, i) for i in sorted(self.ranking.tolist(), key=lambda i: i != first)]
+    def steps(self, prior: Prior, dt: float) -> list[RecurrentStep]:
+        """The steps of all networks, each alone, in their ranking."""
+        return [self.step(prior, dt, i) for i in self.ranking.tolist()]
 
     def stacked_step(self, prior: Prior, dt: float) -> RecurrentStep:
         """The step of all networks at once, tensors ``(networks, n, ...)``; the prior's parameters must be fixed."""
@@ -181,9 +189,10 @@ class Trained:
         return self._step(prior, dt, own, lambda stack: stack, None)
 
     def prior_values(self, i: int | None = None) -> dict[str, float]:
-        """Values [SI] of the parameters trained along with network ``i`` (default: the best); empty if none were."""
-        i = self.best if i is None else i
-        return {n.removeprefix(PREFIX): float(w[i]) for n, w in self.weights.items() if n.startswith(PREFIX)}
+        """Values [SI] of the parameters trained along with network ``i``, or their mean; empty if none were."""
+        which = self.usable if i is None else [i]
+        own = {n: w[which].mean() for n, w in self.weights.items() if n.startswith(PREFIX)}
+        return {n.removeprefix(PREFIX): float(value) for n, value in own.items()}
 
     def _step(
         self,
@@ -193,7 +202,7 @@ class Trained:
         part: Callable[[StackedGRU], nn.Module],
         shift: Tensor | None,
     ) -> RecurrentStep:
-        stack = _stack(prior, self.settings, self.form)
+        stack = _stack(prior, replace(self.settings, networks=len(weights["w_ih"])), self.form)
         stack.load_state_dict(weights)
         use_prior = self.settings.use_prior
         step = self.form(prior, part(stack), self.scaling, dt, use_prior=use_prior, shift=shift)

@@ -51,7 +51,7 @@ from hybrid_mpc.scenario import Scenario, load_scenario
 Array = NDArray[np.float64]
 SCHEMA = 3
 MODEL_NOTE = "benchmark_model.json"
-CANDIDATES = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
+CANDIDATES = ("phy", "pgrnn", "mopgrnn")
 """What may be recommended, where it is trained."""
 SHOWN = 20.0
 """Length of a run that is drawn sample by sample [the machine's seconds]."""
@@ -352,7 +352,7 @@ def _choice(
     settings, smoother = networks["pgrnn"].settings, fit.smoother(prior, dt)
     runs = unseen_runs(settings, training, validation, smoother, benchmark_of(scenario).length)
 
-    def errors(step_of: Callable[[int], Step]) -> list[Array]:
+    def errors(step_of: Callable[[int | None], Step]) -> list[Array]:
         return [
             run.squared_errors(smoother.sizes.y)
             for own, them in runs
@@ -363,7 +363,7 @@ def _choice(
     found = {"phy": errors(lambda own: plain_prior)}
     for kind, trained in networks.items():
         if kind in CANDIDATES:
-            found[kind] = errors(lambda own, trained=trained: trained.steps(prior, dt, own)[0])  # type: ignore[misc]
+            found[kind] = errors(lambda own, trained=trained: trained.step(prior, dt, own))  # type: ignore[misc]
     return recommend(
         found,
         samples=max(1, round(time_unit(training, dt) / dt)),
@@ -378,7 +378,7 @@ def recommended(
 
     Nothing was trained on validation pieces, but they may be shorter than the runs of the test, and then do not show
     drift. Of the networks only those kinds count that are ``sure`` to beat the prior on what they were not trained on
-    (:func:`~hybrid_mpc.identify.choose.recommend`), each alone and as the mean of its kind.
+    (:func:`~hybrid_mpc.identify.choose.recommend`).
     """
 
     def larger(name: str) -> float:
@@ -388,7 +388,7 @@ def recommended(
         return max(math.inf if math.isnan(v) else v for v in over_prior)  # NaN: both have diverged
 
     able = ("phy", *sure)
-    return min((n for n in CANDIDATES if n in validation and n.partition(" ")[0] in able), key=larger)
+    return min((n for n in CANDIDATES if n in validation and n in able), key=larger)
 
 
 def save_model(folder: Path, model: BenchmarkModel) -> None:
@@ -550,8 +550,7 @@ def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]
     from hybrid_mpc.plots.style import save
 
     hybrid = results.model.hybrid
-    kind, _, mean = hybrid.partition(" ")
-    chosen = "fitted prior" if kind == "phy" else kind.upper() + (", mean" if mean else "")
+    chosen = "fitted prior" if hybrid == "phy" else hybrid.upper()
     made, prior = [], scenario.prior()
     units = [(signal.unit, scale) for signal, scale in scored_signals(prior.outputs, benchmark_of(scenario))]
     for file, found in results.test.items():

@@ -248,12 +248,10 @@ def run_freely(
     length: float | None,
     linear: Mapping[str, LinearModel] | None = None,
 ) -> list[BenchmarkRun]:
-    """Free runs of the prior (``phy``), of the best network of each kind, of the mean over those of a kind (``rnn
-    mean``), and of linear models by name.
+    """Free runs of the prior (``phy``), of each kind's model (the mean of its networks), and of linear models by name.
 
     Only what lies within ``warm_up`` [s] is given: it yields the state that all models start from, and the networks'
-    hidden states. Everything after it is scored, or the first ``length`` [s]. Trajectories have the commanded inputs; a
-    kind's best network is that of its own validation.
+    hidden states. Everything after it is scored, or the first ``length`` [s]. Trajectories have the commanded inputs.
     """
     dt = trajectories[0].dt
     warm = warm_samples(warm_up, fit.delay, dt)
@@ -264,8 +262,7 @@ def run_freely(
     after = slice(1, -1)  # after the warm-up: neither the start nor what follows the last input
     found = {"phy": model_states(PriorStep(prior, dt, fit.substeps), starts, warm)[:, after]}
     for kind, trained in networks.items():
-        states = model_states(trained.stacked_step(prior, dt), starts, warm)[:, :, after]
-        found |= {kind: states[trained.best], f"{kind} mean": states.mean(0)}
+        found[kind] = model_states(trained.step(prior, dt), starts, warm)[:, after]
     longest, n_y = max(len(t.t) for t in starts), len(prior.outputs)
     u, w = (np.stack([_padded(getattr(t, key), longest)[warm + 1 :] for t in starts]) for key in ("u", "w"))
     held = np.concatenate(u).T, np.concatenate(w).T, prior.p

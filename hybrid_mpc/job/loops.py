@@ -631,8 +631,8 @@ def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
 
 
 def stand_in(kit: Kit, controller: str) -> ModelPlant:
-    """The model that a controller meets where there is no plant: the prior's meets the hybrid, the hybrid's another
-    network of the same training.
+    """The model that a controller meets where there is no plant: the prior's meets the hybrid, the hybrid's the
+    best of its networks alone.
 
     Raises:
         InputError: If the controller is an oracle's, or the artifact holds no such model.
@@ -644,7 +644,7 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
         )
     model = kit.models.get("hybrid") if of == "prior" else next(iter(kit.members.values()), None)
     if model is None:
-        needed = "a hybrid" if of == "prior" else "another network than the controller's"
+        needed = "a hybrid" if of == "prior" else "a network of its training alone"
         raise InputError(
             f"there is no plant, and the model of scenario {kit.name} holds no model to stand in for the machine of "
             f"controller {controller}: needed is {needed}. Train 2 networks or more (networks of the budget) and run "

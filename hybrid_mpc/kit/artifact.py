@@ -46,7 +46,7 @@ from hybrid_mpc.monitor.lengths import SHARE
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 FILE, PROGRAMS = "model.json", "programs.json"
 FILES = (FILE, PROGRAMS, "weights.safetensors")
 """All files of an artifact; others in its folder do not belong to it."""
@@ -65,7 +65,7 @@ INPUTS = {
     BALANCE: ("x", "xdot", "u", "w", "p"),
 }
 OWN = ("step", "xdot")
-"""Functions of another network that are its own; the others are those of the prior that it stands on."""
+"""Functions of a single network that are its own; the others are those of the prior that it stands on."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 WATCHES = ("own", "energy", "readings", "guard", "residuals")
@@ -223,8 +223,9 @@ class Description:
     """What ``model.json`` holds beside its schema version and its hash.
 
     ``recommended`` is the model that a loop is made of where none is named; empty: the hybrid. ``residuals`` are the
-    limits of the monitor of residuals, by model. ``members`` is how many other networks of the hybrid's training there
-    are, the best first; ``predicting`` what predictions of recordings need beside the models.
+    limits of the monitor of residuals, by model. ``members`` is how many networks the hybrid is the mean of, each
+    held alone beside it, the best first (none: it is a single one); ``predicting`` what predictions of recordings need
+    beside the models.
 
     Raises:
         InputError: If there are no models, too many, or two of one name.
@@ -279,7 +280,7 @@ def save_artifact(
         provenance: What the models were made from.
         loop: What loops need beside the models.
         recommended: Model that a loop is made of where none is named. Default: the hybrid.
-        members: ``step`` and ``xdot`` of other networks of the hybrid's training, the best first. Default: none.
+        members: ``step`` and ``xdot`` of each network that the hybrid is the mean of, the best first. Default: none.
         predicting: What predictions of recordings need beside the models. Default: there can be none.
 
     Raises:
@@ -393,12 +394,12 @@ def build_model(name: str, programs: Mapping[str, nn_export.Program], info: Mode
 
 
 def member_names(count: int) -> list[str]:
-    """Names of the other networks of the hybrid's training: ``"hybrid_2"``, ``"hybrid_3"``, ..."""
-    return [f"{HYBRID}_{i + 2}" for i in range(count)]
+    """Names of the networks that the hybrid is the mean of: ``"hybrid_1"``, ``"hybrid_2"``, ..."""
+    return [f"{HYBRID}_{i + 1}" for i in range(count)]
 
 
 class Members(Mapping[str, HybridModel]):
-    """Models of the other networks of the hybrid's training by name, the best first; each is built when it is asked
+    """Models of the networks that the hybrid is the mean of by name, the best first; each is built when it is asked
     for: no loop on the machine needs them.
     """
 
@@ -482,7 +483,7 @@ class Kit:
         loop: Control problems, noise and what else loops need. Default: nothing.
         recommended: Model that observer, controller and monitor are made of where none is named. Default: the hybrid.
         residuals: Limits of the monitor of residuals, by model. Default: none were learned.
-        members: Other networks of the hybrid's training by name, the best first. Default: none.
+        members: The networks that the hybrid is the mean of, by name, the best first. Default: none.
         predicting: What :func:`hybrid_mpc.predict` needs beside the models. Default: there can be no predictions.
 
     Example: the whole way from a folder to a loop::

@@ -30,7 +30,7 @@ scenario = Scenario(
     benchmark=BenchmarkSpec(
         {
             "quick": BenchmarkBudget(
-                8, 2, teacher_steps=0, free_run_steps=200, horizon=60, batch=16, decay=3000.0
+                8, 4, teacher_steps=0, free_run_steps=200, horizon=60, batch=16, decay=3000.0
             ),
             "full": BenchmarkBudget(
                 16, 4, teacher_steps=0, free_run_steps=1000, horizon=90, batch=16, decay=3000.0

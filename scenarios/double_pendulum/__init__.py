@@ -41,7 +41,7 @@ scenario = Scenario(
     benchmark=BenchmarkSpec(
         {
             "quick": BenchmarkBudget(
-                16, 2, teacher_steps=0, free_run_steps=150, horizon=50, batch=32, decay=1000.0
+                8, 4, teacher_steps=0, free_run_steps=150, horizon=50, batch=32, decay=1000.0
             ),
             "full": BenchmarkBudget(
                 32, 4, teacher_steps=0, free_run_steps=1000, horizon=50, batch=32, decay=1000.0

@@ -36,7 +36,7 @@ scenario = Scenario(
     benchmark=BenchmarkSpec(
         {
             "quick": BenchmarkBudget(
-                8, 2, teacher_steps=0, free_run_steps=150, horizon=150, batch=16, decay=3000.0
+                8, 4, teacher_steps=0, free_run_steps=150, horizon=150, batch=16, decay=3000.0
             ),
             "full": BenchmarkBudget(
                 16, 4, teacher_steps=0, free_run_steps=800, horizon=400, batch=32, decay=3000.0

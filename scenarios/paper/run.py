@@ -193,6 +193,7 @@ class Work:
             warm=self.warm,
             batch=e.batch,
             decay=e.decay,
+            learning_rates=(1e-2, 1e-3, 5e-3, 1e-4),
             every=e.every,
             objectives=("error", "energy"),
         )

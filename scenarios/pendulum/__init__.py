@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from hybrid_mpc import Budget, DataSpec
+from dataclasses import replace
+
+from hybrid_mpc import DEFAULT_BUDGETS, DataSpec
 from scenarios.common import LazyPrior, whole_windows
 from scenarios.paper.experiment import PaperScenario
 from scenarios.pendulum.data import DURATION, make_data, stems
@@ -42,10 +44,5 @@ scenario = PaperScenario(
     safe_input=(0.0,),
     tasks=TASKS,
     experiment=EXPERIMENT,
-    budgets={
-        "quick": Budget(hidden=16, networks=2, teacher_steps=200, free_run_steps=200, seeds=2),
-        "full": Budget(
-            hidden=32, networks=4, teacher_steps=2500, free_run_steps=800, seeds=10, oracle_seeds=10
-        ),
-    },
+    budgets={**DEFAULT_BUDGETS, "full": replace(DEFAULT_BUDGETS["full"], oracle_seeds=10)},
 )

@@ -81,8 +81,8 @@ scenario = Scenario(
     # Eight seconds of training: few steps, much decay. Chosen on sac_0p9Nm and ilqr_0p9Nm, of which nothing
     # is trained on (docs/results): 300, 1500, 3000, 6000 gave 1.2, 0.8, 0.8, 0.7 of the prior's error there.
     budgets={
-        "quick": Budget(hidden=16, networks=4, teacher_steps=300, free_run_steps=400, seeds=2, decay=6000.0),
-        "full": Budget(hidden=16, networks=16, teacher_steps=300, free_run_steps=800, seeds=10, decay=6000.0),
+        "quick": Budget(hidden=8, networks=4, teacher_steps=300, free_run_steps=400, seeds=2, decay=6000.0),
+        "full": Budget(hidden=8, networks=4, teacher_steps=300, free_run_steps=800, seeds=10, decay=6000.0),
     },
     benchmark=BenchmarkSpec(
         {

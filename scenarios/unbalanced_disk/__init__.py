@@ -78,7 +78,7 @@ scenario = Scenario(
     },
     benchmark=BenchmarkSpec(
         {
-            "quick": BenchmarkBudget(16, 2, teacher_steps=200, free_run_steps=200, horizon=60, batch=32),
+            "quick": BenchmarkBudget(8, 4, teacher_steps=200, free_run_steps=200, horizon=60, batch=32),
             "full": BenchmarkBudget(32, 4, teacher_steps=500, free_run_steps=1500, horizon=80, batch=48),
         },
         # the swings grow along the recordings (standard deviation 0.47, 0.49, 0.52 rad over their first 70, next 15 and

@@ -31,7 +31,7 @@ scenario = Scenario(
     benchmark=BenchmarkSpec(
         {
             "quick": BenchmarkBudget(
-                16, 2, teacher_steps=150, free_run_steps=150, horizon=80, batch=32, decay=1000.0
+                8, 4, teacher_steps=150, free_run_steps=150, horizon=80, batch=32, decay=1000.0
             ),
             "full": BenchmarkBudget(
                 32, 4, teacher_steps=500, free_run_steps=2000, horizon=250, batch=32, decay=1000.0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simulated_pendulum import TRUTH, Pendulum
+from simulated_pendulum import DT, TRUTH, Pendulum
 
 from hybrid_mpc import InputError, TrainingSettings, train
 from hybrid_mpc.identify.dataset import in_parts
@@ -102,3 +102,32 @@ def test_networks_with_validations_of_their_own_are_ranked_by_the_prior_s_error_
     harder = replace(trained, curve=trained.curve | {"validation": trained.curve["validation"] * [1.0, 1e3]})
     assert harder.best == 1
     assert replace(harder, settings=replace(SETTINGS, parts=0)).best == int(np.argmin(trained.validation))
+
+
+def test_the_model_is_the_mean_of_its_networks(data):
+    trained = train(PRIOR, *data, SETTINGS)
+    model, alone = trained.step(PRIOR, DT), [trained.step(PRIOR, DT, i) for i in range(2)]
+    assert model.n_h == 2 * SETTINGS.hidden
+    x, u, w = torch.rand(3, 2).double(), torch.rand(3, 1).double(), torch.zeros(3, 0).double()
+    h = [torch.rand(3, SETTINGS.hidden).double() for _ in alone]
+    mean, after = model.correction(x, torch.cat(h, dim=1), u, w)
+    each = [step.correction(x, own, u, w) for step, own in zip(alone, h, strict=True)]
+    np.testing.assert_allclose(mean, sum(out for out, _ in each) / 2, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(after, torch.cat([own for _, own in each], dim=1), rtol=1e-12, atol=1e-15)
+    assert (each[0][0] - each[1][0]).abs().max() > 1e-6
+
+
+def test_a_network_without_finite_validation_is_left_out_of_the_mean(data):
+    trained = train(PRIOR, *data, SETTINGS)
+    one = replace(trained, validation=np.array([np.inf, trained.validation[1]]))
+    np.testing.assert_array_equal(
+        one.step(PRIOR, DT).network.head.weight, one.step(PRIOR, DT, 1).network.head.weight
+    )
+    none = replace(trained, validation=np.full(2, np.inf))
+    assert none.step(PRIOR, DT).n_h == 2 * SETTINGS.hidden
+
+
+def test_the_mean_of_one_network_is_that_network(data):
+    trained = train(PRIOR, *data, replace(SETTINGS, networks=1))
+    for own, alone in zip(*(trained.step(PRIOR, DT, i).network.parameters() for i in (None, 0)), strict=True):
+        np.testing.assert_array_equal(own, alone)

@@ -27,7 +27,7 @@ def test_every_task_runs_on_another_model_than_the_controller_s(bare_tanks):
     found = json.loads((bare_tanks / "run" / "results.json").read_text())
     read_results(found)
     loops = found["on_model"]
-    assert loops["plants"] == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_2"}
+    assert loops["plants"] == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_1"}
     assert loops["default_tasks"] is True
     for cells in loops["details"]["controllers"].values():
         assert set(cells) == {"step", "hold"}
@@ -45,13 +45,13 @@ def test_report_terminal_and_figures_say_that_it_is_no_machine(bare_tanks):
     section = re.search(r"Closed loops on the model, not the machine</h2>(.*?)<h2", page, re.DOTALL)[1]
     tables = re.findall(r"<table.*?</table>", section, re.DOTALL)
     assert len(tables) == 2
-    assert all(("hybrid_2" in table) != ("on the model hybrid in" in table) for table in tables)
+    assert all(("hybrid_1" in table) != ("on the model hybrid in" in table) for table in tables)
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", section, re.DOTALL)
     assert len(captions) == 4  # a figure a task and controller
     assert all(LABEL in caption for caption in captions)
     told = (bare_tanks / "told.txt").read_text()
     assert "prior_observer on the model hybrid, not the machine: cost of step" in told
-    assert "hybrid_observer on the model hybrid_2, not the machine" in told
+    assert "hybrid_observer on the model hybrid_1, not the machine" in told
 
 
 def test_control_does_the_same_from_the_artifact(call, bare_tanks, tmp_path):
@@ -59,11 +59,11 @@ def test_control_does_the_same_from_the_artifact(call, bare_tanks, tmp_path):
     code, told, error = call("control", bare_tanks / "tanks.py", *words)
     assert code == 0, error
     found = json.loads((tmp_path / "loops" / "results.json").read_text())
-    assert found["on_model"] == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_2"}
+    assert found["on_model"] == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_1"}
     assert {row["controller"]: row["on_model"] for row in found["loops"]} == found["on_model"]
     names = {path.name for path in (tmp_path / "loops" / "figures").glob("hold*.png")}
     assert names == {"hold_prior_observer.png", "hold_hybrid_observer.png"}
-    first, second = told.index("prior_observer on the model hybrid,"), told.index("on the model hybrid_2,")
+    first, second = told.index("prior_observer on the model hybrid,"), told.index("on the model hybrid_1,")
     block = told[first:second]
     assert "hybrid_observer " not in block.partition("machine:")[2].partition("a step of")[0]
 
@@ -93,7 +93,9 @@ def test_check_names_the_default_tasks(call, bare_tanks):
 
 def test_without_another_network_the_hybrid_s_controller_has_no_machine(bare_tanks, kit):
     alone = replace(kit, members={})
-    with pytest.raises(InputError, match=r"hybrid_observer: needed is another network than .* write a plant"):
+    with pytest.raises(
+        InputError, match=r"hybrid_observer: needed is a network of its training alone.* write a plant"
+    ):
         stand_in(alone, "hybrid_observer")
     assert stand_in(alone, "prior_observer").model.name == "hybrid"
     with pytest.raises(InputError, match="knows the equations of a plant, and there is none"):
@@ -105,14 +107,14 @@ def test_without_another_network_the_hybrid_s_controller_has_no_machine(bare_tan
 
 
 def test_members_are_networks_of_their_own(kit):
-    hybrid, (other,) = kit.models["hybrid"], kit.members.values()
-    assert (other.name, other.n_h, other.n_x) == ("hybrid_2", hybrid.n_h, hybrid.n_x)
-    point = (hybrid.x0 + 0.05, np.full(hybrid.n_h, 0.1), hybrid.u0 * 1.2, hybrid.w, hybrid.p)
-    own, others = (m.xdot(*point).full() for m in (hybrid, other))
-    assert np.abs(own - others).max() > 1e-6 * np.abs(own).max()
-    assert float(hybrid.output(*(point[i] for i in (0, 2, 3, 4)))) == float(
-        other.output(*(point[i] for i in (0, 2, 3, 4)))
-    )
+    hybrid, others = kit.models["hybrid"], [*kit.members.values()]
+    assert [m.name for m in others] == ["hybrid_1", "hybrid_2"]
+    assert {m.n_h for m in others} == {hybrid.n_h // 2}  # the hybrid holds both
+    x, u, w, p = hybrid.x0 + 0.05, hybrid.u0 * 1.2, hybrid.w, hybrid.p
+    own, first, second = (m.xdot(x, np.full(m.n_h, 0.1), u, w, p).full() for m in (hybrid, *others))
+    assert np.abs(first - second).max() > 1e-6 * np.abs(first).max()
+    np.testing.assert_allclose(own, (first + second) / 2, rtol=1e-12, atol=1e-15)
+    assert {float(m.output(x, u, w, p)) for m in (hybrid, *others)} == {float(hybrid.output(x, u, w, p))}
 
 
 def test_a_model_as_plant_steps_as_the_model_does(kit):

@@ -14,7 +14,7 @@ from hybrid_mpc.identify.evaluate import FreeRun, free_runs, unseen_runs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of, training_settings
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, models_of, runners, training_settings
 from hybrid_mpc.kit.prediction import Bands
 from hybrid_mpc.machine.prior import Prior
 
@@ -65,7 +65,7 @@ def choice_stage(context: Context) -> ChoiceResult:
             judge
             for own, them in runs
             for judge in zip(
-                *(free_runs(step, phy, them, warm) for step in members(context, name, phy, own)), strict=True
+                *(free_runs(step, phy, them, warm) for step in runners(context, name, phy, own)), strict=True
             )
         ]
         errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in judged]
@@ -78,7 +78,7 @@ def choice_stage(context: Context) -> ChoiceResult:
 
 
 def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float) -> list[RunParts]:
-    """Errors of each run of the first network, and the parts of their variance; ``every`` has a row a network."""
+    """Errors of each run of a model, and the parts of their variance; ``every``: its runs, then each network's."""
     assert fit.sizes is not None
     covariance, spread = np.array(fit.covariance(phy.parameters)), np.array(fit.sizes.y)
     found = []
@@ -88,8 +88,8 @@ def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt:
             np.nan_to_num(own.y_hat - own.y, nan=np.nan, posinf=np.inf), -FAR * spread, FAR * spread
         )
         parts = run_variance(
-            phy, covariance, np.stack([run.y_hat for run in runs]), (own.x_hat[0], own.u, own.w), own.t - own.t[0],
-            np.array(fit.sigma), spread, dt=dt, substeps=fit.substeps,
+            phy, covariance, np.stack([run.y_hat for run in runs[1:] or runs]), (own.x_hat[0], own.u, own.w),
+            own.t - own.t[0], np.array(fit.sigma), spread, dt=dt, substeps=fit.substeps,
         )  # fmt: skip
         found.append(RunParts(error, parts))
     return found

@@ -26,7 +26,7 @@ from hybrid_mpc.identify.linear import BASELINES
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.choose import CHOICE, run_parts
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, members, models_of
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, models_of, runners
 from hybrid_mpc.kit.prediction import Bands
 from hybrid_mpc.machine.prior import Prior
 
@@ -65,9 +65,9 @@ class BaselineScores:
 
 @dataclass(frozen=True)
 class ModelScores:
-    """Errors of a model on unseen data: of the network that validation chose, and of all of its kind."""
+    """Errors of a model on unseen data, and of each of its networks alone, if it is the mean of several."""
 
-    best: Scores
+    model: Scores
     networks: tuple[Scores, ...]
 
 
@@ -110,7 +110,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
     for i, name in enumerate(models):
         context.progress.update("models", i, len(models), name)
         found, every, drawn = [], [], []
-        for k, step in enumerate(members(context, name, phy)):
+        for k, step in enumerate(runners(context, name, phy)):
             runs = free_runs(step, phy, test, context.warm)
             found.append(score(runs, phy, spread))
             every.append(runs)
@@ -121,7 +121,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
                 for run in drawn[0] if drawn else free_runs(step, phy, shown, context.warm):
                     for key in DRAWN:
                         arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
-        scores[name] = ModelScores(found[0], tuple(found))
+        scores[name] = ModelScores(found[0], tuple(found[1:]))
         if name in chosen.bands:
             own = chosen.bands[name]
             parts_of_runs = run_parts(phy, prior.fit, every, spec.dt)

@@ -51,15 +51,15 @@ class NoiseResult:
 
 
 def export_stage(context: Context) -> ExportResult:
-    """Write the hybrid, the fitted prior and the other networks as one artifact; compare all with torch."""
+    """Write the hybrid, the fitted prior and each network of the hybrid's as one artifact; compare all with torch."""
     dt, settings, prior, chosen = context.spec.dt, context.settings, context.prior, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
-    networks = trained_models(context, chosen.deployed).steps(phy, dt)[: MOST_MEMBERS + 1]
-    others = member_names(len(networks) - 1)
+    trained = trained_models(context, chosen.deployed)
+    alone = trained.steps(phy, dt)[:MOST_MEMBERS] if len(trained.validation) > 1 else []
     steps: dict[str, RecurrentStep | PriorStep] = {
-        "hybrid": networks[0],
+        "hybrid": trained.step(phy, dt),
         "prior": PriorStep(phy, dt, prior.fit.substeps),
-        **dict(zip(others, networks[1:], strict=True)),
+        **dict(zip(member_names(len(alone)), alone, strict=True)),
     }
     info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
     deployed = replace(info, input_delay=prior.fit.delay, time_unit=context.time_unit)
@@ -75,7 +75,7 @@ def export_stage(context: Context) -> ExportResult:
         phy.values,
     )  # fmt: skip
     folder = context.out / "model"
-    members = [programs.pop(name) for name in others]
+    members = [programs.pop(name) for name in member_names(len(alone))]
     save_artifact(
         folder, programs, deployed, provenance=provenance, loop=loop_settings(context.scenario),
         recommended="prior" if chosen.choice.recommended == "phy" else "hybrid", members=members,

@@ -85,7 +85,7 @@ def _training(context: Context) -> Any:
     units = {b.name: b.rate_unit for b in context.scenario.prior().equations.balances}
     figure = fit.curves(curves, free_run_start=starts, units=units)
     caption = (
-        "Objectives and bounds of the deployed network of each kind, on a fixed set of training windows."
+        "Objectives and bounds of the network of each kind that validates best, on fixed training windows."
     )
     yield "training", "training", figure, caption
 
@@ -115,12 +115,12 @@ def _free_runs(context: Context) -> Any:
         caption = f"Free run over the unseen piece {run}; the warm-up before it is left out."
         yield "free_run", f"free_run_{run.replace('#', '-')}", figure, caption
     metrics = metrics_of(prior)
-    values = {m: _flat(scores.best) for m, scores in found.scores.items()}
+    values = {m: _flat(scores.model) for m, scores in found.scores.items()}
     every = {str(m): [_flat(n) for n in found.scores[m].networks] for m in kinds_of(prior)}
     spread = {
         m: {k: float(np.std([n[k] for n in own])) for k in metrics}
         for m, own in every.items()
-        if all(n[k] is not None for n in own for k in metrics)
+        if own and all(n[k] is not None for n in own for k in metrics)
     }
     caption = "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind."
     yield "free_run", "errors", fit.errors_bar(values, metrics, spread=spread), caption

@@ -310,14 +310,18 @@ def trained_models(context: Context, kind: str) -> Trained:
     return load_trained(context.out / "checkpoints" / "training" / context.read(TRAINING).folder, kind)
 
 
-def members(context: Context, name: str, phy: Prior, first: int = -1) -> Sequence[Step]:
-    """Steps of one model: of its networks, number ``first`` first, by default the best by validation."""
+def runners(context: Context, name: str, phy: Prior, own: int | None = None) -> Sequence[Step]:
+    """Steps of one model: the model itself, then each of its networks, if it has several.
+
+    The model is the mean of its networks, or network ``own`` alone, where the others have seen what it is to run over.
+    """
     dt = context.spec.dt
     if name in ("phy_nominal", "phy"):
         fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
         return [PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)]
     trained = trained_models(context, name)
-    return trained.steps(phy, dt, first)
+    several = len(trained.validation) > 1
+    return [trained.step(phy, dt, own), *(trained.steps(phy, dt) if several else ())]
 
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:

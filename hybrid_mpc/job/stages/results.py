@@ -481,9 +481,9 @@ def collect(context: Context) -> Results:
 def _identification(context: Context) -> Identification:
     found, prior, chosen = context.read(EVALUATION), context.prior, context.read(CHOICE).choice
     network = context.settings.network()
-    best = {name: scores.best for name, scores in found.scores.items()}
-    error = {name: finite(scores.error) for name, scores in best.items()}
-    e_sim = {name: finite(scores.e_sim) for name, scores in best.items()}
+    model = {name: scores.model for name, scores in found.scores.items()}
+    error = {name: finite(scores.error) for name, scores in model.items()}
+    e_sim = {name: finite(scores.e_sim) for name, scores in model.items()}
     details = IdentificationDetails(
         FittedPrior(
             prior.fit.values, prior.fit.standard_errors, prior.nominal, prior.fit.warnings, prior.fit.stages
@@ -513,10 +513,10 @@ def _identification(context: Context) -> Identification:
     )
     return Identification(
         _with_reasons(error),
-        _with_reasons({name: _all_finite(scores.rmse) for name, scores in best.items()}),
-        _with_reasons({name: _all_finite(scores.fit_percent) for name, scores in best.items()}),
+        _with_reasons({name: _all_finite(scores.rmse) for name, scores in model.items()}),
+        _with_reasons({name: _all_finite(scores.fit_percent) for name, scores in model.items()}),
         _with_reasons(e_sim),
-        _with_reasons({name: _all_finite(scores.violation) for name, scores in best.items()}),
+        _with_reasons({name: _all_finite(scores.violation) for name, scores in model.items()}),
         details,
     )
 
