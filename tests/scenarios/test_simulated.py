@@ -1,6 +1,6 @@
-"""Six simulated machines: balances, the prior's fit, and closed loops from an artifact of the prior alone."""
+"""Six simulated machines: balances, and the whole way from a short recording to loops with faults."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -9,27 +9,35 @@ from energy_checks import check_balances
 from scipy.integrate import solve_ivp
 
 import hybrid_mpc as hm
+from hybrid_mpc.identify.export import Parity, check_parity, trace_model
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.kit.artifact import loop_settings
+from hybrid_mpc.scenario import Scenario
 from scenarios.simulated import cart_pole, dc_motor, lever, two_heaters, two_link_arm, two_tanks
 from scenarios.simulated.plant import windows
 
 MACHINES = {m.scenario.name: m for m in (cart_pole, dc_motor, lever, two_heaters, two_link_arm, two_tanks)}
-SHORT = {"two_tanks": 1500.0, "dc_motor": 3.0, "two_heaters": 3000.0}
+SHORT = {"cart_pole": 20.0, "two_tanks": 1500.0, "dc_motor": 6.0, "two_heaters": 3000.0}
 """Seconds of a short recording; 10 s of the others."""
 each = pytest.mark.parametrize("name", MACHINES)
-KINDS = ("lever", "two_heaters", "two_tanks")
-"""A mechanical machine, one of several inputs and outputs, one with a measured disturbance."""
-each_fitted = pytest.mark.parametrize(
-    "name", [n if n in KINDS else pytest.param(n, marks=pytest.mark.full) for n in MACHINES]
-)
-"""Machines whose prior is fitted first; the quick set takes one of each kind."""
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What the whole way leaves, on a short recording."""
+
+    scenario: Scenario
+    train: list[hm.Trajectory]
+    trained: Trained
+    parity: Parity
+    kit: hm.Kit
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
-    """Machine -> scenario, fit of its prior to a short recording, and the artifact of that prior alone."""
+def made(tmp_path_factory):
+    """Machine -> recordings, fitted prior, two small networks, and the artifact of both models with its noise."""
 
     @cache
     def make(name):
@@ -48,13 +56,27 @@ def fitted(tmp_path_factory):
         train, valid = data.by_role("train"), data.by_role("valid")
         fit = hm.fit_prior(scenario.prior, train, valid, dt=dt, length=scenario.data.free_run)
         prior = scenario.prior(fit.values)
-        hm.save_artifact(
-            folder / "model", {"prior": prior_programs(prior, dt, fit.substeps)}, hm.model_info(prior, dt),
-            recommended="prior", loop=loop_settings(scenario),
-        )  # fmt: skip
+        train, valid = (smoothed(scenario.prior, fit, part, dt) for part in (train, valid))
+        settings = hm.TrainingSettings(
+            "mopgrnn",
+            4,
+            2,
+            teacher_steps=0,
+            free_run_steps=60,
+            seed=0,
+            warm=5,
+            horizon=60,
+            every=10,
+        )
+        trained = hm.train(prior, train, valid, settings)
+        step, info = trained.step(prior, dt), hm.model_info(prior, dt)
+        programs = {"hybrid": trace_model(step), "prior": prior_programs(prior, dt, fit.substeps)}
+        parity = check_parity(step, programs["hybrid"], info, train, seed=0, samples=10)
+        hm.save_artifact(folder / "model", programs, info, recommended="prior", loop=loop_settings(scenario))
         kit = hm.load(folder / "model")
-        noise = hm.process_noise(kit.models["prior"], smoothed(scenario.prior, fit, train, dt))
-        return scenario, fit, kit.with_noise({"prior_observer": noise, "prior": noise})
+        noise = {m: hm.process_noise(kit.models[m], train) for m in kit.models}
+        kit = kit.with_noise({**noise, **{f"{m}_observer": sigma for m, sigma in noise.items()}})
+        return Whole(scenario, train, trained, parity, kit)
 
     return make
 
@@ -90,9 +112,10 @@ STEP = np.sqrt(12)
 """A sensor whose steps are this many standard deviations has the same noise as one of white noise."""
 
 
-def closed(scenario, kit, task, seed=0, **options):
+def closed(whole, task, model="prior", seed=0, **options):
+    scenario, kit = whole.scenario, whole.kit
     return hm.simulate(
-        scenario.plant(), kit.observer(), kit.controller(), task.reference,
+        scenario.plant(), kit.observer(model), kit.controller(model), task.reference,
         dt=scenario.data.dt, x0=task.x0, seed=seed, w=task.w,
         **{"faults": task.faults, "duration": task.duration, **options},
     )  # fmt: skip
@@ -104,14 +127,29 @@ def shown(plant, result):
     return np.array([[float(v) for v in plant.outputs(list(x), list(u), list(w), plant)] for x, u, w in rows])
 
 
-@each_fitted
-def test_a_constant_load_leaves_no_offset(name, fitted):
+@each
+def test_networks_learn_and_are_exported(name, made):
+    """Sixty updates of two small networks already follow the machine better than the fitted prior, and the graph
+    computes what torch does.
+    """
+    whole = made(name)
+    assert (whole.trained.validation < whole.trained.curve["validation"][0]).any()
+    assert whole.parity.max_abs_error < 1e-12
+    assert whole.parity.jacobian_max_abs_error < 1e-12
+
+
+MODELS = ("prior", "hybrid")
+
+
+@pytest.mark.parametrize("model", ["prior", pytest.param("hybrid", marks=pytest.mark.full)])
+@each
+def test_a_constant_load_leaves_no_offset(name, model, made):
     """The mean error of the last fifth is below two steps of the sensor."""
-    scenario, _, kit = fitted(name)
-    task = next(t for t in scenario.tasks if t.faults)
+    whole = made(name)
+    scenario, task = whole.scenario, next(t for t in whole.scenario.tasks if t.faults)
     controlled = np.flatnonzero(scenario.control.q_y)
-    assert hm.offset_free(kit.models["prior"], controlled).promised
-    result = closed(scenario, kit, task)
+    assert hm.offset_free(whole.kit.models[model], controlled).promised
+    result = closed(whole, task, model)
     late = slice(len(result.t) * 4 // 5, None)
     error = (shown(scenario.plant(), result) - result.y_ref)[late, controlled].mean(axis=0)
     assert np.all(np.abs(error) < 2 * STEP * np.array(scenario.sensor_sigma)[controlled])
@@ -123,15 +161,19 @@ PERIODS = 30
 """Length of a loop with random faults."""
 
 
-@pytest.mark.parametrize("loops", [3, pytest.param(34, marks=pytest.mark.full)])
-@each_fitted
-def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, fitted):
-    scenario, _, kit = fitted(name)
+@pytest.mark.parametrize("loops", [2, pytest.param(34, marks=pytest.mark.full)])
+@each
+def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, made):
+    """Loops of the prior's controller and the hybrid's, by turns, each watched by its monitor of residuals."""
+    whole = made(name)
+    scenario, kit = whole.scenario, whole.kit
     control, dt, task = scenario.control, scenario.data.dt, scenario.tasks[0]
+    limits = {m: hm.learn_residuals(kit.models[m], kit.observer(m), whole.train) for m in MODELS}
     rng = np.random.default_rng(sorted(MACHINES).index(name))
     for seed in range(loops):
-        faults = random_faults(scenario, rng, dt)
-        result = closed(scenario, kit, task, seed, faults=faults, duration=PERIODS * dt)
+        model, faults = MODELS[seed % 2], random_faults(scenario, rng, dt)
+        monitor = hm.ResidualMonitor(kit.models[model], limits=limits[model])
+        result = closed(whole, task, model, seed, faults=faults, duration=PERIODS * dt, monitor=monitor)
         assert np.all(np.isfinite(result.u))
         assert np.all((result.u >= control.u_min) & (result.u <= control.u_max))
 
