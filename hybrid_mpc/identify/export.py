@@ -39,7 +39,9 @@ class _Model(nn.Module):
         return getattr(self.step, self.method)(x, h, u, w, p)
 
 
-def trace_model(step: Step, like: Mapping[str, nn_export.Program] | None = None) -> dict[str, nn_export.Program]:
+def trace_model(
+    step: Step, like: Mapping[str, nn_export.Program] | None = None
+) -> dict[str, nn_export.Program]:
     """Programs ``step, xdot, output`` of one model, and of its prior's balances.
 
     The prior changes with ``p``; what a network adds does not: it was trained next to the fitted prior. Parameters that

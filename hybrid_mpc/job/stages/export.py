@@ -70,10 +70,14 @@ def export_stage(context: Context) -> ExportResult:
     programs, parities = {}, []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)
-        like = programs.get(member_names(1)[0]) if name in members else None  # they differ in their weights alone
+        like = (
+            programs.get(member_names(1)[0]) if name in members else None
+        )  # they differ in their weights alone
         programs[name] = trace_model(step, like)
         training, samples = context.smoothed("train"), FEW if like else 100
-        parities.append(check_parity(step, programs[name], info, training, seed=settings.seed, samples=samples))
+        parities.append(
+            check_parity(step, programs[name], info, training, seed=settings.seed, samples=samples)
+        )
     provenance = Provenance(
         context.scenario.name, settings.seed, settings.budget, context.read(DATA).hash, context.versions,
         phy.values,
