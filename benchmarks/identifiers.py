@@ -144,7 +144,7 @@ def hybrid_mpc(problem: Problem, watch: Watch, seed: int) -> None:
         run.evaluate()
         if watch.due or run.over:
             networks = {"pgrnn": run.result()}
-            watch.look(*(partial(predict, name, networks) for name in ("pgrnn", "pgrnn mean")))
+            watch.look(partial(predict, "pgrnn", networks))
 
 
 # The prior in numpy and in jax.

@@ -126,12 +126,14 @@ def unseen_runs(
     smoother: Smoother,
     length: float | None = None,
 ) -> list[tuple[int | None, list[Trajectory]]]:
-    """Trajectories that judge a training by what its networks did not see: the validation, and the parts left out.
+    """Trajectories that judge a training by what its networks did not see: the parts that they left out.
+
+    The validation does not judge: the networks' weights were chosen by it. It does where nothing could be left out.
 
     Args:
         settings: Of the training.
         training: Trajectories that it was given to train on, smoothed.
-        validation: Those that it was validated on.
+        validation: Those that its weights were chosen by.
         smoother: Smoother of the warm-ups; the same for every model.
         length: As in :func:`evaluation_trajectories`.
 
@@ -140,10 +142,11 @@ def unseen_runs(
         trajectories.
     """
     pieces, part = in_parts(training, settings.parts, settings.shortest)
-    unseen: list[tuple[int | None, list[Trajectory]]] = [(None, list(validation))]
-    unseen += [
+    unseen: list[tuple[int | None, list[Trajectory]]] = [
         (i, [t for t, own in zip(pieces, part, strict=True) if own == i]) for i in range(settings.networks)
     ]
+    if not any(t for _, t in unseen):
+        unseen = [(None, list(validation))]
     return [(own, evaluation_trajectories(t, smoother, settings.warm, length)) for own, t in unseen if t]
 
 

@@ -96,7 +96,7 @@ def check_parity(
 def _with_weights(program: nn_export.Program, module: nn.Module) -> nn_export.Program:
     """The same operators with the weights of another module of the same structure."""
     own = {**dict(module.named_parameters()), **dict(module.named_buffers())}
-    held = {name: np.array(own[name]) if name in own else value for name, value in program.weights.items()}
+    held = {n: own[n].detach().numpy().copy() if n in own else w for n, w in program.weights.items()}
     strange = [name for name, value in held.items() if value.shape != program.weights[name].shape]
     if strange:
         raise InputError(f"{strange[0]} has another shape than in the program to be like; trace the model")

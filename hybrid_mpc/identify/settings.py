@@ -58,8 +58,8 @@ class TrainingSettings:
         prior_replay: Weight of the mean square of the correction (in its own scale) in states that no recording comes
             near (:mod:`~hybrid_mpc.identify.prior_replay`); it is added to the objectives, which are in units of
             their bounds. An rnn ignores it. Default: zero, none.
-        parts: Parts of the training data, of which network ``i`` leaves out part ``i``: it is validated on that too,
-            and the model is chosen by what networks say of data they never saw. Default 0: all are trained on all.
+        parts: Parts of the training data, of which network ``i`` leaves out part ``i``: the model is chosen by what
+            networks say of data that neither trained them nor chose their weights. Default 0: all are trained on all.
 
     Raises:
         InputError: If a name is not known, there is no objective, an rnn is to train the prior that it does not have,

@@ -150,15 +150,13 @@ class Trained:
 
     @property
     def best(self) -> int:
-        """The network with the lowest validation error; where each has its own validation, over the prior's there."""
+        """The network with the lowest validation error."""
         return int(self.ranking[0])
 
     @property
     def ranking(self) -> NDArray[np.intp]:
         """The networks, the best first."""
-        first = self.curve["validation"][0]  # a correction begins at zero: the prior's
-        own = self.settings.parts and self.settings.use_prior and np.isfinite(first).all()
-        return np.argsort(self.validation / first if own else self.validation, kind="stable")
+        return np.argsort(self.validation, kind="stable")
 
     @property
     def usable(self) -> list[int]:
@@ -236,19 +234,12 @@ class TrainingRun:
         without = [[float(own != i) for i in range(s.networks)] for own in part] if s.parts else []
         horizon = fitting_horizon(training, s.warm, s.horizon)
         windows = cut_windows(training, s.warm, horizon, max(1, horizon // 10), without)
-        left = [
-            (t, row) for t, own, row in zip(training, part, without, strict=False) if 0 <= own < s.networks
-        ]
-        judging = [*validation, *(t for t, _ in left)]
-        only = [[1.0] * s.networks] * len(validation) + [[1.0 - w for w in row] for _, row in left]
         horizon = (
-            fitting_horizon(judging, s.warm, s.validation_horizon)
+            fitting_horizon(validation, s.warm, s.validation_horizon)
             if s.validation_horizon
-            else validation_horizon(judging, s.warm)
+            else validation_horizon(validation, s.warm)
         )
-        valid = cut_windows(judging, s.warm, horizon, max(1, horizon // 5), only if left else [])
-        if valid.weight is not None:  # where no window is a network's own, all are
-            valid.weight[valid.weight.sum(1) == 0] = 1.0
+        valid = cut_windows(validation, s.warm, horizon, max(1, horizon // 5))
         scaling = form.scaling_of(prior, windows, dt, use_prior=s.use_prior)
         own_rates = s.use_prior and form.corrects_prior
         substeps = required_substeps(prior, dt, visited(training)) if own_rates else 0

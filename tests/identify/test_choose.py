@@ -149,3 +149,15 @@ def test_many_blocks_of_two_days_are_two_pieces_of_evidence():
     errors = {"phy": prior, "pgrnn": hybrid}
     assert recommend(errors).recommended == "pgrnn"
     assert recommend(errors, recordings=["monday"] * 4 + ["tuesday"] * 4).recommended == "phy"
+
+
+def test_two_recordings_give_no_bound():
+    """However well they agree; of three the bound is a number."""
+    prior = runs(np.random.default_rng(9), n=3)
+    errors = {"phy": prior, "pgrnn": [0.25 * own for own in prior]}
+    two = recommend({name: own[:2] for name, own in errors.items()}, recordings=["a", "b"])
+    assert two.candidates["pgrnn"].ratio == pytest.approx(0.5)
+    assert two.candidates["pgrnn"].upper == np.inf
+    assert two.recommended == "phy"
+    assert "without a bound: record more; 2 recordings" in two.reason
+    assert recommend(errors, recordings=["a", "b", "c"]).recommended == "pgrnn"

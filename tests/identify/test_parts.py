@@ -9,6 +9,8 @@ from simulated_pendulum import DT, TRUTH, Pendulum
 
 from hybrid_mpc import InputError, TrainingSettings, train
 from hybrid_mpc.identify.dataset import in_parts
+from hybrid_mpc.identify.evaluate import unseen_runs
+from hybrid_mpc.identify.smooth import Smoother, sizes_of
 from hybrid_mpc.identify.train import TrainingRun
 
 PRIOR = Pendulum(TRUTH)
@@ -81,27 +83,17 @@ def test_a_network_learns_nothing_from_the_part_that_it_leaves_out(data, free):
         assert torch.equal(after[0], before[0])
 
 
-def test_validation_is_what_all_leave_out_and_a_network_s_own_part(data):
-    run = TrainingRun(PRIOR, *data, SETTINGS)
-    weight = run.valid.weight
-    both, first, second = (
-        int(((weight[0] == a) & (weight[1] == b)).sum()) for a, b in ((1, 1), (1, 0), (0, 1))
-    )
-    assert both > 0
-    assert first > 0
-    assert second > 0
-    assert both + first + second == len(run.valid)
-    plain = TrainingRun(PRIOR, *data, replace(SETTINGS, parts=0))
-    assert plain.valid.weight is None
-
-
-def test_networks_with_validations_of_their_own_are_ranked_by_the_prior_s_error_there(data):
-    trained = train(PRIOR, *data, SETTINGS)
-    first = trained.curve["validation"][0]
-    assert trained.ranking.tolist() == np.argsort(trained.validation / first).tolist()
-    harder = replace(trained, curve=trained.curve | {"validation": trained.curve["validation"] * [1.0, 1e3]})
-    assert harder.best == 1
-    assert replace(harder, settings=replace(SETTINGS, parts=0)).best == int(np.argmin(trained.validation))
+def test_what_judges_a_network_neither_trains_it_nor_chooses_its_weights(data):
+    """A part that is left out is another one, and the network is the same to the bit."""
+    train_runs, valid = data
+    pieces, part = in_parts(train_runs, 2, SETTINGS.shortest)
+    smoother = Smoother(PRIOR, DT, (1e-3,), (0.1,), sizes_of(PRIOR, train_runs, DT, 1.0))
+    judged = dict(unseen_runs(SETTINGS, train_runs, valid, smoother))
+    assert {t.name for t in judged[0]} == {p.name for p, own in zip(pieces, part, strict=True) if own == 0}
+    assert set(judged) == {0, 1}  # the validation chose the weights: it judges none
+    run = TrainingRun(PRIOR, train_runs, valid, SETTINGS)
+    assert run.valid.weight is None
+    assert len(run.valid) == len(TrainingRun(PRIOR, train_runs, valid, replace(SETTINGS, parts=0)).valid)
 
 
 def test_the_model_is_the_mean_of_its_networks(data):

@@ -12,7 +12,19 @@ from hybrid_mpc.identify.objectives import objectives_of
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.train import REPEATS, TrainingRun, load_checkpoint, save_checkpoint
 
-SMALL = TrainingSettings("mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10)
+SMALL = TrainingSettings(
+    "mopgrnn",
+    4,
+    2,
+    20,
+    20,
+    seed=3,
+    warm=10,
+    horizon=20,
+    batch=8,
+    every=10,
+    learning_rates=(1e-2, 1e-3, 5e-3, 1e-4),
+)
 
 
 PRIOR = Pendulum(TRUTH)

@@ -109,7 +109,7 @@ def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_pat
 def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(made):
     model = made[1].model
     validation, long = model.validation, model.long
-    names = ("phy", "pgrnn", "mopgrnn", "pgrnn mean", "mopgrnn mean")
+    names = ("phy", "pgrnn", "mopgrnn")
     worse = {n: max(part[n].error / part["phy"].error for part in (validation, long)) for n in names}
     able = ("phy", *model.choice.sure)
     assert model.hybrid == min((n for n in names if n.partition(" ")[0] in able), key=worse.get)

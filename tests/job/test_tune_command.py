@@ -136,7 +136,7 @@ def test_files_of_settings_that_are_none(tmp_path, content, message):
 def test_a_run_without_such_a_file_takes_the_budget_s_settings(tmp_path):
     scenario = load_scenario("golf_robot")
     plain = training_settings(Context(RunSettings("golf_robot"), scenario, tmp_path), "mopgrnn")
-    assert (plain.hidden, plain.horizon, plain.batch, plain.validation_horizon) == (16, 50, 32, None)
+    assert (plain.hidden, plain.horizon, plain.batch, plain.validation_horizon) == (8, 50, 32, None)
 
 
 def test_an_rnn_has_no_prior_to_replay():
