@@ -150,7 +150,7 @@ def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
         ("model.json", lambda b: b[: len(b) // 2], "damaged"),
         (
             "model.json",
-            lambda b: b.replace(b'"schema_version": 3', b'"schema_version": 99'),
+            lambda b: b.replace(b'"schema_version": 4', b'"schema_version": 99'),
             "schema version",
         ),
         ("programs.json", lambda b: b[: len(b) // 2], "programs.json"),

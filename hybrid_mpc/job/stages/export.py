@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import nn_export
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import sha256
 from hybrid_mpc.identify.export import check_parity, trace_model
@@ -67,7 +68,8 @@ def export_stage(context: Context) -> ExportResult:
     }
     info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
     deployed = replace(info, input_delay=prior.fit.delay, time_unit=context.time_unit)
-    programs, parities = {}, []
+    programs: dict[str, dict[str, nn_export.Program]] = {}
+    parities = []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)
         like = (
