@@ -278,9 +278,9 @@ def free_runs(name: str, runs: Path) -> dict:
     scores = scores.get("result", scores)["scores"]
     choice = read_json(folder / "choice.json")
     choice = choice.get("result", choice)["choice"]
-    error = {key: value["best"]["error"] for key, value in scores.items()}
+    error = {key: value["model"]["error"] for key, value in scores.items()}
     best = min((key for key in error if key in ("pgrnn", "mopgrnn")), key=error.__getitem__)
-    fit = ", ".join(f"{v:.0f}" for v in scores["phy"]["best"]["fit_percent"].values())
+    fit = ", ".join(f"{v:.0f}" for v in scores["phy"]["model"]["fit_percent"].values())
     recommended = choice["recommended"]
     ratios = {"its error / prior": error[recommended], "best hybrid / prior": error[best]}
     return {"machine": name, "FIT of the prior [%]": fit, "recommended": recommended,

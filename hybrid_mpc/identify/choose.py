@@ -143,7 +143,7 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
     own = figures[best if chosen == prior else chosen]
     bound = f"at most {own.upper:.2f}" if math.isfinite(own.upper) else "without a bound: record more"
-    said = f"its validation error is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
+    said = f"its error on data that were left out is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
     if chosen == prior and own.upper < CONFIDENT:
         said += ", but over all of them together the prior's is no larger"
     if chosen == prior:

@@ -23,7 +23,7 @@ from hybrid_mpc.job.stages.guard import GUARD
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
 from hybrid_mpc.job.stages.monitor import MONITOR
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL
-from hybrid_mpc.job.stages.report import REPORT
+from hybrid_mpc.job.stages.report import REPORT, report_so_far
 from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import Results, read_results
 from hybrid_mpc.records import known
@@ -84,7 +84,10 @@ def run(
             if only and stage.name not in (*only, REPORT.name):
                 context.progress.finish(_as_it_is(context, stage))
             else:
-                context.progress.finish(bring_up_to_date(context, stage, stage.name in skip))
+                said = bring_up_to_date(context, stage, stage.name in skip)
+                if not said and stage in (PRIOR, TRAINING, EVALUATION):
+                    report_so_far(context)
+                context.progress.finish(said)
     return read_results(read_object(out / "results.json"), str(out / "results.json"))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,14 @@ from hybrid_mpc.identify.evaluate import Scores
 from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loop_figures import curves_of, loop_figure
-from hybrid_mpc.job.stage import Absent
+from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.guard import GUARD, read_trace
-from hybrid_mpc.job.stages.identify import trained_models
+from hybrid_mpc.job.stages.identify import PRIOR, TRAINING, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL, by_controller
 from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
@@ -48,13 +48,28 @@ def draw_all(context: Context) -> Figures:
         _data, _training, _free_runs, _overview, _loops, _on_model, _estimation, _timing, _monitor, guard_figures,
         _analysis,
     )  # fmt: skip
+    figures = _draw(context, parts)
+    figures.setdefault("control", [])[:0] = _moving(context)
+    return figures
+
+
+def draw_first(context: Context) -> Figures:
+    """Draw the figures of the stages up to the free runs, of those that have run."""
+    there: dict[Callable[[Context], Any], Stage[Any]] = {
+        _data: PRIOR, _training: TRAINING, _free_runs: EVALUATION,
+    }  # fmt: skip
+    return _draw(
+        context, [part for part, stage in there.items() if not isinstance(context.find(stage), Absent)]
+    )
+
+
+def _draw(context: Context, parts: Sequence[Callable[[Context], Any]]) -> Figures:
     figures: Figures = {}
     for i, part in enumerate(parts):
         context.progress.update("figures", i, len(parts), part.__name__.strip("_"))
         for section, name, figure, caption in part(context):
             path = save(figure, context.out / "figures" / f"{name}.png")
             figures.setdefault(section, []).append((path, caption))
-    figures.setdefault("control", [])[:0] = _moving(context)
     return figures
 
 

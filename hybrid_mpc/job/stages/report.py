@@ -21,7 +21,7 @@ from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT
-from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all
+from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop
 from hybrid_mpc.job.stages.identify import (
     DATA,
@@ -40,6 +40,7 @@ from hybrid_mpc.job.stages.results import (
     Data,
     Export,
     Guard,
+    Identification,
     Monitor,
     OnModel,
     Residuals,
@@ -47,6 +48,8 @@ from hybrid_mpc.job.stages.results import (
     Timing,
     collect,
     finite,
+    identification,
+    recordings,
 )
 from hybrid_mpc.job.summary import Summary
 from hybrid_mpc.monitor.residuals import force_unit
@@ -168,6 +171,33 @@ def report_stage(context: Context) -> ReportResult:
     return ReportResult("report.html", drawn)
 
 
+def report_so_far(context: Context) -> None:
+    """Write a page of the stages up to the free runs, of those that have run, while the others go on."""
+    figures = draw_first(context)
+    tables: dict[str, Sequence[Table]] = {
+        "data": [_data_table(recordings(context))],
+        "models": [_prior_table(context)],
+    }
+    if "free_run" in figures:
+        found = identification(context)
+        tables["free_run"] = [
+            *_score_tables(context, found),
+            _choice_table(found),
+            _band_table(context, found),
+        ]
+    texts = words("run_words.html")
+    shown = [key for key in TITLES if key in figures or key in tables]
+    sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
+    going = "This run goes on: the page is written anew after the first stages and at the end. Load it again."
+    title = f"hybrid-mpc: {context.scenario.name}"
+    write_report(
+        context.out / "report.html",
+        Report(
+            title, context.scenario.title, context.scenario.description, command(context), (), sections, going
+        ),
+    )
+
+
 def report_is_there(context: Context, found: ReportResult) -> str:
     """Whether the report and the results lie where the run left them; a text if not."""
     there = all((context.out / name).is_file() for name in (found.file, "results.json"))
@@ -199,10 +229,11 @@ def command(context: Context, scenario: str = "") -> str:
 
 
 def _report(context: Context, results: Results, figures: Figures) -> Report:
+    found = results.identification
     tables: dict[str, Sequence[Table | None]] = {
         "data": [_data_table(results.data)],
         "models": [_prior_table(context)],
-        "free_run": [*_score_tables(context, results), _choice_table(results), _band_table(context, results)],
+        "free_run": [*_score_tables(context, found), _choice_table(found), _band_table(context, found)],
         "export": [_export_table(results.export)],
         "control": [_control_table(results.control), _tracking_table(results.control)],
         "on_model": _on_model_tables(results.on_model),
@@ -266,7 +297,7 @@ def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     choice = found.details.choice
     own = choice.candidates[choice.hybrid]
     yield KeyFigure(
-        f"Recommended: {name_of(choice.recommended)}; validation error of the hybrid over the prior's", own.ratio, "",
+        f"Recommended: {name_of(choice.recommended)}; left-out error of the hybrid over the prior's", own.ratio, "",
         choice.reason, "plain" if choice.recommended == "phy" else "good",
     )  # fmt: skip
     gap = control.gap_closed
@@ -413,9 +444,9 @@ def _prior_table(context: Context) -> Table:
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
 
-def _score_tables(context: Context, results: Results) -> list[Table]:
+def _score_tables(context: Context, found: Identification) -> list[Table]:
     """Errors of every model: by output; then of its rates and by balance."""
-    found, prior = results.identification, context.scenario.prior()
+    prior = context.scenario.prior()
     models = models_of(prior)
     outputs = [s.label for s in prior.outputs]
     base = _number(found.error["phy"])
@@ -449,8 +480,8 @@ def _score_tables(context: Context, results: Results) -> list[Table]:
     return [*tables, Table(columns, rows, caption)]
 
 
-def _choice_table(results: Results) -> Table:
-    choice = results.identification.details.choice
+def _choice_table(found: Identification) -> Table:
+    choice = found.details.choice
     rows = [
         (name_of(name), c.error, c.ratio, None if name == "phy" else c.upper,
          "recommended" if name == choice.recommended else "")
@@ -458,17 +489,17 @@ def _choice_table(results: Results) -> Table:
     ]  # fmt: skip
     columns = ("model", "error [spreads]", "over the prior's", "at most, by 95 %", "")
     caption = (
-        f"Validation recordings. {choice.reason} The error is that of all recordings together. Where there are "
+        f"Parts of the training data that networks left out. {choice.reason} The error is that of all. Where there are "
         "several, the ratio is the geometric mean of the ratios of each, and the bound is a bound of this mean."
     )
     return Table(columns, rows, caption)
 
 
-def _band_table(context: Context, results: Results) -> Table:
+def _band_table(context: Context, found: Identification) -> Table:
     rows: list[tuple[Any, ...]] = [
         (name_of(name), output.label, f"{100 * b.share:g} %", f"{100 * b.coverage:.0f} %",
          *(by[output.label] for by in (b.width, b.score, b.score_of_constant)))
-        for name, b in results.identification.details.bands.items()
+        for name, b in found.details.bands.items()
         for output in context.scenario.prior().outputs
     ]  # fmt: skip
     what = ("mean width", "interval score", "of a constant band")

@@ -125,8 +125,8 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class CandidateErrors:
-    """Validation error of a candidate [spreads of the outputs], its ratio to the prior's (of several recordings the
-    geometric mean of each one's), and that one's upper bound; None where a run diverged or the bound is not known.
+    """Error of a candidate on left-out parts of the training data [spreads of the outputs], its ratio to the prior's
+    (of several recordings the geometric mean of each one's), and that one's upper bound; None where a run diverged or the bound is not known.
     """
 
     error: float | None
@@ -452,20 +452,14 @@ def _check_values(values: Mapping[str, Any], path: str, where: str) -> None:
 
 def collect(context: Context) -> Results:
     """Results of all stages."""
-    data = context.read(DATA)
     return Results(
         SCHEMA_VERSION,
         context.scenario.name,
         context.settings.seed,
         context.settings.budget,
         context.versions,
-        Data(
-            data.files,
-            data.hash,
-            tuple(CutInterval(c.file, c.start_s, c.end_s) for c in data.cuts),
-            DataDetails(data.seconds, tuple(c.why for c in data.cuts), data.warnings),
-        ),
-        _identification(context),
+        recordings(context),
+        identification(context),
         Export(context.read(EXPORT).parity_max_abs_error, context.read(EXPORT).jacobian_max_abs_error),
         _control(context),
         _on_model(context),
@@ -478,7 +472,19 @@ def collect(context: Context) -> Results:
     )
 
 
-def _identification(context: Context) -> Identification:
+def recordings(context: Context) -> Data:
+    """What the recordings are."""
+    data = context.read(DATA)
+    return Data(
+        data.files,
+        data.hash,
+        tuple(CutInterval(c.file, c.start_s, c.end_s) for c in data.cuts),
+        DataDetails(data.seconds, tuple(c.why for c in data.cuts), data.warnings),
+    )
+
+
+def identification(context: Context) -> Identification:
+    """How well the models predict, and which one is recommended."""
     found, prior, chosen = context.read(EVALUATION), context.prior, context.read(CHOICE).choice
     network = context.settings.network()
     model = {name: scores.model for name, scores in found.scores.items()}
