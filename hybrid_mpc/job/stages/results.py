@@ -126,7 +126,8 @@ class ModelChoice:
 @dataclass(frozen=True)
 class CandidateErrors:
     """Error of a candidate on left-out parts of the training data [spreads of the outputs], its ratio to the prior's
-    (of several recordings the geometric mean of each one's), and that one's upper bound; None where a run diverged or the bound is not known.
+    (of several recordings the geometric mean of each one's), and that one's upper bound; None where a run diverged or
+    the bound is not known.
     """
 
     error: float | None
