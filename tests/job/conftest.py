@@ -115,14 +115,17 @@ scenario = replace(
 
 
 @pytest.fixture(scope="session")
-def bare_tanks(tmp_path_factory) -> Path:
+def bare_tanks(shared) -> Path:
     """Folder of a scenario without plant and tasks: ``tanks.py``, recordings, a finished ``run``, and what it told."""
+    return shared("bare_tanks", write_bare_tanks)
+
+
+def write_bare_tanks(folder: Path) -> None:
     import subprocess
     import sys
 
     from scenarios.simulated.two_tanks import EXPERIMENT
 
-    folder = tmp_path_factory.mktemp("bare_tanks")
     (folder / "tanks.py").write_text(BARE)
     words = []
     for i, name in enumerate(("monday", "tuesday", "later")):
@@ -136,4 +139,3 @@ def bare_tanks(tmp_path_factory) -> Path:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     (folder / "told.txt").write_text(done.stdout)
-    return folder
