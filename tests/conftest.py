@@ -12,6 +12,7 @@ from filelock import FileLock
 LONG = (
     "job/test_machines.py",
     "job/test_run.py",
+    "job/test_on_model.py",
     "notebooks/test_notebooks.py",
     "nn_export/test_random_modules.py",
     "job/study/test_study_runner.py",

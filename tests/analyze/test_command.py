@@ -62,6 +62,7 @@ def prior_alone(golf_artifact):
     )  # fmt: skip
 
 
+@pytest.mark.full
 def test_an_analysis_without_a_control_problem_says_what_it_leaves_out(prior_alone, tmp_path):
     told = []
     result = analyze_models(prior_alone, lambda *words: told.append(words[3]))

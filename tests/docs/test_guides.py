@@ -77,6 +77,7 @@ def test_what_is_refused_is_refused_in_the_words_of_the_guide(machines):
         assert str(told.value) in page
 
 
+@pytest.mark.full
 def test_the_guide_to_the_fit():
     found = executed("docs/prior-fit.md", blocks("docs/prior-fit.md"))
     assert found["fit"].identifiability == ()

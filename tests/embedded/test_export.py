@@ -85,7 +85,10 @@ def written(folder, name, **options):
     return folder
 
 
-@pytest.fixture(scope="module", params=MACHINES)
+@pytest.fixture(
+    scope="module",
+    params=["coupled", *(pytest.param(n, marks=pytest.mark.full) for n in ("tanks", "delayed"))],
+)
 def folder(request, tmp_path_factory):
     return written(tmp_path_factory.mktemp(request.param) / "c", request.param)
 
@@ -112,6 +115,7 @@ def test_vectors_of_the_python_controller_and_no_warning(folder):
     }  # fmt: skip
 
 
+@pytest.mark.full
 @needs_compiler
 @pytest.mark.parametrize("name", MACHINES)
 def test_single_precision(tmp_path, name):

@@ -39,6 +39,7 @@ def recorded(a, b, c, n, seed):
     return Run(y, u)
 
 
+@pytest.mark.full
 def test_a_right_filter_passes_at_the_rate_of_the_bands():
     model, *matrices = system()
     ekf = make(model)

@@ -239,6 +239,7 @@ def test_first_states_need_not_be_measured(noisy_runs):
 # what the result says
 
 
+@pytest.mark.full
 def test_standard_errors_are_the_scatter_over_noise():
     """Over 20 draws the errors over their standard errors have a root mean square of 1, which 20 draws of three
     correlated parameters tell to some 20 %; scatter of a dozen windows as a measure of the errors and the ends of

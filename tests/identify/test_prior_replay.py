@@ -56,6 +56,7 @@ def test_an_angle_counts_all_the_way_round_and_a_full_turn_is_no_distance(data):
     torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
 
 
+@pytest.mark.full
 def test_corrections_fade_there_and_still_explain_the_data(data, prior_replay):
     """Of networks as ``train`` hands them over: the best by validation, which does not know of prior replay."""
 

@@ -82,6 +82,7 @@ def test_three_seconds_make_the_prior_know_the_heavier_mass(machines):
     assert rest.t[0] == pytest.approx(3.0)
 
 
+@pytest.mark.full
 def test_the_monitor_alarms_at_once_with_the_old_model(machines):
     before, after, _ = machines
     step = PriorStep(scenario.prior(OLD), 0.02).requires_grad_(False)

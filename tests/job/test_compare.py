@@ -158,6 +158,7 @@ scenario = replace(scenario, tasks=(task,), oracle=None, budgets={"quick": budge
 """
 
 
+@pytest.mark.full
 def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, jobs_here, tmp_path):
     out, file = tmp_path / "run", tmp_path / "short.py"
     file.write_text(SHORT)

@@ -60,10 +60,11 @@ def own(machine, finished, arguments, tmp_path, monkeypatch):
     ("pattern", "put", "stages"),
     [
         (r'title="[^"]*"|"My machine[^"]*"', None, ["report"]),
-        (
+        pytest.param(
             r"q=\(",
             "q=(2.0 * ",
             ["control", "on_model", "residuals", "monitor", "guard", "analysis", "report"],
+            marks=pytest.mark.full,
         ),
         ("$", "\n# a remark\n", []),
     ],
@@ -111,6 +112,7 @@ def test_only_and_skip(own, call):
         assert (code, told in message.replace("\n", " ")) == (2, True)
 
 
+@pytest.mark.full
 def test_what_lies_outside_the_stage_s_file_is_missed(own, call):
     _, out, command = own
     (out / "model" / "programs.json").write_text("{}")

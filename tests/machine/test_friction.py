@@ -82,9 +82,9 @@ def lost(prior, free, x, u):
 
 
 IN_TORCH = pytest.mark.parametrize(
-    "kind", [k if k in ("stribeck", "all") else pytest.param(k, marks=pytest.mark.full) for k in TERMS]
+    "kind", [k if k == "stribeck" else pytest.param(k, marks=pytest.mark.full) for k in TERMS]
 )
-"""On a prior in torch, which takes a second to trace: the quick set has the one with most parts, and all together."""
+"""On a prior in torch, which takes a second to trace: the quick set has the one with most parts."""
 
 
 @IN_TORCH
@@ -100,7 +100,7 @@ def test_torques_are_the_hand_written_formulas(kind):
 @pytest.mark.parametrize(
     ("kind", "base"),
     [(kind, base) for base in (GolfRobotPrior, TorquePendulumPrior, Pendulum) for kind in TERMS]
-    + [pytest.param(kind, PendulumPrior, marks=[] if kind == "all" else pytest.mark.full) for kind in TERMS],
+    + [pytest.param(kind, PendulumPrior, marks=pytest.mark.full) for kind in TERMS],
 )
 def test_energy_balance_stays_zero_along_the_flow(kind, base):
     # those without m, l and g have a load that changes its sign

@@ -45,6 +45,7 @@ def test_scale_is_found_again():
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("count", "most"), [(2, 10), pytest.param(4, 16, marks=pytest.mark.full)])
 def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_one(learned, count, most):
     _, detector = learned

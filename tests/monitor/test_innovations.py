@@ -42,7 +42,9 @@ def recording(make, swing, sigma, n, seed, *, broken=None, **plant):
     return SimpleNamespace(t=model.dt * np.arange(n), u=u_all, y=y_all, w=np.tile(model.w, (n, 1)))
 
 
-@pytest.fixture(scope="module", params=MACHINES)
+@pytest.fixture(
+    scope="module", params=["tanks", *(pytest.param(n, marks=pytest.mark.full) for n in ("motor", "thermal"))]
+)
 def watched(request):
     make, swing, sigma, step = MACHINES[request.param]
     model = make()

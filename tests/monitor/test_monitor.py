@@ -45,6 +45,7 @@ def levels():
     return [replay(monitor, Observer(model), simulate(5000, s, noise=NOISE)).level_w[100:] for s in range(4)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("count", "least", "most"), [(2, 0, 20), pytest.param(6, 1, 30, marks=pytest.mark.full)]
 )

@@ -163,6 +163,7 @@ def diverging(folder):
     return folder
 
 
+@pytest.mark.full
 def test_the_command_fails_where_no_reading_is_valid(recordings, tmp_path):
     model = diverging(tmp_path / "model")
     done = command(recordings, model, tmp_path / "out", "long")

@@ -174,6 +174,7 @@ def judged(tmp_path, cases, *steps):
     return outcomes
 
 
+@pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of a process are Linux's here")
 def test_small_files_that_ask_for_gigabytes_or_minutes_are_refused_at_once(tmp_path):
     outcomes = judged(tmp_path, crafted(), "load", "build")

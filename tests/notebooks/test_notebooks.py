@@ -89,6 +89,7 @@ def test_it_runs(path):
     assert [len(c.outputs) > 0 for c in code(fresh)] == [len(c.outputs) > 0 for c in code(read(path))]
 
 
+@pytest.mark.full
 def test_the_cells_that_a_newcomer_opens_first_run():
     """In this process, with a short training; nothing is drawn that a cell only shows."""
     cells = "\n".join(cell.source for cell in code(read(FILES[0])))

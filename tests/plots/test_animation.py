@@ -49,6 +49,7 @@ def planned_pixels(picture):
     return int(np.sum(np.abs(picture - PLANNED).sum(axis=-1) < 60))
 
 
+@pytest.mark.full
 def test_three_seconds_are_small_and_play_in_real_time(tmp_path):
     path = write(tmp_path / "films" / "a.gif", *swing())
     assert path.stat().st_size < 2e6  # what a web page bears

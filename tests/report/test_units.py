@@ -112,6 +112,7 @@ def job(tmp_path_factory):
     return results, " ".join(text.rpartition("Names and definitions")[0].split()), drawn, folder / "run"
 
 
+@pytest.mark.full
 def test_the_page_names_every_signal_in_its_unit_and_no_other(job):
     _, text, _, _ = job
     for words in (
@@ -122,6 +123,7 @@ def test_the_page_names_every_signal_in_its_unit_and_no_other(job):
     assert not WRONG.search(text), WRONG.search(text)
 
 
+@pytest.mark.full
 def test_every_axis_of_every_figure_has_a_unit_of_this_machine(job):
     _, _, drawn, _ = job
     assert {"recordings", "training", "errors", "loop_warmer", "bode_rest_from_heater_to_back"} <= set(drawn)
@@ -133,6 +135,7 @@ def test_every_axis_of_every_figure_has_a_unit_of_this_machine(job):
             assert found[1] in OWN, f"{name}: {label!r}"
 
 
+@pytest.mark.full
 def test_a_loop_shows_every_output_with_its_reference_and_every_input_and_disturbance(job):
     results, text, drawn, _ = job
     labels = [label.replace("\n", " ") for label in drawn["loop_warmer"]]

@@ -93,6 +93,7 @@ def stand_in(monkeypatch):
     return asked
 
 
+@pytest.mark.full
 def test_run_resume_report(stand_in, tmp_path, monkeypatch, capsys):
     out = tmp_path / "study"
     results = room.run_monitor_study(SMALL, out)

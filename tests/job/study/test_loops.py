@@ -83,6 +83,7 @@ def test_monitors(run_folder):
     assert 0.0 < energy["first_alarm_s"] < 1.0
 
 
+@pytest.mark.full
 def test_workers_give_the_bits_of_this_process(run_folder, tmp_path):
     study = Study(
         "golf_robot", run_folder, tasks=["track_sine", "stroke_1.4"], controllers=["prior", "hybrid_observer"],
@@ -128,6 +129,7 @@ def test_a_cluster_gives_the_same_bits(run_folder, tmp_path):
     assert near[keep].set_index("id").sort_index().equals(far[keep].set_index("id").sort_index())
 
 
+@pytest.mark.full
 def test_a_resumed_study_keeps_its_noise(run_folder, tmp_path):
     moved = tmp_path / "run"
     shutil.copytree(run_folder, moved)

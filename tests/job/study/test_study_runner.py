@@ -186,6 +186,7 @@ def killed_and_resumed(tmp_path, kills, seed):
     assert len(StudyResults.load(folder).table) == RUNS
 
 
+@pytest.mark.full
 def test_killed_in_the_middle(tmp_path):
     killed_and_resumed(tmp_path, 1, seed=9)  # after a tenth of the runs
 

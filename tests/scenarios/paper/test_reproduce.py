@@ -80,6 +80,7 @@ def test_interrupted_and_resumed_equals_the_finished_one(exact, finished, tmp_pa
     assert (out / "results.csv").read_bytes() == (finished / "results.csv").read_bytes()
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("no_sindy")
 def test_where_only_the_angle_is_measured(measured, tmp_path):
     results = reproduce(ReproductionSettings(measured), tmp_path / "out", workers=0)
