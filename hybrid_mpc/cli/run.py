@@ -83,7 +83,8 @@ def run(
         results = run_job(
             settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress,
         )  # fmt: skip
-    print_summary(summary(results), folder / "report.html", "report")
+    lines = ["the run ends here: later stages have not run, and --only names none of them"]
+    print_summary(lines if results is None else summary(results), folder / "report.html", "report")
     if failed := failed_stages(folder):
         for stage, why in failed.items():
             print(f"stage {stage} could not run: {why}")

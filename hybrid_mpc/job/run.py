@@ -45,8 +45,11 @@ def run(
     only: Sequence[str] = (),
     skip: Sequence[str] = (),
     progress: Progress | None = None,
-) -> Results:
+) -> Results | None:
     """Run the main job into the folder ``out``; the results stand in its ``results.json``, too.
+
+    With ``only`` it ends at the first stage that nothing can be taken of, and gives None: ``only=("data", "prior")`` of
+    a new run fits the prior and leaves the first page of the report.
 
     Every stage leaves its result in ``out/checkpoints``. With ``resume`` a stage runs again only where something that
     it reads has changed: after an edit of a task its loops and the report are made anew, and nothing is trained again.
@@ -78,8 +81,12 @@ def run(
     if settings.deploy:
         there = models_of(scenario.prior())
         known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
+    end = _end(context, only)
     with open_folder(out, run_note(settings), resume=resume):
         for stage in STAGES:
+            if stage is end:
+                report_so_far(context)
+                return None
             context.progress.start(stage.title)
             if only and stage.name not in (*only, REPORT.name):
                 context.progress.finish(_as_it_is(context, stage))
@@ -103,13 +110,32 @@ def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
         )
 
 
+def _end(context: Context, only: Sequence[str]) -> Stage[Any] | None:
+    """The first stage that others need, and that has not run and may not; None where there is none.
+
+    Raises:
+        InputError: If a stage that may run needs it.
+    """
+    if not only:
+        return None
+    for i, stage in enumerate(STAGES):
+        if stage.optional or stage.name in (*only, REPORT.name):
+            continue
+        stored = context.stored(stage)
+        if stored is not None and not stored.unfit:
+            continue
+        later = [s.name for s in STAGES[i:] if s.name in only and s is not REPORT]
+        if later:
+            why = f"has not run in {context.out}" if stored is None else f"must run again: {stored.unfit}"
+            raise InputError(f"stage {stage.name} {why}, and {later[0]} needs it; leave --only out")
+        return stage
+    return None
+
+
 def _as_it_is(context: Context, stage: Stage[Any]) -> str:
     """Take a stage as the folder holds it."""
     stored = context.stored(stage)
     if stored is None or stored.unfit:
-        if not stage.optional:
-            why = f"has not run in {context.out}" if stored is None else f"must run again: {stored.unfit}"
-            raise InputError(f"stage {stage.name} {why}; leave --only out")
         context.leave_out(stage, f"stage {stage.name} was left out")
         return "left out"
     why = changed(stored.keys, stage.keys(context))

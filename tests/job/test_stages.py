@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, RunSettings, load, load_scenario
+from hybrid_mpc.job import run as job
 from hybrid_mpc.job.context import Context, Progress
-from hybrid_mpc.job.run import NAMES, STAGES, _as_it_is
+from hybrid_mpc.job.run import NAMES, STAGES, _as_it_is, _end
 from hybrid_mpc.job.stage import (
     UNKNOWN,
     Absent,
@@ -112,6 +113,22 @@ def test_only_and_skip(own, call):
         assert (code, told in message.replace("\n", " ")) == (2, True)
 
 
+def test_only_the_first_stages_of_a_new_run(own, call, tmp_path):
+    """The fit alone is no error; what cannot run is refused before there is a folder."""
+    _, _, command = own
+    words = [*command[: command.index("--out")], "--out", str(tmp_path / "new")]
+    code, _, message = call(*words, "--only", "guard")
+    assert code == 2
+    assert "stage data has not run in" in message
+    assert "guard needs it" in message
+    assert not (tmp_path / "new").exists()
+    code, told, message = call(*words, "--only", "data", "--only", "prior")
+    assert code == 0, message
+    assert "the run ends here: later stages have not run" in told
+    assert "This run goes on" in (tmp_path / "new" / "report.html").read_text()
+    assert not (tmp_path / "new" / "results.json").exists()
+
+
 @pytest.mark.full
 def test_what_lies_outside_the_stage_s_file_is_missed(own, call):
     _, out, command = own
@@ -196,14 +213,15 @@ def test_a_result_of_another_version_is_computed_again_and_that_is_said(context)
     assert bring_up_to_date(again, one(None)) == "up to date"
 
 
-def test_only_does_not_take_a_result_of_another_version(context):
+def test_only_does_not_take_a_result_of_another_version(context, monkeypatch):
     old = Stage("sum", "adding up", OldSum, lambda context: OldSum(1.0, 1.0, {}), one(None).reads)
     bring_up_to_date(context, old)
     fresh = Context(context.settings, context.scenario, context.out)
+    monkeypatch.setattr(job, "STAGES", (one(None), replace(one(None), name="later")))
     with pytest.raises(
-        InputError, match=r"stage sum must run again: another version wrote .* leave --only out"
+        InputError, match=r"stage sum must run again: another version wrote .*, and later needs it"
     ):
-        _as_it_is(fresh, one(None))
+        _end(fresh, ("later",))
     assert _as_it_is(fresh, one(None, optional=True)) == "left out"
 
 
