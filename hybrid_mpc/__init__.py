@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     )
     from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
     from hybrid_mpc.control.best_of import BestOf
+    from hybrid_mpc.control.move import Move, shortest_move
     from hybrid_mpc.control.nlp import IpoptController
     from hybrid_mpc.control.ocp import OCP, Limits
     from hybrid_mpc.control.problem import Status
@@ -152,8 +153,6 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
-    "__version__",
-    "plots",
     "Balance",
     "Bench",
     "BenchmarkBudget",
@@ -198,6 +197,7 @@ __all__ = [
     "MechanicalPrior",
     "Mode",
     "ModelInfo",
+    "Move",
     "OCP",
     "OffsetFree",
     "OperatingPoint",
@@ -238,6 +238,7 @@ __all__ = [
     "Viscous",
     "Window",
     "ZeroPhaseFilter",
+    "__version__",
     "balanced_truncation",
     "check_excitation",
     "check_parity",
@@ -300,6 +301,7 @@ __all__ = [
     "parameter_sensitivities",
     "parameter_states",
     "physical_states",
+    "plots",
     "prbs",
     "predict",
     "process_noise",
@@ -315,6 +317,7 @@ __all__ = [
     "score",
     "set_calibration",
     "set_process_noise",
+    "shortest_move",
     "simulate",
     "sinusoid",
     "steady_filter",
@@ -344,6 +347,7 @@ _ROOMS = {
     ),
     "analyze.sensitivity": ("parameter_sensitivities",),
     "control.best_of": ("BestOf",),
+    "control.move": ("Move", "shortest_move"),
     "control.nlp": ("IpoptController",),
     "control.ocp": ("Limits", "OCP"),
     "control.problem": ("Status",),

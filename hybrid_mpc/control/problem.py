@@ -151,12 +151,17 @@ class SoftRows:
         each = [
             np.hstack([g.rows for g in block]) for block in blocks
         ]  # of a period; rows go period by period
-        lower, upper, self.linear, self.quadratic, hard = np.hstack([np.tile(rows, n) for rows in each])
+        lower, upper, self.linear, self.quadratic, hard, at_end = np.hstack(
+            [np.tile(rows, n) for rows in each]
+        )
         sizes = [rows.shape[1] for rows in each]
         self.hard = hard > 0
         self.stage = np.concatenate(
             [np.repeat(np.arange(n) + (b == 0), size) for b, size in enumerate(sizes)]
         )
+        last = np.concatenate([np.full(n * size, n - (b > 0)) for b, size in enumerate(sizes)])
+        before = (at_end > 0) & (self.stage < last)
+        lower, upper = np.where(before, -np.inf, lower), np.where(before, np.inf, upper)
         move = [np.repeat([size] * (n - 1) + [0], size) for size in sizes]
         self.later = np.arange(self.stage.size) + np.concatenate(move)
         self.names = tuple(name for block in blocks for name in n * sum((g.names for g in block), ()))
@@ -253,7 +258,8 @@ class SoftRows:
 class _Bounded:
     """What is bounded in a period: states, or the values of a function ``(x, u, e)``.
 
-    ``rows`` ``(5, n)`` are lower and upper bounds, linear and quadratic penalties, and 1 for hard bounds.
+    ``rows`` ``(6, n)`` are lower and upper bounds, linear and quadratic penalties, 1 for hard bounds, and 1 for those
+    of the end alone.
     """
 
     function: ca.Function | None
@@ -280,14 +286,18 @@ def _bounded(ocp: OCP, model: HybridModel | None) -> list[_Bounded]:
     def outputs(model: HybridModel, *rows: Array) -> _Bounded:
         return _Bounded(_outputs(model, ocp.n_p), none, np.array(rows), y_names)
 
-    found = [states(ocp.x_min, ocp.x_max, *ocp.penalties, np.zeros(ocp.n_x))]
+    found = [states(ocp.x_min, ocp.x_max, *ocp.penalties, *np.zeros((2, ocp.n_x)))]
     found += [
         states(*_hard_rows(b, ocp, ocp.q)) for b in ocp.hard if isinstance(b.what, str) and b.what == "x"
     ]
     for b in ocp.soft:
-        found.append(values(b.expression, b.lower, b.upper, b.linear, b.quadratic, np.zeros(b.lower.size)))
+        found.append(
+            values(b.expression, b.lower, b.upper, b.linear, b.quadratic, *np.zeros((2, b.lower.size)))
+        )
     if ocp.y_min.size and model is not None:
-        found.append(outputs(model, *output_bounds(ocp.q_y, ocp.y_min, ocp.y_max), np.zeros(ocp.y_min.size)))
+        found.append(
+            outputs(model, *output_bounds(ocp.q_y, ocp.y_min, ocp.y_max), *np.zeros((2, ocp.y_min.size)))
+        )
     for hard in ocp.hard:
         if not isinstance(hard.what, str):
             found.append(values(hard.what, *_hard_rows(hard, ocp)))
@@ -297,14 +307,21 @@ def _bounded(ocp: OCP, model: HybridModel | None) -> list[_Bounded]:
 
 
 def _hard_rows(bound: HardBound, ocp: OCP, weights: Array | None = None) -> list[Array]:
-    """Bounds of a hard bound, the penalties by which it gives way, and that it is hard ``(n,)`` each."""
+    """Bounds of a hard bound, the penalties by which it gives way, that it is hard, and of the end, ``(n,)`` each."""
     ranks = sorted({b.priority for b in ocp.hard})
     size, range_ = bound.sizes, ocp.input_range
     cost = np.full(size.size, max(1.0, float(np.max((ocp.r + ocp.r_delta) * range_**2))))
     if weights is not None and weights.size:
         cost = np.maximum(cost, weights * size**2)
     linear = GIVES_WAY * HIGHER ** ranks.index(bound.priority) * cost / size
-    return [bound.lower, bound.upper, linear, linear / size, np.ones(size.size)]
+    return [
+        bound.lower,
+        bound.upper,
+        linear,
+        linear / size,
+        np.ones(size.size),
+        np.full(size.size, bound.at_end),
+    ]
 
 
 def _first_stages(model: HybridModel, functions: tuple[ca.Function, ...]) -> tuple[Array, list[Array]]:

@@ -110,9 +110,11 @@ class HardBound:
         lower: ``(n,)``; ``-inf`` for none.
         upper: ``(n,)``; ``inf`` for none.
         priority: Bounds with a higher one are kept longer. Default: 0.
+        at_end: Whether it holds at the end of the plan alone: states in ``x_N``, outputs and expressions in the last
+            period. A target, or a set from which the rest is safe. Default: everywhere.
 
     Raises:
-        InputError: If shapes do not fit, bounds cross, or the priority is no whole number.
+        InputError: If shapes do not fit, bounds cross, the priority is no whole number, or ``at_end`` is neither.
 
     Example:
         >>> level = HardBound("x", [0.0, 0.0], [0.5, np.inf])
@@ -124,9 +126,15 @@ class HardBound:
     lower: Array
     upper: Array
     priority: int
+    at_end: bool
 
     def __init__(
-        self, what: str | ca.Function, lower: ArrayLike, upper: ArrayLike, priority: int = 0
+        self,
+        what: str | ca.Function,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        priority: int = 0,
+        at_end: bool = False,
     ) -> None:
         if what not in ("x", "y") if isinstance(what, str) else not _is_expression(what):
             raise InputError(
@@ -135,6 +143,8 @@ class HardBound:
             )
         if not isinstance(priority, int) or isinstance(priority, bool):
             raise InputError(f"hard bound: priority must be a whole number, got {priority!r}")
+        if not isinstance(at_end, bool):
+            raise InputError(f"hard bound: at_end must be True or False, got {at_end!r}")
         low, up = numbers(lower, "hard bound: lower"), numbers(upper, "hard bound: upper")
         n = low.size if isinstance(what, str) else int(what.size1_out(0))
         one = np.ones(n)
@@ -144,6 +154,7 @@ class HardBound:
             ("lower", fixed(low)),
             ("upper", fixed(up)),
             ("priority", priority),
+            ("at_end", at_end),
         ):
             object.__setattr__(self, name, value)
 
@@ -174,11 +185,11 @@ def _is_expression(f: object) -> bool:
 
 
 def tightest(lower: Array, upper: Array, hard: Sequence[HardBound], what: str, n: int) -> tuple[Array, Array]:
-    """Bounds ``(n,)`` of states or outputs, soft ones (which may be empty) and hard ones."""
+    """Bounds ``(n,)`` of states or outputs, soft ones (which may be empty) and hard ones of all periods."""
     low = lower.copy() if lower.size else np.full(n, -np.inf)
     up = upper.copy() if upper.size else np.full(n, np.inf)
     for bound in hard:
-        if isinstance(bound.what, str) and bound.what == what:
+        if isinstance(bound.what, str) and bound.what == what and not bound.at_end:
             low, up = np.maximum(low, bound.lower), np.minimum(up, bound.upper)
     return low, up
 
