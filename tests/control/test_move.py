@@ -82,7 +82,7 @@ def test_a_nonlinear_machine_with_hidden_state():
         (HardBound("x", [0.9, -0.1], [1.1, 0.1]), {}, r"needed: a HardBound\(..., at_end=True\)"),
         (HardBound("y", [0.9], [1.1], at_end=True), {}, "give a row of it"),
         (
-            rest_at(5.0),
+            rest_at(0.1, 1e-2),
             {"longest": 8},
             r"no move of 8 periods \(0.4 s\) ends within the target; .* misses x0 by",
         ),
