@@ -6,6 +6,7 @@ All are ``(s, h) -> (output, h_next)``; the hidden state h is an explicit vector
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -114,16 +115,17 @@ class StackedGRU(nn.Module):
         network.load_state_dict({n: w[i].T if "weight" in n else w[i, 0] for n, w in stacked.items()})
         return network
 
-    def joined(self) -> GRUNetwork:
-        """All networks as one, whose output is the mean of theirs; its hidden state is theirs, one after the other.
+    def joined(self, shares: Sequence[float]) -> GRUNetwork:
+        """All networks as one, whose output is a mean of theirs; its hidden state is theirs, one after the other.
 
-        Its recurrent weights are block-diagonal: the networks do not see each other.
+        Its recurrent weights are block-diagonal: the networks do not see each other. ``shares`` ``(networks,)`` of the
+        mean sum up to one.
 
         Example:
             >>> stack = StackedGRU(2, 3, 4, 1, seed=0).requires_grad_(False)
             >>> s, h = torch.ones(3, dtype=torch.float64), torch.zeros(4, dtype=torch.float64)
             >>> each = [stack.member(i)(s, h)[0] for i in range(2)]
-            >>> out, h = stack.joined()(s, torch.zeros(8, dtype=torch.float64))
+            >>> out, h = stack.joined([0.5, 0.5])(s, torch.zeros(8, dtype=torch.float64))
             >>> bool(torch.allclose(out, sum(each) / 2)), tuple(h.shape)
             (True, (8,))
         """
@@ -134,6 +136,7 @@ class StackedGRU(nn.Module):
             """Gates of each network ``(m, n, 3 z)`` as gates of all, each gate whole ``(3 m z, n)``."""
             return weight.mT.unflatten(1, (3, z)).transpose(0, 1).reshape(3 * m * z, -1)
 
+        share = torch.tensor(shares, dtype=torch.float64)[:, None, None]
         of = torch.arange(m).repeat_interleave(z)  # which network a unit is of
         recurrent = rows(self.w_hh).repeat(1, m) * (of.repeat(3)[:, None] == of)
         network.load_state_dict(
@@ -142,8 +145,8 @@ class StackedGRU(nn.Module):
                 "cell.weight_hh": recurrent,
                 "cell.bias_ih": rows(self.b_ih)[:, 0],
                 "cell.bias_hh": rows(self.b_hh)[:, 0],
-                "head.weight": self.w_out.flatten(0, 1).T / m,
-                "head.bias": self.b_out.mean(0)[0],
+                "head.weight": (share * self.w_out).flatten(0, 1).T,
+                "head.bias": (share * self.b_out).sum(0)[0],
             }
         )
         return network

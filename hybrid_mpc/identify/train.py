@@ -159,13 +159,21 @@ class Trained:
         return np.argsort(self.validation, kind="stable")
 
     @property
-    def usable(self) -> list[int]:
-        """Networks whose validation is finite; all, if that of none is."""
-        finite = np.flatnonzero(np.isfinite(self.validation))
-        return (finite if finite.size else np.arange(len(self.validation))).tolist()
+    def shares(self) -> NDArray[np.float64]:
+        """Share of each network in the mean ``(networks,)``: by one over the square of its validation error.
+
+        So are guesses weighed whose errors have nothing to do with each other. A network without finite validation has
+        none, unless none has one; then all have the same.
+        """
+        finite = np.isfinite(self.validation)
+        if not finite.any():
+            return np.full(finite.size, 1.0 / finite.size)
+        least = max(float(self.validation[finite].min()), 1e-300)
+        weight = np.where(finite, np.square(least / np.maximum(self.validation, least)), 0.0)
+        return np.asarray(weight / weight.sum())
 
     def step(self, prior: Prior, dt: float, i: int | None = None) -> RecurrentStep:
-        """The model: the mean of all usable networks' corrections as one network; or network ``i`` alone.
+        """The model: the mean of the networks' corrections (:attr:`shares`) as one network; or network ``i`` alone.
 
         Each network has left out another part of the data, so each errs elsewhere, and the mean errs less than the one
         that validation ranks first. It is around the prior's parameters that were trained along, or their mean.
@@ -173,9 +181,10 @@ class Trained:
         """
         values = self.prior_values(i)
         shift = shift_to(prior, values) if values else None
-        which = self.usable if i is None else [i]
+        which = np.flatnonzero(self.shares) if i is None else [i]
+        shares = (self.shares[which] if i is None else np.ones(1)).tolist()
         own = {n: torch.tensor(w[which]) for n, w in self.weights.items() if not n.startswith(PREFIX)}
-        return self._step(prior, dt, own, lambda stack: stack.joined(), shift)
+        return self._step(prior, dt, own, lambda stack: stack.joined(shares), shift)
 
     def steps(self, prior: Prior, dt: float) -> list[RecurrentStep]:
         """The steps of all networks, each alone, in their ranking."""
@@ -188,8 +197,8 @@ class Trained:
 
     def prior_values(self, i: int | None = None) -> dict[str, float]:
         """Values [SI] of the parameters trained along with network ``i``, or their mean; empty if none were."""
-        which = self.usable if i is None else [i]
-        own = {n: w[which].mean() for n, w in self.weights.items() if n.startswith(PREFIX)}
+        shares = self.shares if i is None else np.eye(len(self.validation))[i]
+        own = {n: shares @ w for n, w in self.weights.items() if n.startswith(PREFIX)}
         return {n.removeprefix(PREFIX): float(value) for n, value in own.items()}
 
     def _step(

@@ -104,7 +104,10 @@ def test_the_model_is_the_mean_of_its_networks(data):
     h = [torch.rand(3, SETTINGS.hidden).double() for _ in alone]
     mean, after = model.correction(x, torch.cat(h, dim=1), u, w)
     each = [step.correction(x, own, u, w) for step, own in zip(alone, h, strict=True)]
-    np.testing.assert_allclose(mean, sum(out for out, _ in each) / 2, rtol=1e-12, atol=1e-15)
+    shares = np.square(1 / trained.validation) / np.sum(np.square(1 / trained.validation))
+    assert shares[0] != pytest.approx(shares[1])
+    want = sum(share * out for share, (out, _) in zip(shares, each, strict=True))
+    np.testing.assert_allclose(mean, want, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(after, torch.cat([own for _, own in each], dim=1), rtol=1e-12, atol=1e-15)
     assert (each[0][0] - each[1][0]).abs().max() > 1e-6
 
