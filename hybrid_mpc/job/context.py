@@ -47,12 +47,16 @@ class Progress:
 
 @dataclass(frozen=True)
 class Context:
-    """A run in its folder: what it computes, the machine, and where it reports to."""
+    """A run in its folder: what it computes, the machine, and where it reports to.
+
+    ``pictures`` are those that this process has drawn, by part of the report: section, file, caption.
+    """
 
     settings: RunSettings
     scenario: Scenario
     out: Path
     progress: Progress = field(default_factory=Progress)
+    pictures: dict[str, list[tuple[str, Path, str]]] = field(default_factory=dict, repr=False, compare=False)
     _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @property

@@ -64,11 +64,17 @@ def draw_first(context: Context) -> Figures:
 
 
 def _draw(context: Context, parts: Sequence[Callable[[Context], Any]]) -> Figures:
+    """Figures of some parts by section; what this process has drawn of the run's results is not drawn again."""
     figures: Figures = {}
     for i, part in enumerate(parts):
-        context.progress.update("figures", i, len(parts), part.__name__.strip("_"))
-        for section, name, figure, caption in part(context):
-            path = save(figure, context.out / "figures" / f"{name}.png")
+        name_of_part = part.__name__.strip("_")
+        context.progress.update("figures", i, len(parts), name_of_part)
+        if name_of_part not in context.pictures:
+            context.pictures[name_of_part] = [
+                (section, save(figure, context.out / "figures" / f"{name}.png"), caption)
+                for section, name, figure, caption in part(context)
+            ]
+        for section, path, caption in context.pictures[name_of_part]:
             figures.setdefault(section, []).append((path, caption))
     return figures
 
