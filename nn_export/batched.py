@@ -107,7 +107,8 @@ class Batched:
         """The same by torch operators; the leading axes of the arguments are broadcast to ``shape``."""
         self.check_walkable()
         assert self.steps is not None
-        columns = [a.unbind(-1) for a in args]
+        exporting = torch.compiler.is_exporting()  # unbind would have to be decomposed, which takes long
+        columns = [[a.select(-1, i) for i in range(a.shape[-1])] if exporting else a.unbind(-1) for a in args]
         slots: dict[int, Any] = {}
         results: list[list[Any]] = [[None] * self.function.nnz_out(i) for i in range(self.function.n_out())]
         for step in self.steps:

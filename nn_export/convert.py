@@ -57,6 +57,15 @@ def convert(exported: torch.export.ExportedProgram, input_names: list[str], n_ou
     return tuple(nodes), sources, {k: v for k, v in weights.items() if k in used}, inputs
 
 
+def understood(exported: torch.export.ExportedProgram) -> bool:
+    """Whether every operator of a program that was not decomposed is one of :data:`OPERATORS`.
+
+    What writes into a tensor is none of them, so nothing is missed that decomposing would bring to light.
+    """
+    calls = (n for n in exported.graph.nodes if n.op not in ("placeholder", "output"))
+    return all(str(n.target) in _SKIPPED or op_name(n) in OPERATORS for n in calls)
+
+
 def _weight_refs(data: Any) -> list[Reference]:
     if isinstance(data, dict):
         return [data] if set(data) == {"weight"} else [r for v in data.values() for r in _weight_refs(v)]

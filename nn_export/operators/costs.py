@@ -489,7 +489,7 @@ def _layers(
 MOVEMENTS: dict[str, Rule] = {
     "aten.alias.default": _same, "aten.clone.default": _same, "aten.detach.default": _same,
     "aten.lift_fresh_copy.default": _same, "aten.contiguous.default": _same, "aten.slice.Tensor": _part,
-    "aten.select.int": _part, "aten.unsqueeze.default": _part, "aten.squeeze.dims": _part,
+    "aten.select.int": _part, "aten.unsqueeze.default": _part, "aten.squeeze.dims": _part, "aten.squeeze.dim": _part,
     "aten.view.default": _view, "aten.reshape.default": _view, "aten._unsafe_view.default": _view,
     "aten.permute.default": _part, "aten.transpose.int": _part, "aten.t.default": _part,
     "aten.expand.default": _expand, "aten.repeat.default": _repeat, "aten.flip.default": _part,

@@ -36,9 +36,9 @@ def unsqueeze(self: Value, dim: int) -> Value:
     return move(self, np.expand_dims(self.positions, dim))
 
 
-def squeeze(self: Value, dim: Sequence[int]) -> Value:
+def squeeze(self: Value, dim: int | Sequence[int]) -> Value:
     """Drops those of the named axes that have size 1."""
-    axes = tuple(d for d in dim if self.shape[d] == 1)
+    axes = tuple(d for d in ([dim] if isinstance(dim, int) else dim) if self.shape[d] == 1)
     return move(self, np.squeeze(self.positions, axis=axes))
 
 
@@ -229,6 +229,7 @@ OPERATORS: dict[str, Callable[..., Value | tuple[Value, ...]]] = {
     "aten.alias.default": same, "aten.clone.default": same, "aten.detach.default": same,
     "aten.lift_fresh_copy.default": same, "aten.contiguous.default": same, "aten.slice.Tensor": slice_,
     "aten.select.int": select, "aten.unsqueeze.default": unsqueeze, "aten.squeeze.dims": squeeze,
+    "aten.squeeze.dim": squeeze,
     "aten.view.default": view, "aten.reshape.default": view, "aten._unsafe_view.default": view,
     "aten.permute.default": permute, "aten.transpose.int": transpose, "aten.t.default": t,
     "aten.expand.default": expand, "aten.repeat.default": repeat, "aten.flip.default": flip,
