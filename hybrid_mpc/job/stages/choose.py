@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.identify.bands import FAR, RunParts, fit_bands, run_variance
 from hybrid_mpc.identify.choose import Choice, recommend
-from hybrid_mpc.identify.evaluate import FreeRun, free_runs, unseen_runs
+from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, free_runs, unseen_runs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
@@ -44,10 +44,10 @@ class ChoiceResult:
 
 
 def choice_stage(context: Context) -> ChoiceResult:
-    """Free runs of all candidates, as long as those on unseen data, over what no network saw.
+    """Free runs of all candidates, as long as those on unseen data, over what no network was trained on.
 
-    That are the validation recordings, and of the training ones the part that each network left out: it is the one that
-    runs there.
+    Of the training recordings that is the part that each network left out: it runs there alone. So the model is chosen.
+    The bands are calibrated on the validation recordings, too, to which the prior was not fitted.
     """
     prior, spec, warm = context.prior, context.spec, context.warm
     phy = context.scenario.prior(prior.fit.values)
@@ -57,23 +57,28 @@ def choice_stage(context: Context) -> ChoiceResult:
     runs = unseen_runs(
         settings, context.smoothed("train"), context.smoothed("valid"), smoother, spec.free_run
     )
+    calibrating = list(runs)
+    if all(own is not None for own, _ in runs):
+        validation = evaluation_trajectories(context.smoothed("valid"), smoother, warm, spec.free_run)
+        calibrating.append((None, validation))
+    judging = sum(len(them) for _, them in runs)
     errors: dict[str, list[Array]] = {}
     bands: dict[str, Bands] = {}
     for i, name in enumerate(candidates):
         context.progress.update("candidates", i, len(candidates), name)
         judged = [
             judge
-            for own, them in runs
+            for own, them in calibrating
             for judge in zip(
                 *(free_runs(step, phy, them, warm) for step in runners(context, name, phy, own)), strict=True
             )
         ]
-        errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in judged]
+        errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in judged[:judging]]
         bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*judged, strict=True)), spec.dt))
     samples = max(1, round(context.time_unit / spec.dt))
     recordings = [t.file for _, them in runs for t in them]
     found = recommend(errors, deploy=context.settings.deploy, samples=samples, recordings=recordings)
-    longest = max((len(t.t) - warm - 2) * spec.dt for _, them in runs for t in them)
+    longest = max((len(t.t) - warm - 2) * spec.dt for _, them in calibrating for t in them)
     return ChoiceResult(found, bands, longest)
 
 
