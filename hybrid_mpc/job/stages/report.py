@@ -505,7 +505,7 @@ def _band_table(context: Context, found: Identification) -> Table:
     what = ("mean width", "interval score", "of a constant band")
     columns = ("model", "output", "is to hold", "all hold", *what)
     caption = (
-        "Bands around free runs, calibrated on validation recordings, on unseen data, in the outputs' units; a low "
+        "Bands around free runs, calibrated on what was not trained on, on unseen data, in the outputs' units; a low "
         "score is good."
     )
     return Table(columns, rows, caption)
