@@ -17,6 +17,8 @@ from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+RUN = 5000
+"""Periods of a run that leads to a rest where Newton's method does not."""
 RESIDUAL = 1e-10
 ITERATIONS = 50
 STARTS = 64
@@ -30,6 +32,9 @@ MARGINAL = 1e-7
 def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[Array, Array]:
     """The equilibrium ``x`` ``(n_x,)``, ``h`` ``(n_h,)`` under a held input, by Newton's method from a guess of ``x``.
 
+    Where it does not end there, it begins anew from where the model's own run has come to, which finds a rest that is
+    stable.
+
     Raises:
         InputError: If a size is wrong or none is found (largest residual above 1e-10 in the units of the state).
     """
@@ -37,11 +42,22 @@ def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[A
     start = np.concatenate([x0, _settled(model, x0, u0)])
     found, size = _newton(_change(model), start, u0)
     if size > RESIDUAL:
+        found, size = _newton(_change(model), _run(model, start, u0), u0)
+    if size > RESIDUAL:
         raise InputError(
             f"model {model.name}: no fixed point found from x = {x0.tolist()} under u = {u0.tolist()} "
             f"(residual {size:.2g}, needed {RESIDUAL:g}); give a nearer x_guess or an input it can rest under"
         )
     return found[: model.n_x], found[model.n_x :]
+
+
+def _run(model: HybridModel, z: Array, u: Array) -> Array:
+    """States and hidden states ``(n_z,)`` that the model's own run comes to; where it diverges, the start."""
+    x, h = z[: model.n_x], z[model.n_x :]
+    for _ in range(RUN):
+        x, h = (v.full().ravel() for v in model.step(x, h, u, model.w, model.p))
+    after = np.concatenate([x, h])
+    return after if np.all(np.isfinite(after)) else z
 
 
 def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:

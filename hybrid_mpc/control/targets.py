@@ -17,6 +17,8 @@ from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
+SETTLING = 6
+"""Steps of Newton's method at most by which a hidden state is brought to rest."""
 ITERATIONS = 60
 STEADY = 1e-9
 """Largest step, in scales of the unknowns, at which Newton's method has converged."""
@@ -207,10 +209,10 @@ class Targets:
                 done = at.lacks <= STILL
                 break
             share = 1.0
-            after = self._point(at.v + step, goal, d, w)
+            after = self._settled(at.v + step, goal, d, w)
             while not after.merit < at.merit and share > LEAST_SHARE:
                 share *= 0.5
-                after = self._point(at.v + share * step, goal, d, w)
+                after = self._settled(at.v + share * step, goal, d, w)
             if not after.merit < at.merit:
                 done = size < 1e-5 and at.lacks <= STILL  # rounding is all that is left
                 break
@@ -260,6 +262,25 @@ class Targets:
             upper.append((high - now)[k] / scale[places[k]] - onto[places[k]])
         eta = bounded_least_squares(h, g, np.vstack(rows), np.concatenate(lower), np.concatenate(upper))
         return None if eta is None else (onto + along @ eta) * scale
+
+    def _settled(self, v: Array, goal: Array, d: Array, w: Array) -> _Point:
+        """The point with the hidden state at rest under its state and input, by Newton's method; as it is where that
+        does not end there. What a network does between two rests says nothing of how far the machine is from one.
+        """
+        plain = at = self._point(v, goal, d, w)
+        hidden = slice(self.model.n_x, self._n_z)
+        for _ in range(SETTLING if self.model.n_h else 0):
+            off = at.rest[hidden]
+            if not np.all(np.isfinite(at.rest)) or np.max(np.abs(off)) < STEADY:
+                break
+            try:
+                move = np.linalg.solve(at.rest_by_v[hidden, hidden], -off)
+            except np.linalg.LinAlgError:
+                return plain
+            v = at.v.copy()
+            v[hidden] += move
+            at = self._point(v, goal, d, w)
+        return at if at.merit < plain.merit else plain
 
     def _point(self, v: Array, goal: Array, d: Array, w: Array) -> _Point:
         """What descents need to know of ``v``; the merit is infinite where something is not finite."""
