@@ -246,6 +246,9 @@ class OCP:
         names = [field.name for field in dataclass_fields(self)]
         for name in fields:
             known(name, names, "field of a control problem")
+        if "q" in fields and np.size(fields["q"]) != self.n_x:  # bounds that bound nothing have no size
+            free = (name for name in ("x_min", "x_max") if not np.any(np.isfinite(getattr(self, name))))
+            fields = {**dict.fromkeys(free), **fields}
         return replace(self, **fields)
 
     def __eq__(self, other: object) -> bool:

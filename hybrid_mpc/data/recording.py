@@ -495,8 +495,8 @@ def _factor(column: str, unit: str | float, signal: Signal) -> float:
     """What a column's numbers are multiplied by to be in the signal's unit."""
     if isinstance(unit, str):
         known = {signal.unit: 1.0, **UNITS.get(signal.unit, {})}
-        if unit in known:
-            return known[unit]
+        if size := known.get(unit) or factor(unit, signal.unit):
+            return size
         raise InputError(
             f"data specification: unit {unit!r} of column {column!r} is none for {signal.label}; there are: "
             f"{', '.join(known)}. Or give the factor to {signal.unit} as a number."

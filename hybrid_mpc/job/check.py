@@ -507,8 +507,9 @@ def _check_task(
                 raise InputError("weight: factors must not be negative")
             if name == "reference":
                 _check_within(name, values[:, : len(signals)], t, signals)
-                if isinstance(control, OCP) and rest is not None and not by_output:
-                    _check_set_point(report, task, values[:, :n_x], control, prior, rest)
+                if isinstance(control, OCP) and rest is not None:
+                    set_points = values[:, : len(signals)]
+                    _check_set_point(report, task, set_points, control, prior, rest, by_output)
 
 
 def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal]) -> None:
@@ -524,19 +525,23 @@ def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal])
 
 
 def _check_set_point(
-    report: Report, task: Task, reference: Array, control: OCP, prior: Prior, rest: Rest
+    report: Report, task: Task, reference: Array, control: OCP, prior: Prior, rest: Rest, by_output: bool
 ) -> None:
-    """Where a reference comes to rest, the inputs' limits let the machine rest, too."""
+    """Where a reference of states or outputs comes to rest, the inputs' limits let the machine rest, too."""
     n_x, n_u = len(prior.states), len(prior.inputs)
     last = reference[-max(2, len(reference) // 10) :]
-    weights = np.sqrt(control.q) if len(control.q) == n_x else np.zeros(n_x)
-    if np.ptp(last, axis=0).any() or not weights.any() or len(control.u_min) != n_u:
+    weights, signals = (control.q_y, prior.outputs) if by_output else (control.q, prior.states)
+    if len(weights) != len(signals) or len(control.q) != n_x or len(control.u_min) != n_u:
+        return
+    tied = weights > 0
+    if np.ptp(last, axis=0)[tied].any() or not tied.any():
         return
     from scipy.optimize import least_squares  # takes longer to import than the search takes
 
-    target, sizes = last[-1], _sizes(prior.states, last[-1])
-    tied = weights > 0
-    first = np.concatenate([np.where(tied, target, rest.x), np.clip(rest.u, control.u_min, control.u_max)])
+    target, sizes, wanted = last[-1], _sizes(prior.states, rest.x), _sizes(signals, last[-1])
+    first = np.concatenate([rest.x, np.clip(rest.u, control.u_min, control.u_max)])
+    if not by_output:
+        sizes, first[:n_x] = wanted, np.where(tied, target, rest.x)
     low = np.concatenate([np.full(n_x, -np.inf), control.u_min])
     high = np.concatenate([np.full(n_x, np.inf), control.u_max])
     span = np.concatenate([sizes, control.input_range])
@@ -545,13 +550,19 @@ def _check_set_point(
 
     def misses(z: Array) -> Array:
         rates = prior.equations.xdot(z[:n_x], z[n_x:], rest.w, prior.p).full().ravel()
-        return np.concatenate([1e3 * second * rates / sizes, ((z[:n_x] - target) / sizes)[tied]])
+        return np.concatenate([1e3 * second * rates / sizes, ((shown(z) - target) / wanted)[tied]])
+
+    def shown(z: Array) -> Array:
+        if not by_output:
+            return z[:n_x]
+        y: Array = prior.equations.output(z[:n_x], z[n_x:], rest.w, prior.p).full().ravel()
+        return y
 
     found = least_squares(misses, first, bounds=(low, high), x_scale=span)
-    missed = np.abs(found.x[:n_x] - target) / sizes
-    if (missed[tied] > REACHED).any():
+    nearest, what = shown(found.x), "y" if by_output else "x"
+    if (np.abs(nearest - target)[tied] / wanted[tied] > REACHED).any():
         report.warn(
-            f"task {task.name}: its reference comes to rest at x = {target.round(6).tolist()}, which no input within "
-            f"its limits holds; the nearest point of rest is x = {(found.x[:n_x].round(4) + 0.0).tolist()} under u = "
-            f"{found.x[n_x:].round(4).tolist()}"
+            f"task {task.name}: its reference comes to rest at {what} = {target.round(6).tolist()}, which no input "
+            f"within its limits holds; the nearest point of rest is {what} = {(nearest.round(4) + 0.0).tolist()} under "
+            f"u = {found.x[n_x:].round(4).tolist()}"
         )

@@ -266,3 +266,11 @@ def test_a_problem_is_stated_without_torch_and_scipy():
         "assert not {'torch', 'scipy', 'daqp'} & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_another_number_of_states_needs_no_new_bounds_where_none_bound_anything():
+    ocp = OCP(10, [1.0, 2.0], [0.1], [0.0], [-1.0], [1.0])
+    wider = ocp.changed(q=(1.0, 2.0, 3.0))
+    assert (wider.n_x, wider.x_max.size) == (3, 3)
+    with pytest.raises(InputError, match="3 needed"):
+        ocp.changed(x_max=[1.0, np.inf]).changed(q=(1.0, 2.0, 3.0))

@@ -7,6 +7,7 @@ from machine_signals import machine
 from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
+from hybrid_mpc.data.recording import check_unit
 from hybrid_mpc.data.trajectories import hold_mean
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
@@ -174,3 +175,13 @@ def test_too_short_a_recording_is_told_how_long_one_must_be(tmp_path):
     assert {t.role for t in read(needed + 0.02).trajectories} == {"train", "valid", "test"}
     with pytest.raises(InputError, match=r"no piece of 0\.7 s"):
         read(needed - 0.2)
+
+
+def test_units_of_the_specification_are_those_of_a_header():
+    """Whatever a column's header may name, ``units`` may name, too."""
+    spec = DataSpec("t", ("heater",), ("flow",), dt=1.0, max_gap=2.0, smoothing=5.0, warm_up=5.0,
+                    units={"heater": "W", "flow": "m^3/h"})  # fmt: skip
+    check_unit(spec, "heater", Signal("heater", "kW"))
+    check_unit(spec, "flow", Signal("flow", "l/min"))
+    with pytest.raises(InputError, match=r"unit 'W' of column 'heater' is none for heater \[K\]"):
+        check_unit(spec, "heater", Signal("heater", "K"))

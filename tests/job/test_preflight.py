@@ -573,3 +573,15 @@ def test_a_set_point_of_outputs_that_cannot_be_is_told(changed, words):
         check_scenario(rainy(tasks=(task,)))
     for word in words:
         assert word in str(told.value)
+
+
+def test_a_set_point_of_outputs_that_no_input_holds_is_told():
+    """At most 0.2 flows in: 1.9 m are within the signal's range and out of reach."""
+    task, weak = (
+        dataclasses.replace(rainy().tasks[0], reference=filled(1.9)),
+        rainy().control.changed(u_max=(0.2,)),
+    )
+    found = check_scenario(rainy(tasks=(task,), control=weak))
+    (told,) = [w for w in found.warnings if "comes to rest" in w]
+    assert "its reference comes to rest at y = [1.9], which no input within its limits holds" in told
+    assert "under u = [0.2]" in told
