@@ -13,6 +13,7 @@ from scipy.signal import max_len_seq
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.machine.specification import DataSpec
 
 Array = NDArray[np.float64]
 NOTHING = 1e-6
@@ -385,3 +386,21 @@ def _hann_spectrum(u: Array, dt: float) -> tuple[Array, Array]:
     amplitude: Array = 2 * np.abs(np.fft.rfft((u - mean) * window)) / window.sum()
     amplitude[0] = 0.0
     return np.asarray(np.fft.rfftfreq(n, dt), dtype=np.float64), amplitude
+
+
+def short_runs(spec: DataSpec, test: Sequence[Trajectory]) -> tuple[str, ...]:
+    """A warning if no test recording is as long as free runs are to be; the empty tuple if one is.
+
+    Example:
+        >>> spec = DataSpec("t", ("u",), ("y",), dt=1, max_gap=2, smoothing=5, warm_up=10, free_run=100)
+        >>> short_runs(spec, ())
+        ()
+    """
+    longest = max((len(t.t) * spec.dt - spec.warm_up for t in test), default=0.0)
+    if not spec.free_run or not test or longest >= 0.95 * spec.free_run:
+        return ()
+    return (
+        f"free runs of {spec.free_run:g} s are asked for (DataSpec.free_run); the longest piece of test data leaves "
+        f"{max(longest, 0.0):.4g} s behind its warm-up of {spec.warm_up:g} s: models are judged by shorter runs. Give "
+        "longer recordings, or windows of your own",
+    )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.data.excitation import check_excitation
+from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.recording import check_unit
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
@@ -26,6 +26,7 @@ from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.machine.specification import DataSpec
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.scenario import Budget, Scenario, Task
 
@@ -137,7 +138,7 @@ def preflight(
         tasks = _default_tasks(report, scenario)
     dataset, n_warnings = None, len(report.warnings)
     if recordings is not None and prior is not None:
-        dataset = _check_recordings(report, prior, recordings, rest, scenario.data.dt)
+        dataset = _check_recordings(report, prior, recordings, rest, scenario.data)
     problems, warnings = (
         tuple(f"scenario {scenario.name}: {text}" for text in texts)
         for texts in (report.problems, report.warnings)
@@ -225,7 +226,7 @@ def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[E
 
 
 def _check_recordings(
-    report: Report, prior: Prior, recordings: Callable[[], Dataset], rest: Rest | None, dt: float
+    report: Report, prior: Prior, recordings: Callable[[], Dataset], rest: Rest | None, spec: DataSpec
 ) -> Dataset | None:
     """The recordings can be read, move what is to be learned, and have been where the machine works."""
     dataset = None
@@ -236,9 +237,9 @@ def _check_recordings(
     for finding in dataset.findings:
         report.warn(f"recordings: {finding}")
     for file, sampling in zip(dataset.files, dataset.sampling, strict=True):
-        if sampling > COARSE * dt:
+        if sampling > COARSE * spec.dt:
             report.warn(
-                f"recordings: {file} is sampled every {sampling:.3g} s, the model's period is {dt:g} s: what lies "
+                f"recordings: {file} is sampled every {sampling:.3g} s, the model's period is {spec.dt:g} s: what lies "
                 "between is made up; raise dt in the DataSpec, or record faster"
             )
     train = dataset.by_role("train")
@@ -246,6 +247,8 @@ def _check_recordings(
     with report.part("recordings"):
         for warning in check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free):
             report.warn(f"recordings: {warning}")
+    for warning in short_runs(spec, dataset.by_role("test")):
+        report.warn(f"recordings: {warning}")
     if rest is not None and prior.operating_point is not None:
         y = prior.equations.output(rest.x, rest.u, rest.w, prior.p).full().ravel()
         for signals, values, key in ((prior.inputs, rest.u, "u"), (prior.outputs, y, "y")):

@@ -7,8 +7,9 @@ from machine_signals import machine
 from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
+from hybrid_mpc.data.excitation import short_runs
 from hybrid_mpc.data.recording import check_unit
-from hybrid_mpc.data.trajectories import hold_mean
+from hybrid_mpc.data.trajectories import Trajectory, hold_mean
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
@@ -185,3 +186,14 @@ def test_units_of_the_specification_are_those_of_a_header():
     check_unit(spec, "flow", Signal("flow", "l/min"))
     with pytest.raises(InputError, match=r"unit 'W' of column 'heater' is none for heater \[K\]"):
         check_unit(spec, "heater", Signal("heater", "K"))
+
+
+def test_free_runs_longer_than_any_test_piece_are_told():
+    spec = DataSpec("t", ("u",), ("y",), dt=1.0, max_gap=2.0, smoothing=5.0, warm_up=10.0, free_run=100.0)
+    z = np.zeros((80, 1))
+    piece = Trajectory("run", "test", 1.0, np.arange(80.0), z, z, z, z)
+    (told,) = short_runs(spec, [piece])
+    assert "free runs of 100 s are asked for" in told
+    assert "leaves 70 s behind its warm-up of 10 s" in told
+    assert short_runs(replace(spec, free_run=70.0), [piece]) == ()
+    assert short_runs(replace(spec, free_run=None), [piece]) == ()

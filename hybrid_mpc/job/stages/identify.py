@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.excitation import check_excitation
+from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
@@ -169,6 +169,7 @@ def doubts(context: Context) -> tuple[str, ...]:
         return found
     return (
         *found,
+        *short_runs(context.spec, context.trajectories("test")),
         *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
     )
 
