@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.identify.bands import FAR, RunParts, fit_bands, run_variance
 from hybrid_mpc.identify.choose import Choice, recommend
-from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, free_runs, unseen_runs
+from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, unseen_runs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, models_of, runners, training_settings
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, models_of, runs_of, training_settings
 from hybrid_mpc.kit.prediction import Bands
 from hybrid_mpc.machine.prior import Prior
 
@@ -69,9 +69,7 @@ def choice_stage(context: Context) -> ChoiceResult:
         judged = [
             judge
             for own, them in calibrating
-            for judge in zip(
-                *(free_runs(step, phy, them, warm) for step in runners(context, name, phy, own)), strict=True
-            )
+            for judge in zip(*runs_of(context, name, phy, them, own), strict=True)
         ]
         errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in judged[:judging]]
         bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*judged, strict=True)), spec.dt))

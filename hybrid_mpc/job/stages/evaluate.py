@@ -17,7 +17,6 @@ from hybrid_mpc.identify.evaluate import (
     OutputErrors,
     Scores,
     evaluation_trajectories,
-    free_runs,
     measured_as,
     output_errors,
     score,
@@ -26,7 +25,7 @@ from hybrid_mpc.identify.linear import BASELINES
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.choose import CHOICE, run_parts
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, models_of, runners
+from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, models_of, runs_of
 from hybrid_mpc.kit.prediction import Bands
 from hybrid_mpc.machine.prior import Prior
 
@@ -109,19 +108,14 @@ def evaluation_stage(context: Context) -> EvaluationResult:
     models = models_of(phy)
     for i, name in enumerate(models):
         context.progress.update("models", i, len(models), name)
-        found, every, drawn = [], [], []
-        for k, step in enumerate(runners(context, name, phy)):
-            runs = free_runs(step, phy, test, context.warm)
-            found.append(score(runs, phy, spread))
-            every.append(runs)
-            if name in chosen.bands:
-                drawn.append(free_runs(step, phy, shown, context.warm))
-            if k == 0:
-                files[name] = {f: score(part, phy, spread) for f, part in _by_file(runs).items()}
-                for run in drawn[0] if drawn else free_runs(step, phy, shown, context.warm):
-                    for key in DRAWN:
-                        arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
-        scores[name] = ModelScores(found[0], tuple(found[1:]))
+        every = runs_of(context, name, phy, test)
+        drawn = every if spec.free_run is None else runs_of(context, name, phy, shown)
+        model, *networks = (score(runs, phy, spread) for runs in every)
+        scores[name] = ModelScores(model, tuple(networks))
+        files[name] = {f: score(part, phy, spread) for f, part in _by_file(every[0]).items()}
+        for run in drawn[0]:
+            for key in DRAWN:
+                arrays[f"{name}/{run.name}/{key}"] = getattr(run, key)
         if name in chosen.bands:
             own = chosen.bands[name]
             parts_of_runs = run_parts(phy, prior.fit, every, spec.dt)

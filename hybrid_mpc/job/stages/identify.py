@@ -13,11 +13,12 @@ from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
+from hybrid_mpc.identify.evaluate import FreeRun, free_runs, stacked_free_runs
 from hybrid_mpc.identify.fit import beyond_ranges, fit_prior, smoothed
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
-from hybrid_mpc.identify.step import PriorStep, Scaling, Step
+from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.engine import WORKERS, run_jobs
@@ -311,18 +312,26 @@ def trained_models(context: Context, kind: str) -> Trained:
     return load_trained(context.out / "checkpoints" / "training" / context.read(TRAINING).folder, kind)
 
 
-def runners(context: Context, name: str, phy: Prior, own: int | None = None) -> Sequence[Step]:
-    """Steps of one model: the model itself, then each of its networks, if it has several.
+def runs_of(
+    context: Context, name: str, phy: Prior, trajectories: Sequence[Trajectory], own: int | None = None
+) -> list[list[FreeRun]]:
+    """Free runs of one model: of the model itself, then of each of its networks, if it has several.
 
-    The model is the mean of its networks, or network ``own`` alone, where the others have seen what it is to run over.
+    The model is the mean of its networks, or network ``own`` alone, where the others have seen what it runs over.
     """
-    dt = context.spec.dt
+    dt, warm = context.spec.dt, context.warm
     if name in ("phy_nominal", "phy"):
         fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
-        return [PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)]
+        step = PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)
+        return [free_runs(step, phy, trajectories, warm)]
     trained = trained_models(context, name)
-    several = len(trained.validation) > 1
-    return [trained.step(phy, dt, own), *(trained.steps(phy, dt) if several else ())]
+    if len(trained.validation) == 1:
+        return [free_runs(trained.step(phy, dt), phy, trajectories, warm)]
+    every = stacked_free_runs(trained, phy, dt, phy, trajectories, warm)
+    return [
+        every[own] if own is not None else free_runs(trained.step(phy, dt), phy, trajectories, warm),
+        *every,
+    ]
 
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:
