@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -380,12 +379,3 @@ def _tables(
 def template(name: str) -> str:
     """A source that is the same for all controllers."""
     return (files("hybrid_mpc.embedded") / "c" / name).read_text()
-
-
-def write_sources(found: Sources, folder: Path) -> None:
-    """Write all that is to be compiled."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in (*SOURCES, *HEADERS):
-        (folder / name).write_text(template(name))
-    for name, text in found.texts.items():
-        (folder / name).write_text(text)
