@@ -92,7 +92,7 @@ def shortest_move(
     def total(n: int) -> float:
         return plans[n].cost + price * n * model.dt if reaches(n) else np.inf
 
-    least, most = 1, 2
+    least, most = 0, 1
     while not reaches(most):
         if most >= longest:
             raise InputError(

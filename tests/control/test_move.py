@@ -55,6 +55,12 @@ def test_a_second_that_costs_little_lets_the_move_be_gentle():
         assert duration[price] == pytest.approx((36 / price) ** 0.25, rel=0.05)
 
 
+def test_within_the_target_a_period_is_enough():
+    move = shortest_move(MODEL, problem(), estimate_of(MODEL, [0.5, 0.0]), rest_at(0.5))
+    assert len(move.u) == 1
+    assert move.duration == DT
+
+
 @pytest.mark.parametrize("solver", [lambda m, o: CondensedController(m, o, iterations=30), IpoptController])
 def test_other_solvers_find_as_short_a_move(solver):
     start = estimate_of(MODEL, [0.0, 0.0])
