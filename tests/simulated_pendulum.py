@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hybrid_mpc import MechanicalPrior, Parameter, Signal, Trajectory, train
+from hybrid_mpc import MechanicalPrior, Parameter, Signal, TrainingSettings, Trajectory, train
 
 DT = 0.02
 TRUTH = {"J": 0.1, "mgl": 1.2, "d": 0.05}
+SMALL = TrainingSettings(
+    "mopgrnn", 4, 2, 20, 20, seed=3, warm=10, horizon=20, batch=8, every=10, learning_rates=(1e-2, 1e-3, 5e-3, 1e-4)
+)  # fmt: skip
+"""A training of a second."""
 
 
 class Pendulum(MechanicalPrior):

@@ -7,26 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from simulated_pendulum import TRUTH, Pendulum
+from simulated_pendulum import SMALL, TRUTH, Pendulum
 
-from hybrid_mpc import InputError, SearchSpace, TrainingSettings, train, tune
+from hybrid_mpc import InputError, SearchSpace, train, tune
 from hybrid_mpc.identify import tune as module
 from hybrid_mpc.identify.train import TrainingRun
 from hybrid_mpc.identify.tune import parsed_space
 
-SMALL = TrainingSettings(
-    "mopgrnn",
-    4,
-    2,
-    20,
-    20,
-    seed=3,
-    warm=10,
-    horizon=20,
-    batch=8,
-    every=10,
-    learning_rates=(1e-2, 1e-3, 5e-3, 1e-4),
-)
 BASE = replace(SMALL, hidden=16, batch=32, teacher_steps=200, free_run_steps=200, every=20)
 SPACE = SearchSpace(batch=(8, 128))
 TOTAL = BASE.teacher_steps + BASE.free_run_steps

@@ -3,29 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simulated_pendulum import DT, TRUTH, Pendulum, killed_and_resumed, same_training
+from simulated_pendulum import DT, SMALL, TRUTH, Pendulum, killed_and_resumed, same_training
 
-from hybrid_mpc import InputError, TrainingSettings, train
+from hybrid_mpc import InputError, train
 from hybrid_mpc.identify import train as training
 from hybrid_mpc.identify.dataset import LONGEST, cut_windows, fitting_horizon, validation_horizon
 from hybrid_mpc.identify.objectives import objectives_of
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.train import REPEATS, TrainingRun, load_checkpoint, save_checkpoint
-
-SMALL = TrainingSettings(
-    "mopgrnn",
-    4,
-    2,
-    20,
-    20,
-    seed=3,
-    warm=10,
-    horizon=20,
-    batch=8,
-    every=10,
-    learning_rates=(1e-2, 1e-3, 5e-3, 1e-4),
-)
-
 
 PRIOR = Pendulum(TRUTH)
 
