@@ -233,19 +233,30 @@ class ExtendedKalmanFilter:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
+        f = self._transition(estimate, u)
+        x, h, *_ = self._step.outputs  # of the next call
+        p = f @ estimate.P @ f.T
+        p.flat[:: p.shape[0] + 1] += self._noise
+        empty, t, w = np.full(self.model.n_y, np.nan), estimate.t + self.model.dt, self._known(estimate, None)
+        return Estimate(t, x + self._on_x @ estimate.d, h.copy(), estimate.d, p, empty, float("nan"), w=w)
+
+    def tangent(self, estimate: Estimate, u: ArrayLike) -> tuple[Array, Array]:
+        """Jacobians of the next ``(x, h, d)`` ``(n, n)`` and of the output ``(n_y, n)`` by ``(x, h, d)``."""
+        return self._transition(estimate, u), self._predicted(estimate, u)[1]
+
+    def _transition(self, estimate: Estimate, u: ArrayLike) -> Array:
+        """Jacobian of the next ``(x, h, d)``; the next ``(x, h)`` without ``d`` is the step's output then."""
         (n_x, n_h, n_d, _), step = self._sizes, self._step
-        n_z, w = n_x + n_h, self._known(estimate, None)
+        n_z = n_x + n_h
         step.inputs[0][:], step.inputs[1][:] = estimate.x, estimate.h
-        step.inputs[2][:], step.inputs[3][:] = np.asarray(u, dtype=float).ravel() + self._on_u @ estimate.d, w
+        step.inputs[2][:] = np.asarray(u, dtype=float).ravel() + self._on_u @ estimate.d
+        step.inputs[3][:] = self._known(estimate, None)
         step()
-        x, h, a, b = step.outputs  # of the next call
+        _, _, a, b = step.outputs
         f = np.eye(n_z + n_d)
         f[:n_z, :n_z], f[:n_z, n_z:] = a.reshape(n_z, n_z).T, b.reshape(-1, n_z).T @ self._on_u
         f[:n_x, n_z:] += self._on_x
-        p = f @ estimate.P @ f.T
-        p.flat[:: p.shape[0] + 1] += self._noise
-        empty, t = np.full(self.model.n_y, np.nan), estimate.t + self.model.dt
-        return Estimate(t, x + self._on_x @ estimate.d, h.copy(), estimate.d, p, empty, float("nan"), w=w)
+        return f
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
         """Estimate after the measurement ``y`` ``(n_y,)``, in Joseph form; ``u`` is the input of the output equation,

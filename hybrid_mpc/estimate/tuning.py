@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 ROUNDING = 1e-9
@@ -118,3 +120,33 @@ def most_likely(
     """The one of ``scales`` whose filter ``make(scale)`` makes the recordings, undisturbed ones, most likely."""
     values = [sum(log_likelihood(make(s), r) for r in recordings) for s in scales]
     return float(scales[int(np.argmax(values))])
+
+
+def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
+    """Share of each constant disturbance that a filter has not found after ``periods``, ``(n_d,)``.
+
+    At the model's operating point, with the gain of the settled covariance. Of a filter whose covariance does not
+    settle there nobody can tell: zeros.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> slow, quick = (ExtendedKalmanFilter(model, sigma_y=[1.0], sigma_x=[1.0], sigma_x0=[1.0], sigma_d=[step])
+        ...                for step in (0.01, 0.1))
+        >>> load_left(slow, 50).round(2), load_left(quick, 50).round(2)
+        (array([0.61]), array([0.01]))
+
+    Source: Anderson and Moore, *Optimal Filtering*, 1979, section 4.4.
+    """
+    model = ekf.model
+    f, c = ekf.tangent(ekf.start(np.full(model.n_y, np.nan)), model.u0)
+    noise, noise_y = ekf.noise
+    try:
+        p, _ = dare(f.T, c.T, np.diag(noise), np.diag(noise_y))  # of the predicted estimate
+    except InputError:
+        return np.zeros(model.n_d)
+    gain = np.linalg.solve(c @ p @ c.T + np.diag(noise_y), c @ p).T
+    left = np.linalg.matrix_power(f - gain @ c @ f, periods)
+    return np.abs(np.diag(left)[len(left) - model.n_d :])

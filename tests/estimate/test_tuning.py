@@ -8,7 +8,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise
-from hybrid_mpc.estimate.tuning import log_likelihood, most_likely
+from hybrid_mpc.estimate.tuning import load_left, log_likelihood, most_likely
+from hybrid_mpc.kit.assembly import MOST_DOUBLED, QUIET_SHARE, quiet_shares
 
 DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
 
@@ -76,3 +77,40 @@ def test_process_noise_is_the_error_of_one_period():
     assert np.array_equal(process_noise(model, [half, half], most=50), process_noise(model, [half]))
     with pytest.raises(InputError, match="two samples"):
         process_noise(model, [])
+
+
+def observer_of(shares, sigma_x=SIGMA_X):
+    return ExtendedKalmanFilter(
+        mass(), sigma_y=[SIGMA_Y], sigma_x=sigma_x, sigma_x0=[SIGMA_Y, 0.1], sigma_d=np.ravel(shares)
+    )
+
+
+def test_what_is_left_of_a_load_is_what_the_filter_shows():
+    """A settled filter under a constant load, without noise."""
+    ekf, load, periods = observer_of(0.02), 1.0, 40
+    estimate = ekf.start(np.zeros(1))
+    for _ in range(2000):
+        estimate = ekf.update(estimate, np.zeros(1), np.zeros(1))
+    x = np.zeros(2)
+    for _ in range(periods):
+        x = np.array([x[0] + DT * x[1], x[1] + DT * load])
+        estimate = ekf.update(estimate, x[:1], np.zeros(1))
+    left = abs(load - estimate.d[0]) / load
+    # to rounding: the filter before the first measurement and after it differ by one gain, the covariance has settled
+    assert load_left(ekf, periods)[0] == pytest.approx(left, rel=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "periods"), [(0.05, 5000), (0.05, 400), (0.05, 100)])
+def test_the_quiet_filter_finds_a_constant_load_in_time(noise, periods):
+    shares = quiet_shares(lambda s: observer_of(s, (0.0, noise)), periods, 1)
+    doubled = round(np.log2(shares[0] / QUIET_SHARE))
+    assert load_left(observer_of(shares, (0.0, noise)), periods)[0] < np.exp(-1) or doubled == MOST_DOUBLED
+    if doubled:  # no more than it takes
+        assert load_left(observer_of(shares / 2, (0.0, noise)), periods)[0] > np.exp(-1)
+    assert doubled == {5000: 0, 400: 3, 100: 5}[periods]
+
+
+def test_a_filter_that_does_not_settle_keeps_its_step():
+    """No noise reaches the speed, which nothing damps."""
+    still = observer_of(0.0, (0.0, 0.0))
+    assert load_left(still, 10).tolist() == [0.0]
