@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump")
 """Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
 QUIET_SHARE = 0.0003
-"""Step of the estimated load per period while nothing happens (drift, temperature), as a share of the load's size. Where
+"""Step of the estimated load per period while nothing happens (drift, temperature), as a share of its size. Where
 it finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
 FOUND_HORIZONS, MOST_DOUBLED = 4.0, 5
 """Horizons of the controller within which the quiet filter has found two thirds of a constant load, and how often its
@@ -192,9 +192,7 @@ def make_estimator(
     return SwitchingFilter(modes, SWITCHES)
 
 
-def quiet_shares(
-    filter_of: Callable[[Array], ExtendedKalmanFilter], periods: int, n_d: int
-) -> Array:
+def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: int, n_d: int) -> Array:
     """Steps ``(n_d,)`` of the loads in the quiet filter a period, as shares of their sizes.
 
     Each is :data:`QUIET_SHARE`, doubled until the filter has found two thirds of a constant load of that kind after
