@@ -562,7 +562,8 @@ class Shooting:
         windows, seen, n, limit = self.windows, self.seen, len(x), LARGEST * self.spread
         y, by = self.own.outputs(theta, x, windows, before.substeps, slopes)
         error = np.nan_to_num(y, nan=np.inf) - np.where(seen, windows.y, 0.0)
-        counts = seen & ~((windows.censored != 0) & (windows.censored * error > 0))
+        beyond = np.where(windows.censored > 0, error > 0, error < 0)
+        counts = seen & ~((windows.censored != 0) & beyond)
         inside = counts & (np.abs(error) < limit)
         error = np.where(counts, np.clip(error, -limit, limit), 0.0).reshape(n, -1)
         by[~inside] = 0.0

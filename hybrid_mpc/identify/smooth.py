@@ -31,6 +31,8 @@ SWEEPS = 4
 """Linearizations along the smoothed trajectory at most, after the first along the filter's estimates."""
 STILL = 0.01
 """A trajectory whose estimates move by less than this share of their standard deviations is smoothed."""
+NEWTON = 15
+"""Newton steps to the equilibrium of the first inputs."""
 MOST_SWEEPS = 20
 """Linearizations at most, where the censored samples that count are not yet the same from one to the next."""
 DECADES = (-6.0, 2.0)
@@ -209,17 +211,20 @@ class Smoother:
         return _Filtered(counts[..., 0] > 0, expected, now, slope, e[..., 0], s)
 
     def _starts(self, trajectories: Sequence[Trajectory]) -> Array:
-        """States ``(b, n_x)`` at the first samples: nearest to rest, in their sizes, of those that explain what is
-        measured.
+        """States ``(b, n_x)`` at the first samples: nearest to where the first inputs would hold the machine, in their
+        sizes, of those that explain what is measured.
+
+        That is the stable equilibrium of the first inputs, or where there is none, rest. It decides between states that
+        a sensor cannot tell apart, as the sign of a speed of which it shows the size.
         """
         n, rest = len(trajectories), rest_of(self.prior)
-        x = np.tile(rest[0], (n, 1))
         u, w = (
             np.stack([v[0] if len(v[0]) else near for v in given])
             for given, near in (
                 ([t.u for t in trajectories], rest[1]), ([t.w for t in trajectories], rest[2])
             )
         )  # fmt: skip
+        x = self._held(rest[0], u, w)
         y = np.stack([_first_seen(t.y) for t in trajectories])
         output = _output_slope(self.prior.equations).map(n)
         size, outputs = np.array(self.sizes.x), np.array(self.sizes.y)
@@ -229,6 +234,27 @@ class Smoother:
             scaled = np.moveaxis(c.reshape(c.shape[0], n, -1), 1, 0) * size / outputs[:, None]
             x = x + size * (np.linalg.pinv(scaled, rcond=1e-6) @ e[..., None])[..., 0]
         return x
+
+    def _held(self, rest: Array, u: Array, w: Array) -> Array:
+        """Stable equilibria ``(b, n_x)`` under constant inputs within the states' ranges, near rest; else rest."""
+        n, size = len(u), np.array(self.sizes.x)
+        held = u.T, w.T, np.tile(self.prior.p[:, None], (1, n))
+        rates, slopes = self.prior.equations.xdot.map(n), flow_slope(self.prior.equations.xdot).map(n)
+        low, high = (np.array([getattr(s, end) for s in self.prior.states]) for end in ("lower", "upper"))
+        x = np.tile(rest, (n, 1))
+        for _ in range(NEWTON):
+            xdot = rates(x.T, *held).full().T
+            a = np.moveaxis(slopes(x.T, *held).full().reshape(len(rest), n, -1), 1, 0)
+            good = np.isfinite(xdot).all(axis=1) & np.isfinite(a).all(axis=(1, 2))
+            xdot, a = np.where(good[:, None], xdot, 0.0), np.where(good[:, None, None], a, 0.0)
+            scaled = a * size / size[:, None]
+            step = size * (np.linalg.pinv(scaled, rcond=1e-9) @ (xdot / size)[..., None])[..., 0]
+            x = x - step
+        stable = np.linalg.eigvals(a).real.max(axis=1) < 0
+        found = (
+            good & stable & (np.abs(step) < STILL * size).all(axis=1) & ((low <= x) & (x <= high)).all(axis=1)
+        )
+        return np.where(found[:, None], x, rest)
 
 
 def _first_seen(y: Array) -> Array:

@@ -10,7 +10,7 @@ import pytest
 from example_priors import TANKS, Tanks
 from scipy.linalg import expm
 
-from hybrid_mpc import MechanicalPrior, Parameter, Prior, Signal, Trajectory, fit_smoother
+from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Prior, Signal, Trajectory, fit_smoother
 from hybrid_mpc.data.differentiate import local_polynomial
 from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.identify.simulation import Simulation
@@ -294,6 +294,42 @@ def test_a_sensor_of_the_speeds_size_helps_and_its_sign_is_not_lost():
     errors = [rms((s.x - truth.x)[:, 1]) for s in (both, alone)]
     assert errors[0] < 0.01  # the sensor's own noise; a wrong sign would cost the speed itself, 3 rad/s
     assert errors[0] < 0.3 * errors[1]
+
+
+class Drive(Prior):
+    """A speed that follows the input, a counter that shows a mean of its size."""
+
+    states = (Signal("speed", "m/s", -5.0, 5.0), Signal("shown", "m/s", -1.0, 5.0))
+    inputs = (Signal("voltage", "V", -5.0, 5.0),)
+    outputs = (Signal("shown", "m/s"),)
+    operating_point = OperatingPoint(x=(1.0, 1.0), u=(1.0,))
+
+    def xdot(self, x, u, w, p):
+        size = ca.sqrt(x.speed**2 + 1e-4)
+        return (u.voltage - x.speed) / 0.3, (size - x.shown) / 0.05
+
+
+@pytest.mark.parametrize("voltage", [-2.0, 2.0])
+def test_the_first_input_says_which_way_a_machine_runs(voltage):
+    """Four samples of a counter in the steady state; after them the input goes to zero."""
+    prior, dt, n = Drive(), 0.02, 4
+    run = Trajectory(
+        "drive", "test", dt, dt * np.arange(n), np.full((n, 1), voltage), np.full((n, 1), 2.0),
+        np.full((n, 2), np.nan), np.full((n, 2), np.nan),
+    )  # fmt: skip
+    (smoothed,) = smoother_of(prior, [run], dt, (1e-3,), (0.1, 0.1)).smooth([run])
+    # the rounded corner makes the counter show 2.000025; four samples tell the speed to a few of their noises
+    assert smoothed.x[-1] == pytest.approx([voltage, 2.0], abs=0.01)
+
+
+def test_where_the_first_input_holds_nothing_the_start_is_at_rest():
+    """A mass that a force drives away, and a drive whose equilibrium lies beyond its range."""
+    mass = smoother_of(Pendulum(TRUTH), [record(5)], DT, (0.05,), (0.05,))
+    upright = mass._held(np.array([np.pi, 0.0]), np.zeros((1, 1)), np.zeros((1, 0)))
+    assert upright[0].tolist() == [np.pi, 0.0]  # an equilibrium, not a stable one
+    run = replace(record(5), u=np.full((len(record(5).t), 1), 9.0))
+    drive = Smoother(Drive(), 0.02, (1e-3,), (0.1, 0.1), Sizes((1.0,), (1e-3,), (1.0, 1.0), (1.0, 1.0)))
+    assert drive._held(np.ones(2), run.u[:1], run.w[:1]).tolist() == [[1.0, 1.0]]
 
 
 def test_what_no_output_tells_of_is_named():
