@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_mpc import InputError, Trajectory, fit_prior, load_scenario
+from hybrid_mpc import InputError, fit_prior, load_scenario
 from hybrid_mpc.identify.linear import fit_arx, fit_subspace
-from hybrid_mpc.job.benchmark_runs import benchmark_of, read_test, read_training, run_freely
+from hybrid_mpc.job.benchmark_runs import benchmark_of, in_runs, read_test, read_training, run_freely
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,6 @@ def cut(source: Path, folder: Path) -> tuple[Path, Path]:
     for path, rows in zip(parts, (lines[1:split], lines[split:]), strict=True):
         path.write_text("\n".join([lines[0], *rows]) + "\n")
     return parts
-
-
-def in_runs(trajectories: list[Trajectory], n: int) -> list[Trajectory]:
-    """Parts of ``n`` samples one behind the other."""
-    return [t.part(slice(a, a + n)) for t in trajectories for a in range(0, len(t.t) - n + 1, n)]
 
 
 def told(errors: list[np.ndarray]) -> str:

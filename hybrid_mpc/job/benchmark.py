@@ -32,6 +32,7 @@ from hybrid_mpc.job.benchmark_runs import (
     BenchmarkRun,
     Recordings,
     benchmark_of,
+    in_runs,
     read_test,
     read_training,
     run_error,
@@ -442,10 +443,17 @@ def _evaluate(
 def _runs(
     scenario: Scenario, model: BenchmarkModel, fit: PriorFit, trajectories: Sequence[Trajectory]
 ) -> list[BenchmarkRun]:
-    prior, length = scenario.prior(fit.values), benchmark_of(scenario).length
-    warm_up = scenario.data.warm_up
+    prior, spec, warm_up, dt = (
+        scenario.prior(fit.values),
+        benchmark_of(scenario),
+        scenario.data.warm_up,
+        model.dt,
+    )
+    if spec.repeated and spec.length is not None:
+        # behind what is given and what is judged the last input, and the sample that it leads to
+        trajectories = in_runs(trajectories, round(warm_up / dt) + round(spec.length / dt) + 2)
     return run_freely(
-        prior, fit, model.networks, trajectories, warm_up=warm_up, length=length, linear=model.linear
+        prior, fit, model.networks, trajectories, warm_up=warm_up, length=spec.length, linear=model.linear
     )
 
 

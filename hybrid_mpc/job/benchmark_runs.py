@@ -225,6 +225,18 @@ def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
     )
 
 
+def in_runs(trajectories: Sequence[Trajectory], n: int) -> list[Trajectory]:
+    """Parts of ``n`` samples one behind the other; a shorter trajectory stays as it is.
+
+    Example:
+        >>> z = np.zeros((101, 1))
+        >>> run = Trajectory("run", "test", 0.1, 0.1 * np.arange(101), z, z, np.zeros((101, 2)), np.zeros((101, 2)))
+        >>> [(p.name, len(p.t), round(float(p.t[0]), 1)) for p in in_runs([run], 40)], len(in_runs([run], 200))
+        ([('run', 40, 0.0), ('run', 40, 4.0)], 1)
+    """
+    return [t.part(slice(a, a + n)) for t in trajectories for a in range(0, max(1, len(t.t) - n + 1), n)]
+
+
 @dataclass(frozen=True)
 class BenchmarkRun:
     """A free run of all candidates over one trajectory: the scored samples, commanded inputs as they act, measured

@@ -163,13 +163,15 @@ def check_prior_replay(weight: float) -> None:
 class BenchmarkSpec:
     """How a machine's models are evaluated by free runs over recordings that they have not seen.
 
-    A run starts from the scenario's ``warm_up``; it is the whole recording after that, or its first ``length`` seconds.
+    A run starts from the scenario's ``warm_up``; it is the whole recording after that, or ``length`` seconds.
 
     Args:
         budgets: Effort by name, ``"quick"`` and ``"full"``.
         units: By the name of an output the unit of its figures, and how many of these are one of its own: ``{"x":
             ("mm", 1e3)}`` for an output in metres. Default: every output's own.
         length: Length [s] of a run after what is given. Default: the whole recording.
+        repeated: Whether a recording is judged by as many runs of that length as fit into it one behind the other.
+            Default: by one, from its beginning.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
         cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
             its last ones would not be a fair sample. Default: none, the data specification splits.
@@ -179,7 +181,7 @@ class BenchmarkSpec:
 
     Raises:
         InputError: If a length or a factor is out of its range, a cycle lacks a role that is needed, or
-            both ``cycle`` and ``valid_every`` are given.
+            both ``cycle`` and ``valid_every`` are given, or runs without a length are to be repeated.
 
     Example:
         >>> BenchmarkSpec({}, units={"q": ("mm", 1e3)}).length is None
@@ -192,8 +194,11 @@ class BenchmarkSpec:
     piece: float = 25.0
     cycle: tuple[str, ...] = ()
     valid_every: int = 0
+    repeated: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
+        if self.repeated and self.length is None:
+            raise InputError("benchmark specification: repeated runs need a length")
         factors = [factor for _, factor in self.units.values()]
         if not (min([*factors, self.piece]) > 0 and (self.length is None or self.length > 0)):
             raise InputError(

@@ -48,6 +48,7 @@ scenario = Scenario(
             ),
         },
         length=0.5,
+        repeated=True,
         piece=1.0,
         valid_every=3,
     ),

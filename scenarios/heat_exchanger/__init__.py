@@ -44,6 +44,7 @@ scenario = Scenario(
         },
         units={"outlet": ("K", 1.0)},
         length=300.0,
+        repeated=True,
         piece=700.0,
     ),
 )

@@ -39,6 +39,7 @@ scenario = Scenario(
         },
         units=dict.fromkeys(("temperature1", "temperature2"), ("K", 1.0)),
         length=600.0,
+        repeated=True,
         piece=900.0,
     ),
 )

@@ -65,6 +65,19 @@ def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine
     assert written["data"]["seconds"]["train"] > written["data"]["seconds"]["valid"] > 0
 
 
+def test_a_file_is_judged_by_all_runs_that_fit_in(machine, made, tmp_path):
+    scenario, _, test = machine
+    again = tmp_path / "cart.py"
+    again.write_text(scenario.read_text().replace("piece=20.0,", "piece=20.0, length=5.0, repeated=True,"))
+    settings = BenchmarkSettings(str(again), (), (test,), model=made[0] / "model")
+    (row,) = benchmark(settings, tmp_path / "judged").test.values()
+    # a run takes 10 given periods, 50 judged ones and a sample at either end: six of them fit into 400 samples
+    assert [run.t[0] for run in row.runs] == pytest.approx([1.1 + 6.2 * i for i in range(6)])
+    assert {len(run.t) for run in row.runs} == {50}
+    with pytest.raises(InputError, match="repeated runs need a length"):
+        BenchmarkSpec({}, repeated=True)
+
+
 def test_linear_baselines_run_over_the_same_samples(machine, made):
     row = made[1].test["test.csv"]
     run, scenario = row.runs[0], load_scenario(str(machine[0]))
