@@ -21,6 +21,7 @@ from hybrid_mpc.job.study_run import StudyModel, load_models
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import Provenance
+from hybrid_mpc.loop.faults import fault_text
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.innovations import ResidualLimits
@@ -116,7 +117,7 @@ def run_control(
         write_json(out / "results.json", {**without_loops, "loops": [row.plain() for row in results.loops]})
         progress.finish("")
         progress.start("drawing")
-        figures(bench, rows, out / "figures", progress, gif)
+        figures(bench, rows, study, out / "figures", progress, gif)
         progress.finish("")
     return results
 
@@ -125,7 +126,7 @@ def _rows(bench: Bench, study: Study, model: StudyModel, folder: Path, progress:
     """The rows of all loops: those that the folder holds, and the others as they run."""
     first, specs = study.loop_seeds[0], dict[str, list[LoopSpec]]()
     for spec in study.runs():
-        arrays = ("step_ms", *((*DRAWN, "plans") if spec.seed == first else ()))
+        arrays = ("step_ms", *((*DRAWN, "plans", "alarm") if spec.seed == first else ()))
         specs.setdefault(spec.task, []).append(replace(spec, keep=arrays))
     rows: list[LoopRow] = []
     for task, own in specs.items():
@@ -179,14 +180,16 @@ def _times(rows: Sequence[LoopRow]) -> dict[str, Array]:
     return {n: np.concatenate([r.arrays["step_ms"] for r in rows if r.controller == n]) for n in names}
 
 
-def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progress, gif: bool) -> list[Path]:
+def figures(
+    bench: Bench, rows: Sequence[LoopRow], study: Study, folder: Path, progress: Progress, gif: bool
+) -> list[Path]:
     """Figures of the first loop of every task and controller, and the durations of steps."""
     # half a second to import: what is refused, is refused before
     from hybrid_mpc.job.loop_figures import curves_of, loop_figure
     from hybrid_mpc.plots import animation, loops
     from hybrid_mpc.plots.style import save
 
-    (kit,) = bench.kits.values()
+    (kit,), (faults,) = bench.kits.values(), study.fault_sets
     model, scenario, written = kit.models["prior"], bench.scenario, []
     drawn = by_task([row for row in rows if "plans" in row.arrays])
     for i, task in enumerate(tasks_of(scenario, tuple(drawn))):
@@ -210,6 +213,8 @@ def figures(bench: Bench, rows: Sequence[LoopRow], folder: Path, progress: Progr
                 path, own["t"], own["x"], own["plans"], dt=model.dt, draw=scenario.draw, u=own["u"],
                 title=f"{task.title} ({name}{said})", curves=curves_of(model), inputs=model.inputs,
                 limits=(control.u_min, control.u_max),
+                alarm=own["alarm"] if study.guard else None,
+                events=[(fault.start, fault_text([fault])) for fault in faults],
             )  # fmt: skip
             written.append(path)
     written.append(save(loops.solve_times(_times(rows), 1e3 * model.dt), folder / "step_times.png"))

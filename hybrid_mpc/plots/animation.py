@@ -1,10 +1,10 @@
-"""A closed loop as a moving picture: the machine, its planned motion, its input."""
+"""A closed loop as a moving picture: the machine, its planned motion, its input, faults and alarms."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,24 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
+from numpy.typing import NDArray
 from PIL import Image
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import replacing
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.plots.style import FAINT, INK, Array, axis_label, checked, colour, dress, plain, shared_legend
+from hybrid_mpc.plots.style import (
+    ALARM,
+    FAINT,
+    INK,
+    Array,
+    axis_label,
+    checked,
+    colour,
+    dress,
+    plain,
+    shared_legend,
+)
 
 Draw = Callable[[Array], Sequence[Array]]
 
@@ -44,6 +56,8 @@ class AnimatedLoop:
     dt: float
     draw: Draw
     moving: tuple[bool, ...]
+    alarm: NDArray[np.bool_] | None = None
+    events: tuple[tuple[float, str], ...] = ()
 
 
 class Scene:
@@ -79,11 +93,23 @@ class Scene:
         self._applied: list[Line2D] = []
         for i, (ax, signal) in enumerate(zip(panels[n:], inputs, strict=True)):
             self._input_panel(ax, i, signal, None if limits is None else (limits[0][i], limits[1][i]))
+        self._bars = [self._alarm_bar(ax) for ax in panels] if loop.alarm is not None else []
+        for at, _ in loop.events:
+            for ax in panels:
+                ax.axvline(at, color=ALARM, linestyle="--", linewidth=1.2)
         panels[-1].set_xlabel("time [s]")
         for ax in panels[:-1]:
             ax.tick_params(labelbottom=False)
         self._figure.align_ylabels(panels)
         shared_legend(self._figure)
+
+    def _alarm_bar(self, ax: Axes) -> Line2D:
+        """A bar along the top of a panel for as long as the monitor alarms."""
+        height = ax.get_xaxis_transform()  # the top of the panel, whatever its values
+        bar = self._line(
+            ax, color=ALARM, linewidth=6, solid_capstyle="butt", transform=height, label="monitor alarms"
+        )
+        return bar
 
     def _line(self, ax: Axes, **style: object) -> Line2D:
         """A line that each frame draws anew; over those before it."""
@@ -124,8 +150,12 @@ class Scene:
         ]
         self._machine = [self._body(ax, i, INK, 1.0, 2.8) for i in bodies]
         self._clock = ax.text(0.03, 0.96, "", transform=ax.transAxes, fontsize=10, color=INK, va="top")
-        self._clock.set_animated(True)
-        self._live.append((ax, self._clock))
+        self._said = ax.text(
+            0.03, 0.89, "", transform=ax.transAxes, fontsize=10, color=ALARM, va="top", weight="bold"
+        )
+        for text in (self._clock, self._said):
+            text.set_animated(True)
+            self._live.append((ax, text))
 
     def _view(self) -> tuple[Array, Array]:
         """Corners of the machine's panel: all true positions, and the planned ones unless far beyond."""
@@ -197,6 +227,13 @@ class Scene:
                 np.append(loop.t[: k + 1], loop.t[held]), np.append(loop.u[: k + 1, i], loop.u[k, i])
             )
         self._clock.set_text(f"t = {loop.t[k]:.2f} s")
+        said = [what for at, what in loop.events if at <= loop.t[k]]
+        if loop.alarm is not None:
+            on = loop.alarm[: k + 1]
+            for bar in self._bars:
+                bar.set_data(loop.t[: k + 1], np.where(on, 0.97, np.nan))
+            said += ["ALARM"] if on[k] else []
+        self._said.set_text("\n".join(plain(line) for line in said))
         _place(self._machine, loop.draw(loop.x[k]))
         later = np.flatnonzero(ahead)[1:]
         even = np.linspace(0, len(later) - 1, GHOSTS + 1)[1:].astype(int)
@@ -237,6 +274,8 @@ def animate(
     inputs: Sequence[Signal] | None = None,
     limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
     reference: Array | None = None,
+    alarm: Array | None = None,
+    events: Sequence[tuple[float, str]] = (),
 ) -> Path:
     """Write a closed loop as GIF that plays in real time: the machine, its planned motion, its input.
 
@@ -259,6 +298,8 @@ def animate(
         inputs: Signals of ``u``. Default: ``u_0, ...`` without units.
         limits: Lower and upper bounds of the inputs, drawn as lines where finite. Default: none.
         reference: References of the states with a curve, ``(n, len(curves))``. Default: none.
+        alarm: Whether the monitor alarms ``(n,)``. Default: nothing watches.
+        events: Instants [s] and what happens then, such as a fault. Default: none.
 
     Raises:
         InputError: If the name does not end in ``.gif``, shapes do not fit, times do not increase, a true state
@@ -291,7 +332,9 @@ def animate(
             f"animation {path}: curves are of states 0 to {loop.x.shape[1] - 1}, got {list(curves)}"
         )
     target = None if reference is None else checked("reference", reference, len(loop.t), len(curves))
-    scene = Scene(loop, title, curves, signals, limits, target)
+    if alarm is not None:
+        loop = replace(loop, alarm=checked("alarm", alarm, len(loop.t)) > 0.5)
+    scene = Scene(replace(loop, events=tuple(events)), title, curves, signals, limits, target)
     shown = _frames(loop.t, fps)
     ends = np.append(loop.t[shown[1:]], loop.t[shown[-1]] + LAST)
     # GIF knows hundredths of a second: rounded as a sum, so that the film never drifts from real time.

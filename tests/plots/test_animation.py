@@ -1,6 +1,7 @@
 """The animation: whole files that play in real time and show what the loop did."""
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -124,6 +125,32 @@ def test_axes_carry_units_and_the_legend_is_complete(tmp_path):
     assert all(label.endswith("]") for label in labels)
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["reference", "true motion", "planned motion", "input limits", "input"]
+
+
+def test_a_fault_and_the_alarm_are_said_from_their_instant_on(tmp_path):
+    t, x, plans, u = swing(n=6)
+    loop = replace(
+        animation._checked(tmp_path / "a.gif", t, x, plans, 0.02, draw, u),
+        alarm=np.array([False, False, False, True, True, False]), events=((0.04, "friction doubles"),),
+    )  # fmt: skip
+    scene = Scene(loop, "A swing", [(0, Signal("phi", "rad"))], (Signal("u", "N m"),), None, None)
+    said = []
+    for k in range(6):
+        scene._set(k)
+        said.append(scene._said.get_text())
+    told = "friction doubles"
+    assert said == ["", "", told, f"{told}\nALARM", f"{told}\nALARM", told]
+    drawn = [bar.get_xydata() for bar in scene._bars]
+    assert len(drawn) == 2  # a bar over the curve and one over the input
+    for bar in drawn:
+        assert np.isfinite(bar[:, 1]).tolist() == loop.alarm.tolist()
+    assert [len(ax.lines) for ax in scene._figure.axes[1:]] == [5, 3]  # with the fault's line and the bar
+    assert "monitor alarms" in [text.get_text() for text in scene._figure.legends[0].get_texts()]
+
+
+def test_an_alarm_of_another_length_is_refused(tmp_path):
+    with pytest.raises(InputError, match="alarm"):
+        write(tmp_path / "a.gif", *swing(n=5), alarm=np.zeros(4))
 
 
 def test_a_plan_that_runs_away_does_not_flatten_the_motion(tmp_path):
