@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,12 @@ STAGES: tuple[Stage[Any], ...] = (
 )  # fmt: skip
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
+SECONDS = {
+    "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 4, "export": 9, "noise": 8, "control": 62,
+    "on_model": 20, "estimation": 1, "residuals": 7, "monitor": 7, "guard": 28, "analysis": 4, "report": 6,
+}  # fmt: skip
+"""What each stage of `make demo` takes on two idle cores [s], ``on_model`` where there is no plant: how long the rest
+of a run may take follows from what its first stages took."""
 
 
 def run(
@@ -82,20 +89,51 @@ def run(
         there = models_of(scenario.prior())
         known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
     end = _end(context, only)
+    took: dict[str, float] = {}
+    without = "on_model" if scenario.plant is not None else "control"
     with open_folder(out, run_note(settings), resume=resume):
-        for stage in STAGES:
+        for i, stage in enumerate(STAGES):
             if stage is end:
                 report_so_far(context)
                 return None
-            context.progress.start(stage.title)
+            ahead = [
+                s.name for s in STAGES[i:] if s.name not in (*skip, without) and (not only or s.name in only)
+            ]
+            context.progress.start(stage.title + remaining(took, ahead))
+            begun = time.monotonic()
             if only and stage.name not in (*only, REPORT.name):
                 context.progress.finish(_as_it_is(context, stage))
             else:
                 said = bring_up_to_date(context, stage, stage.name in skip)
                 if not said and stage in (PRIOR, TRAINING, EVALUATION):
                     report_so_far(context)
+                if not said:
+                    took[stage.name] = time.monotonic() - begun
                 context.progress.finish(said)
     return read_results(read_object(out / "results.json"), str(out / "results.json"))
+
+
+def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
+    """How long the stages ahead may take, for the user; nothing before the first long one is done.
+
+    Args:
+        took: What stages have taken [s].
+        ahead: Names of those that are still to run.
+
+    Example:
+        >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["guard", "analysis", "report"])
+        ' (about 80 s left)'
+        >>> remaining({"data": 4.0}, ["prior"])
+        ''
+    """
+    known_ = sum(SECONDS[name] for name in took)
+    left = sum(SECONDS[name] for name in ahead)
+    if known_ < SECONDS["training"] or not left:
+        return ""
+    seconds = left * sum(took.values()) / known_
+    if seconds < 90:
+        return f" (about {max(10, 10 * round(seconds / 10)):.0f} s left)"
+    return f" (about {seconds / 60:.0f} min left)"
 
 
 def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:

@@ -135,14 +135,7 @@ def test_what_does_not_fit_is_refused_as_the_page_says(what_fits):
 
 def test_the_machines_of_the_readme():
     sources = [source for source in blocks("README.md") if re.search(r"^class ", source, re.MULTILINE)]
-    assert len(sources) == 3  # in CasADi with its scenario, another machine, and the first one in torch
-    check_scenario(executed("README.md", sources[1:2])["scenario"])
-    assert len(sources[1].splitlines()) <= 25
-    found = executed("README.md", sources[::2])
-    scenario = found["scenario"]
-    check_scenario(scenario)
-    check_scenario(replace(scenario, prior=found["TorchPendulum"]))
-    one, other = found["Pendulum"](), found["TorchPendulum"]()
-    point = [0.3, -1.0], [0.5], []
-    difference = one.equations.xdot(*point, one.p) - other.equations.xdot(*point, other.p)
-    assert np.abs(difference.full()).max() < 1e-12  # rounding of the same operations
+    assert len(sources) == 2  # a tank and a pendulum, each with its scenario
+    for source in sources:
+        check_scenario(executed("README.md", [source])["scenario"])
+    assert len(sources[0].splitlines()) <= 25

@@ -49,7 +49,8 @@ def machine(shared) -> Path:
 
 def write_machine(folder: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    (folder / "my_machine.py").write_text(blocks[0] + TINY)
+    pendulum = next(block for block in blocks if "class Pendulum" in block)
+    (folder / "my_machine.py").write_text(pendulum + TINY)
     for i, name in enumerate(("monday", "tuesday")):
         columns = recording(i)
         columns["phi_rad"][600 : 600 + 10 * i] = columns["phi_rad"][600]
