@@ -231,7 +231,7 @@ def load_scenario(name_or_path: str) -> Scenario:
     """The scenario of a registered name or of a user's Python file (which defines ``scenario``).
 
     Loading a Python file runs it, so only a name that the user has typed may come here; for one that stands in a file
-    there is :func:`scenario_of`.
+    there is :func:`scenario_of`. It may import other files of its folder, whose names no installed module has.
 
     Raises:
         InputError: If there is no such name or file, the file fails, or defines no ``scenario``.
@@ -256,6 +256,9 @@ def load_scenario(name_or_path: str) -> Scenario:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses and worker processes look their module up by name
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.append(folder)  # files beside it may be imported; installed modules come first
     try:
         spec.loader.exec_module(module)
     except Exception as error:

@@ -1,7 +1,11 @@
 """Bad input ends with exit code 2 and a message that names file, row or field, and a remedy; nothing is left."""
 
+import sys
+
 import numpy as np
 import pytest
+
+from hybrid_mpc import load_scenario
 
 from .conftest import recording, write
 
@@ -95,6 +99,19 @@ def test_bad_scenario_files(call, tmp_path, source, words):
     path = tmp_path / "machine.py"
     path.write_text(source)
     refused(call, tmp_path / "o", words, path)
+
+
+def test_a_machine_s_file_may_import_one_beside_it(machine, tmp_path, monkeypatch):
+    """Its plant, say. Installed modules come first: a file cannot take their place."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "rig_of_mine.py").write_text("TITLE = 'From beside'\n")
+    (tmp_path / "casadi.py").write_text("raise RuntimeError('not this one')\n")
+    source = "import casadi\nfrom dataclasses import replace\nfrom rig_of_mine import TITLE\n"
+    source += (machine / "my_machine.py").read_text() + "\nscenario = replace(scenario, title=TITLE)\n"
+    path = tmp_path / "machine.py"
+    path.write_text(source)
+    assert load_scenario(str(path)).title == "From beside"
+    assert sys.path[-1] == str(tmp_path)
 
 
 def test_columns_by_option(call, machine, tmp_path):
