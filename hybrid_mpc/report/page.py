@@ -35,6 +35,15 @@ class KeyFigure:
 
 
 @dataclass(frozen=True)
+class Hint:
+    """What to do next: a verdict (``"bad"`` needs the reader), what was found, and a remedy, which may be empty."""
+
+    verdict: Verdict
+    finding: str
+    remedy: str
+
+
+@dataclass(frozen=True)
 class Table:
     """A table: heads with units, cells (numbers get three significant digits, None a dash), a sentence about it."""
 
@@ -83,7 +92,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A page: titles, a paragraph about the machine, the command that made it, key figures, sections.
+    """A page: titles, a paragraph about the machine, the command that made it, key figures, hints, sections.
 
     ``remark`` is a line under the title: seed, budget, versions.
     """
@@ -95,6 +104,7 @@ class Report:
     summary: Sequence[KeyFigure] = ()
     sections: Sequence[Section] = ()
     remark: str = ""
+    hints: Sequence[Hint] = ()
 
 
 def write_report(path: str | Path, report: Report) -> Path:

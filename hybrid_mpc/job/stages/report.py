@@ -15,6 +15,7 @@ from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.stage import Stage, source_of
+from hybrid_mpc.job.stages.advice import advice
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -275,6 +276,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         list(_summary(context, results)),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
+        advice(results),
     )
 
 

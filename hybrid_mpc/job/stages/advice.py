@@ -1,0 +1,129 @@
+"""What to do next: hints that a run's own figures give, in words, each with a remedy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from hybrid_mpc.job.stages.results import Identification, Results
+from hybrid_mpc.plots.style import name_of
+from hybrid_mpc.report.page import Hint
+
+EXPLAINED = 60.0
+"""FIT [%] of the fitted prior below which it lacks more than a network should have to learn."""
+HELD = (0.10, 0.07)
+"""By how much less and more than its share of unseen measurements a band may hold: 80 to 97 % of one for 90 %."""
+MOST = 4
+"""Warnings of one kind that are told here; the sections have all."""
+
+
+def advice(results: Results) -> list[Hint]:
+    """Hints about a finished run, what needs the user first; where nothing does, how to go on.
+
+    Example:
+        ``[hint.finding for hint in advice(read_results(read_object(path), str(path))) if hint.verdict == "bad"]``
+    """
+    found = [
+        *_recordings(results), *_prior(results.identification), *_choice(results.identification),
+        *_bands(results.identification), *_loops(results), *_watching(results),
+    ]  # fmt: skip
+    if not any(hint.verdict == "bad" for hint in found):
+        found.append(
+            Hint(
+                "good",
+                "Nothing stands out.",
+                "Close the loop on the machine: hm.Runner, or the controller as C.",
+            )
+        )
+    return sorted(found, key=lambda hint: hint.verdict != "bad")
+
+
+def _recordings(results: Results) -> Iterator[Hint]:
+    for warning in results.data.details.warnings[:MOST]:
+        yield Hint(
+            "bad", f"Recordings: {warning}", "Section Data shows it; record again, or say so in the DataSpec."
+        )
+
+
+def _prior(found: Identification) -> Iterator[Hint]:
+    for warning in found.details.prior_parameters.warnings[:MOST]:
+        yield Hint("plain", f"Fit of the prior: {warning}", "docs/prior-fit.md says what to do.")
+    for label, fit in _by_output(found.fit_percent.get("phy")).items():
+        if fit < EXPLAINED:
+            yield Hint(
+                "bad", f"The fitted prior has a FIT of {fit:.0f} % on {label.partition(' [')[0]}: it lacks much.",
+                "Look at signs, units, and a term that is missing, in the sensor too; a network is for what is small.",
+            )  # fmt: skip
+
+
+def _choice(found: Identification) -> Iterator[Hint]:
+    choice = found.details.choice
+    own = choice.candidates[choice.hybrid]
+    if choice.recommended != "phy":
+        yield Hint("good", choice.reason, "")
+        return
+    why = choice.reason
+    if own.error is None or own.ratio is None:
+        yield Hint(
+            "plain", why, "Shorter free runs or fewer units may train; the prior alone is a model, too."
+        )
+    elif own.upper is None or not math.isfinite(own.upper):
+        yield Hint("plain", why, "Give three recordings or more: of fewer nobody can tell what carries over.")
+    elif own.ratio < 1.0:
+        yield Hint("plain", why, "More recordings, in the conditions of the tasks, make the bound narrower.")
+    else:
+        yield Hint(
+            "plain", why,
+            "What the prior lacks differs from recording to recording, or is noise: look at the residuals of the free "
+            "runs for a term of the prior or a curve of the sensor.",
+        )  # fmt: skip
+
+
+def _bands(found: Identification) -> Iterator[Hint]:
+    name = found.details.choice.recommended
+    band = found.details.bands.get(name)
+    if band is None:
+        return
+    if band.coverage < band.share - HELD[0]:
+        yield Hint(
+            "bad", f"The {band.share:.0%} band of {name_of(name)} holds {band.coverage:.0%} of unseen measurements.",
+            "Unseen recordings differ from those that calibrated it: train on such ones; its width is too small.",
+        )  # fmt: skip
+    elif band.coverage > band.share + HELD[1]:
+        yield Hint(
+            "plain", f"The {band.share:.0%} band holds {band.coverage:.0%} of unseen measurements: it is wide.",
+            "Validation recordings were harder than the unseen ones.",
+        )  # fmt: skip
+
+
+def _loops(results: Results) -> Iterator[Hint]:
+    times, period = results.timing.controller_step_ms, results.timing.period_ms
+    if times.p99 is not None and times.p99 > period:
+        yield Hint(
+            "bad", f"A controller step takes {times.p99:.3g} ms in 99 of 100 periods, the period is {period:g} ms.",
+            "Was the computer busy? Else the solver native (compiled C), a shorter horizon or a longer dt.",
+        )  # fmt: skip
+    if not results.on_model.reason:
+        yield Hint(
+            "plain", "There is no plant: loops ran on a model, which shows no more than that they run.",
+            "Write a plant that differs from the prior as your machine may (Scenario(plant=...)).",
+        )  # fmt: skip
+
+
+def _watching(results: Results) -> Iterator[Hint]:
+    for what, clean in (
+        ("Alarms of the energy monitor", results.monitor.details.clean),
+        ("Alarms of the monitor of residuals", results.residuals.details.clean),
+    ):  # fmt: skip
+        if clean is not None and clean.alarms:
+            yield Hint(
+                "bad", f"{what}: {clean.alarms} in {clean.seconds:.0f} s known to be undisturbed.",
+                "Recordings that it learned from are too few or too unlike: look where it alarms before you act on it.",
+            )  # fmt: skip
+
+
+def _by_output(fit: object) -> dict[str, float]:
+    """FIT by output, of those that have one."""
+    if not isinstance(fit, dict):
+        return {}
+    return {label: float(v) for label, v in fit.items() if isinstance(v, int | float) and math.isfinite(v)}

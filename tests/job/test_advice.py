@@ -1,0 +1,91 @@
+"""What to do next: each finding of a run becomes a hint with a remedy, and nothing else does."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hybrid_mpc.files import read_object
+from hybrid_mpc.job.stages.advice import advice
+from hybrid_mpc.job.stages.monitor import CleanAlarms
+from hybrid_mpc.job.stages.results import CandidateErrors, Results, StepTimes, read_results
+from hybrid_mpc.report.page import Hint, Report, render
+
+PATH = Path(__file__).parents[2] / "docs/results/golf_robot_quick.json"
+
+
+@pytest.fixture(scope="module")
+def results() -> Results:
+    """A run of the golf robot in which nothing stands out."""
+    found = read_results(read_object(PATH), str(PATH))
+    quick = replace(found.timing, controller_step_ms=StepTimes(median=3.0, p99=5.0, max=9.0))
+    quiet = replace(found.residuals, details=replace(found.residuals.details, clean=CleanAlarms(300.0, 0)))
+    return replace(found, timing=quick, residuals=quiet)
+
+
+def changed(results: Results, **details: object) -> Results:
+    found = results.identification
+    return replace(results, identification=replace(found, details=replace(found.details, **details)))
+
+
+def chosen(results: Results, upper: float | None, ratio: float | None) -> Results:
+    """The fitted prior is recommended, of a hybrid with these figures."""
+    choice = results.identification.details.choice
+    own = CandidateErrors(None if ratio is None else 0.1, ratio, upper)
+    candidates = {**choice.candidates, choice.hybrid: own}
+    return changed(results, choice=replace(choice, recommended="phy", candidates=candidates))
+
+
+def bad(results: Results) -> list[str]:
+    return [hint.finding for hint in advice(results) if hint.verdict == "bad"]
+
+
+def test_a_run_in_which_nothing_stands_out_says_how_to_go_on(results):
+    assert bad(results) == []
+    assert advice(results)[-1].finding == "Nothing stands out."
+    assert any("pgrnn is recommended" in hint.finding for hint in advice(results))
+
+
+def test_each_finding_is_told_with_what_to_do(results):
+    slow = replace(results, timing=replace(results.timing, controller_step_ms=StepTimes(p99=30.7)))
+    (said,) = bad(slow)
+    assert "30.7 ms" in said
+    assert "period is 20 ms" in said
+    noisy = replace(results, monitor=replace(
+        results.monitor, details=replace(results.monitor.details, clean=CleanAlarms(250.0, 1))
+    ))  # fmt: skip
+    assert bad(noisy) == ["Alarms of the energy monitor: 1 in 250 s known to be undisturbed."]
+    warned = replace(results, data=replace(
+        results.data, details=replace(results.data.details, warnings=("monday.csv is nearly constant",))
+    ))  # fmt: skip
+    assert bad(warned) == ["Recordings: monday.csv is nearly constant"]
+    found = results.identification
+    poor = replace(results, identification=replace(
+        found, fit_percent={**found.fit_percent, "phy": {"phi [rad]": 41.0}}
+    ))  # fmt: skip
+    assert bad(poor) == ["The fitted prior has a FIT of 41 % on phi: it lacks much."]
+    bands = found.details.bands
+    thin = changed(results, bands={**bands, "pgrnn": replace(bands["pgrnn"], coverage=0.6)})
+    assert bad(thin) == ["The 90% band of PGRNN holds 60% of unseen measurements."]
+    assert all(hint.remedy for case in (slow, noisy, warned, poor, thin) for hint in advice(case)[:1])
+
+
+@pytest.mark.parametrize(
+    ("upper", "ratio", "remedy"),
+    [
+        (None, 0.7, "three recordings"), (float("inf"), 0.7, "three recordings"), (1.1, 0.9, "More recordings"),
+        (1.5, 1.1, "residuals of the free runs"), (None, None, "Shorter free runs"),
+    ],
+)  # fmt: skip
+def test_why_the_prior_is_recommended_says_what_may_help(results, upper, ratio, remedy):
+    (hint,) = [h for h in advice(chosen(results, upper, ratio)) if remedy in h.remedy]
+    assert hint.verdict == "plain"
+
+
+def test_the_page_shows_hints_with_their_signs(results):
+    page = Report("t", "s", "d", "c", hints=[Hint("bad", "a < b", "mend it"), Hint("good", "fine", "")])
+    text = render(page)
+    assert "What to do next" in text
+    assert "✗</span> a &lt; b" in text
+    assert text.index("✗</span>") < text.index("✓</span> fine")
+    assert "What to do next" not in render(replace(page, hints=()))
