@@ -40,9 +40,9 @@ from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridMod
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.innovations import ResidualLimits, ResidualMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.monitor.lengths import SHARE
+from hybrid_mpc.monitor.residuals import ResidualLimits, ResidualMonitor
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario
 

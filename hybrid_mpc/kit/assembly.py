@@ -29,8 +29,8 @@ from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian, positions_of
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.energy_readings import check_model
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
-from hybrid_mpc.monitor.residuals import check_model
 from hybrid_mpc.records import known
 from nn_export.errors import CompileError
 

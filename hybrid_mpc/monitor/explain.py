@@ -15,8 +15,8 @@ from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, changeable, incidence
 from hybrid_mpc.monitor.diagnose import Change, Diagnosis
-from hybrid_mpc.monitor.innovations import SHORT_S, ResidualLimits, ResidualTrace, machine_second
 from hybrid_mpc.monitor.replay import TrajectoryLike
+from hybrid_mpc.monitor.residuals import SHORT_S, ResidualLimits, ResidualTrace, machine_second
 
 Array = NDArray[np.float64]
 BEFORE_S, AFTER_S = 2.0, 1.0

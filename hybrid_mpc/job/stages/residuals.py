@@ -24,7 +24,8 @@ from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import stretches
-from hybrid_mpc.monitor.innovations import (
+from hybrid_mpc.monitor.replay import along
+from hybrid_mpc.monitor.residuals import (
     ResidualLimits,
     ResidualMonitor,
     ResidualTrace,
@@ -32,7 +33,6 @@ from hybrid_mpc.monitor.innovations import (
     limits_of,
     replay_residuals,
 )
-from hybrid_mpc.monitor.replay import along
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
