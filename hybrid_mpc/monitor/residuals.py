@@ -11,13 +11,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.data.scales import COARSEST, noise_of, periods
+from hybrid_mpc.data.scales import noise_of, periods
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import alarm_intervals, calibrate
 from hybrid_mpc.monitor.energy import FROZEN_STEPS, SECONDS, Validity
-from hybrid_mpc.monitor.lengths import block_seconds
+from hybrid_mpc.monitor.lengths import block_seconds, machine_second
 from hybrid_mpc.monitor.replay import REPORTED, EstimatorLike, TrajectoryLike
 
 Array = NDArray[np.float64]
@@ -235,7 +235,7 @@ class ResidualMonitor:
                 )
         self._travel = np.maximum(FROZEN_STEPS * steps, 0.0 if limits is None else np.array(limits.travel))
         self._repeats = np.zeros(model.n_y) if limits is None else np.array(limits.repeats)
-        unit = machine_second(model)
+        unit = machine_second(model.dt, model.time_unit)
         self.short, self.long, self.settling = (
             periods(length * unit, model.dt) for length in (SHORT_S, LONG_S, SETTLING_S)
         )
@@ -341,11 +341,6 @@ class ResidualMonitor:
             return Validity.WARM_UP
         missing = not (np.isfinite(y).all() and np.isfinite(u_prev).all())
         return Validity.MISSING if missing else Validity.NOT_FINITE
-
-
-def machine_second(model: HybridModel) -> float:
-    """The machine's second [s] in which a :class:`ResidualMonitor` counts: no fewer than ten periods."""
-    return max(model.time_unit, COARSEST * model.dt)
 
 
 @dataclass(frozen=True)
