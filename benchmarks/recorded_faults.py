@@ -48,7 +48,7 @@ from hybrid_mpc.job.stages.monitor import rates
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import first_deviations
 from hybrid_mpc.monitor.calibrate import stretches
-from hybrid_mpc.monitor.innovations import ResidualTrace
+from hybrid_mpc.monitor.residuals import ResidualTrace
 
 SCALES = (0.3, 1.0, 3.0, 10.0)
 """Candidate factors on the model's errors of a period; the likeliest on the training recording gives the noise."""

@@ -136,15 +136,15 @@ if TYPE_CHECKING:
     from hybrid_mpc.monitor.diagnose import Diagnoser
     from hybrid_mpc.monitor.energy import EnergyMonitor
     from hybrid_mpc.monitor.explain import ResidualDiagnoser
-    from hybrid_mpc.monitor.innovations import (
+    from hybrid_mpc.monitor.learn import guard_monitor, learn_from
+    from hybrid_mpc.monitor.lengths import rest_speeds
+    from hybrid_mpc.monitor.replay import replay
+    from hybrid_mpc.monitor.residuals import (
         ResidualLimits,
         ResidualMonitor,
         learn_residuals,
         replay_residuals,
     )
-    from hybrid_mpc.monitor.learn import guard_monitor, learn_from
-    from hybrid_mpc.monitor.lengths import rest_speeds
-    from hybrid_mpc.monitor.replay import replay
     from hybrid_mpc.scenario import DEFAULT_BUDGETS, Budget, Scenario, Task, load_scenario
 
 try:
@@ -424,10 +424,10 @@ _ROOMS = {
     "monitor.diagnose": ("Diagnoser",),
     "monitor.energy": ("EnergyMonitor",),
     "monitor.explain": ("ResidualDiagnoser",),
-    "monitor.innovations": ("ResidualLimits", "ResidualMonitor", "learn_residuals", "replay_residuals"),
     "monitor.learn": ("guard_monitor", "learn_from"),
     "monitor.lengths": ("rest_speeds",),
     "monitor.replay": ("replay",),
+    "monitor.residuals": ("ResidualLimits", "ResidualMonitor", "learn_residuals", "replay_residuals"),
     "scenario": ("Budget", "DEFAULT_BUDGETS", "Scenario", "Task", "load_scenario"),
 }  # fmt: skip
 """Public names by the module that defines them."""

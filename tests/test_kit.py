@@ -120,6 +120,15 @@ def test_the_solver_is_the_one_asked_for(run, solver, kind):
     assert type(hm.load(run).controller(solver=solver).controller).__name__ == kind
 
 
+@pytest.mark.parametrize("solver", ["rti", "sqp", "ipopt", "native"])
+def test_iterations_count_or_are_refused(run, solver):
+    """None of the solvers ignores them: 0 is refused where they count, any number where they do not."""
+    with pytest.raises(
+        hm.InputError, match="leave iterations out" if solver == "native" else "at least 1"
+    ):
+        hm.load(run).controller(solver=solver, iterations=0)
+
+
 def test_a_solver_more_is_a_line_in_the_table(run, monkeypatch):
     """A real-time iteration by another name: split into its two parts, its first plan another's."""
     monkeypatch.setitem(SOLVERS, "mine", CondensedController)

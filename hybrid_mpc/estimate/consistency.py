@@ -55,16 +55,6 @@ class Consistency:
     ljung_box: float
     ljung_box_limit: float
 
-    @property
-    def nis_passes(self) -> bool:
-        """Whether the mean NIS is within its band."""
-        return self.nis_band[0] <= self.mean_nis <= self.nis_band[1]
-
-    @property
-    def white(self) -> bool:
-        """Whether the Ljung-Box statistic is within its limit."""
-        return self.ljung_box <= self.ljung_box_limit
-
 
 def consistency(
     estimator: Filter,

@@ -63,7 +63,6 @@ from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.data.excitation import multisine
-from hybrid_mpc.data.scales import COARSEST
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
@@ -74,6 +73,7 @@ from hybrid_mpc.kit.assembly import MODES, make_ocp
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel, positions_of
+from hybrid_mpc.monitor.lengths import machine_second
 from hybrid_mpc.scenario import Scenario, scenario_of
 from nn_export import Program, load_programs
 
@@ -430,22 +430,11 @@ def pairs(box: Array) -> list[tuple[float, float]]:
     return [(float(a), float(b)) for a, b in box]
 
 
-def machine_second(model: HybridModel) -> float:
-    """The machine's second [s], in which all lengths here count: no shorter than ten periods.
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> [machine_second(SimpleNamespace(dt=dt, time_unit=1.0)) for dt in (0.02, 5.0)]
-        [1.0, 50.0]
-    """
-    return max(model.time_unit, COARSEST * model.dt)
-
-
 def driving_input(given: AnalysisInput, model: HybridModel, seconds: float) -> Array:
     """A multisine ``(n, n_u)`` of working size around the middle of each input's range, over so many of the machine's
     seconds; each input has lines of its own.
     """
-    unit = machine_second(model)
+    unit = machine_second(model.dt, model.time_unit)
     t = np.asarray(model.dt * np.arange(round(seconds * unit / model.dt)), dtype=np.float64)
     sizes = [(LEVEL * 0.5 * (high - low), 0.5 * (low + high)) for low, high in pairs(given.u_range)]
     low, high = (edge / unit for edge in DRIVEN_BAND)
@@ -471,7 +460,7 @@ def friction_of(given: AnalysisInput, points: Mapping[str, Point]) -> dict[str, 
 def systems(given: AnalysisInput, name: str, point: Point) -> dict[str, Any]:
     """The linearizations of a model as ``control.StateSpace``, by the names in :data:`POINTS`."""
     model, (x, h) = given.models[name], point
-    u, settled = model.u0, round(5.0 * machine_second(model) / model.dt)
+    u, settled = model.u0, round(5.0 * machine_second(model.dt, model.time_unit) / model.dt)
     found = {"rest": linearize(model, x, u, h)}
     if given.speed.size:
         found["working"] = linearize_secant(model, x, u, given.speed, h)
@@ -494,7 +483,7 @@ def linearizations_of(
 
 
 def _linearization(given: AnalysisInput, model: HybridModel, point: Point, system: Any) -> Linearization:
-    unit = machine_second(model)
+    unit = machine_second(model.dt, model.time_unit)
     structure, omega = system_structure(system), np.geomspace(0.02 / unit, np.pi / model.dt, 400)
     structure = replace(structure, hankel=hankel_singular_values(_scaled(given, model, system)))
     t = np.asarray(model.dt * np.arange(round(4.0 * unit / model.dt) + 1), dtype=np.float64)
@@ -556,12 +545,11 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
     """Responses of machine and models to the same inputs: of recordings, else of the simulated plant."""
     models = given.models
     some = next(iter(models.values()))
+    unit = machine_second(some.dt, some.time_unit)
     if some.n_u != 1:
         raise InputError(f"responses are estimated for one input; this machine has {some.n_u}")
     if given.recordings:
-        length = min(
-            10.0 * machine_second(some), 0.25 * max(u.size for u, _, _ in given.recordings) * some.dt
-        )
+        length = min(10.0 * unit, 0.25 * max(u.size for u, _, _ in given.recordings) * some.dt)
         machine = welch_response([(u, y) for u, y, _ in given.recordings], some.dt, length=length)
         responses = {
             name: welch_response(
@@ -573,9 +561,9 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
     elif given.plant is not None:
         low_u, high_u = given.u_range[0].tolist()
         amplitude, bias = LEVEL * 0.5 * (high_u - low_u), 0.5 * (low_u + high_u)
-        low, high = (edge / machine_second(some) for edge in BAND)
+        low, high = (edge / unit for edge in BAND)
         driven: dict[str, Any] = {
-            "amplitude": amplitude, "bias": bias, "band": (low, high), "period": PERIOD * machine_second(some),
+            "amplitude": amplitude, "bias": bias, "band": (low, high), "period": PERIOD * unit,
             "periods": PERIODS,
         }  # fmt: skip
         machine = multisine_response(run_plant(given.plant, some.x0, some.dt), some.dt, **driven)
@@ -657,7 +645,7 @@ def loops_of(
                 loop = mpc_loop(gain, steady, made[machine][point])
                 rows = found.setdefault(f"{name} on {machine}", {}).setdefault(point, {})
                 for j, signal in enumerate(model.inputs):
-                    own = gain.by_state[:, : model.n_x], model.dt, machine_second(model)
+                    own = gain.by_state[:, : model.n_x], model.dt, machine_second(model.dt, model.time_unit)
                     rows[f"{mode}{at_input(model, signal)}"] = _loop(loop, j, *own)
     return found
 

@@ -28,10 +28,10 @@ from hybrid_mpc.job.analyze import (
     ScheduleAnalysis,
     SensitivityAnalysis,
     at_input,
-    machine_second,
 )
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel, positions_of
+from hybrid_mpc.monitor.lengths import machine_second
 from hybrid_mpc.plots import analysis as plots
 from hybrid_mpc.plots.style import ratio_unit, save
 from hybrid_mpc.records import plain
@@ -236,10 +236,11 @@ def _sensitivity(some: HybridModel, part: Mapping[str, SensitivityAnalysis]) -> 
         for name, rms in zip(found.parameters, found.rms.T, strict=True)
     ]
     heads = [f"{s.name} per 100 % [{s.unit}]" for s in some.states]
+    length = 10 * machine_second(some.dt, some.time_unit)
     return Table(
         ("model", "parameter", *heads, "identifiable"), rows,
-        f"Root mean square change of a free run of {10 * machine_second(some):.4g} s. What is not identifiable cannot "
-        "be told from others by it.",
+        f"Root mean square change of a free run of {length:.4g} s. What is not identifiable cannot be told from others "
+        "by it.",
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from hybrid_mpc.kit.artifact import Provenance
 from hybrid_mpc.loop.faults import fault_text
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.innovations import ResidualLimits
+from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
 

@@ -35,7 +35,7 @@ from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel, kinematics
 from hybrid_mpc.monitor.calibrate import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.innovations import ResidualMonitor
+from hybrid_mpc.monitor.residuals import ResidualMonitor
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario, Task, load_scenario, registered_scenarios
 

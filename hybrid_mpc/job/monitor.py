@@ -22,18 +22,18 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnose import Diagnoser
 from hybrid_mpc.monitor.energy import EnergyMonitor, Validity
+from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.monitor.explain import ResidualDiagnoser
-from hybrid_mpc.monitor.innovations import (
+from hybrid_mpc.monitor.learn import guard_monitor, learn_from
+from hybrid_mpc.monitor.lengths import HISTORY_S, samples
+from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, along, replay
+from hybrid_mpc.monitor.residuals import (
     ResidualLimits,
     ResidualMonitor,
     ResidualTrace,
     learn_residuals,
     replay_residuals,
 )
-from hybrid_mpc.monitor.learn import guard_monitor, learn_from
-from hybrid_mpc.monitor.lengths import HISTORY_S, samples
-from hybrid_mpc.monitor.replay import EstimatorLike, MonitorTrace, TrajectoryLike, along, replay
-from hybrid_mpc.monitor.residuals import force_unit
 from hybrid_mpc.records import plain, record
 from hybrid_mpc.scenario import Scenario
 

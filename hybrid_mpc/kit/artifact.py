@@ -40,9 +40,9 @@ from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridMod
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.innovations import ResidualLimits, ResidualMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.monitor.lengths import SHARE
+from hybrid_mpc.monitor.residuals import ResidualLimits, ResidualMonitor
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario
 
@@ -618,7 +618,7 @@ class Kit:
         return make_estimator(found, self, noise, self.problem(task), observer=load)
 
     def controller(
-        self, model: str = "", *, task: str = "", solver: str = "rti", iterations: int = 1
+        self, model: str = "", *, task: str = "", solver: str = "rti", iterations: int | None = None
     ) -> SafeController:
         """The MPC of a model; its safeguards use the prior.
 
@@ -626,10 +626,11 @@ class Kit:
             model: Name of the model that plans. Default: the recommended one.
             task: Whose control problem it solves. Default: the common one.
             solver: ``"rti"``, ``"native"`` (the same as compiled C), ``"sqp"`` or ``"ipopt"``.
-            iterations: Linearizations a period of ``rti``. Default: one.
+            iterations: Linearizations a period of ``rti``, most iterations a solve of ``sqp`` and ``ipopt``; ``native``
+            has one. Default: the solver's own, one of ``rti``.
 
         Raises:
-            InputError: If there is no such model, task or solver, or no control problem.
+            InputError: If there is no such model, task or solver, none of so many iterations, or no control problem.
         """
         return make_controller(
             self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations,

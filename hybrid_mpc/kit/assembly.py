@@ -29,8 +29,8 @@ from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian, positions_of
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.energy import EnergyMonitor
+from hybrid_mpc.monitor.energy_readings import check_model
 from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
-from hybrid_mpc.monitor.residuals import check_model
 from hybrid_mpc.records import known
 from nn_export.errors import CompileError
 
@@ -277,7 +277,7 @@ def make_controller(
     control: OCP,
     *,
     solver: str = "rti",
-    iterations: int = 1,
+    iterations: int | None = None,
     safe_input: ArrayLike | None = None,
 ) -> SafeController:
     """A model's controller with its safeguards, which use the prior.
@@ -289,11 +289,13 @@ def make_controller(
         prior: The fitted prior, for terminal weight and fallback.
         control: The control problem.
         solver: Name in :data:`SOLVERS`.
-        iterations: Linearizations a period of ``rti``. Default: one.
+        iterations: Linearizations a period of ``rti``, most iterations a solve of ``sqp`` and ``ipopt``; ``native``
+            has one. Default: the solver's own, one of ``rti``.
         safe_input: Input ``(n_u,)`` that the machine may be left with. Default: none is declared.
 
     Raises:
-        InputError: If there is no such solver, or the inputs cannot hold the outputs that the problem weighs.
+        InputError: If there is no such solver, or none of so many iterations, or the inputs cannot hold the outputs
+            that the problem weighs.
 
     Example:
         ``make_controller(models["hybrid"], models["prior"], scenario.control)``
@@ -305,7 +307,11 @@ def make_controller(
             raise InputError(
                 f"control problem: at the operating point {found.why}; weigh other outputs in q_y"
             )
-    options = {"iterations": iterations} if solver == "rti" else {}
+    if iterations is not None and solver == "native":
+        raise InputError(
+            "solver native linearizes once a period: leave iterations out, or take rti, sqp or ipopt"
+        )
+    options = {} if iterations is None else {"iterations": iterations}
     controller = SOLVERS[known(solver, SOLVERS, "solver")](model, ocp, **options)
     first = None if controller.converges else first_controller(model, ocp)
     return SafeController(controller, prior, first=first, safe_input=safe_input)

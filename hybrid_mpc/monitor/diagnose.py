@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, changeable, incidence, prior_acceleration
 from hybrid_mpc.monitor.energy import EnergyMonitor, MonitorState
-from hybrid_mpc.monitor.residuals import inertia_of
+from hybrid_mpc.monitor.energy_readings import inertia_of
 
 Array = NDArray[np.float64]
 LEAST = 0.01

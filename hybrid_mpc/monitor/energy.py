@@ -17,8 +17,8 @@ from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
+from hybrid_mpc.monitor.energy_readings import Layout, check_model, reading_function
 from hybrid_mpc.monitor.lengths import NOTHING_STICKS, checked_rest
-from hybrid_mpc.monitor.residuals import Layout, check_model, reading_function
 
 Array = NDArray[np.float64]
 QUIET = (False, False)
@@ -55,7 +55,7 @@ class MonitorState:
     """All that the monitor remembers, never changed in place; ``x`` and ``h`` are the latest estimate's.
 
     Args:
-        memory: One vector, laid out as :class:`~hybrid_mpc.monitor.residuals.Layout` says; NaN until filled.
+        memory: One vector, laid out as :class:`~hybrid_mpc.monitor.energy_readings.Layout` says; NaN until filled.
         alarms: True while the alarm on the violation, and the one on the residual force, is on.
         left: Periods left of each free run.
         frozen: True while the sensor is held for frozen.

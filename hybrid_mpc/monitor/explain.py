@@ -15,8 +15,9 @@ from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, changeable, incidence
 from hybrid_mpc.monitor.diagnose import Change, Diagnosis
-from hybrid_mpc.monitor.innovations import SHORT_S, ResidualLimits, ResidualTrace, machine_second
+from hybrid_mpc.monitor.lengths import machine_second
 from hybrid_mpc.monitor.replay import TrajectoryLike
+from hybrid_mpc.monitor.residuals import SHORT_S, ResidualLimits, ResidualTrace
 
 Array = NDArray[np.float64]
 BEFORE_S, AFTER_S = 2.0, 1.0
@@ -122,7 +123,7 @@ class ResidualDiagnoser:
         self._units = (*[""] * (len(groups) + n_u), *added[0], *[""] * n_y, *added[1])
         self._is_share = np.repeat([True, False, True, False], [len(groups) + n_u, n_u, n_y, n_y])
         self._run = _sensitivities(model, shares[: model.n_p], prior)
-        unit = machine_second(model)
+        unit = machine_second(model.dt, model.time_unit)
         self.before, self.after, self.short = (
             max(1, round(length * unit / model.dt)) for length in (BEFORE_S, AFTER_S, SHORT_S)
         )

@@ -54,9 +54,19 @@ def half_window(length: float, model: HybridModel) -> int:
     return samples(0.5 * length, model, 2)
 
 
+def machine_second(dt: float, time_unit: float) -> float:
+    """The machine's second [s] where it must hold samples: no shorter than ten periods.
+
+    Example:
+        >>> [machine_second(dt, 1.0) for dt in (0.02, 5.0)]
+        [1.0, 50.0]
+    """
+    return max(time_unit, COARSEST * dt)
+
+
 def block_seconds(dt: float, time_unit: float = 1.0) -> float:
-    """Length [s] of a block: of ``BLOCK_S`` of the machine's seconds, which are no fewer than 10 periods."""
-    return BLOCK_S * max(time_unit, COARSEST * dt)
+    """Length [s] of a block: of ``BLOCK_S`` of the machine's seconds (:func:`machine_second`)."""
+    return BLOCK_S * machine_second(dt, time_unit)
 
 
 def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[float, ...]:

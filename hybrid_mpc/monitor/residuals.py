@@ -1,338 +1,637 @@
-"""The energy monitor's arithmetic as one CasADi function: violation, residual force, free runs, frozen sensor."""
+"""The monitor of any machine: what its model does not explain of every output and of every balance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.data.scales import noise_of, periods
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.model import Balance, HybridModel
+from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.calibrate import alarm_intervals, calibrate
+from hybrid_mpc.monitor.energy import FROZEN_STEPS, SECONDS, Validity
+from hybrid_mpc.monitor.lengths import block_seconds, machine_second
+from hybrid_mpc.monitor.replay import REPORTED, EstimatorLike, TrajectoryLike
 
 Array = NDArray[np.float64]
+SHORT_S, LONG_S = 0.3, 3.0
+"""Lengths of the two averages [the machine's seconds]: one is soon there, one shows what is small and lasts."""
+FREE_RUN_S = 1.0
+"""Length of the model's free runs [the machine's seconds]. A jump of a sensor, which the estimator follows within a few
+samples, shows in them until the next one begins."""
+SETTLING_S = 1.0
+"""Beginning of a recording or loop that counts for nothing [the machine's seconds]: the estimator does not know the
+states yet."""
+MARGIN = 1.5
+"""Where nominal data are too short for a rate: threshold over the highest nominal level."""
 RUNS = 2
-"""Free runs side by side, half a length apart: the older one always has half a length behind it."""
-RUN_SUMS = 3
-"""Sums of a free run: energy departure, squared speed, squared input."""
-ENERGY = "energy"
-"""Name of the balance that is watched."""
-FORCES = {("W", "rad/s"): "N m", ("W", "m/s"): "N"}
-"""Short names of a power over a speed."""
-HELD_SHARE = 0.25
-"""Change of an input, as a share of its range, that sticking friction does not hold."""
+"""Free runs that take turns, half a length apart: one has always half a length behind it."""
 
 
-class Layout:
-    """Where things lie in the monitor's memory and in its outputs.
+@dataclass(frozen=True)
+class ResidualLimits:
+    """Thresholds of a :class:`ResidualMonitor`, learned from recordings in which nothing is wrong.
 
-    ``window`` and ``average`` are samples, ``length`` the periods of a free run, ``history`` the rows kept for a
-    diagnosis; 0 for none.
+    Args:
+        channels: Names of the residuals, see :attr:`ResidualMonitor.channels`.
+        dt: Period [s] they were learned at.
+        threshold: Levels ``(channels, 2)`` above which an alarm starts, of the short and of the long average [units of
+            the channels]. Infinite where a measured disturbance was constant.
+        release: Levels below which it ends.
+        travel: How far each output may be predicted to move while its sensor repeats itself ``(n_y,)`` [its unit].
+        repeats: For so many samples each sensor may repeat itself while it should move ``(n_y,)``.
+        false_alarms_per_hour: Wanted rate [1/h] of all alarms together.
+        hours: Duration of the recordings [h].
+        method: How they were found.
+        rated: Whether the rate was told from the recordings; False where they were too short for any, and thresholds
+            are a margin above the highest nominal level.
+
+    Raises:
+        InputError: If the sizes differ, or a number is not positive.
+    """
+
+    channels: tuple[str, ...]
+    dt: float
+    threshold: tuple[tuple[float, float], ...]
+    release: tuple[tuple[float, float], ...]
+    travel: tuple[float, ...]
+    repeats: tuple[int, ...]
+    false_alarms_per_hour: float
+    hours: float
+    method: str = ""
+    rated: bool = True
+
+    def __post_init__(self) -> None:
+        sides = np.array(self.threshold, dtype=float), np.array(self.release, dtype=float)
+        if any(a.shape != (len(self.channels), 2) or not np.all(a > 0) for a in sides):
+            raise InputError(
+                f"limits of residuals: {len(self.channels)} channels need two positive thresholds and releases each, "
+                f"got {self.threshold} and {self.release}"
+            )
+        if not all(travel > 0 for travel in self.travel):
+            raise InputError(f"limits of residuals: travels must be positive, got {self.travel}")
+
+
+@dataclass(frozen=True)
+class ResidualState:
+    """All that the monitor remembers, never changed in place.
+
+    Args:
+        x: The latest estimate's state ``(n_x,)``; ``h`` its hidden state, ``w`` its disturbances; NaN before the first.
+        y: The latest measurement ``(n_y,)``.
+        recent: The latest residuals ``(long, channels)``, NaN until there are any and where something was missing.
+        travel: How far each output was predicted to move since its sensor last moved ``(n_y,)``.
+        repeats: Samples since then ``(n_y,)``.
+        on: Which alarms are on ``(channels, 2)``.
+        runs: States, hidden states and unmeasured disturbances of the free runs ``(2, n_x + n_h + n_d)``.
+        age: Periods since each of them began; negative: so long until it does.
+        seen: Samples taken, up to the long average's.
+        invalid: Samples in a row without a valid reading.
+    """
+
+    x: Array
+    h: Array
+    w: Array
+    y: Array
+    recent: Array
+    travel: Array
+    repeats: NDArray[np.int_]
+    on: NDArray[np.bool_]
+    runs: Array
+    age: tuple[int, ...]
+    seen: int = 0
+    invalid: int = 0
+
+
+@dataclass(frozen=True)
+class ResidualReading:
+    """What the monitor says of the period that just ended.
+
+    Args:
+        residual: By channel ``(channels,)`` [their units]; NaN where unknown.
+        level: Means of the latest residuals over both lengths ``(channels, 2)`` [units of the channels], with sign.
+        share: The largest level over its threshold [-]; NaN without limits.
+        channels: Names of the channels that alarm.
+        frozen_outputs: Names of the outputs whose sensor repeats itself while the model predicts that they move.
+        travel: How far each output was predicted to move since its sensor last moved ``(n_y,)`` [its unit].
+        repeats: Samples since then ``(n_y,)``.
+        alarm: True while any channel alarms, a sensor is frozen, or the monitor is blind.
+        validity: Whether this reading is valid, and if not, why.
+        blind: True while no reading has been valid for twice the short average.
+    """
+
+    residual: Array
+    level: Array
+    share: float
+    channels: tuple[str, ...]
+    frozen_outputs: tuple[str, ...]
+    travel: Array
+    repeats: NDArray[np.int_]
+    alarm: bool
+    validity: Validity
+    blind: bool
+
+    @property
+    def frozen(self) -> bool:
+        """Whether a sensor is frozen."""
+        return bool(self.frozen_outputs)
+
+    @property
+    def violation_w(self) -> float:
+        """NaN: a power [W] is known of the energy monitor alone."""
+        return math.nan
+
+    @property
+    def level_w(self) -> float:
+        """NaN, as :attr:`violation_w`."""
+        return math.nan
+
+
+class ResidualMonitor:
+    """Compares a model with its machine, output by output and balance by balance; for any model.
+
+    Its channels, in this order:
+
+    - Each **output**: what was measured less what one step of the model predicts from the estimate of a period ago,
+      under the input that acted and without the estimated disturbance [its unit].
+    - Each **balance**: what the estimate has become instead, over the period, is a rate that the model does not
+      explain, ``r = (x_hat - x_predicted) / dt``. It holds the correction by the measurement, and what a disturbance
+      observer takes for a load: so a constant load shows as long as it is there. The residual is ``dS/dx r`` [unit of
+      rate], for a mechanical prior the power that the machine has and the model has not.
+    - Each **measured disturbance**: how far it is from the operating point's [its unit]. No model says what it should
+      be, but one that is where it never was when nothing was wrong is an alarm by itself, and models know nothing
+      there.
+    - The **free run** of each output: what was measured less what the model, left alone since up to one of the
+      machine's seconds, makes of the inputs and of the disturbance that was estimated at its start [unit of the
+      output]. The one step begins at an estimate that has half followed the fault; the free run does not. Two take
+      turns, and the older one is read.
+
+    **Levels** are means over two lengths. An alarm starts where one passes the threshold of its channel, and its
+    channel is named. The first of the machine's seconds counts for nothing: estimates settle in it; an average counts
+    from when its length has passed since. **Frozen sensor**:
+    an output repeats itself exactly, for longer than when nothing was wrong, while the model's own predictions of it
+    add up to more than they did then (limits), and to more than three of the sensor's steps (resolution). A sensor
+    at an end of its range is not frozen.
+
+    For a mechanical model whose positions are measured :class:`~hybrid_mpc.monitor.energy.EnergyMonitor` sees more: it
+    knows dry friction. Not for several threads at once (it reuses its buffers).
+
+    Args:
+        model: The model that is compared with the machine.
+        limits: Thresholds, of :func:`learn_residuals`. Default: none, then only a frozen sensor and blindness alarm.
+        resolution: Step of each sensor ``(n_y,)`` [output units]. Default: the limits' alone; without these no test
+            for freezing.
+
+    Raises:
+        InputError: If the limits are of other channels or of another period, or a step is not positive.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("level", "m"),)
+        >>> tank = HybridModel.of("tank", 1.0, level, (Signal("inflow", "m/s"),), level,
+        ...     x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> monitor = ResidualMonitor(tank)
+        >>> none = np.zeros(0)
+        >>> memory = monitor.initial()
+        >>> for measured in (0.0, 0.1, 0.4):  # 0.1 m flow in each period, and 0.2 m more in the last one
+        ...     known = SimpleNamespace(x=np.array([measured]), h=none, w=none)
+        ...     memory, reading = monitor.update(memory, np.array([measured]), np.array([0.1]), known)
+        >>> monitor.channels, reading.residual.round(6).tolist()
+        (('level', 'free run of level'), [0.2, nan])
     """
 
     def __init__(
-        self, model: HybridModel, window: int, average: int, length: int = 0, history: int = 0
+        self, model: HybridModel, *, limits: ResidualLimits | None = None, resolution: ArrayLike | None = None
     ) -> None:
-        self.model, self.window, self.average, self.length, self.history = (
-            model,
-            window,
-            average,
-            length,
-            history,
+        self.model, self.limits = model, limits
+        outputs, balances, measured = model.outputs, model.balances, model.disturbances
+        free = tuple(f"free run of {s.name}" for s in outputs)
+        names = *(s.name for s in outputs), *(b.name for b in balances), *(s.name for s in measured)
+        self.channels = (*names, *free)
+        """Names of the residuals."""
+        units = tuple(s.unit for s in outputs)
+        self.units = (*units, *(b.rate_unit for b in balances), *(s.unit for s in measured), *units)
+        if limits is not None and (
+            limits.channels != self.channels or abs(limits.dt - model.dt) > 1e-9 * model.dt
+        ):
+            raise InputError(
+                f"residual monitor: the limits are of {limits.channels} at {limits.dt} s, the model {model.name} has "
+                f"{self.channels} at {model.dt} s; learn them anew with learn_residuals"
+            )
+        steps = np.full(model.n_y, np.inf if limits is None else 0.0)
+        if resolution is not None:
+            steps = np.asarray(resolution, dtype=float).ravel()
+            if steps.shape != (model.n_y,) or not np.all(steps > 0):
+                raise InputError(
+                    f"residual monitor: resolution needs {model.n_y} positive steps, got {steps.tolist()}"
+                )
+        self._travel = np.maximum(FROZEN_STEPS * steps, 0.0 if limits is None else np.array(limits.travel))
+        self._repeats = np.zeros(model.n_y) if limits is None else np.array(limits.repeats)
+        unit = machine_second(model.dt, model.time_unit)
+        self.short, self.long, self.settling = (
+            periods(length * unit, model.dt) for length in (SHORT_S, LONG_S, SETTLING_S)
         )
-        n_q = self.n_q = model.n_x // 2
-        self.row = 2 * n_q + model.n_u + model.n_w
-        """Model increments, input and measured disturbances of a period."""
-        self.one_step = window * n_q + (window - 1) * self.row
-        """Size of the window's part of the memory."""
-        self.averaged = self.one_step + 3 * n_q + model.n_u
-        """Where the latest violations begin; the residuals follow them."""
-        self.runs = self.averaged + average * (1 + n_q)
-        """Where the free runs begin."""
-        self.run = model.n_x + model.n_h + window * n_q + RUN_SUMS
-        """Size of a free run: state, hidden state, positions, sums."""
-        self.rows = self.runs + (RUNS * self.run if length else 0)
-        """Where the history begins."""
-        self.history_row = 3 * n_q + model.n_u
-        """Numbers of a row: state and input at the centre, residual."""
-        self.size = self.rows + history * self.history_row
+        self._length = periods(FREE_RUN_S * unit, model.dt, RUNS)
+        ends = [s.saturation or (-np.inf, np.inf) for s in model.outputs]
+        self._ends = np.array(ends, dtype=float).T
+        if limits is not None:
+            self._threshold, self._release = np.array(limits.threshold), np.array(limits.release)
+        self._function = BufferedFunction(_residuals(model))
 
-    def initial(self) -> tuple[Array, tuple[int, ...]]:
-        """Memory before the first sample, and the periods until each free run begins anew."""
-        memory = np.full(self.size, np.nan)
-        memory[self.one_step : self.averaged] = 0.0
-        return memory, (1, self.length // 2 + 1) if self.length else ()
+    def initial(self) -> ResidualState:
+        """State before the first sample."""
+        m, n = self.model, len(self.channels)
+        x, h, w, y = (np.full(size, np.nan) for size in (m.n_x, m.n_h, m.n_w, m.n_y))
+        recent, on = np.full((self.long, n), np.nan), np.zeros((n, 2), dtype=bool)
+        runs = np.full((RUNS, m.n_x + m.n_h + m.n_d), np.nan)
+        age = tuple(-self.settling - i * self._length // RUNS for i in range(RUNS))
+        return ResidualState(x, h, w, y, recent, np.zeros(m.n_y), np.zeros(m.n_y, dtype=int), on, runs, age)
 
-    def begin_runs(self, memory: Array, left: tuple[int, ...], x: Array, h: Array) -> tuple[int, ...]:
-        """Begin those free runs anew, in place, that have come to their end; returns the periods left of each."""
+    def update(
+        self, state: ResidualState, y: Array, u_prev: Array, estimate: Any
+    ) -> tuple[ResidualState, ResidualReading]:
+        """Take one sample; pure: the same arguments give the same result.
+
+        Args:
+            state: State after the previous sample, or :meth:`initial`.
+            y: Measurement ``(n_y,)`` now; NaN where missing.
+            u_prev: Input ``(n_u,)`` applied over the period that just ended.
+            estimate: Estimate at this sample, of which ``x``, ``h``, ``w`` and, where it has one, ``d`` are read.
+
+        Returns:
+            The next state and the reading.
+        """
+        m = self.model
+        y = np.array(y, dtype=np.float64).ravel()
+        x, h = (np.array(values, dtype=np.float64).ravel() for values in (estimate.x, estimate.h))
+        given = estimate.w if np.size(estimate.w) == m.n_w else m.w
+        w, d = np.array(given, dtype=np.float64).ravel(), np.ravel(getattr(estimate, "d", ()))
+        ins, outs = self._function.inputs, self._function.outputs
+        for place, values in zip(ins, (state.x, state.h, u_prev, state.w, y, x, state.runs), strict=True):
+            place[:] = values.ravel()
+        self._function()
+        moved, ahead, free = outs[1].copy(), outs[2].reshape(RUNS, -1).copy(), outs[3].reshape(RUNS, -1)
+        begun = np.concatenate([x, h, d if d.size == m.n_d else np.zeros(m.n_d)])
+        runs, age, error = self._turned(ahead, free, begun, state.age)
+        residual = np.concatenate([outs[0], w - m.w, error])
+        residual[~np.isfinite(residual)] = np.nan
+        seen = min(state.seen + 1, self.settling + self.long)
+        counted = residual if seen > self.settling else np.full_like(residual, np.nan)
+        recent = np.vstack([state.recent[1:], counted])
+        level = np.column_stack([_mean(recent[-length:]) for length in (self.short, self.long)])
+        level[:, [seen < self.settling + length for length in (self.short, self.long)]] = np.nan
+        on, share = self.alarms(level, state.on)
+        still = (y == state.y) & np.isfinite(moved) & (seen > self.settling)
+        travel = np.where(still, state.travel + moved, 0.0)
+        repeats = np.where(still, state.repeats + 1, 0)
+        frozen = self.frozen(y, travel, repeats)
+        validity = self._validity(residual[: -m.n_y], y, u_prev, seen)
+        invalid = state.invalid + 1 if validity else 0
+        blind = invalid > 2 * self.short
+        names = tuple(name for name, row in zip(self.channels, on, strict=True) if row.any())
+        stuck = tuple(s.name for s, f in zip(m.outputs, frozen, strict=True) if f)
+        following = ResidualState(x, h, w, y, recent, travel, repeats, on, runs, age, seen, invalid)
+        alarm = bool(names or stuck or blind)
+        return following, ResidualReading(
+            residual, level, share, names, stuck, travel, repeats, alarm, validity, blind
+        )
+
+    def _turned(
+        self, ahead: Array, free: Array, begun: Array, age: tuple[int, ...]
+    ) -> tuple[Array, tuple[int, ...], Array]:
+        """Free runs and their ages after those that are at their end, or lost, have begun anew; error of the older."""
+        running = [k for k in range(RUNS) if age[k] >= 0]
+        older = max(running, key=lambda k: age[k], default=None)
+        error = np.full(self.model.n_y, np.nan) if older is None else free[older].copy()
         following = []
-        for i, periods in enumerate(left):
-            if periods > 1:
-                following.append(periods - 1)
-                continue
-            first, n = self.runs + i * self.run, self.model.n_x + self.model.n_h
-            memory[first : first + self.run - RUN_SUMS] = np.nan
-            memory[first : first + n] = np.concatenate([x, h])
-            memory[first + self.run - RUN_SUMS - self.n_q : first + self.run - RUN_SUMS] = x[: self.n_q]
-            memory[first + self.run - RUN_SUMS : first + self.run] = 0.0
-            known = bool(np.isfinite(x).all())  # else try again at the next sample
-            following.append(self.length if known else 1)
-        return tuple(following)
+        for k, periods_ago in enumerate(age):
+            now = periods_ago + 1
+            lost = now > 0 and not np.isfinite(ahead[k]).all()
+            if now == 0 or now >= self._length or lost:
+                ahead[k] = begun
+                now = 0 if np.isfinite(begun).all() else -1  # else try again at the next sample
+            following.append(now)
+        return ahead, tuple(following), error
+
+    def frozen(self, y: Array, travel: Array, repeats: NDArray[np.int_]) -> NDArray[np.bool_]:
+        """Which sensors are frozen ``(n_y,)``: from the measurement, and how far and long each repeated itself."""
+        inside = (y > self._ends[0]) & (y < self._ends[1])
+        return inside & (np.abs(travel) > self._travel) & (repeats > self._repeats)
+
+    def alarms(self, level: Array, were_on: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
+        """Which alarms are on at levels ``(channels, 2)``, and the largest level over its threshold."""
+        if self.limits is None:
+            return were_on, math.nan
+        size = np.abs(np.nan_to_num(level))
+        on = size > np.where(were_on, self._release, self._threshold)
+        return on, float(np.max(size / self._threshold))
+
+    def _validity(self, residual: Array, y: Array, u_prev: Array, seen: int) -> Validity:
+        if np.isfinite(residual).all():
+            return Validity.VALID
+        if seen < 2:
+            return Validity.WARM_UP
+        missing = not (np.isfinite(y).all() and np.isfinite(u_prev).all())
+        return Validity.MISSING if missing else Validity.NOT_FINITE
 
 
-def weights(window: int, dt: float) -> tuple[Array, Array, Array, Array, Array]:
-    """Weights of position, velocity, acceleration, and the Peano kernel at nodes with its slopes."""
-    s = (np.arange(window) - 0.5 * (window - 1)) * dt
-    scale = s[-1]
-    fit = np.linalg.pinv(np.vander(s / scale, 4, increasing=True))
-    position, velocity, acceleration = fit[0], fit[1] / scale, 2.0 * fit[2] / scale**2
-    kernel = np.maximum(s[None, :] - s[:, None], 0.0) @ acceleration
-    return position, velocity, acceleration, kernel, np.diff(kernel) / dt
+@dataclass(frozen=True)
+class ResidualTrace:
+    """Readings of a :class:`ResidualMonitor` along a recording of ``n`` samples.
 
-
-def _given(model: HybridModel, g: ca.MX) -> tuple[ca.MX, Any]:
-    """Input and measured disturbances of ``g``: both, or the input alone, under those of the operating point."""
-    n_u = model.n_u
-    return (g, model.w) if g.shape[0] == n_u else (g[:n_u], g[n_u:])
-
-
-def energy_balance(model: HybridModel, x: ca.MX, xdot: ca.MX, g: ca.MX) -> ca.MX:
-    """Residual [W] of the model's energy balance if its state changes at ``xdot``; ``g`` is the input ``(n_u,)``, or
-    the input and the measured disturbances.
+    Args:
+        t: Time [s] ``(n,)``.
+        residual: ``(n, channels)`` [units of the channels].
+        level: ``(n, channels, 2)``.
+        share: Largest level over its threshold ``(n,)`` [-].
+        on: Which channels alarm ``(n, channels)``.
+        frozen: Which outputs are frozen ``(n, n_y)``.
+        travel: How far outputs were predicted to move while their sensor repeated itself ``(n, n_y)``.
+        repeats: For how many samples it did ``(n, n_y)``.
+        alarm: Any alarm ``(n,)``.
+        validity: Values of :class:`~hybrid_mpc.monitor.energy.Validity` ``(n,)``.
+        channels: Names of the channels.
+        outputs: Names of the outputs.
     """
-    return _energy_of(model).residual(x, xdot, *_given(model, g), model.p)
+
+    t: Array
+    residual: Array
+    level: Array
+    share: Array
+    on: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
+    travel: Array
+    repeats: NDArray[np.int_]
+    alarm: NDArray[np.bool_]
+    validity: NDArray[np.int_]
+    channels: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def intervals(self) -> list[tuple[float, float]]:
+        """Alarms as ``(first, last)`` [s] in the recording's own time."""
+        return _intervals(self.alarm, self.t)
+
+    def by_channel(self) -> dict[str, list[tuple[float, float]]]:
+        """Alarms of each channel that had any, and of each frozen sensor as ``"NAME frozen"``."""
+        every = dict(zip(self.channels, self.on.T, strict=True))
+        every |= {f"{name} frozen": on for name, on in zip(self.outputs, self.frozen.T, strict=True)}
+        return {name: _intervals(on, self.t) for name, on in every.items() if on.any()}
+
+    def named(self, start: float, end: float) -> tuple[str, ...]:
+        """Channels that alarm between two instants [s], in the order in which they do; frozen sensors as
+        ``"NAME frozen"``.
+        """
+        within = (self.t >= start - 1e-9) & (self.t <= end + 1e-9)
+        on = np.hstack([self.on, self.frozen])[within]
+        names = (*self.channels, *(f"{name} frozen" for name in self.outputs))
+        first = [int(np.argmax(column)) if column.any() else len(on) for column in on.T]
+        return tuple(names[i] for i in np.argsort(first, kind="stable") if first[i] < len(on))
+
+    def coverage(self, dt: float) -> dict[str, float]:
+        """Seconds with a valid reading, and those without, by reason."""
+        return {name: float(np.sum(self.validity == why)) * dt for why, name in SECONDS.items()}
 
 
-def _energy_of(model: HybridModel) -> Balance:
-    for balance in model.balances:
-        if balance.name == ENERGY:
-            return balance
-    known = ", ".join(b.name for b in model.balances) or "none"
-    raise InputError(
-        f"energy monitor: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
-        "watched; give its prior one (a MechanicalPrior has it), and export it again, or take no monitor"
-    )
+def _intervals(on: NDArray[np.bool_], t: Array) -> list[tuple[float, float]]:
+    return [(float(t[int(a)]), float(t[int(b)])) for a, b in alarm_intervals(on, 1.0)]
 
 
-def force_units(model: HybridModel) -> tuple[str, ...]:
-    """Unit of each residual force: that of the balance's rate over that of the speed."""
-    rate = _energy_of(model).rate_unit
-    return tuple(FORCES.get((rate, v.unit), f"{rate}/({v.unit})") for v in model.states[model.n_x // 2 :])
+def replay_residuals(
+    monitor: ResidualMonitor,
+    estimator: EstimatorLike,
+    recording: TrajectoryLike,
+    *,
+    on_sample: Callable[[int, Any], None] = lambda k, estimate: None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> ResidualTrace:
+    """Feed a recording to the estimator and the monitor, sample by sample.
 
+    Args:
+        monitor: The monitor.
+        estimator: The one that the loop uses.
+        recording: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) and, where the model has measured disturbances, ``w``
+            (n, n_w), on the model's grid.
+        on_sample: Called with each sample's number and estimate. Default: none.
+        on_progress: Called with ``(done, total)`` samples every so often. Default: none.
 
-def force_unit(model: HybridModel) -> str:
-    """Unit of the level of all residual forces together; forces of several units are all named.
-
-    Example: ``force_unit(kit.models["prior"])`` is ``"N m"`` for a pendulum, ``"N, N m"`` for a cart with one.
+    Example: ``replay_residuals(kit.monitor(), kit.observer(), recording).by_channel()``
     """
-    return ", ".join(dict.fromkeys(force_units(model)))
+    m, n = monitor.model, len(recording.t)
+    state, readings, estimate, on = monitor.initial(), [], None, []
+    w_all: Array | None = getattr(recording, "w", None)
+    for k, y in enumerate(np.asarray(recording.y, dtype=np.float64)):
+        if k % REPORTED == 0:
+            on_progress(k, n)
+        also: dict[str, Any] = {} if not m.n_w or w_all is None else {"w": w_all[k]}
+        u_prev = recording.u[k - 1] if k else np.full(m.n_u, np.nan)
+        if estimate is None:
+            estimate = estimator.start(y, float(recording.t[0]), **also)
+        else:
+            estimate = estimator.update(estimate, y, u_prev, **also)
+        state, reading = monitor.update(state, y, u_prev, estimate)
+        readings.append(reading)
+        on.append(state.on.any(axis=1))
+        on_sample(k, estimate)
+    on_progress(n, n)
+    outputs = tuple(s.name for s in m.outputs)
+    columns = {
+        name: np.array([getattr(r, name) for r in readings])
+        for name in ("residual", "level", "share", "travel", "repeats", "alarm", "validity")
+    }
+    return ResidualTrace(
+        np.asarray(recording.t, dtype=np.float64), on=np.array(on),
+        frozen=np.array([[name in r.frozen_outputs for name in outputs] for r in readings]),
+        channels=monitor.channels, outputs=outputs, **columns,
+    )  # fmt: skip
 
 
-def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
-    """Inertia matrix ``M(q)`` of the energy balance, which is ``v' M a`` plus terms without ``a``."""
-    n_q = model.n_x // 2
-    a, rows = ca.MX.sym("a", n_q), []
-    for i in range(n_q):
-        v = ca.DM.zeros(n_q)
-        v[i] = 1.0
-        state, rate = ca.vertcat(x[:n_q], v), ca.vertcat(v, a)
-        rows.append(ca.jacobian(energy_balance(model, state, rate, u), a))
-    return ca.graph_substitute(ca.vertcat(*rows), [a], [ca.MX.zeros(n_q)])
+def judged(monitor: ResidualMonitor, trace: ResidualTrace, y: Array) -> ResidualTrace:
+    """A trace with the alarms of ``monitor``'s limits; ``y`` ``(n, n_y)`` are its measurements.
 
-
-def _near_rest(
-    model: HybridModel, position: ca.MX, h: ca.MX, g: ca.MX, rest: ca.DM
-) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """What a model says of slow motion: its mean acceleration there, and by how much dry friction and damping slow it.
-
-    Half the difference of the accelerations back and forth is ``D(s) = jump + damping s``: dry friction, which is fully
-    there at the rest speed, and what grows with the speed. So ``2 D(s) - D(2 s)`` is what dry friction can hold at
-    rest, and what damps is no part of it. Returned are the mean, ``D(s)`` and ``2 D(s) - D(2 s)``.
+    Residuals do not depend on limits, so nothing is replayed.
     """
-    n_q = model.n_x // 2
-    (back, forth), (faster_back, faster_forth) = (
-        [
-            model.xdot(ca.vertcat(position, sign * speed), h, *_given(model, g), model.p)[n_q:]
-            for sign in (-1, 1)
-        ]
-        for speed in (rest, 2 * rest)
-    )
-    slowed = 0.5 * (back - forth)
-    return 0.5 * (back + forth), slowed, 2 * slowed - 0.5 * (faster_back - faster_forth)
+    rows, frozen = [], []
+    on = np.zeros((len(monitor.channels), 2), dtype=bool)
+    shares = []
+    for level, travel, repeats, measured in zip(trace.level, trace.travel, trace.repeats, y, strict=True):
+        on, share = monitor.alarms(level, on)
+        rows.append(on.any(axis=1))
+        shares.append(share)
+        frozen.append(monitor.frozen(measured, travel, repeats))
+    found, stuck = np.array(rows), np.array(frozen)
+    blind = trace.alarm & ~trace.on.any(axis=1) & ~trace.frozen.any(axis=1)
+    alarm = found.any(axis=1) | stuck.any(axis=1) | blind
+    return replace(trace, share=np.array(shares), on=found, frozen=stuck, alarm=alarm)
 
 
-def _residual(
-    model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, g: ca.MX, rest: ca.DM
-) -> ca.MX:
-    """Force ``(n_q,)`` that the model does not explain; near rest, what dry friction could not hold either.
+def learn_residuals(
+    model: HybridModel,
+    estimator: EstimatorLike,
+    recordings: Iterable[TrajectoryLike],
+    *,
+    false_alarms_per_hour: float | Sequence[float] = 1.0,
+    nominal: Sequence[NDArray[np.bool_]] | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> ResidualLimits:
+    """Limits of a :class:`ResidualMonitor` from recordings in which nothing is wrong.
 
-    The model's accelerations near rest are half the monitor's work, so they are left out at speed.
+    Each channel and length has its share of the wanted rate. Its threshold is the level that nominal ones pass so often
+    (:func:`~hybrid_mpc.monitor.calibrate.calibrate`, extreme values); where the recordings are too short for that,
+    half as much again as the highest of them, and ``method`` says so.
+
+    Args:
+        model: The model.
+        estimator: The one that the loop will use.
+        recordings: With ``t``, ``y``, ``u`` and, where the model has disturbances, ``w``, on the model's grid.
+        false_alarms_per_hour: Wanted rate [1/h] of all alarms together; of several, in rising order, the first that the
+            recordings are long enough for in every channel. Default 1.
+        nominal: Which samples of each recording count, ``(n,)`` each. Default: all behind the first of the machine's
+            seconds, in which the estimator settles.
+        on_progress: Called with ``(done, total)`` samples as the replays go on. Default: not at all.
+
+    Raises:
+        InputError: If the recordings leave nothing behind their beginning, or a channel has no residual in them.
     """
-    n_q = model.n_x // 2
-    sizes = {"e": n_q, "a": n_q, "x": model.n_x, "h": model.n_h, "g": model.n_u + model.n_w}
-    sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
-    error, measured, state, hidden, held_input = sym
-    inertia, speed = inertia_of(model, state, held_input), state[n_q:]
-    mean, slowed, jump = _near_rest(model, state[:n_q], hidden, held_input, rest)
-    friction = ca.fmax(0, inertia @ jump)
-    damping = (inertia @ slowed - friction) * speed / rest  # between joints it counts as each joint's own
-    held = inertia @ (measured - mean) + damping  # friction of either direction taken out
-    held = ca.sign(held) * ca.fmax(0, ca.fabs(held) - friction)
-    near = ca.fmax(0, ca.fmin(1, 2 - ca.fabs(speed) / rest))
-    slow = ca.Function("slow", sym, [ca.densify(near * held + (1 - near) * (inertia @ error))])
-    fast = ca.Function("fast", sym, [ca.densify(inertia @ error)])
-    at_speed = ca.mmin(ca.fabs(x[n_q:]) / rest) >= 2
-    choice = ca.Function.if_else("residual", fast, slow)
-    return choice(at_speed, a_measured - a_model, a_measured, x, h, g)
+    monitor, given = ResidualMonitor(model), list(recordings)
+    total, before = sum(len(r.t) for r in given), 0
+    traces = []
+    for recording in given:
+        start = before
+
+        def say(done: int, own: int, start: int = start) -> None:
+            on_progress(start + done, total)
+
+        traces.append(replay_residuals(monitor, estimator, recording, on_progress=say))
+        before += len(recording.t)
+    return limits_of(monitor, given, traces, false_alarms_per_hour=false_alarms_per_hour, nominal=nominal)
 
 
-def _free_run(
-    layout: Layout, memory: ca.MX, g: ca.MX, measured_w: ca.MX, g_mean: ca.MX, v: ca.MX, full: ca.MX
-) -> tuple[ca.MX, ca.MX]:
-    """A free run one period on: its memory, and its sums over the periods whose windows are full.
+def limits_of(
+    monitor: ResidualMonitor,
+    recordings: Sequence[TrajectoryLike],
+    traces: Sequence[ResidualTrace],
+    *,
+    false_alarms_per_hour: float | Sequence[float] = 1.0,
+    nominal: Sequence[NDArray[np.bool_]] | None = None,
+) -> ResidualLimits:
+    """The limits of :func:`learn_residuals` from the ``traces`` of the ``recordings`` by a monitor without limits."""
+    model, levels, travels, repeats = monitor.model, [], [], []
+    for i, trace in enumerate(traces):
+        counts = np.ones(len(trace.t), dtype=bool) if nominal is None else np.array(nominal[i])
+        counts[: monitor.settling] = False
+        levels.append(np.where(counts[:, None, None], np.abs(trace.level), np.nan))
+        travels.append(np.abs(trace.travel[counts]))
+        repeats.append(trace.repeats[counts])
+    seconds = float(sum(np.isfinite(run[:, 0, 0]).sum() for run in levels)) * model.dt
+    if not seconds:
+        raise InputError(
+            f"learn_residuals: no recording is longer than the {monitor.settling * model.dt:g} s that the estimator "
+            "settles in"
+        )
+    far, often = _freezing(model, recordings, np.concatenate(travels), np.concatenate(repeats))
+    for rate in np.atleast_1d(false_alarms_per_hour).tolist():
+        threshold, release, short = _thresholds(monitor, levels, rate)
+        if not short:
+            break
+    return ResidualLimits(
+        monitor.channels, model.dt, _pairs(threshold), _pairs(release), far, often, rate, seconds / 3600,
+        f"{MARGIN} x the highest nominal level ({short})" if short else "extreme values of blocks", not short,
+    )  # fmt: skip
 
-    Its own positions go through the same polynomial as the measured ones.
+
+def _thresholds(monitor: ResidualMonitor, levels: Sequence[Array], rate: float) -> tuple[Array, Array, str]:
+    """Thresholds and releases ``(channels, 2)`` for a rate, and why extreme values do not tell them all."""
+    model, n = monitor.model, len(monitor.channels)
+    first_w = model.n_y + len(model.balances)
+    each, block = rate / (2 * n), block_seconds(model.dt, model.time_unit)
+    threshold, release, short = np.empty((n, 2)), np.empty((n, 2)), ""
+    for i, j in np.ndindex(n, 2):
+        runs = [run[:, i, j] for run in levels]
+        finite = np.concatenate(runs)
+        finite = finite[np.isfinite(finite)]
+        if first_w <= i < first_w + model.n_w and not (finite.size and finite.max() > 0):
+            threshold[i, j] = release[i, j] = math.inf
+            continue
+        if not (finite.size and finite.max() > 0):
+            raise InputError(
+                f"learn_residuals: {monitor.channels[i]} has no residual in the recordings that is not zero"
+            )
+        try:
+            found = calibrate(runs, model.dt, false_alarms_per_hour=each, block_s=block)
+            assert found.threshold_w is not None
+            assert found.release_w is not None
+            threshold[i, j], release[i, j] = found.threshold_w, found.release_w
+        except InputError as error:
+            short = str(error)
+            threshold[i, j] = MARGIN * float(finite.max())
+            release[i, j] = max(0.5 * float(threshold[i, j]), float(np.quantile(finite, 0.95)))
+    return threshold, release, short
+
+
+def _freezing(
+    model: HybridModel, recordings: Sequence[TrajectoryLike], travel: Array, repeats: NDArray[np.int_]
+) -> tuple[tuple[float, ...], tuple[int, ...]]:
+    """How far outputs may be predicted to move, and for how many samples, while their sensor repeats itself: beyond
+    what nominal data have, and three of the sensor's steps.
+
+    The step is that of an even error as large as the sensor's noise, and no less than the smallest change recorded.
+    Repetitions of what is not predicted to move by a step are those of a machine at rest.
     """
-    model, window, n_q = layout.model, layout.window, layout.n_q
-    n_x, n_z = model.n_x, model.n_x + model.n_h
-    x, h = model.step(memory[:n_x], memory[n_x:n_z], *_given(model, g), model.p)
-    ring = ca.vertcat(memory[n_z + n_q : n_z + window * n_q], x[:n_q])
-    position, velocity, acceleration, _, _ = weights(window, model.dt)
-    # No need to take the newest off: a run is short.
-    q_m, v_m, a_m = (ca.reshape(ring, n_q, window) @ ca.DM(w) for w in (position, velocity, acceleration))
-    power = energy_balance(model, ca.vertcat(q_m, v_m), ca.vertcat(v_m, a_m), g_mean)
-    u_mean = g_mean[: model.n_u]
-    added = model.dt * ca.vertcat(power - measured_w, ca.dot(v, v), ca.dot(u_mean, u_mean))
-    sums = memory[n_z + window * n_q :] + ca.if_else(full, added, 0)
-    return ca.vertcat(x, h, ring, sums), sums
+    found = []
+    for i, (signal, noise) in enumerate(zip(model.outputs, noise_of(recordings).tolist(), strict=True)):
+        changes = np.concatenate([np.abs(np.diff(r.y[:, i])) for r in recordings])
+        changes = changes[changes > 0]
+        if not changes.size:
+            raise InputError(f"learn_residuals: {signal.name} never changes in the recordings")
+        step, moved = max(math.sqrt(12.0) * noise, float(changes.min())), np.abs(travel[:, i])
+        most = int(np.max(repeats[moved > step, i], initial=0))
+        found.append((max(MARGIN * float(moved.max()), FROZEN_STEPS * step), math.ceil(MARGIN * most)))
+    return tuple(far for far, _ in found), tuple(count for _, count in found)
 
 
-def _pushed(
-    layout: Layout,
-    memory: ca.MX,
-    still: ca.MX,
-    x: ca.MX,
-    h: ca.MX,
-    u: ca.MX,
-    w: ca.MX,
-    rest: ca.DM,
-    spans: ca.DM,
-) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """Speed and travel ``(n_q,)`` that the input should have caused since the sensors' last step, and the input then.
+def _pairs(values: Array) -> tuple[tuple[float, float], ...]:
+    return tuple((float(short), float(long)) for short, long in values)
 
-    An estimator takes a frozen sensor for a standing machine, and an unknown load for what holds it; the controller
-    pulls, and nothing moves. What counts is what both the input's change since then and the input itself, beyond
-    friction, would do: a load that is there is no change, and a machine that has braked is left with no pull. The model
-    is asked only beyond ``HELD_SHARE`` of the input's range, for it costs six evaluations.
+
+def _residuals(model: HybridModel) -> ca.Function:
+    """``(x, h, u, w, y, x_hat, runs) -> residuals of outputs and balances, predicted changes of the outputs, free runs
+    a period on, and their errors``; ``x`` and ``h`` of a period ago.
     """
-    model, n_q = layout.model, layout.n_q
-    first = layout.one_step + n_q
-    speed, travel, before = ca.vertsplit(
-        memory[first : layout.averaged], [0, n_q, 2 * n_q, 2 * n_q + model.n_u]
-    )
-    if model.delay_states:  # the oldest of the inputs on their way is the one that has begun to act
-        u = h[: model.n_u]
-    before = ca.if_else(ca.logic_and(still, ca.mmin(_known(before))), before, u)
-    strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - HELD_SHARE * spans) > 0)
-    sizes = {"x": model.n_x, "h": model.n_h, "u": model.n_u, "before": model.n_u, "w": model.n_w}
-    sym = [ca.MX.sym(name, size) for name, size in sizes.items()]
-    (mean, _, jump), (earlier, _, _) = (
-        _near_rest(model, sym[0][:n_q], sym[1], ca.vertcat(pull, sym[4]), rest) for pull in sym[2:4]
-    )
-    alone = ca.sign(mean) * ca.fmax(0, ca.fabs(mean) - ca.fmax(0, jump))
-    change = mean - earlier
-    both = ca.sign(alone) * ca.fmin(ca.fabs(alone), ca.fabs(change)) * (alone * change > 0)
-    asked = ca.Function("asked", sym, [ca.densify(both)])
-    none = ca.Function("none", sym, [ca.DM.zeros(n_q)])
-    push = ca.Function.if_else("push", asked, none)(strong, x, h, u, before, w)
-    speed = ca.if_else(strong, speed + model.dt * push, 0)
-    travel = ca.if_else(still, travel + model.dt * ca.fabs(speed), 0)
-    return ca.if_else(_known(speed), speed, 0), ca.if_else(_known(travel), travel, 0), before
-
-
-def _known(values: ca.MX) -> ca.MX:
-    """Where values are numbers. ``values == values`` is true for CasADi, whatever they are."""
-    return ca.fabs(values) < np.inf
-
-
-def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) -> ca.Function:
-    """``(memory, x_prev, h_prev, u_prev, y, full, w_prev) -> (memory_next, numbers)``.
-
-    The numbers: balances of model and measurement, violation, residual ``(n_q)``, travel ``(n_q)``, speed ``(n_q)``
-    and input ``(n_u)`` at the centre; with free runs the sums of each. ``full`` says of each run whether its window is
-    full. ``rest_speed`` ``(n_q,)`` are the speeds below which friction may stick, ``spans`` ``(n_u,)`` the ranges of
-    the inputs.
-    """
-    model, window, n_q, rest = layout.model, layout.window, layout.n_q, ca.DM(list(rest_speed))
-    n_u, dt, row = model.n_u, model.dt, layout.row
-    position, velocity, acceleration, kernel, slope = weights(window, dt)
-    memory = ca.MX.sym("memory", layout.size)
-    x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", n_u)
-    y, full, w = ca.MX.sym("y", n_q), ca.MX.sym("full", RUNS), ca.MX.sym("w", model.n_w)
-    given = ca.vertcat(u, w)
-    x_next = model.step(x, h, u, w, model.p)[0]
-    dv = x_next[n_q:] - x[n_q:]
-    dp = x_next[:n_q] - x[:n_q] - dt * x[n_q:]
-    ys = ca.vertcat(memory[n_q : window * n_q], y)
-    rows = ca.vertcat(memory[window * n_q + row : layout.one_step], dv, dp, given)
-    y_grid, row_grid = ca.reshape(ys, n_q, window), ca.reshape(rows, row, window - 1)
-    # Positions relative to the newest: after many turns the small differences keep their digits.
-    relative = y_grid - ca.repmat(y, 1, window)
-    q, v, a_measured = (relative @ ca.DM(w) for w in (position, velocity, acceleration))
-    a_model = row_grid[:n_q, :] @ ca.DM(kernel[1:]) - row_grid[n_q : 2 * n_q, :] @ ca.DM(slope)
-    g_mean = row_grid[2 * n_q :, :] @ ca.DM(0.5 * dt * (kernel[:-1] + kernel[1:]))
-    u_mean, state = g_mean[:n_u], ca.vertcat(q + y, v)
-    balances = [energy_balance(model, state, ca.vertcat(v, a), g_mean) for a in (a_model, a_measured)]
-    residual = _residual(model, a_measured, a_model, state, h, g_mean, rest)
-    # What is predicted while the sensor repeats itself; a missing sample or estimate begins anew. Where friction may
-    # stick nothing counts: there an estimate creeps that does not know of it.
-    y_before = memory[(window - 1) * n_q : window * n_q]
-    moved = x_next[:n_q] - x[:n_q]
-    ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest * dt)
-    travel = ca.if_else(ca.logic_and(y == y_before, _known(ahead)), ahead, 0)
-    pushed = _pushed(layout, memory, ca.mmin(y == y_before), x, h, u, w, rest, ca.DM(spans))
-    shown = ca.if_else(pushed[1] > ca.fabs(travel), pushed[1], travel)
-    violation = ca.fabs(balances[0] - balances[1])
-    averaged = memory[layout.averaged : layout.runs]
-    outs = [
-        ys,
-        rows,
-        travel,
-        *pushed,
-        averaged[1 : layout.average],
-        violation,
-        averaged[layout.average + n_q :],
-        residual,
+    x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
+    w, y, x_hat = ca.MX.sym("w", model.n_w), ca.MX.sym("y", model.n_y), ca.MX.sym("x_hat", model.n_x)
+    x_next, _ = model.step(x, h, u, w, model.p)
+    predicted = model.output(x_next, u, w, model.p)
+    r = (x_hat - x_next) / model.dt
+    none = ca.MX.zeros(model.n_x)
+    violations = [
+        b.residual(x, r, u, w, model.p) - b.residual(x, none, u, w, model.p) for b in model.balances
     ]
-    numbers = [*balances, violation, residual, shown, v, u_mean]
-    if layout.length:
-        for i in range(RUNS):
-            part = memory[layout.runs + i * layout.run : layout.runs + (i + 1) * layout.run]
-            run, sums = _free_run(layout, part, given, balances[1], g_mean, v, full[i])
-            outs.append(run)
-            numbers.append(sums)
-    if layout.history:
-        outs += [memory[layout.rows + layout.history_row :], state, u_mean, residual]
-    vectors = [ca.densify(ca.vertcat(*parts)) for parts in (outs, numbers)]
-    return ca.Function("monitor", [memory, x, h, u, y, full, w], vectors)
+    moved = predicted - model.output(x, u, w, model.p)
+    n_z = model.n_x + model.n_h
+    runs, ahead, errors = ca.MX.sym("runs", n_z + model.n_d, RUNS), [], []
+    on_u, on_x, on_y = (ca.DM(matrix) for matrix in model.disturbed)
+    for k in range(RUNS):
+        x_k, h_k, d = ca.vertsplit(runs[:, k], [0, model.n_x, n_z, n_z + model.n_d])
+        acting = u + on_u @ d
+        x_k, h_k = model.step(x_k, h_k, acting, w, model.p)
+        x_k += on_x @ d
+        ahead.append(ca.vertcat(x_k, h_k, d))
+        errors.append(y - model.output(x_k, acting, w, model.p) - on_y @ d)
+    outs = [ca.vertcat(y - predicted, *violations), moved, ca.vertcat(*ahead), ca.vertcat(*errors)]
+    return ca.Function("residuals", [x, h, u, w, y, x_hat, runs], [ca.densify(values) for values in outs])
 
 
-def check_model(model: HybridModel) -> None:
-    """Refuse a model that the monitor cannot read: its outputs are not its positions, or it has no energy balance."""
-    n_q = model.n_x // 2
-    x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
-    jacobian = ca.Function("C", [x, u], [ca.jacobian(model.output(x, u, model.w, model.p), ca.vertcat(x, u))])
-    given = np.array(jacobian(0, 0).full())
-    if given.shape[0] != n_q or not np.array_equal(given, np.eye(n_q, model.n_x + model.n_u)):
-        raise InputError(
-            f"energy monitor: the outputs of model {model.name} must be its positions "
-            f"{[s.name for s in model.states[:n_q]]}; it measures {[s.name for s in model.outputs]}. "
-            "Give a model whose output is x[:n_q]."
-        )
-    if not np.all(np.diag(ca.Function("M", [x, u], [inertia_of(model, x, u)])(0, 0).full()) > 0):
-        raise InputError(
-            f"energy monitor: the energy balance of model {model.name} does not grow with its acceleration, so it "
-            "says nothing of its motion; check the mass matrix of its prior, or the storage of its balance"
-        )
+def _mean(rows: Array) -> Array:
+    """Mean of each column without NaN; NaN where fewer than half are numbers."""
+    finite = np.isfinite(rows)
+    count = finite.sum(axis=0)
+    total = np.where(finite, rows, 0.0).sum(axis=0)
+    return np.where(2 * count >= len(rows), total / np.maximum(count, 1), np.nan)

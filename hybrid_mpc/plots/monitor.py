@@ -28,8 +28,8 @@ from hybrid_mpc.plots.style import (
 )
 
 if TYPE_CHECKING:
-    from hybrid_mpc.monitor.innovations import ResidualTrace
     from hybrid_mpc.monitor.replay import MonitorTrace
+    from hybrid_mpc.monitor.residuals import ResidualTrace
 
 LEVEL, POWER = COLOURS["hybrid"], COLOURS["prior"]
 
@@ -152,7 +152,7 @@ def channels(
     """Levels of every residual over a recording, a panel each, with thresholds and alarms of the channel.
 
     Args:
-        trace: What :func:`~hybrid_mpc.monitor.innovations.replay_residuals` returned.
+        trace: What :func:`~hybrid_mpc.monitor.residuals.replay_residuals` returned.
         units: Unit of each channel.
         thresholds: Of the short and the long average of each channel. Default: none.
         notes: Times [s] and what to write there, e.g. a diagnosis. Default: none.

@@ -12,7 +12,7 @@ from hybrid_mpc import Calibration, Detector, InputError, load, load_scenario, s
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.files import write_json
 from hybrid_mpc.job.monitor import MonitorJob, prepared, read_detector, watched
-from hybrid_mpc.monitor.residuals import force_units
+from hybrid_mpc.monitor.energy_readings import force_units
 from hybrid_mpc.records import plain
 from scenarios.golf_robot.rig import Rig
 

@@ -24,8 +24,8 @@ from hybrid_mpc import (
     rest_speeds,
 )
 from hybrid_mpc.data.scales import noise_of, time_unit
+from hybrid_mpc.monitor.energy_readings import force_units
 from hybrid_mpc.monitor.lengths import NOTHING_STICKS
-from hybrid_mpc.monitor.residuals import force_units
 from hybrid_mpc.records import plain, record
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
     from hybrid_mpc.estimate.switching import SwitchingFilter
     from hybrid_mpc.monitor.energy import EnergyMonitor
-    from hybrid_mpc.monitor.innovations import ResidualMonitor
+    from hybrid_mpc.monitor.residuals import ResidualMonitor
 
 Array = NDArray[np.float64]
 TIMED_PERIODS = 1000

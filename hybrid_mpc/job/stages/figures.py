@@ -28,7 +28,7 @@ from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
 from hybrid_mpc.job.summary import summaries
 from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.monitor.residuals import force_unit
+from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import save
 

@@ -20,7 +20,7 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
-from hybrid_mpc.job.stages.monitor import MONITOR, NO_ENERGY, RATES, clean_windows
+from hybrid_mpc.job.stages.monitor import FAULT_SEED, HELD, MONITOR, NO_ENERGY, RATES, clean_windows
 from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
 from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.faults import Fault, install
@@ -127,8 +127,6 @@ def knows(scenario: Scenario, target: str) -> bool:
 # Loops in which something breaks, watched by the learned guard: how soon it is seen, and what it is taken for.
 
 Array = NDArray[np.float64]
-SEED = 600
-"""Number of these loops, away from those that the detector is learned from."""
 SHOWN = ("t", "violation_w", "level_w", "residual_level", "energy_j", "energy_s", "frozen", "scores", "alarm")
 """What of a trace is kept for the report."""
 
@@ -223,7 +221,7 @@ def faulted(
         title = f"{case.title} ({channel})" if channel and len(signals) > 1 else case.title
         fault = Fault(start, math.inf, case.target, case.value, channel)
         spec = LoopSpec(
-            named, MODEL, task.name, CONTROLLER, monitor="guard", guard="rest", seed=SEED, run_seed=run_seed,
+            named, MODEL, task.name, CONTROLLER, monitor="guard", guard="rest", seed=FAULT_SEED, run_seed=run_seed,
             faults=(fault,),
         )  # fmt: skip
         row, result = bench.run(spec, monitor=monitor)
@@ -261,10 +259,6 @@ def read_trace(arrays: Mapping[str, Any], name: str) -> MonitorTrace:
     own = {key: arrays[f"{name}/{key}"] for key in SHOWN}
     none = np.full(len(own["t"]), np.nan)
     return MonitorTrace(dE_model_w=none, dE_measured_w=none, **own)
-
-
-HELD = ("valid", "nominal")
-"""Roles that no parameter was fitted to. Test recordings are kept to try the detector on."""
 
 
 @dataclass(frozen=True)

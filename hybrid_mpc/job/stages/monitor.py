@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -35,6 +35,10 @@ RATES = (1.0, 2.0, 5.0, 10.0)
 enough for."""
 NOMINAL = ("train", "valid", "nominal")
 """Roles of what the monitor is calibrated on."""
+HELD = ("valid", "nominal")
+"""Those that no parameter was fitted to. Test recordings are kept to try limits and detector on."""
+FAULT_SEED = 600
+"""Number of the loops in which something breaks, away from those that a detector is learned from."""
 LOAD_SHARE = 0.2
 """Unknown load of the demonstration, as a share of half the input's range."""
 MARGIN = 1.5
@@ -173,24 +177,15 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         result = MonitorResult(Calibration.without(reason, rest), covered, reason)
         put_calibration(context, result)
         return result
-    alarms, arrays, clean = [], {}, CleanAlarms()
+    alarms, arrays, on = [], {}, []
     for recording, levels in zip(whole, traces, strict=True):
         trace = with_alarms(make_monitor(model, calibration), levels)
         alarms += [RecordedAlarm(recording.name, a, b) for a, b in trace.intervals()]
         for key in ("t", "violation_w", "level_w", "residual_level", "alarm"):
             arrays[f"{recording.name}/{key}"] = getattr(trace, key)
         arrays[f"{recording.name}/y"] = recording.y
-        # an alarm counts where it begins: it may reach in from a disturbed part
-        starts, _ = stretches(trace.alarm)
-        every, test = (
-            inside(context, recording, roles) for roles in (("train", "valid", "nominal", "test"), ("test",))
-        )
-        clean = CleanAlarms(
-            clean.seconds + float(every.sum() * model.dt),
-            clean.alarms + int(every[starts].sum()),
-            clean.test_seconds + float(test.sum() * model.dt),
-            clean.test_alarms + int(test[starts].sum()),
-        )
+        on.append(trace.alarm)
+    clean = clean_alarms(context, whole, on)
     load = None
     if context.scenario.plant is not None and context.scenario.tasks:
         load, loop = _load_loop(context, replace(kit, calibration=calibration))
@@ -198,6 +193,23 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     result = MonitorResult(calibration, covered, "", tuple(alarms), clean, load, arrays)
     put_calibration(context, result)
     return result
+
+
+def clean_alarms(
+    context: Context, recordings: Sequence[Trajectory], on: Sequence[NDArray[np.bool_]]
+) -> CleanAlarms:
+    """Alarms that are ``on`` ``(n,)`` in the undisturbed parts of the recordings, which have any role.
+
+    An alarm counts where it begins: it may reach in from a disturbed part.
+    """
+    seconds, counts = [0.0, 0.0], [0, 0]
+    for recording, alarm in zip(recordings, on, strict=True):
+        starts, _ = stretches(alarm)
+        for i, roles in enumerate(((*NOMINAL, "test"), ("test",))):
+            clean = inside(context, recording, roles)
+            seconds[i] += float(clean.sum() * recording.dt)
+            counts[i] += int(clean[starts].sum())
+    return CleanAlarms(seconds[0], counts[0], seconds[1], counts[1])
 
 
 def put_calibration(context: Context, found: MonitorResult) -> str:

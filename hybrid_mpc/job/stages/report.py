@@ -53,7 +53,7 @@ from hybrid_mpc.job.stages.results import (
     recordings,
 )
 from hybrid_mpc.job.summary import Summary
-from hybrid_mpc.monitor.residuals import force_unit
+from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 

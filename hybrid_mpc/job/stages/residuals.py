@@ -18,13 +18,13 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
-from hybrid_mpc.job.stages.monitor import CleanAlarms, inside, rates
+from hybrid_mpc.job.stages.monitor import FAULT_SEED, HELD, CleanAlarms, clean_alarms, inside, rates
 from hybrid_mpc.kit.artifact import Kit, read_description, set_residuals
 from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.monitor.calibrate import stretches
-from hybrid_mpc.monitor.innovations import (
+from hybrid_mpc.monitor.replay import along
+from hybrid_mpc.monitor.residuals import (
     ResidualLimits,
     ResidualMonitor,
     ResidualTrace,
@@ -32,15 +32,10 @@ from hybrid_mpc.monitor.innovations import (
     limits_of,
     replay_residuals,
 )
-from hybrid_mpc.monitor.replay import along
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
 
-HELD = ("valid", "nominal")
-"""Roles that no parameter was fitted to. Test recordings are kept to try the limits on."""
-SEED = 600
-"""Number of the loops in which something breaks, as that of the guard's."""
 WEAKER = 0.8
 """What is left of an actuator's force in them."""
 
@@ -177,22 +172,15 @@ def _on_recordings(
     traces: Sequence[ResidualTrace],
 ) -> tuple[tuple[ChannelAlarm, ...], CleanAlarms]:
     alarms: list[ChannelAlarm] = []
-    clean, dt = CleanAlarms(), monitor.model.dt
+    on: list[NDArray[np.bool_]] = []
     for recording, levels in zip(recordings, traces, strict=True):
         trace = judged(monitor, levels, recording.y)
         alarms += [
             ChannelAlarm(recording.name, start, end, trace.named(start, end))
             for start, end in trace.intervals()
         ]
-        starts, _ = stretches(trace.alarm)
-        every, test = (inside(context, recording, roles) for roles in ((*HELD, "train", "test"), ("test",)))
-        clean = CleanAlarms(
-            clean.seconds + float(every.sum() * dt),
-            clean.alarms + int(every[starts].sum()),
-            clean.test_seconds + float(test.sum() * dt),
-            clean.test_alarms + int(test[starts].sum()),
-        )
-    return tuple(alarms), clean
+        on.append(trace.alarm)
+    return tuple(alarms), clean_alarms(context, recordings, on)
 
 
 @dataclass(frozen=True)
@@ -216,7 +204,7 @@ def _faulted(context: Context, kit: Kit, task_name: str) -> tuple[FaultedChannel
     scenario, settings = context.scenario, context.settings
     bench, model = Bench(scenario, {MODEL: kit}), kit.models["hybrid"]
     base = LoopSpec(
-        settings.scenario, MODEL, task_name, "hybrid_observer", monitor="residuals", seed=SEED,
+        settings.scenario, MODEL, task_name, "hybrid_observer", monitor="residuals", seed=FAULT_SEED,
         run_seed=settings.seed,
     )  # fmt: skip
     start = model.dt * round(0.5 * bench.task(base).duration / model.dt)

@@ -34,7 +34,7 @@ from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChan
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.innovations import ResidualLimits
+from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from machines import MachinePlant, dc_motor, thermal, two_tanks
 
 from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, ResidualMonitor, Signal, learn_residuals
 from hybrid_mpc.monitor.energy import Validity
-from hybrid_mpc.monitor.innovations import replay_residuals
+from hybrid_mpc.monitor.residuals import replay_residuals
 
 MACHINES = {
     "tanks": (two_tanks, (4e-5,), 1e-3, 1e-6),
