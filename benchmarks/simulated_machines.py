@@ -1,7 +1,12 @@
-"""The six simulated machines: free runs, rest under a constant load, and cost against PI(D) and linear MPC.
+"""Machines on simulated plants: free runs, rest under a constant load, and cost against PI(D) and linear MPC.
 
     hybrid-mpc run two_tanks --budget quick --out runs/two_tanks   (and the other five)
     python benchmarks/simulated_machines.py --runs runs [--machines lever] [--tasks hold] [--seeds 10] [--workers 2]
+
+The same of real machines, whose models are of recordings and whose loops run on a plant that no model has seen:
+
+    hybrid-mpc run temperature_lab --data prbs.csv --budget quick --out runs/temperature_lab
+    python benchmarks/simulated_machines.py --runs runs --machines temperature_lab
 
 Reads the runs and closes loops on the plants, every controller with the same seeds, limits and measurements:
 
@@ -12,20 +17,25 @@ Reads the runs and closes loops on the plants, every controller with the same se
   where the input is at a limit. Gains and filters are those that make *this very task* cheapest, load included: by
   differential evolution on the fitted prior with its sensors' noise, then by Nelder and Mead's method on the plant
   itself, both with seeds of their own. Nobody has so much when he tunes: it is about the best that PI(D) does here.
+- ``blind``, in tasks with measured disturbances: ``prior`` without their measurement.
 
 The cost counts what all pay for alike: weighed outputs without noise, weighed speeds, changes of the input. A ratio is
 the geometric mean over seeds with its 95 % interval (paired, by Student's t of the logarithms). With a constant load,
 *offset* is the mean error of the controlled outputs over the last 20 % of the task, the largest of the seeds, over what
 is allowed: the larger of two steps of the sensor (of a sensor of steps with the same noise) and 0.5 % of the range that
-the training recordings cover; *rest* is the root mean square error there, so that a ripple counts.
+the training recordings cover (real machines: the steps alone); *rest* is the root mean square error there, so that a
+ripple counts.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -38,9 +48,11 @@ from hybrid_mpc.files import read_json
 from hybrid_mpc.loop.faults import corrupt_input
 from hybrid_mpc.loop.plant import SimulatedMachine
 from hybrid_mpc.model.model import output_with_jacobian
+from hybrid_mpc.model.riccati import hidden_fixed_point
 
 MACHINES = ("two_tanks", "dc_motor", "lever", "two_heaters", "two_link_arm", "cart_pole")
-LOADS = ("leak", "brake", "hold", "draught", "carry", "push")
+REAL = ("temperature_lab", "cascaded_tanks", "heat_exchanger")
+LOADS = ("leak", "brake", "hold", "draught", "carry", "push", "weak_heater", "weak_pump", "weak_valve")
 CONTROLLERS = ("hybrid", "prior", "linear", "pid")
 TUNED_ON = (1000, 1001)
 """Seeds of the loops that PI(D) are tuned on."""
@@ -52,26 +64,34 @@ FACTORS, TRIALS = (4.0, 1.0, 0.4, 0.15), 25
 
 
 def linear_model(model: hm.HybridModel) -> hm.HybridModel:
-    """The model linearized at its operating point, exactly as it steps."""
-    x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
-    moved, a, b, e = step_slopes(model)
+    """The model linearized at its operating point, exactly as it steps; delayed inputs are hidden states as before."""
+    x, h, u, w = (
+        ca.MX.sym(k, n) for k, n in zip("xhuw", (model.n_x, model.n_h, model.n_u, model.n_w), strict=True)
+    )
+    z0, moved, a, b, e = step_slopes(model)
     y0, c, d = (m.full() for m in output_with_jacobian(model)(model.x0, model.u0, model.w))
-    dx, du, dw = x - model.x0, u - model.u0, w - model.w
-    x_next = moved + a @ dx + b @ du + (e @ dw if model.n_w else 0)
-    return hm.HybridModel.of(
-        "linear", model.dt, model.states, model.inputs, model.outputs, x=x, u=u, w=w, x_next=x_next,
-        xdot=(x_next - x) / model.dt, y=y0 + c @ dx + d @ du, disturbances=model.disturbances,
-        nominal_x=model.nominal_x, nominal_u=model.nominal_u, nominal_w=model.nominal_w,
-        disturbance_model=model.disturbance_model,
+    dz, du, dw = ca.vertcat(x, h) - z0, u - model.u0, w - model.w
+    after = moved + a @ dz + b @ du + (e @ dw if model.n_w else 0)
+    x_next, h_next = after[: model.n_x], after[model.n_x :]
+    linear = hm.HybridModel.of(
+        "linear", model.dt, model.states, model.inputs, model.outputs, x=x, h=h, u=u, w=w, x_next=x_next,
+        h_next=h_next, xdot=(x_next - x) / model.dt, y=y0 + c @ dz[: model.n_x] + d @ du,
+        disturbances=model.disturbances, nominal_x=model.nominal_x, nominal_u=model.nominal_u,
+        nominal_w=model.nominal_w, disturbance_model=model.disturbance_model,
     )  # fmt: skip
+    return replace(linear, delay_states=model.delay_states)
 
 
 def step_slopes(model: hm.HybridModel) -> tuple[np.ndarray, ...]:
-    """One step from the operating point, and its slopes by state, input and disturbance."""
-    x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
-    after = model.step(x, [], u, w, model.p)[0]
-    slopes = ca.Function("slopes", [x, u, w], [after, *(ca.jacobian(after, v) for v in (x, u, w))])
-    return tuple(m.full() for m in slopes(model.x0, model.u0, model.w))
+    """The operating point ``z = (x, h)``, one step from it, and its slopes by ``z``, input and disturbance."""
+    h0 = hidden_fixed_point(model, model.x0, model.u0)
+    z, u, w = (
+        ca.MX.sym(k, n) for k, n in zip("zuw", (model.n_x + model.n_h, model.n_u, model.n_w), strict=True)
+    )
+    after = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u, w, model.p))
+    slopes = ca.Function("slopes", [z, u, w], [after, *(ca.jacobian(after, v) for v in (z, u, w))])
+    z0 = np.concatenate([model.x0, h0])
+    return z0, *(m.full() for m in slopes(z0, model.u0, model.w))
 
 
 def pid_law(gains, y, goal, forward, memory, low, high, dt):
@@ -104,9 +124,11 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
     control, dt, m = task.control or scenario.control, model.dt, len(controlled)
     t, goals, forward, w, load = courses(scenario, model, task)
     # a period: the prior, its PI(D) and their cost
-    x, held, memory, own = (
-        ca.SX.sym(n, k) for n, k in (("x", model.n_x), ("u", model.n_u), ("m", 2 * m), ("g", 4 * m))
+    z0, _, a, b, _ = step_slopes(model)
+    z, held, memory, own = (
+        ca.SX.sym(n, k) for n, k in (("z", len(z0)), ("u", model.n_u), ("m", 2 * m), ("g", 4 * m))
     )
+    x = z[: model.n_x]
     goal, ahead, noise, now, off = (
         ca.SX.sym(n, k)
         for n, k in zip("rfnwo", (model.n_y, model.n_u, model.n_y, model.n_w, model.n_u), strict=True)
@@ -118,21 +140,26 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
             ca.vertsplit(memory[2 * j : 2 * j + 2]), control.u_min[j], control.u_max[j], dt,
         )  # fmt: skip
         after += kept
-    x_next = model.step.expand()(x, [], u + off, now, model.p)[0]
+    z_next = ca.vertcat(*model.step.expand()(x, z[model.n_x :], u + off, now, model.p))
     stage = dt * (
         ca.dot(control.q_y, (y - goal) ** 2)
         + ca.dot(control.q, x**2)
         + ca.dot(control.r_delta, (u - held) ** 2)
     )
     period = ca.Function(
-        "period", [x, held, memory, own, goal, ahead, noise, now, off], [x_next, u, ca.vertcat(*after), stage]
+        "period", [z, held, memory, own, goal, ahead, noise, now, off], [z_next, u, ca.vertcat(*after), stage]
     )
     course = period.mapaccum("course", len(t), 3)
-    _, a, b, _ = step_slopes(model)
     y0, c, _ = (v.full() for v in output_with_jacobian(model)(np.array(task.x0), model.u0, w[0]))
-    steady = np.diag(c[controlled] @ np.linalg.lstsq(1.05 * np.eye(len(a)) - a, b, rcond=None)[0])
-    poles = np.abs(np.linalg.eigvals(a))
+    answer = np.linalg.lstsq(1.05 * np.eye(len(a)) - a, b, rcond=None)[0]
+    steady = np.diag(c[controlled] @ answer[: model.n_x])
+    poles, modes = np.linalg.eig(a.T)
+    moved = (
+        np.linalg.norm(modes.T @ b, axis=1) > 1e-9
+    )  # a room that comes back in a day is no time constant of these
+    poles = np.abs(poles)[moved]
     slowest = dt / max(1e-3, 1 - np.max(poles[poles < 1 - 1e-6]))
+    start = np.concatenate([task.x0, z0[model.n_x :]])
     noises = [
         np.random.default_rng(s).standard_normal((len(t), model.n_y)) * scenario.sensor_sigma
         for s in TUNED_ON
@@ -152,7 +179,7 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
             first = np.ravel([[0.0, v] for v in (y0.ravel() + noise[0])[controlled]])
             own_all = np.tile(own[:, None], len(t))
             total += float(
-                ca.sum2(course(task.x0, u0, first, own_all, goals.T, forward.T, noise.T, w.T, load.T)[3])
+                ca.sum2(course(start, u0, first, own_all, goals.T, forward.T, noise.T, w.T, load.T)[3])
             )
         return math.log(total) if np.isfinite(total) and total > 0 else 1e3
 
@@ -200,7 +227,10 @@ def run_pid(scenario, model, gains, controlled, task, seed, course=None):
 def shown(plant, x, u):
     """What the sensors would show without noise ``(n, n_y)``."""
     return np.array(
-        [[float(v) for v in plant.outputs(list(a), list(b), [], plant)] for a, b in zip(x, u, strict=True)]
+        [
+            [float(v) for v in plant.outputs(list(plant.start(a)), list(b), [], plant)]
+            for a, b in zip(x, u, strict=True)
+        ]
     )
 
 
@@ -219,27 +249,51 @@ def parts(name: str, runs: Path, controller: str, place: int):
     kit = kit.on(scenario)
     controlled = np.flatnonzero(scenario.control.q_y).tolist()
     prior = kit.models["prior"]
+    task = scenario.tasks[place]
     if controller == "pid":
-        return scenario, prior, controlled, tuned_pid(scenario, prior, controlled, scenario.tasks[place])
+        return scenario, prior, controlled, tuned_pid(scenario, prior, controlled, task)
     if controller == "linear":
-        model = linear_model(prior)
+        model, control = linear_model(prior), task.control or scenario.control
         noise = kit.noise("prior_observer")
-        made = hm.make_estimator(model, scenario, noise), hm.make_controller(model, model, scenario.control)
+        made = hm.make_estimator(model, scenario, noise), hm.make_controller(model, model, control)
         return scenario, model, controlled, made
-    made = kit.observer(controller), kit.controller(controller)
-    return scenario, kit.models[controller], controlled, made
+    planned = "prior" if controller == "blind" else controller
+    made = kit.observer(planned), kit.controller(planned, task=task.name)
+    return scenario, kit.models[planned], controlled, made
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """A plant whose measured disturbances act as they do, and nobody measures them: a loop is told the usual ones."""
+
+    plant: Any
+    w: Callable[[np.ndarray], np.ndarray]
+
+    def __getattr__(self, name: str) -> Any:
+        """All else is the plant's."""
+        return getattr(self.plant, name)
+
+    def step(self, state: Any, u: np.ndarray, dt: float, w: np.ndarray) -> Any:
+        """A period on, with the disturbances of the time; ``w`` is not looked at."""
+        return self.plant.step(state, u, dt, self.w(np.array([state.t]))[0])
+
+
+def controllers_of(task: hm.Task) -> tuple[str, ...]:
+    """Those of all tasks, and without measurement where there is one."""
+    return CONTROLLERS if task.w is None else (*CONTROLLERS, "blind")
 
 
 def loop(name: str, runs: Path, controller: str, place: int, seed: int) -> dict:
     """Cost, rest and largest use of limits of one loop."""
-    scenario, model, controlled, made = parts(name, runs, controller, place if controller == "pid" else 0)
+    scenario, model, controlled, made = parts(name, runs, controller, place)
     task, plant, control = scenario.tasks[place], scenario.plant(), scenario.control
     if controller == "pid":
         x, u = run_pid(scenario, model, made, controlled, task, seed)
     else:
+        blind = controller == "blind"
         result = hm.simulate(
-            plant, *made, task.reference, dt=model.dt, duration=task.duration, x0=task.x0, seed=seed, w=task.w,
-            faults=task.faults,
+            Unseen(plant, task.w) if blind else plant, *made, task.reference, dt=model.dt, duration=task.duration,
+            x0=task.x0, seed=seed, w=None if blind else task.w, faults=task.faults,
         )  # fmt: skip
         x, u = result.x, result.u
     error = shown(plant, x, u) - task.reference(model.dt * np.arange(len(x)))
@@ -254,11 +308,14 @@ def allowed(name: str, runs: Path) -> np.ndarray:
     """Largest offset of each controlled output."""
     scenario = hm.load_scenario(name)
     controlled = np.flatnonzero(scenario.control.q_y)
+    steps = 2 * math.sqrt(12) * np.array(scenario.sensor_sigma)[controlled]
     files = sorted((runs / name / "data").glob("train_*.csv"))
+    if not files:
+        return steps
     tables = np.vstack([np.genfromtxt(path, delimiter=",", skip_header=1) for path in files])
     n = len(scenario.sensor_sigma)
     reach = np.ptp(tables[:, -n:], axis=0)[controlled]
-    return np.maximum(2 * math.sqrt(12) * np.array(scenario.sensor_sigma)[controlled], 0.005 * reach)
+    return np.maximum(steps, 0.005 * reach)
 
 
 def interval(logs: np.ndarray) -> str:
@@ -291,16 +348,21 @@ def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
     """Ratios of cost, offsets, and how the hybrid rests against its prior, of one task."""
     own = {
         c: [r for r in cells if (r["machine"], r["task"], r["controller"]) == (name, task.name, c)]
-        for c in CONTROLLERS
+        for c in controllers_of(task)
     }
     costs = {c: np.log([r["cost"] for r in found]) for c, found in own.items()}
     row = {"machine": name, "task": task.name}
     row |= {f"hybrid / {c}": interval(costs["hybrid"] - costs[c]) for c in CONTROLLERS[1:]}
+    row |= {f"prior / {c}": interval(costs["prior"] - costs[c]) for c in controllers_of(task)[2:]}
+    row["cost, prior"] = f"{np.exp(costs['prior'].mean()):.4g}"
     if task.faults:
         bound = allowed(name, runs)
-        share = {c: np.max(np.abs([r["offset"] for r in own[c]]) / bound) for c in CONTROLLERS}
-        row |= {f"offset, {c}": f"{share[c]:.2f}" for c in CONTROLLERS}
-        rest = {c: np.log(np.linalg.norm([r["rest"] for r in own[c]] / bound, axis=1)) for c in CONTROLLERS}
+        share = {c: np.max(np.abs([r["offset"] for r in found]) / bound) for c, found in own.items()}
+        row |= {f"offset, {c}": f"{share[c]:.2f}" for c in own}
+        rest = {
+            c: np.log(np.linalg.norm([r["rest"] for r in own[c]] / bound, axis=1))
+            for c in ("hybrid", "prior")
+        }
         row["rest, hybrid / prior"] = interval(rest["hybrid"] - rest["prior"])
     row["beyond limits"] = max(0.0, *(r["beyond"] for found in own.values() for r in found))
     return row
@@ -310,7 +372,7 @@ def main() -> None:
     """Measure and print."""
     parser = arguments(__doc__)
     parser.add_argument("--runs", type=Path, required=True, help="folder of the runs, one a machine")
-    parser.add_argument("--machines", nargs="+", default=[*MACHINES], choices=MACHINES)
+    parser.add_argument("--machines", nargs="+", default=[*MACHINES], choices=MACHINES + REAL)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument(
         "--tasks", nargs="+", help="only these; those with a constant load: " + " ".join(LOADS)
@@ -326,8 +388,8 @@ def main() -> None:
     with ProcessPoolExecutor(given.workers) as pool:
         jobs = [
             pool.submit(loop, name, given.runs, controller, place, seed)
-            for name, place, _ in tasks
-            for controller in CONTROLLERS
+            for name, place, task in tasks
+            for controller in controllers_of(task)
             for seed in range(given.seeds)
         ]
         cells = [job.result() for job in jobs]

@@ -145,6 +145,10 @@ class Scenario:
             where there is a control problem.
         first_sigma: Standard deviations of the states that no output shows alone [state units] at the estimator's
             start. Default: of the speeds of measured states ``sqrt(2) sensor_sigma / dt``, of others by their range.
+        state_noise: How far a state strays in a period (standard deviation, state units), by the state's name, where
+            the machine's builder knows it. Default: by the model's errors on the recordings. A state to whose rate all
+            goes that a prior does not explain seems to stray far, and a filter that believes it takes every lag that
+            the model lacks for a move of that state.
         safe_input: Input ``(n_u,)`` [input units] that the machine may be left with: when a sensor is lost, when
             nothing is finite, at the end of a run. It is never guessed: a guard that rests and a run on the real
             machine need it. Default: none is declared; a loop in simulation then holds its last input.
@@ -180,6 +184,7 @@ class Scenario:
     control: OCP | None = None
     sensor_sigma: tuple[float, ...] = ()
     first_sigma: tuple[float, ...] | None = None
+    state_noise: Mapping[str, float] = field(default_factory=dict)
     safe_input: tuple[float, ...] | None = None
     tasks: tuple[Task, ...] = ()
     budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)

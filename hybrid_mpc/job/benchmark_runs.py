@@ -77,12 +77,8 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
             "gives whole files their roles; leave out one of the two"
         )
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
-    dataset = load_trajectories(
-        paths,
-        prior,
-        scenario.data,
-        needed=needed,
-    )
+    data = replace(scenario.data, fractions=spec.fractions or scenario.data.fractions)  # and checked as given
+    dataset = load_trajectories(paths, prior, data, needed=needed)
     parts = _parts(dataset, scenario, uncut)
     train, valid, held_back = (
         tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test")

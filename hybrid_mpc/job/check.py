@@ -352,6 +352,12 @@ def _check_sensors(report: Report, scenario: Scenario, prior: Prior | None) -> N
         values = getattr(scenario, name)
         if values is not None and not all(math.isfinite(s) and s > 0 for s in values):
             report.add(f"{name} must be positive and finite, got {values}")
+    for name, sigma in scenario.state_noise.items():
+        if prior is not None and name not in [s.name for s in prior.states]:
+            names = ", ".join(s.name for s in prior.states)
+            report.add(f"state_noise: no state {name!r}; there are: {names}")
+        if not (math.isfinite(sigma) and sigma > 0):
+            report.add(f"state_noise of {name} must be positive and finite, got {sigma}")
 
 
 def _check_problem(

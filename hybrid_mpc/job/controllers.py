@@ -97,7 +97,14 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     # the plant's own equations err by nothing but the smoothing: start from the better model's errors
     errors["oracle"] = errors["hybrid"]
     found = {
-        name: tuned_noise(models[c.model], scenario, errors[c.model], recordings, observer=c.observer)
+        name: tuned_noise(
+            models[c.model],
+            scenario,
+            errors[c.model],
+            recordings,
+            observer=c.observer,
+            known=scenario.state_noise,
+        )
         for name, c in CONTROLLERS.items()
         if c.model in models and not c.truth
     }

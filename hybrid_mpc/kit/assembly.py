@@ -127,16 +127,24 @@ def tuned_noise(
     recordings: Sequence[Trajectory],
     *,
     observer: bool,
+    known: Mapping[str, float] | None = None,
 ) -> Array:
     """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
 
-    ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load.
+    ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of
+    single states by name, which no scale changes.
     """
+    own = np.array([(known or {}).get(s.name, np.nan) for s in model.states])
     chosen = [recordings[i] for i in evenly(len(recordings), TUNED_RECORDINGS)]
     parts = [r.part(slice(TUNED_PERIODS), r.name, "train") for r in chosen]
-    return base * most_likely(
-        lambda s: make_estimator(model, scenario, s * base, observer=observer), parts, SCALES
-    )
+
+    def scaled(scale: float) -> Array:
+        return np.where(np.isnan(own), scale * base, own)
+
+    def filter_of(scale: float) -> Filter:
+        return make_estimator(model, scenario, scaled(scale), observer=observer)
+
+    return scaled(most_likely(filter_of, parts, SCALES))
 
 
 def make_estimator(

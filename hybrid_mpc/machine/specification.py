@@ -178,6 +178,9 @@ class BenchmarkSpec:
         valid_every: Of several training files every so many-th, in the order of their names, validates as a whole, and
             the others train as wholes. For short runs, whose last second is no fair sample. The files must not have
             windows in the data specification. Fewer files than that are split by it. Default: zero, never.
+        fractions: Shares of training, validation and held-back samples, where they are not those of the data
+            specification: a benchmark's test files are of its own, the main job needs a part to judge by. Default:
+            those of the data specification.
 
     Raises:
         InputError: If a length or a factor is out of its range, a cycle lacks a role that is needed, or
@@ -195,6 +198,7 @@ class BenchmarkSpec:
     cycle: tuple[str, ...] = ()
     valid_every: int = 0
     repeated: bool = field(default=False, kw_only=True)
+    fractions: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.repeated and self.length is None:

@@ -20,7 +20,7 @@ def noise(monkeypatch):
     monkeypatch.setattr(
         controllers,
         "tuned_noise",
-        lambda model, scenario, base, recordings, observer: (2 if observer else 1) * base,
+        lambda model, scenario, base, recordings, observer, known: (2 if observer else 1) * base,
     )
     artifact = SimpleNamespace(models={"prior": "prior", "hybrid": "hybrid"})
 

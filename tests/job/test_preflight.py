@@ -309,6 +309,8 @@ WRONG = {
     "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["sensor_sigma must be positive"]),
     "NaN sensor_sigma": (field(sensor_sigma=(math.nan,)), ["sensor_sigma must be positive"]),
     "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["first_sigma needs 1 standard deviations", "(phi_dot)"]),
+    "noise of no state": (field(state_noise={"phi_dott": 0.1}), ["state_noise: no state 'phi_dott'", "phi_dot"]),
+    "zero state_noise": (field(state_noise={"phi": 0.0}), ["state_noise of phi must be positive"]),
     "zero du_max": (control(du_max=(0,)), ["du_max"]),
     "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["state bounds cross"]),
     "hard bounds of too many outputs": (

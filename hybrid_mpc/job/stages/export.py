@@ -145,6 +145,7 @@ def observed(context: Context) -> dict[str, object]:
     scenario, control = context.scenario, context.scenario.control
     return {
         "sensors": (scenario.sensor_sigma, scenario.first_sigma),
+        "noise of the states": dict(scenario.state_noise),
         "limits of the input": None if control is None else (control.u_min, control.u_max),
         "beyond recordings": scenario.beyond_recordings,
         "disturbance model": scenario.disturbance_model,

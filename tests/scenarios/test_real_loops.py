@@ -1,0 +1,217 @@
+"""Loops of real machines on simulated plants: how each plant differs from its prior, and that its tasks can be done."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hybrid_mpc as hm
+from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.kit.artifact import build_model
+from hybrid_mpc.kit.assembly import tuned_noise
+from hybrid_mpc.model.delay import with_input_delay
+from scenarios.cascaded_tanks import REST as TANKS_REST
+from scenarios.cascaded_tanks import scenario as tanks
+from scenarios.cascaded_tanks.plant import CascadedTanksPlant
+from scenarios.heat_exchanger import scenario as exchanger
+from scenarios.heat_exchanger.plant import HeatExchangerPlant
+from scenarios.heat_exchanger.tasks import DAY, saw_tooth
+from scenarios.race_car import scenario as car
+from scenarios.race_car.plant import RaceCarPlant
+from scenarios.temperature_lab import scenario as lab
+from scenarios.temperature_lab.plant import TemperatureLabPlant
+
+# fitted to the recordings, as the machine's page has them
+FITTED = {
+    "temperature_lab": {"P1": 0.677, "P2": 0.375, "tau": 59.7, "tau_12": 173.0, "lag1": 108.0, "lag2": 77.9},
+    "cascaded_tanks": {"k_1": 0.0417, "k_2": 0.0389, "k_p": 0.0365, "edge_1": 9.4, "edge_2": 10.45, "share": 1.0,
+                       "bend": 0.0571},
+    "heat_exchanger": {"k": 0.626, "slope": 4.71, "middle": 0.95, "tau": 36.9},
+    "race_car": {"k": 0.879, "offset": -0.0129, "tau_v": 0.235, "tau_s": 0.141, "a": 0.134, "psi_0": -0.0131},
+}  # fmt: skip
+SIGMA_X = {
+    "temperature_lab": (0.5, 0.5, 0.03, 0.03, 1e-6),
+    "cascaded_tanks": (0.05, 0.04),
+    "heat_exchanger": (0.02, exchanger.state_noise["cold"]),
+    "race_car": (1e-3, 1e-3, 1e-3, 1e-2, 1e-2),
+}
+"""Process noise a period, of the size of the models' one-period errors on the recordings."""
+SCENARIOS = {s.name: s for s in (lab, tanks, exchanger, car)}
+
+
+def rates(plant, z, u, w=()):
+    return np.array([float(v) for v in plant.rates(list(z), list(u), list(w), plant)])
+
+
+def fitted_model(name):
+    scenario = SCENARIOS[name]
+    prior, dt = scenario.prior(FITTED[name]), scenario.data.dt
+    programs = {f"prior/{key}": program for key, program in prior_programs(prior, dt).items()}
+    model = build_model("prior", programs, hm.model_info(prior, dt))
+    model = replace(model, disturbance_model=scenario.disturbance_model)
+    return with_input_delay(model, 3.0) if name == "heat_exchanger" else model  # fitted, too
+
+
+def closed(name, task, periods):
+    """A loop of the fitted prior's controller and observer, over the first periods of a task."""
+    scenario, model = SCENARIOS[name], fitted_model(name)
+    dt = model.dt
+    control = task.control or scenario.control
+    estimator = hm.make_estimator(model, scenario, np.array(SIGMA_X[name]), control)
+    controller = hm.make_controller(model, model, control, safe_input=scenario.safe_input)
+    return hm.simulate(
+        scenario.plant(), estimator, controller, task.reference, dt=dt, duration=periods * dt, x0=task.x0, seed=0,
+        w=task.w, faults=task.faults,
+    )  # fmt: skip
+
+
+def test_the_lab_radiates_and_its_power_lags():
+    plant = TemperatureLabPlant()
+
+    def loss(t):
+        z = plant.start(np.array([t, t, t, t, 24.0]))
+        z[5:7] = 0.0
+        return -rates(plant, z, (0.0, 0.0))[0] / (t - 24.0)
+
+    # the prior loses in proportion; a third of the loss is radiation, and this third is 1.27 times as much at 80 degC
+    assert loss(80.0) > 1.08 * loss(30.0)
+    z = plant.start(np.array(lab.tasks[0].x0))
+    jump = rates(plant, z, (100.0, 30.0)) - rates(plant, z, (30.0, 30.0))
+    assert np.flatnonzero(jump).tolist() == [5]
+    assert jump[5] == pytest.approx(70.0 / plant.lag_power)
+
+
+def test_the_room_of_the_lab_sways():
+    plant = TemperatureLabPlant()
+    state, room = plant.reset(np.array(lab.tasks[0].x0), 0), []
+    for _ in range(54):
+        state = plant.step(state, np.array([30.0, 30.0]), 100.0)
+        room.append(plant.truth(state)[4])
+    t = 100.0 * np.arange(1, 55)
+    np.testing.assert_allclose(
+        room, 24.0 + 1.5 * np.sin(2 * np.pi * t / 5400.0), atol=1e-5
+    )  # integrated to 1e-8
+
+
+def test_the_tanks_have_sharp_edges_and_no_ideal_orifices():
+    plant = CascadedTanksPlant()
+
+    def upper(level):
+        return rates(plant, (level, 4.0, 0.0), (0.0,))[0]
+
+    assert upper(8.0) / upper(2.0) == pytest.approx(4.0**0.56)  # the prior's: 2
+    over = -upper(8.6 + 0.25) - 0.034 * 8.85**0.56
+    assert over == pytest.approx(0.4 * 0.25**1.5)
+    assert upper(8.6 - 1e-6) == pytest.approx(-0.034 * 8.6**0.56)  # the prior runs over before its edge
+    full = plant.reset(np.array([8.0, 10.1]), 0)
+    readings = [plant.measure(full, np.random.default_rng(s))[0] for s in range(20)]
+    assert max(readings) == 10.0
+    assert min(readings) > 9.9
+
+
+def test_the_exchanger_follows_its_valve_over_three_lags():
+    plant = HeatExchangerPlant()
+    z = plant.start(np.array(DAY))
+    jump = rates(plant, z, (1.5,), (78.0,)) - rates(plant, z, (0.98,), (78.0,))
+    assert np.flatnonzero(jump).tolist() == [3]  # the prior's outlet moves at once
+    ends = [rates(plant, [*z[:3], v, *z[4:]], (v,), (78.0,))[2] for v in (-5.0, 5.0)]
+    cold, hot = (r * plant.lag_plates + z[2] + plant.loss * (z[2] - 22.0) for r in ends)
+    assert cold == pytest.approx(DAY[1], abs=1e-6)
+    assert hot == pytest.approx(0.66 * 78.0 + 0.34 * DAY[1], abs=1e-6)
+
+
+def test_the_reservoir_is_a_saw_tooth():
+    w = saw_tooth(np.array([0.0, 240.0, 335.0, 430.0, 550.0]))[:, 0]
+    assert w == pytest.approx([75.5, 78.2, 76.85, 75.5, 76.85])
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.5])
+def test_the_car_rolls_when_slow_and_slips_when_fast(speed):
+    """Slip of the rear axle in a steady turn: sideways acceleration over stiffness and gravity, 0.1 and 2.5 degrees."""
+    plant = RaceCarPlant(offset=0.0)
+    state = plant.reset(np.array([0.0, 0.0, 0.0, speed, 0.3 * plant.k]), 0)
+    for _ in range(120):
+        state = plant.step(state, np.array([0.3, speed]), 0.025)
+    _, _, _, v, _, side, turn = state.z
+    slip = np.arctan((plant.rear * turn - side) / v)
+    # the curve of the tyre bends by a few per cent, and slow wheels slip a little less than rolling ones by STANDING
+    assert slip == pytest.approx(v * turn / (plant.stiffness * 9.81), rel=0.06)
+    assert (slip > 0.03) == (speed > 1.0)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_plants_stay_within_a_fifth_of_what_was_fitted(name):
+    """Parameters that plant and prior share."""
+    plant, fitted = SCENARIOS[name].plant(), FITTED[name]
+    shared = set(fitted) & set(plant.parameters_of) - {"k_1", "k_2"}  # of another exponent
+    if name == "temperature_lab":
+        assert plant.warming1 * fitted["tau"] == pytest.approx(fitted["P1"], rel=0.2)
+        assert plant.warming2 * fitted["tau"] == pytest.approx(fitted["P2"], rel=0.2)
+        assert plant.between * fitted["tau_12"] == pytest.approx(1.0, rel=0.2)
+    if name == "cascaded_tanks":
+        for key in ("k_1", "k_2"):
+            assert getattr(plant, key) * 5**plant.exponent == pytest.approx(fitted[key] * 5**0.5, rel=0.2)
+    for key in shared:
+        assert getattr(plant, key) == pytest.approx(fitted[key], rel=0.2)
+        assert getattr(plant, key) != fitted[key]
+
+
+HELD = [
+    ("temperature_lab", "weak_heater", 200),
+    ("cascaded_tanks", "weak_pump", 400),
+    ("heat_exchanger", "weak_valve", 375),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "periods"),
+    [HELD[0], *(pytest.param(*one, marks=pytest.mark.full) for one in HELD[1:])],
+)
+def test_the_priors_controller_holds_a_set_point_under_a_load(name, task, periods):
+    """The mean error of the last fifth is below what steps of the sensor allow, and no input leaves its limits."""
+    scenario = SCENARIOS[name]
+    task = next(t for t in scenario.tasks if t.name == task)
+    result = closed(name, task, periods)
+    plant, late = scenario.plant(), slice(periods * 4 // 5, None)
+    y = np.array(
+        [np.ravel(plant.outputs(list(plant.start(x)), None, None, plant)).astype(float) for x in result.x]
+    )
+    error = (y - result.y_ref)[late].mean(axis=0)
+    assert np.all(np.abs(error) < 2 * np.sqrt(12) * np.array(scenario.sensor_sigma))
+    assert np.all((result.u >= scenario.control.u_min) & (result.u <= scenario.control.u_max))
+    assert set(result.source) == {"MPC"}
+
+
+@pytest.mark.parametrize("task", ["lanes", pytest.param("fast_slalom", marks=pytest.mark.full)])
+def test_the_priors_controller_keeps_the_car_on_its_path(task):
+    task = next(t for t in car.tasks if t.name == task)
+    result = closed("race_car", task, round(task.duration / car.data.dt))
+    off = np.hypot(*(result.x - result.reference)[:, :2].T)
+    assert np.sqrt(np.mean(off**2)) < 0.05  # a path swings by 0.2 m
+    assert np.all((result.u >= car.control.u_min) & (result.u <= car.control.u_max))
+
+
+def test_no_recording_changes_the_noise_that_a_scenario_declares():
+    """The scale that recordings find likeliest is that of the other states."""
+    model, n = fitted_model("heat_exchanger"), 60
+    x = np.tile(model.x0, (n, 1))
+    y = x[:, :1] + 0.065 * np.random.default_rng(0).standard_normal((n, 1))
+    u, w = np.tile(model.u0, (n, 1)), np.tile(model.w, (n, 1))
+    still = hm.Trajectory("still", "train", model.dt, model.dt * np.arange(n), u, y, x, 0 * x, w=w)
+    base = np.array([0.02, 0.7])
+    found = tuned_noise(model, exchanger, base, [still], observer=False, known=exchanger.state_noise)
+    assert found[1] == exchanger.state_noise["cold"]
+    assert found[0] in (0.02, pytest.approx(0.06))
+    assert tuned_noise(model, exchanger, base, [still], observer=False)[1] >= 0.7
+
+
+def test_levels_ask_for_a_full_upper_tank():
+    """The second level needs more than the upper tank's outlet gives at the plant's edge: it runs over."""
+    plant = CascadedTanksPlant()
+    most = plant.k_1 * plant.edge_1**plant.exponent
+    lower = np.roots(
+        [plant.bend, 1 - 10 * plant.bend, -tanks.tasks[0].reference(np.array([1200.0]))[0, 0]]
+    ).max()
+    assert plant.k_2 * lower**plant.exponent > most
+    assert tanks.control.x_max[0] > plant.edge_1
+    assert tanks.tasks[0].x0 == TANKS_REST
