@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
@@ -74,6 +75,7 @@ def recommend(
     deploy: str = "",
     samples: int = 1,
     recordings: Sequence[str] = (),
+    evidence: str = "recordings",
 ) -> Choice:
     """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
 
@@ -89,7 +91,8 @@ def recommend(
         prior: Name of the prior among them.
         deploy: Candidate that the user wants whatever the figures say. Default: none.
         samples: Samples of a block at least, within which errors hang together. Default: 1.
-        recordings: Which recording each run is from. Default: all are from one.
+        recordings: Which recording each run is from, or which part of a single one. Default: all are from one.
+        evidence: What these are called in the reason.
 
     Raises:
         InputError: If ``deploy`` is no candidate, or there is no validation run.
@@ -127,13 +130,29 @@ def recommend(
         if figures[name].upper < CONFIDENT and figures[name].error < figures[prior].error
     ]
     chosen = min(safe, key=lambda name: figures[name].error, default=prior)
-    of_what = "recordings, their geometric mean" if whole else "block" if len(sizes) == 1 else "blocks"
+    of_what = f"{evidence}, their geometric mean" if whole else "block" if len(sizes) == 1 else "blocks"
     reason = _reason(figures, best, chosen, prior, f"{len(sizes)} {of_what}")
     if deploy and deploy != chosen:
         reason = f"{deploy} is deployed as asked for. {reason}"
     return Choice(
         deploy or chosen, best if deploy in ("", prior) else deploy, figures, reason, len(sizes), tuple(safe)
     )
+
+
+def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tuple[list[str], str]:
+    """Which piece of evidence each run is of, and what these are called.
+
+    A recording is one: errors within it hang together. Of a single recording each part that a network left out is one.
+    Its blocks agreed by chance on the EMPS, and a hybrid with twice the prior's error was recommended.
+
+    Args:
+        runs: What judges a training (:func:`~hybrid_mpc.identify.evaluate.unseen_runs`).
+    """
+    files = [t.file for _, them in runs for t in them]
+    if len(set(files)) > 1:
+        return files, "recordings"
+    parts = [f"part {own}" for own, them in runs if own is not None for _ in them]
+    return (parts, "parts of one recording") if parts else (files, "recordings")
 
 
 def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str) -> str:

@@ -20,7 +20,7 @@ from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
-from hybrid_mpc.identify.choose import Choice, recommend
+from hybrid_mpc.identify.choose import Choice, evidence_of, recommend
 from hybrid_mpc.identify.evaluate import OutputErrors, free_runs, unseen_runs
 from hybrid_mpc.identify.fit import fit_prior, refit, smoothed
 from hybrid_mpc.identify.linear import BASELINES, LinearModel
@@ -365,10 +365,9 @@ def _choice(
     for kind, trained in networks.items():
         if kind in CANDIDATES:
             found[kind] = errors(lambda own, trained=trained: trained.step(prior, dt, own))  # type: ignore[misc]
+    recordings, evidence = evidence_of(runs)
     return recommend(
-        found,
-        samples=max(1, round(time_unit(training, dt) / dt)),
-        recordings=[t.file for _, them in runs for t in them],
+        found, samples=max(1, round(time_unit(training, dt) / dt)), recordings=recordings, evidence=evidence
     )
 
 

@@ -1,10 +1,12 @@
 """Do no harm: a hybrid is recommended where it surely beats the prior, and nowhere else."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.identify.choose import recommend
+from hybrid_mpc.identify.choose import evidence_of, recommend
 
 
 def runs(rng, n=4, size=1.0, length=200):
@@ -45,6 +47,30 @@ def test_one_recording_that_is_much_better_does_not_make_it_sure():
     assert choice.candidates["pgrnn"].ratio < 1.0 < choice.candidates["pgrnn"].upper
     assert choice.recommended == "phy"
     assert "does not surely beat" in choice.reason
+
+
+def test_of_a_single_recording_each_left_out_part_is_a_piece_of_evidence():
+    of = {name: SimpleNamespace(file=name) for name in ("monday", "tuesday")}
+    one = [(0, [of["monday"]] * 2), (1, [of["monday"]])]
+    assert evidence_of(one) == (["part 0", "part 0", "part 1"], "parts of one recording")
+    both = [(0, [of["monday"]]), (1, [of["tuesday"]])]
+    assert evidence_of(both) == (["monday", "tuesday"], "recordings")
+    assert evidence_of([(None, [of["monday"]] * 3)]) == (["monday"] * 3, "recordings")  # nothing was left out
+
+
+def test_blocks_of_one_part_do_not_make_a_hybrid_sure():
+    """In three of four parts it is a little worse, in one of ten runs each much better: its runs say the same thing
+    ten times."""
+    rng = np.random.default_rng(4)
+    prior = runs(rng, n=40)
+    hybrid = [(0.2 if i < 10 else 1.05) * r for i, r in enumerate(prior)]
+    hybrid = [0.6 * r if 10 <= i < 20 else r for i, r in enumerate(hybrid)]
+    given = {"phy": prior, "pgrnn": hybrid}
+    assert recommend(given).recommended == "pgrnn"
+    parts = [f"part {i // 10}" for i in range(40)]
+    found = recommend(given, recordings=parts, evidence="parts of one recording")
+    assert found.recommended == "phy"
+    assert "4 parts of one recording" in found.reason
 
 
 def test_a_hybrid_that_diverges_is_never_recommended():

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.identify.bands import FAR, RunParts, fit_bands, run_variance
-from hybrid_mpc.identify.choose import Choice, recommend
+from hybrid_mpc.identify.choose import Choice, evidence_of, recommend
 from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, unseen_runs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
@@ -74,8 +74,10 @@ def choice_stage(context: Context) -> ChoiceResult:
         errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in judged[:judging]]
         bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*judged, strict=True)), spec.dt))
     samples = max(1, round(context.time_unit / spec.dt))
-    recordings = [t.file for _, them in runs for t in them]
-    found = recommend(errors, deploy=context.settings.deploy, samples=samples, recordings=recordings)
+    recordings, evidence = evidence_of(runs)
+    found = recommend(
+        errors, deploy=context.settings.deploy, samples=samples, recordings=recordings, evidence=evidence
+    )
     longest = max((len(t.t) - warm - 2) * spec.dt for _, them in calibrating for t in them)
     return ChoiceResult(found, bands, longest)
 
