@@ -59,8 +59,7 @@ def test_of_a_single_recording_each_left_out_part_is_a_piece_of_evidence():
 
 
 def test_blocks_of_one_part_do_not_make_a_hybrid_sure():
-    """In three of four parts it is a little worse, in one of ten runs each much better: its runs say the same thing
-    ten times."""
+    """Two of four parts are much better, two a little worse; the ten runs of a part say the same thing ten times."""
     rng = np.random.default_rng(4)
     prior = runs(rng, n=40)
     hybrid = [(0.2 if i < 10 else 1.05) * r for i, r in enumerate(prior)]
