@@ -123,9 +123,7 @@ def test_the_solver_is_the_one_asked_for(run, solver, kind):
 @pytest.mark.parametrize("solver", ["rti", "sqp", "ipopt", "native"])
 def test_iterations_count_or_are_refused(run, solver):
     """None of the solvers ignores them: 0 is refused where they count, any number where they do not."""
-    with pytest.raises(
-        hm.InputError, match="leave iterations out" if solver == "native" else "at least 1"
-    ):
+    with pytest.raises(hm.InputError, match="leave iterations out" if solver == "native" else "at least 1"):
         hm.load(run).controller(solver=solver, iterations=0)
 
 
