@@ -13,327 +13,156 @@ import importlib
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from hybrid_mpc import plots
-    from hybrid_mpc.analyze.equilibria import equilibria, holding_input
+# fmt: off
+if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says that a name is public
+    from hybrid_mpc import plots as plots
+    from hybrid_mpc.analyze.equilibria import equilibria as equilibria, holding_input as holding_input
     from hybrid_mpc.analyze.linearize import (
-        friction_slopes,
-        jacobians,
-        linearize,
-        linearize_along,
-        linearize_at_speed,
-        linearize_secant,
+        friction_slopes as friction_slopes, jacobians as jacobians, linearize as linearize,
+        linearize_along as linearize_along, linearize_at_speed as linearize_at_speed,
+        linearize_secant as linearize_secant,
     )
-    from hybrid_mpc.analyze.margins import gain_schedule, mpc_gain, mpc_loop, steady_filter
-    from hybrid_mpc.analyze.measured import multisine_response, run_model, run_plant
-    from hybrid_mpc.analyze.memory import contraction, feature_box, gru_weights, lyapunov_exponent
+    from hybrid_mpc.analyze.margins import (
+        gain_schedule as gain_schedule, mpc_gain as mpc_gain, mpc_loop as mpc_loop,
+        steady_filter as steady_filter,
+    )
+    from hybrid_mpc.analyze.measured import (
+        multisine_response as multisine_response, run_model as run_model, run_plant as run_plant,
+    )
+    from hybrid_mpc.analyze.memory import (
+        contraction as contraction, feature_box as feature_box, gru_weights as gru_weights,
+        lyapunov_exponent as lyapunov_exponent,
+    )
     from hybrid_mpc.analyze.properties import (
-        balanced_truncation,
-        frequency_response,
-        physical_states,
-        steady_gain,
-        system_structure,
+        balanced_truncation as balanced_truncation, frequency_response as frequency_response,
+        physical_states as physical_states, steady_gain as steady_gain, system_structure as system_structure,
     )
-    from hybrid_mpc.analyze.sensitivity import parameter_sensitivities
-    from hybrid_mpc.control.best_of import BestOf
-    from hybrid_mpc.control.move import Move, shortest_move
-    from hybrid_mpc.control.nlp import IpoptController
-    from hybrid_mpc.control.ocp import OCP, Limits
-    from hybrid_mpc.control.problem import Status
-    from hybrid_mpc.control.rti import CondensedController
-    from hybrid_mpc.control.safeguard import SafeController
-    from hybrid_mpc.control.soft import HardBound, SoftBound
-    from hybrid_mpc.control.sqp import SQPController
-    from hybrid_mpc.control.targets import Steady, Targets
+    from hybrid_mpc.analyze.sensitivity import parameter_sensitivities as parameter_sensitivities
+    from hybrid_mpc.control.best_of import BestOf as BestOf
+    from hybrid_mpc.control.move import Move as Move, shortest_move as shortest_move
+    from hybrid_mpc.control.nlp import IpoptController as IpoptController
+    from hybrid_mpc.control.ocp import OCP as OCP, Limits as Limits
+    from hybrid_mpc.control.problem import Status as Status
+    from hybrid_mpc.control.rti import CondensedController as CondensedController
+    from hybrid_mpc.control.safeguard import SafeController as SafeController
+    from hybrid_mpc.control.soft import HardBound as HardBound, SoftBound as SoftBound
+    from hybrid_mpc.control.sqp import SQPController as SQPController
+    from hybrid_mpc.control.targets import Steady as Steady, Targets as Targets
     from hybrid_mpc.data.differentiate import (
-        CausalPolynomial,
-        LocalPolynomial,
-        SmoothingSpline,
-        ZeroPhaseFilter,
-        differentiate,
+        CausalPolynomial as CausalPolynomial, LocalPolynomial as LocalPolynomial,
+        SmoothingSpline as SmoothingSpline, ZeroPhaseFilter as ZeroPhaseFilter,
+        differentiate as differentiate,
     )
     from hybrid_mpc.data.excitation import (
-        check_excitation,
-        chirp,
-        excitation_of,
-        multisine,
-        prbs,
-        random_steps,
-        sinusoid,
+        check_excitation as check_excitation, chirp as chirp, excitation_of as excitation_of,
+        multisine as multisine, prbs as prbs, random_steps as random_steps, sinusoid as sinusoid,
     )
-    from hybrid_mpc.data.files import write_csv
-    from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
-    from hybrid_mpc.errors import InputError, SafeInputError
-    from hybrid_mpc.estimate.delay import DelayCompensation
-    from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, TrueState
-    from hybrid_mpc.estimate.offset_free import OffsetFree, offset_free
+    from hybrid_mpc.data.files import write_csv as write_csv
+    from hybrid_mpc.data.trajectories import (
+        Dataset as Dataset, Trajectory as Trajectory, load_trajectories as load_trajectories,
+    )
+    from hybrid_mpc.errors import InputError as InputError, SafeInputError as SafeInputError
+    from hybrid_mpc.estimate.delay import DelayCompensation as DelayCompensation
+    from hybrid_mpc.estimate.kalman import (
+        Estimate as Estimate, ExtendedKalmanFilter as ExtendedKalmanFilter, TrueState as TrueState,
+    )
+    from hybrid_mpc.estimate.offset_free import OffsetFree as OffsetFree, offset_free as offset_free
     from hybrid_mpc.estimate.parameters import (
-        parameter_factors,
-        parameter_filter,
-        parameter_states,
-        with_parameter_states,
+        parameter_factors as parameter_factors, parameter_filter as parameter_filter,
+        parameter_states as parameter_states, with_parameter_states as with_parameter_states,
     )
-    from hybrid_mpc.estimate.switching import SwitchingFilter
-    from hybrid_mpc.estimate.tuning import process_noise
-    from hybrid_mpc.files import write_arrays
-    from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
-    from hybrid_mpc.identify.export import check_parity, trace_model
-    from hybrid_mpc.identify.fit import FirstStates, fit_prior
-    from hybrid_mpc.identify.linear import LinearModel, fit_arx, fit_subspace
-    from hybrid_mpc.identify.networks import GRUNetwork
-    from hybrid_mpc.identify.predict import Prediction, predict
-    from hybrid_mpc.identify.prior_model import model_info
-    from hybrid_mpc.identify.settings import TrainingSettings
-    from hybrid_mpc.identify.smooth import fit_smoother
-    from hybrid_mpc.identify.step import HybridStep, PriorStep, Scaling, n_features
-    from hybrid_mpc.identify.train import train
-    from hybrid_mpc.identify.tune import SearchSpace, tune
-    from hybrid_mpc.job.check import check_scenario
-    from hybrid_mpc.job.controllers import find_noise
-    from hybrid_mpc.job.loops import Bench, LoopRow, LoopSpec, varied
-    from hybrid_mpc.job.run import run
-    from hybrid_mpc.job.settings import RunSettings
-    from hybrid_mpc.job.study import FaultKind, RandomFaults, Study
-    from hybrid_mpc.job.study_results import StudyResults, write_study_report
-    from hybrid_mpc.job.study_run import dry_run, run_study
+    from hybrid_mpc.estimate.switching import SwitchingFilter as SwitchingFilter
+    from hybrid_mpc.estimate.tuning import process_noise as process_noise
+    from hybrid_mpc.files import write_arrays as write_arrays
+    from hybrid_mpc.identify.evaluate import (
+        evaluation_trajectories as evaluation_trajectories, free_runs as free_runs, score as score,
+    )
+    from hybrid_mpc.identify.export import check_parity as check_parity, trace_model as trace_model
+    from hybrid_mpc.identify.fit import FirstStates as FirstStates, fit_prior as fit_prior
+    from hybrid_mpc.identify.linear import (
+        LinearModel as LinearModel, fit_arx as fit_arx, fit_subspace as fit_subspace,
+    )
+    from hybrid_mpc.identify.networks import GRUNetwork as GRUNetwork
+    from hybrid_mpc.identify.predict import Prediction as Prediction, predict as predict
+    from hybrid_mpc.identify.prior_model import model_info as model_info
+    from hybrid_mpc.identify.settings import TrainingSettings as TrainingSettings
+    from hybrid_mpc.identify.smooth import fit_smoother as fit_smoother
+    from hybrid_mpc.identify.step import (
+        HybridStep as HybridStep, PriorStep as PriorStep, Scaling as Scaling, n_features as n_features,
+    )
+    from hybrid_mpc.identify.train import train as train
+    from hybrid_mpc.identify.tune import SearchSpace as SearchSpace, tune as tune
+    from hybrid_mpc.job.check import check_scenario as check_scenario
+    from hybrid_mpc.job.controllers import find_noise as find_noise
+    from hybrid_mpc.job.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
+    from hybrid_mpc.job.run import run as run
+    from hybrid_mpc.job.settings import RunSettings as RunSettings
+    from hybrid_mpc.job.study import FaultKind as FaultKind, RandomFaults as RandomFaults, Study as Study
+    from hybrid_mpc.job.study_results import (
+        StudyResults as StudyResults, write_study_report as write_study_report,
+    )
+    from hybrid_mpc.job.study_run import dry_run as dry_run, run_study as run_study
     from hybrid_mpc.kit.artifact import (
-        Kit,
-        LoopSettings,
-        ModelInfo,
-        Provenance,
-        load,
-        save_artifact,
-        set_calibration,
-        set_process_noise,
+        Kit as Kit, LoopSettings as LoopSettings, ModelInfo as ModelInfo, Provenance as Provenance,
+        load as load, save_artifact as save_artifact, set_calibration as set_calibration,
+        set_process_noise as set_process_noise,
     )
     from hybrid_mpc.kit.assembly import (
-        make_adaptive_guard,
-        make_controller,
-        make_estimator,
-        make_monitor,
-        make_ocp,
-        make_resting_guard,
+        make_adaptive_guard as make_adaptive_guard, make_controller as make_controller,
+        make_estimator as make_estimator, make_monitor as make_monitor, make_ocp as make_ocp,
+        make_resting_guard as make_resting_guard,
     )
-    from hybrid_mpc.kit.export_c import generate_controller
-    from hybrid_mpc.loop.faults import Fault, check_plant_faults, corrupt_input, corrupt_measurement
-    from hybrid_mpc.loop.guard import Guard, Mode
-    from hybrid_mpc.loop.loop import Loop
-    from hybrid_mpc.loop.realtime import Runner, SafeEnd
-    from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
-    from hybrid_mpc.machine.friction import Coulomb, LoadDependent, Stribeck, Viscous, with_friction
-    from hybrid_mpc.machine.mechanical import MechanicalPrior
-    from hybrid_mpc.machine.prior import Balance, OperatingPoint, Prior
-    from hybrid_mpc.machine.signals import Parameter, Signal
-    from hybrid_mpc.machine.specification import BenchmarkBudget, BenchmarkSpec, DataSpec, Role, Window
-    from hybrid_mpc.machine.torch_prior import TorchPrior
-    from hybrid_mpc.model.buffered import BufferedFunction
-    from hybrid_mpc.model.delay import with_input_delay
-    from hybrid_mpc.model.disturbance import Disturbance
-    from hybrid_mpc.model.model import HybridModel, kinematics, longer_period
-    from hybrid_mpc.model.riccati import dare, lqr
-    from hybrid_mpc.monitor.calibrate import Calibration, count_alarms
-    from hybrid_mpc.monitor.detector import Detector
-    from hybrid_mpc.monitor.diagnose import Diagnoser
-    from hybrid_mpc.monitor.energy import EnergyMonitor
-    from hybrid_mpc.monitor.explain import ResidualDiagnoser
-    from hybrid_mpc.monitor.learn import guard_monitor, learn_from
-    from hybrid_mpc.monitor.lengths import rest_speeds
-    from hybrid_mpc.monitor.replay import replay
+    from hybrid_mpc.kit.export_c import generate_controller as generate_controller
+    from hybrid_mpc.loop.faults import (
+        Fault as Fault, check_plant_faults as check_plant_faults, corrupt_input as corrupt_input,
+        corrupt_measurement as corrupt_measurement,
+    )
+    from hybrid_mpc.loop.guard import Guard as Guard, Mode as Mode
+    from hybrid_mpc.loop.loop import Loop as Loop
+    from hybrid_mpc.loop.realtime import Runner as Runner, SafeEnd as SafeEnd
+    from hybrid_mpc.loop.simulate import ClosedLoopResult as ClosedLoopResult, simulate as simulate
+    from hybrid_mpc.machine.friction import (
+        Coulomb as Coulomb, LoadDependent as LoadDependent, Stribeck as Stribeck, Viscous as Viscous,
+        with_friction as with_friction,
+    )
+    from hybrid_mpc.machine.mechanical import MechanicalPrior as MechanicalPrior
+    from hybrid_mpc.machine.prior import Balance as Balance, OperatingPoint as OperatingPoint, Prior as Prior
+    from hybrid_mpc.machine.signals import Parameter as Parameter, Signal as Signal
+    from hybrid_mpc.machine.specification import (
+        BenchmarkBudget as BenchmarkBudget, BenchmarkSpec as BenchmarkSpec, DataSpec as DataSpec,
+        Role as Role, Window as Window,
+    )
+    from hybrid_mpc.machine.torch_prior import TorchPrior as TorchPrior
+    from hybrid_mpc.model.buffered import BufferedFunction as BufferedFunction
+    from hybrid_mpc.model.delay import with_input_delay as with_input_delay
+    from hybrid_mpc.model.disturbance import Disturbance as Disturbance
+    from hybrid_mpc.model.model import (
+        HybridModel as HybridModel, kinematics as kinematics, longer_period as longer_period,
+    )
+    from hybrid_mpc.model.riccati import dare as dare, lqr as lqr
+    from hybrid_mpc.monitor.calibrate import Calibration as Calibration, count_alarms as count_alarms
+    from hybrid_mpc.monitor.detector import Detector as Detector
+    from hybrid_mpc.monitor.diagnose import Diagnoser as Diagnoser
+    from hybrid_mpc.monitor.energy import EnergyMonitor as EnergyMonitor
+    from hybrid_mpc.monitor.explain import ResidualDiagnoser as ResidualDiagnoser
+    from hybrid_mpc.monitor.learn import guard_monitor as guard_monitor, learn_from as learn_from
+    from hybrid_mpc.monitor.lengths import rest_speeds as rest_speeds
+    from hybrid_mpc.monitor.replay import replay as replay
     from hybrid_mpc.monitor.residuals import (
-        ResidualLimits,
-        ResidualMonitor,
-        learn_residuals,
-        replay_residuals,
+        ResidualLimits as ResidualLimits, ResidualMonitor as ResidualMonitor,
+        learn_residuals as learn_residuals, replay_residuals as replay_residuals,
     )
-    from hybrid_mpc.scenario import DEFAULT_BUDGETS, Budget, Scenario, Task, load_scenario
+    from hybrid_mpc.scenario import (
+        DEFAULT_BUDGETS as DEFAULT_BUDGETS, Budget as Budget, Scenario as Scenario, Task as Task,
+        load_scenario as load_scenario,
+    )
+# fmt: on
 
 try:
     __version__ = version("hybrid-mpc")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
-__all__ = [
-    "Balance",
-    "Bench",
-    "BenchmarkBudget",
-    "BenchmarkSpec",
-    "BestOf",
-    "Budget",
-    "BufferedFunction",
-    "Calibration",
-    "CausalPolynomial",
-    "ClosedLoopResult",
-    "CondensedController",
-    "Coulomb",
-    "DEFAULT_BUDGETS",
-    "DataSpec",
-    "Dataset",
-    "DelayCompensation",
-    "Detector",
-    "Diagnoser",
-    "Disturbance",
-    "EnergyMonitor",
-    "Estimate",
-    "ExtendedKalmanFilter",
-    "Fault",
-    "FaultKind",
-    "FirstStates",
-    "GRUNetwork",
-    "Guard",
-    "HardBound",
-    "HybridModel",
-    "HybridStep",
-    "InputError",
-    "IpoptController",
-    "Kit",
-    "Limits",
-    "LinearModel",
-    "LoadDependent",
-    "LocalPolynomial",
-    "Loop",
-    "LoopRow",
-    "LoopSettings",
-    "LoopSpec",
-    "MechanicalPrior",
-    "Mode",
-    "ModelInfo",
-    "Move",
-    "OCP",
-    "OffsetFree",
-    "OperatingPoint",
-    "Parameter",
-    "Prediction",
-    "Prior",
-    "PriorStep",
-    "Provenance",
-    "RandomFaults",
-    "ResidualDiagnoser",
-    "ResidualLimits",
-    "ResidualMonitor",
-    "Role",
-    "RunSettings",
-    "Runner",
-    "SQPController",
-    "SafeController",
-    "SafeEnd",
-    "SafeInputError",
-    "Scaling",
-    "Scenario",
-    "SearchSpace",
-    "Signal",
-    "SmoothingSpline",
-    "SoftBound",
-    "Status",
-    "Steady",
-    "Stribeck",
-    "Study",
-    "StudyResults",
-    "SwitchingFilter",
-    "Targets",
-    "Task",
-    "TorchPrior",
-    "TrainingSettings",
-    "Trajectory",
-    "TrueState",
-    "Viscous",
-    "Window",
-    "ZeroPhaseFilter",
-    "__version__",
-    "balanced_truncation",
-    "check_excitation",
-    "check_parity",
-    "check_plant_faults",
-    "check_scenario",
-    "chirp",
-    "contraction",
-    "corrupt_input",
-    "corrupt_measurement",
-    "count_alarms",
-    "dare",
-    "differentiate",
-    "dry_run",
-    "equilibria",
-    "evaluation_trajectories",
-    "excitation_of",
-    "feature_box",
-    "find_noise",
-    "fit_arx",
-    "fit_prior",
-    "fit_smoother",
-    "fit_subspace",
-    "free_runs",
-    "frequency_response",
-    "friction_slopes",
-    "gain_schedule",
-    "generate_controller",
-    "gru_weights",
-    "guard_monitor",
-    "holding_input",
-    "jacobians",
-    "kinematics",
-    "learn_from",
-    "learn_residuals",
-    "linearize",
-    "linearize_along",
-    "linearize_at_speed",
-    "linearize_secant",
-    "load",
-    "load_scenario",
-    "load_trajectories",
-    "longer_period",
-    "lqr",
-    "lyapunov_exponent",
-    "make_adaptive_guard",
-    "make_controller",
-    "make_estimator",
-    "make_monitor",
-    "make_ocp",
-    "make_resting_guard",
-    "model_info",
-    "mpc_gain",
-    "mpc_loop",
-    "multisine",
-    "multisine_response",
-    "n_features",
-    "offset_free",
-    "parameter_factors",
-    "parameter_filter",
-    "parameter_sensitivities",
-    "parameter_states",
-    "physical_states",
-    "plots",
-    "prbs",
-    "predict",
-    "process_noise",
-    "random_steps",
-    "replay",
-    "replay_residuals",
-    "rest_speeds",
-    "run",
-    "run_model",
-    "run_plant",
-    "run_study",
-    "save_artifact",
-    "score",
-    "set_calibration",
-    "set_process_noise",
-    "shortest_move",
-    "simulate",
-    "sinusoid",
-    "steady_filter",
-    "steady_gain",
-    "system_structure",
-    "trace_model",
-    "train",
-    "tune",
-    "varied",
-    "with_friction",
-    "with_input_delay",
-    "with_parameter_states",
-    "write_arrays",
-    "write_csv",
-    "write_study_report",
-]
 _ROOMS = {
     "analyze.equilibria": ("equilibria", "holding_input"),
     "analyze.linearize": (
@@ -432,6 +261,7 @@ _ROOMS = {
 }  # fmt: skip
 """Public names by the module that defines them."""
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
+__all__ = sorted((*_HOME, "plots", "__version__"))
 
 
 def __getattr__(name: str) -> Any:

@@ -67,30 +67,6 @@ class Recorder:
         return getattr(self.plant, name)
 
 
-class ModelPlant:
-    """A machine that is a model without hidden states, with a load on its input and a sensor of 0.1 mm."""
-
-    def __init__(self, model, load=0.0):
-        self._model, self._load = model, load
-
-    def reset(self, x0, seed):
-        return np.asarray(x0, dtype=float)
-
-    def step(self, state, u, dt):
-        m = self._model
-        return m.step(state, [], u + self._load, m.w, m.p)[0].full().ravel()
-
-    def measure(self, state, rng):
-        n_y = self._model.n_y
-        return state[:n_y] + 1e-4 * rng.normal(size=n_y)
-
-    def truth(self, state):
-        return state
-
-    def hidden(self, state):
-        return np.zeros(0)
-
-
 def run(model, safe, **changes):
     """A short closed loop of the mismatched pendulum; ``changes`` are arguments of ``simulate``."""
     arguments = {

@@ -2,23 +2,14 @@
 
 import casadi as ca
 import numpy as np
+from online_models import StatePlant, rk4
 from scipy.optimize import brentq
 
-from hybrid_mpc import HybridModel, Signal
+from hybrid_mpc import ExtendedKalmanFilter, HybridModel, Signal
 
 AREA, PIPE, GRAVITY = 0.02, 1.2e-4, 9.81
 LEVEL, PUMP, INFLOW = 0.30, 1.8e-4, 4e-5
 """Levels [m], the pump's flow [m^3/s] and the measured inflow of the lower tank [m^3/s] of the operating point."""
-
-
-def rk4(f, x, dt, n=2):
-    for _ in range(n):
-        h = dt / n
-        a = f(x)
-        b = f(x + h / 2 * a)
-        c = f(x + h / 2 * b)
-        x = x + h / 6 * (a + 2 * b + 2 * c + f(x + h * c))
-    return x
 
 
 def _model(name, dt, states, inputs, outputs, rates, y, *, w=None, **options):
@@ -94,14 +85,19 @@ def thermal(dt=10.0, **options):
     )  # fmt: skip
 
 
-class MachinePlant:
+def observer(model, sigma_d=None, *, sigma_y=1e-3, sigma_x0=0.1):
+    """A filter whose deviations are the same for all outputs and states."""
+    return ExtendedKalmanFilter(
+        model, sigma_y=[sigma_y] * model.n_y, sigma_x=[1e-4] * model.n_x, sigma_x0=[sigma_x0] * model.n_x,
+        sigma_d=sigma_d, sigma_d0=sigma_d,
+    )  # fmt: skip
+
+
+class MachinePlant(StatePlant):
     """A machine that is a model, with loads on its inputs, leaks of its states [1/s] and white noise of its sensors."""
 
     def __init__(self, model, load=0.0, leak=0.0, offset=0.0, sigma=0.0):
         self._model, self._load, self._leak, self._offset, self._sigma = model, load, leak, offset, sigma
-
-    def reset(self, x0, seed):
-        return np.asarray(x0, dtype=float)
 
     def step(self, state, u, dt, w=None):
         m = self._model
@@ -113,9 +109,3 @@ class MachinePlant:
         m = self._model
         y = m.output(state, getattr(self, "_u", m.u0), getattr(self, "_w", m.w), m.p).full().ravel()
         return y + self._offset + self._sigma * rng.normal(size=m.n_y)
-
-    def truth(self, state):
-        return state
-
-    def hidden(self, state):
-        return np.zeros(0)

@@ -50,7 +50,23 @@ def pendulum_rhs(x, u, *, inertia=0.14, gravity=2.4, damping=0.02, friction=0.05
     return ca.vertcat(x[1], acceleration)
 
 
-def rk4(f, x, dt, substeps):
+class StatePlant:
+    """A plant whose state is that of the model; its step is a test's own. The first state is measured, exactly."""
+
+    def reset(self, x0, seed):
+        return np.array(x0, dtype=float)
+
+    def measure(self, state, rng):
+        return state[:1]
+
+    def truth(self, state):
+        return state
+
+    def hidden(self, state):
+        return np.zeros(0)
+
+
+def rk4(f, x, dt, substeps=2):
     step = dt / substeps
     for _ in range(substeps):
         k1 = f(x)

@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
+from example_priors import Swing
 from scipy.integrate import solve_ivp
 
-from hybrid_mpc import MechanicalPrior, Parameter, Signal, TrainingSettings, Trajectory, train
+from hybrid_mpc import TrainingSettings, Trajectory, train
 
 DT = 0.02
 TRUTH = {"J": 0.1, "mgl": 1.2, "d": 0.05}
@@ -17,24 +17,8 @@ SMALL = TrainingSettings(
 """A training of a second."""
 
 
-class Pendulum(MechanicalPrior):
-    states = (Signal("phi", "rad", periodic=True), Signal("phi_dot", "rad/s"))
-    inputs = (Signal("torque", "N m"),)
-    outputs = (states[0],)
-    parameters = (
-        Parameter("J", 0.15, "kg m^2", 0.02, 0.5),
-        Parameter("mgl", 1.0, "N m", 0.2, 5.0),
-        Parameter("d", 0.01, "N m s/rad", 0.0, 0.5),
-    )
-
-    def mass_matrix(self, q, p):
-        return p.J
-
-    def potential(self, q, p):
-        return -p.mgl * ca.cos(q.phi)
-
-    def friction(self, q, v, p):
-        return p.d * v.phi_dot
+Pendulum = Swing
+"""The prior that these runs are for."""
 
 
 def record(seed, seconds=4.0, role="train", extra=lambda phi, v: 0.0, noise=0.0, size=0.6):

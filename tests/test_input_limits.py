@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import cart
 import numpy as np
 import pytest
-from closed_loop_parts import ModelPlant, ScriptedMonitor
+from closed_loop_parts import ScriptedMonitor
 from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc import (
@@ -33,6 +33,7 @@ from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.loops import excess, limits_used
 from hybrid_mpc.job.stages.monitor import unknown_load
 from hybrid_mpc.kit.assembly import sensor_steps, working_point
+from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.plots.loops import Motion, closed_loops
 
@@ -125,7 +126,7 @@ def test_a_cart_is_brought_to_what_its_limits_allow(carts, limits):
     # At rest the spring of 1 N/m holds what pushes: a place of so many metres takes so many newtons.
     for place in (0.7, -0.7):
         result = simulate(
-            ModelPlant(model), make_estimator(model, machine, np.array([1e-5, 1e-4])),
+            ModelPlant(model, (1e-4,)), make_estimator(model, machine, np.array([1e-5, 1e-4])),
             make_controller(model, model, control), lambda t, place=place: np.tile([place, 0.0], (len(t), 1)),
             dt=model.dt, duration=14.0, x0=[0.0, 0.0], seed=0,
         )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +14,6 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
-SIGNAL_TARGETS = (
-    "measurement_offset", "measurement_scale", "measurement_freeze", "measurement_dropout", "input_gain",
-    "input_offset",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -102,6 +98,18 @@ class Fault:
         return neutral + share * (self.value - neutral)
 
 
+EFFECTS: Mapping[str, Callable[[Fault, float, float, float], float]] = {
+    "measurement_offset": lambda fault, t, value, before: value + fault.value_at(t, 0.0),
+    "measurement_scale": lambda fault, t, value, before: value * fault.value_at(t, 1.0),
+    "measurement_freeze": lambda fault, t, value, before: before,
+    "measurement_dropout": lambda fault, t, value, before: math.nan,
+    "input_gain": lambda fault, t, value, before: value * fault.value_at(t, 1.0),
+    "input_offset": lambda fault, t, value, before: value + fault.value_at(t, 0.0),
+}
+"""What a fault makes at ``t`` of a measured or commanded value; ``before`` is the measurement before it."""
+SIGNAL_TARGETS = tuple(EFFECTS)
+
+
 def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequence[str]) -> None:
     """Refuse faults of channels that do not exist or are not named, and faults that only a plant can show.
 
@@ -134,11 +142,6 @@ def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequ
             raise InputError(
                 f"fault {fault.target}: no {kind} {fault.channel!r}; there are: {', '.join(names)}"
             )
-
-
-def _place(fault: Fault, names: Sequence[str]) -> int:
-    """Place of a fault's channel; the first where none is named."""
-    return names.index(fault.channel) if fault.channel else 0
 
 
 def check_plant_faults(faults: Sequence[Fault], known: Sequence[str]) -> None:
@@ -182,20 +185,7 @@ def corrupt_measurement(
 
     ``outputs`` are their names; needed where faults name one.
     """
-    y = y.copy()
-    for fault in faults:
-        if not fault.active(t) or not fault.target.startswith("measurement_"):
-            continue
-        i = _place(fault, outputs)
-        if fault.target == "measurement_offset":
-            y[i] += fault.value_at(t, 0.0)
-        elif fault.target == "measurement_scale":
-            y[i] *= fault.value_at(t, 1.0)
-        elif fault.target == "measurement_freeze":
-            y[i] = y_before[i]
-        elif fault.target == "measurement_dropout":
-            y[i] = np.nan
-    return y
+    return _corrupted(faults, t, y, y_before, outputs, "measurement_")
 
 
 def corrupt_input(faults: Sequence[Fault], t: float, u: Array, inputs: Sequence[str] = ()) -> Array:
@@ -203,13 +193,18 @@ def corrupt_input(faults: Sequence[Fault], t: float, u: Array, inputs: Sequence[
 
     ``inputs`` are their names; needed where faults name one.
     """
-    u = u.copy()
+    return _corrupted(faults, t, u, u, inputs, "input_")
+
+
+def _corrupted(
+    faults: Sequence[Fault], t: float, now: Array, before: Array, names: Sequence[str], kind: str
+) -> Array:
+    values = now.copy()
     for fault in faults:
-        if fault.active(t) and fault.target == "input_gain":
-            u[_place(fault, inputs)] *= fault.value_at(t, 1.0)
-        elif fault.active(t) and fault.target == "input_offset":
-            u[_place(fault, inputs)] += fault.value_at(t, 0.0)
-    return u
+        if fault.target.startswith(kind) and fault.active(t):
+            i = names.index(fault.channel) if fault.channel else 0
+            values[i] = EFFECTS[fault.target](fault, t, values[i], before[i])
+    return values
 
 
 def fault_text(faults: Sequence[Fault], late: Sequence[tuple[float, float]] = ()) -> str:

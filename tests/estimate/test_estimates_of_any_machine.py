@@ -6,12 +6,11 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from machines import INFLOW, dc_motor, thermal, two_tanks
+from machines import INFLOW, dc_motor, observer, thermal, two_tanks
 
 from hybrid_mpc import (
     OCP,
     Disturbance,
-    ExtendedKalmanFilter,
     HybridModel,
     InputError,
     Signal,
@@ -24,13 +23,6 @@ from hybrid_mpc.estimate.offset_free import distinguishable
 from hybrid_mpc.kit.assembly import disturbance_sizes, first_deviations
 
 ALL = (two_tanks, dc_motor, thermal)
-
-
-def observer(model, sigma_d=None, sigma_x0=0.1):
-    return ExtendedKalmanFilter(
-        model, sigma_y=[1e-3] * model.n_y, sigma_x=[1e-4] * model.n_x, sigma_x0=[sigma_x0] * model.n_x,
-        sigma_d=sigma_d, sigma_d0=sigma_d,
-    )  # fmt: skip
 
 
 def sensor(output, x0=0.0, n=1):

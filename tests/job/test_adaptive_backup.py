@@ -19,6 +19,7 @@ from hybrid_mpc import (
     with_input_delay,
 )
 from hybrid_mpc.kit.assembly import adaptable
+from hybrid_mpc.loop.plant import ModelPlant
 
 CONTROL = OCP(20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,))
 CAUSES = {"mass": ("J", "mgl"), "friction": ("gamma",), "motor": ("gain of u",)}
@@ -27,29 +28,8 @@ SCENARIO = Scenario(
 )
 LATE = with_input_delay(pendulum(), 0.02)
 SIGMA_X = np.array([1e-5, 1e-3])
-
-
-class Heavy:
-    """A pendulum half as heavy again from the start; its sensor is good to 0.1 mrad."""
-
-    def __init__(self):
-        self._model = pendulum(inertia=1.5 * J, mgl=1.5 * MGL)
-
-    def reset(self, x0, seed):
-        return np.asarray(x0, dtype=float)
-
-    def step(self, state, u, dt):
-        m = self._model
-        return m.step(state, [], u, m.w, m.p)[0].full().ravel()
-
-    def measure(self, state, rng):
-        return state[:1] + 1e-4 * rng.normal(size=1)
-
-    def truth(self, state):
-        return state
-
-    def hidden(self, state):
-        return np.zeros(0)
+HEAVY = ModelPlant(pendulum(inertia=1.5 * J, mgl=1.5 * MGL), (1e-4,))
+"""A pendulum half as heavy again from the start; its sensor is good to 0.1 mrad."""
 
 
 def test_gains_are_left_to_the_mass():
@@ -66,7 +46,7 @@ def test_it_switches_once_the_alarm_has_lasted_and_pays():
         run(
             model,
             safe,
-            plant=Heavy(),
+            plant=HEAVY,
             estimator=estimator,
             monitor=ScriptedMonitor([(5, 10**9)]),
             guard=g,

@@ -14,6 +14,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from online_models import StatePlant
 
 from hybrid_mpc import (
     OCP,
@@ -67,24 +68,12 @@ class Cart(MechanicalPrior):
         return p.c * q.s**2 / 2
 
 
-class Plant:
+class Plant(StatePlant):
     """A cart in simulation."""
-
-    def reset(self, x0, seed):
-        return np.array(x0, dtype=float)
 
     def step(self, state, u, dt):
         v = state[1] + dt * (u[0] - 8.0 * state[0]) / 2.0
         return np.array([state[0] + dt * v, v])
-
-    def measure(self, state, rng):
-        return state[:1]
-
-    def truth(self, state):
-        return state
-
-    def hidden(self, state):
-        return np.zeros(0)
 
 
 BUDGET = {"quick": Budget(4, 1, 5, 5, 1)}

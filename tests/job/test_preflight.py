@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from example_priors import Tanks
+from online_models import StatePlant
 
 from hybrid_mpc import (
     OCP,
@@ -74,21 +75,9 @@ class TorchTank(TorchPrior):
         return (Balance("volume", p.area * x.level, u.inflow, out, "m^3", "m^3/s"),)
 
 
-class Plant:
-    def reset(self, x0, seed):
-        return np.array(x0)
-
+class Plant(StatePlant):
     def step(self, state, u, dt):
         return state + dt * np.array([state[1], 10 * u[0] - 10 * np.sin(state[0])])
-
-    def measure(self, state, rng):
-        return state[:1]
-
-    def truth(self, state):
-        return state
-
-    def hidden(self, state):
-        return np.zeros(0)
 
 
 DATA = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.5)
@@ -501,14 +490,11 @@ class RainyTanks(Tanks):
     )
 
 
-class RainyPlant:
+class RainyPlant(StatePlant):
     """The prior itself, by small steps of Euler."""
 
     def __init__(self):
         self._prior = RainyTanks()
-
-    def reset(self, x0, seed):
-        return np.array(x0, dtype=float)
 
     def step(self, state, u, dt, w):
         p = self._prior.p
@@ -518,12 +504,6 @@ class RainyPlant:
 
     def measure(self, state, rng):
         return state[1:]
-
-    def truth(self, state):
-        return state
-
-    def hidden(self, state):
-        return np.zeros(0)
 
 
 def filled(to):

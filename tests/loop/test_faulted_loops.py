@@ -1,60 +1,34 @@
 """Random faults in motion, on the golf robot's prior and a small hybrid: ten loops of 200 periods survive.
 
-Every loop has one to three cases of the fault catalogue, single NaN samples and late solves among them. *Forced* are
-the periods whose solve is declared late, and nothing else.
+Every loop is one of the study ``faults_1000``: one to three of the machine's faults, missing samples and late solves
+among them. *Forced* are the periods whose solve is declared late, and nothing else.
 """
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hybrid_mpc import Fault, load, make_controller, make_estimator, make_monitor, simulate
+from hybrid_mpc import load, make_controller, make_estimator, make_monitor, simulate
+from hybrid_mpc.job.study import built_in_study
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue
 
 DT, PERIODS = 0.02, 200
 SIGMA_X = (1e-4, 2e-2)
 """Process noise per period [rad, rad/s]: the order of the prior's one-period errors on the rig."""
-KINDS = ("nan_samples", "late", *(case.name for case in catalogue() if not case.nominal))
-SHARES = ("plant_friction", "plant_mass", "input_gain", "measurement_scale")
-"""Targets whose value is 1 where nothing is wrong."""
+STUDY = built_in_study("faults_1000", ".")
+TASKS = [task for task in scenario.tasks if task.name in STUDY.tasks]
+"""Holding a position is no motion."""
 
 
 def drawn(seed):
-    """A random loop: task, kinds of fault, faults, periods with a late solve, first instant of a fault [s]."""
+    """A random loop: task, faults, intervals of late solves, first instant of a fault [s]."""
     rng = np.random.default_rng(seed)
-    # holding a position is no motion
-    tasks = [task for task in scenario.tasks if not task.faults or task.name == "reject_heavy"]
-    task = tasks[rng.integers(len(tasks))]
-    kinds = rng.choice(KINDS, size=rng.integers(1, 4), replace=False).tolist()
-    faults, late, starts = list(task.faults), set(), []
-    for kind in kinds:
-        start = DT * int(rng.integers(70, 100))  # 1.4 to 2 s: every task moves then
-        end = np.inf if rng.random() < 0.5 else start + DT * int(rng.integers(10, 100))
-        starts.append(start)
-        if kind == "nan_samples":
-            gone = rng.choice(np.arange(start, PERIODS * DT, DT), size=10, replace=False)
-            faults += [Fault(t, t + DT, "measurement_dropout") for t in gone.tolist()]
-        elif kind == "late":
-            first = round(start / DT)
-            late |= set(range(first, first + int(rng.integers(1, 12))))
-            late |= set(rng.integers(first, PERIODS, size=6).tolist())
-        else:
-            case = next(c for c in catalogue(start, end) if c.name == kind)
-            faults += [resized(fault, rng) for fault in case.faults]
-    return task, kinds, faults, late, min(starts)
-
-
-def resized(fault, rng):
-    """The fault at 70 to 130 % of its distance from nothing wrong, in either direction where it has a sign."""
-    factor = rng.uniform(0.7, 1.3)
-    if fault.target in SHARES:
-        return replace(fault, value=1.0 + factor * (fault.value - 1.0))
-    if fault.target in ("plant_push", "measurement_offset"):
-        return replace(fault, value=float(rng.choice([-1.0, 1.0]) * factor * fault.value))
-    return replace(fault, value=factor * fault.value)
+    task = TASKS[rng.integers(len(TASKS))]
+    faults, late = STUDY.random_faults.drawn(rng)
+    start = min([fault.start for fault in faults] + [begin for begin, _ in late])
+    return task, (*task.faults, *faults), late, start
 
 
 def excess(u, ocp):
@@ -65,12 +39,13 @@ def excess(u, ocp):
     return max(beyond)
 
 
-@pytest.fixture(scope="module", params=[range(9, 12), pytest.param(range(12, 19), marks=pytest.mark.full)])
+@pytest.fixture(scope="module", params=[range(19, 22), pytest.param(range(12, 19), marks=pytest.mark.full)])
 def loops(request, golf_artifact):
     """The draw and the result of loops, with the limits they had; an exception in any ends them all."""
     models, done = load(golf_artifact).models, []
     for seed in request.param:
-        task, kinds, faults, late, start = drawn(seed)
+        task, faults, spans, start = drawn(seed)
+        late = {k for k in range(PERIODS) if any(a - 1e-9 <= k * DT < b - 1e-9 for a, b in spans)}
         model, control = models[("hybrid", "prior")[seed % 2]], task.control or scenario.control
         controller = make_controller(model, models["prior"], control)
         result = simulate(
@@ -78,16 +53,16 @@ def loops(request, golf_artifact):
             task.reference, weight=task.weight, dt=DT, duration=PERIODS * DT, x0=np.array(task.x0), seed=seed,
             faults=faults, monitor=make_monitor(model, None), late=lambda t, at=late: round(t / DT) in at,
         )  # fmt: skip
-        done.append((kinds, late, start, result, controller.controller.ocp))
+        done.append((faults, late, start, result, controller.controller.ocp))
     return done
 
 
 def test_inputs_are_finite_and_within_their_limits(loops):
-    for kinds, _, _, result, ocp in loops:
-        assert len(result.u) == PERIODS, kinds
-        assert np.isfinite(result.u).all(), kinds
+    for faults, _, _, result, ocp in loops:
+        assert len(result.u) == PERIODS, faults
+        assert np.isfinite(result.u).all(), faults
         # rounding of the slew, a difference of inputs below 1 N m
-        assert excess(result.u, ocp) <= 1e-12, kinds
+        assert excess(result.u, ocp) <= 1e-12, faults
 
 
 def test_nearly_all_periods_are_solved_but_those_whose_solve_is_late(loops):
@@ -101,13 +76,16 @@ def test_nearly_all_periods_are_solved_but_those_whose_solve_is_late(loops):
 
 
 def test_faults_begin_in_motion(loops):
-    for kinds, _, start, result, _ in loops:
+    for faults, _, start, result, _ in loops:
         begun = (result.t >= start - 1e-9) & (result.t < start + 0.3)
-        assert np.abs(result.x[begun, 1]).max() > 0.05, kinds  # rad/s
+        assert np.abs(result.x[begun, 1]).max() > 0.05, faults  # rad/s
 
 
 def test_draws_cover_the_catalogue():
     draws = [drawn(seed) for seed in range(200)]
-    assert {kind for _, kinds, *_ in draws for kind in kinds} == set(KINDS)
-    signs = {np.sign(f.value) for _, _, faults, *_ in draws for f in faults if f.target == "plant_push"}
-    assert signs == {-1.0, 1.0}
+    faults = [fault for _, some, *_ in draws for fault in some]
+    assert any(late for *_, late, _ in draws)
+    assert {case.target for entry in catalogue() if not entry.nominal for case in entry.faults} <= {
+        fault.target for fault in faults
+    }
+    assert {np.sign(f.value) for f in faults if f.target == "plant_push"} == {-1.0, 1.0}

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from closed_loop_parts import FakeClock, ScriptedMonitor
-from machines import AMBIENT, HEAT, INFLOW, PUMP, MachinePlant, dc_motor, thermal, two_tanks
+from machines import AMBIENT, HEAT, INFLOW, PUMP, MachinePlant, dc_motor, observer, thermal, two_tanks
 
 from hybrid_mpc import (
     OCP,
@@ -28,13 +28,6 @@ from hybrid_mpc import (
 TANKS = OCP(15, [0.0, 0.0], [1e4], [1e5], [0.0], [4e-4], q_y=[1.0])
 HEATERS = OCP(12, [0.0] * 2, [0.1] * 2, [0.1] * 2, [0.0] * 2, [20.0] * 2, q_y=[1.0, 1.0])
 MOTOR = OCP(15, [0.0, 0.0], [0.01], [0.01], [-12.0], [12.0], q_y=[0.0, 1.0])
-
-
-def observer(model, sigma_d, *, sigma_y=1e-3, sigma_x0=0.1):
-    return ExtendedKalmanFilter(
-        model, sigma_y=[sigma_y] * model.n_y, sigma_x=[1e-4] * model.n_x, sigma_x0=[sigma_x0] * model.n_x,
-        sigma_d=sigma_d, sigma_d0=sigma_d,
-    )  # fmt: skip
 
 
 def closed(model, ocp, estimator, plant, reference, duration, **options):

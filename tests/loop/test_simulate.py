@@ -4,7 +4,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from closed_loop_parts import DT, ModelPlant, Recorder, ScriptedReading, hold, make_ekf, make_safe, run, sine
+from closed_loop_parts import DT, Recorder, ScriptedReading, hold, make_ekf, make_safe, run, sine
+from machines import MachinePlant
 from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc import (
@@ -260,7 +261,7 @@ def test_several_inputs_and_outputs():
         model, OCP(15, [10.0, 1.0], [1e-4] * 2, [0.0] * 2, [-3.0] * 2, [3.0] * 2)
     )
     zero = lambda t: np.zeros((len(t), 2))  # noqa: E731
-    plant = ModelPlant(model, np.array([0.0, 0.2]))
+    plant = MachinePlant(model, np.array([0.0, 0.2]), sigma=1e-4)
     result = simulate(plant, ekf, controller, zero, dt=0.1, duration=8.0, x0=[1.0, 0.0], seed=0)
     # Sensor noise of 1e-4 makes d jitter by some 1e-3 to 1e-2 (its random walk is 1e-2 a period).
     np.testing.assert_allclose(result.d[-20:].mean(axis=0), [0.0, 0.2], atol=5e-3)

@@ -5,7 +5,8 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from machines import MachinePlant, rk4
+from machines import MachinePlant
+from online_models import rk4
 
 from hybrid_mpc import (
     ExtendedKalmanFilter,

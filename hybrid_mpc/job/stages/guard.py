@@ -153,15 +153,6 @@ DRIVE = Case("drive", "the drive loses a fifth of its force", "input_gain", 0.8)
 FREEZE = Case("freeze", "the sensor freezes", "measurement_freeze")
 
 
-@dataclass(frozen=True)
-class Samples:
-    """What a loop recorded: ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u)."""
-
-    t: Array
-    y: Array
-    u: Array
-
-
 def cases(scenario: Scenario) -> tuple[Case, ...]:
     """What is tried: friction twice as large, or a weaker drive where the plant knows no friction; a frozen sensor.
 
@@ -226,8 +217,7 @@ def faulted(
         )  # fmt: skip
         row, result = bench.run(spec, monitor=monitor)
         # The estimator is deterministic: over the record it says again what it said in the loop.
-        samples = Samples(result.t, result.y, result.u)
-        trace, alarms = explained(monitor, bench.parts(spec)[0], samples, causes, prior=kit.models["prior"])
+        trace, alarms = explained(monitor, bench.parts(spec)[0], result, causes, prior=kit.models["prior"])
         before, seen = begun(alarms, start)
         loops.append(
             FaultedLoop(

@@ -183,16 +183,6 @@ def _on_recordings(
     return tuple(alarms), clean_alarms(context, recordings, on)
 
 
-@dataclass(frozen=True)
-class _Record:
-    """What a loop recorded: ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u), ``w`` (n, n_w)."""
-
-    t: NDArray[np.float64]
-    y: NDArray[np.float64]
-    u: NDArray[np.float64]
-    w: NDArray[np.float64]
-
-
 def broken(model: HybridModel, start: float) -> list[Fault]:
     """What is tried from ``start`` [s] on: each actuator loses a fifth of its force, each sensor freezes."""
     weaker = [Fault(start, math.inf, "input_gain", WEAKER, s.name) for s in model.inputs]
@@ -213,12 +203,11 @@ def _faulted(context: Context, kit: Kit, task_name: str) -> tuple[FaultedChannel
         context.progress.update("faults", i, len(faults), f"{fault.target} of {fault.channel}")
         spec = replace(base, faults=(fault,))
         result = bench.run(spec)[1]
-        record = _Record(result.t, result.y, result.u, result.w)
         monitor = bench.monitor(spec)
         assert isinstance(monitor, ResidualMonitor)
         # the estimator is deterministic: over the record it says again what it said in the loop
         _, alarms = explained_residuals(
-            monitor, bench.parts(spec)[0], record, kit.models["prior"], kit.causes
+            monitor, bench.parts(spec)[0], result, kit.models["prior"], kit.causes
         )
         before, seen = begun(alarms, start)
         found.append(
