@@ -25,7 +25,8 @@ the geometric mean over seeds with its 95 % interval (paired, by Student's t of 
 *offset* is the mean error of the controlled outputs over the last 20 % of the task, the largest of the seeds, over what
 is allowed: the larger of two steps of the sensor (of a sensor of steps with the same noise) and 0.5 % of the range that
 the training recordings cover (real machines: the steps alone); *rest* is the root mean square error there, so that a
-ripple counts.
+ripple counts. Soft limits of states cost nothing in it; PI(D) does not know them. How far they were exceeded at most is
+told beside it, in the state's unit.
 """
 
 from __future__ import annotations
@@ -337,9 +338,12 @@ def loop(name: str, runs: Path, controller: str, place: int, seed: int) -> dict:
     error = shown(plant, x, u) - task.reference(model.dt * np.arange(len(x)))[:, : model.n_y]
     last = error[len(x) * 4 // 5 :, controlled]
     beyond = np.maximum(u - control.u_max, control.u_min - u).max()
+    low, high = control.state_range
+    soft = np.where(np.isfinite(low) | np.isfinite(high), np.maximum(x - high, low - x), 0.0).max(axis=0)
     return {"machine": name, "controller": controller, "task": task.name, "seed": seed,
             "cost": cost_of(scenario, model, task, x, u), "offset": last.mean(axis=0).tolist(),
-            "rest": np.sqrt((last**2).mean(axis=0)).tolist(), "beyond": float(beyond)}  # fmt: skip
+            "rest": np.sqrt((last**2).mean(axis=0)).tolist(), "beyond": float(beyond),
+            "soft": np.maximum(soft, 0.0).tolist()}  # fmt: skip
 
 
 def allowed(name: str, runs: Path) -> np.ndarray:
@@ -402,6 +406,10 @@ def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
             for c in ("hybrid", "prior")
         }
         row["rest, hybrid / prior"] = interval(rest["hybrid"] - rest["prior"])
+    if np.isfinite(np.hstack(hm.load_scenario(name).control.state_range)).any():
+        row |= {
+            f"over a soft limit, {c}": f"{np.max([r['soft'] for r in found]):.3g}" for c, found in own.items()
+        }
     row["beyond limits"] = max(0.0, *(r["beyond"] for found in own.values() for r in found))
     return row
 
