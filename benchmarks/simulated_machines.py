@@ -17,6 +17,7 @@ Reads the runs and closes loops on the plants, every controller with the same se
   where the input is at a limit. Gains and filters are those that make *this very task* cheapest, load included: by
   differential evolution on the fitted prior with its sensors' noise, then by Nelder and Mead's method on the plant
   itself, both with seeds of their own. Nobody has so much when he tunes: it is about the best that PI(D) does here.
+  A car's steering holds y and its speed x, on top of wheels that roll along the path.
 - ``blind``, in tasks with measured disturbances: ``prior`` without their measurement.
 
 The cost counts what all pay for alike: weighed outputs without noise, weighed speeds, changes of the input. A ratio is
@@ -24,7 +25,8 @@ the geometric mean over seeds with its 95 % interval (paired, by Student's t of 
 *offset* is the mean error of the controlled outputs over the last 20 % of the task, the largest of the seeds, over what
 is allowed: the larger of two steps of the sensor (of a sensor of steps with the same noise) and 0.5 % of the range that
 the training recordings cover (real machines: the steps alone); *rest* is the root mean square error there, so that a
-ripple counts.
+ripple counts. Soft limits of states cost nothing in it; PI(D) does not know them. How far they were exceeded at most is
+told beside it, in the state's unit.
 """
 
 from __future__ import annotations
@@ -49,10 +51,24 @@ from hybrid_mpc.loop.faults import corrupt_input
 from hybrid_mpc.loop.plant import SimulatedMachine
 from hybrid_mpc.model.model import output_with_jacobian
 from hybrid_mpc.model.riccati import hidden_fixed_point
+from scenarios.race_car.prior import WHEELBASE
 
 MACHINES = ("two_tanks", "dc_motor", "lever", "two_heaters", "two_link_arm", "cart_pole")
-REAL = ("temperature_lab", "cascaded_tanks", "heat_exchanger")
-LOADS = ("leak", "brake", "hold", "draught", "carry", "push", "weak_heater", "weak_pump", "weak_valve")
+REAL = ("temperature_lab", "cascaded_tanks", "heat_exchanger", "race_car")
+LOADS = (
+    "leak",
+    "brake",
+    "hold",
+    "draught",
+    "carry",
+    "push",
+    "weak_heater",
+    "weak_pump",
+    "weak_valve",
+    "crooked",
+)
+PATHS = {"race_car": [1, 0]}
+"""Machines that follow paths of states, and the output that each input's PI(D) holds: steering y, speed x."""
 CONTROLLERS = ("hybrid", "prior", "linear", "pid")
 TUNED_ON = (1000, 1001)
 """Seeds of the loops that PI(D) are tuned on."""
@@ -110,13 +126,29 @@ def courses(scenario, model, task):
     t = model.dt * np.arange(round(task.duration / model.dt))
     goals = task.reference(t)
     w = np.tile(model.w, (len(t), 1)) if task.w is None else task.w(t)
-    targets, steady, forward = hm.Targets(model, task.control or scenario.control), None, []
-    for goal, now in zip(goals, w, strict=True):
-        steady = targets.at(goal, w=now, start=steady)
-        forward.append(steady.u)
+    forward = (
+        along_path(model, goals) if scenario.name in PATHS else held_inputs(scenario, model, task, goals, w)
+    )
     names = [s.name for s in model.inputs]
     load = np.array([corrupt_input(task.faults, now, np.zeros(model.n_u), names) for now in t])
-    return t, goals, np.array(forward), w, load
+    return t, goals, forward, w, load
+
+
+def held_inputs(scenario, model, task, goals, w) -> np.ndarray:
+    """Inputs ``(n, n_u)`` that hold set-points and measured disturbances by the model."""
+    targets, steady, found = hm.Targets(model, task.control or scenario.control), None, []
+    for goal, now in zip(goals, w, strict=True):
+        steady = targets.at(goal, w=now, start=steady)
+        found.append(steady.u)
+    return np.array(found)
+
+
+def along_path(car, goals) -> np.ndarray:
+    """Steering and speed ``(n, 2)`` of a car's wheels that roll along a path, by its fitted gain and offset."""
+    values = {p.name: p.value for p in car.parameters}
+    rate, speed = np.gradient(np.unwrap(goals[:, 2]), car.dt), goals[:, 3]
+    angle = np.arctan(WHEELBASE * rate / np.maximum(speed, 0.1))
+    return np.column_stack([(angle - values["offset"]) / values["k"], speed])
 
 
 def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
@@ -129,10 +161,8 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
         ca.SX.sym(n, k) for n, k in (("z", len(z0)), ("u", model.n_u), ("m", 2 * m), ("g", 4 * m))
     )
     x = z[: model.n_x]
-    goal, ahead, noise, now, off = (
-        ca.SX.sym(n, k)
-        for n, k in zip("rfnwo", (model.n_y, model.n_u, model.n_y, model.n_w, model.n_u), strict=True)
-    )
+    sizes = goals.shape[1], model.n_u, model.n_y, model.n_w, model.n_u
+    goal, ahead, noise, now, off = (ca.SX.sym(n, k) for n, k in zip("rfnwo", sizes, strict=True))
     y, u, after = model.output.expand()(x, held, now, model.p), ca.SX(model.u0), []
     for j, i in enumerate(controlled):
         u[j], kept = pid_law(
@@ -141,11 +171,12 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
         )  # fmt: skip
         after += kept
     z_next = ca.vertcat(*model.step.expand()(x, z[model.n_x :], u + off, now, model.p))
-    stage = dt * (
-        ca.dot(control.q_y, (y - goal) ** 2)
-        + ca.dot(control.q, x**2)
-        + ca.dot(control.r_delta, (u - held) ** 2)
+    astray = (
+        ca.dot(control.q_y, (y - goal) ** 2) + ca.dot(control.q, x**2)
+        if control.n_y
+        else ca.dot(control.q, (x - goal) ** 2)
     )
+    stage = dt * (astray + ca.dot(control.r_delta, (u - held) ** 2))
     period = ca.Function(
         "period", [z, held, memory, own, goal, ahead, noise, now, off], [z_next, u, ca.vertcat(*after), stage]
     )
@@ -237,9 +268,17 @@ def shown(plant, x, u):
 def cost_of(scenario, model, task, x, u) -> float:
     """What all pay for alike."""
     control = task.control or scenario.control
-    error = shown(scenario.plant(), x, u) - task.reference(model.dt * np.arange(len(x)))
+    goals = task.reference(model.dt * np.arange(len(x)))
     du = np.diff(u, axis=0, prepend=np.clip(model.u0, control.u_min, control.u_max)[None])
+    if not control.n_y:
+        return float(((x - goals) ** 2 @ control.q + du**2 @ control.r_delta).sum() * model.dt)
+    error = shown(scenario.plant(), x, u) - goals
     return float((error**2 @ control.q_y + x**2 @ control.q + du**2 @ control.r_delta).sum() * model.dt)
+
+
+def controlled_of(scenario) -> list[int]:
+    """Places of the outputs that are held, in the order of the inputs that hold them by PI(D)."""
+    return PATHS.get(scenario.name) or np.flatnonzero(scenario.control.q_y).tolist()
 
 
 @cache
@@ -247,7 +286,7 @@ def parts(name: str, runs: Path, controller: str, place: int):
     """Scenario, model, controlled outputs and what the controller of a task is made of."""
     scenario, kit = hm.load_scenario(name), hm.load(runs / name / "model")
     kit = kit.on(scenario)
-    controlled = np.flatnonzero(scenario.control.q_y).tolist()
+    controlled = controlled_of(scenario)
     prior = kit.models["prior"]
     task = scenario.tasks[place]
     if controller == "pid":
@@ -296,18 +335,21 @@ def loop(name: str, runs: Path, controller: str, place: int, seed: int) -> dict:
             x0=task.x0, seed=seed, w=None if blind else task.w, faults=task.faults,
         )  # fmt: skip
         x, u = result.x, result.u
-    error = shown(plant, x, u) - task.reference(model.dt * np.arange(len(x)))
+    error = shown(plant, x, u) - task.reference(model.dt * np.arange(len(x)))[:, : model.n_y]
     last = error[len(x) * 4 // 5 :, controlled]
     beyond = np.maximum(u - control.u_max, control.u_min - u).max()
+    low, high = control.state_range
+    soft = np.where(np.isfinite(low) | np.isfinite(high), np.maximum(x - high, low - x), 0.0).max(axis=0)
     return {"machine": name, "controller": controller, "task": task.name, "seed": seed,
             "cost": cost_of(scenario, model, task, x, u), "offset": last.mean(axis=0).tolist(),
-            "rest": np.sqrt((last**2).mean(axis=0)).tolist(), "beyond": float(beyond)}  # fmt: skip
+            "rest": np.sqrt((last**2).mean(axis=0)).tolist(), "beyond": float(beyond),
+            "soft": np.maximum(soft, 0.0).tolist()}  # fmt: skip
 
 
 def allowed(name: str, runs: Path) -> np.ndarray:
     """Largest offset of each controlled output."""
     scenario = hm.load_scenario(name)
-    controlled = np.flatnonzero(scenario.control.q_y)
+    controlled = controlled_of(scenario)
     steps = 2 * math.sqrt(12) * np.array(scenario.sensor_sigma)[controlled]
     files = sorted((runs / name / "data").glob("train_*.csv"))
     if not files:
@@ -364,6 +406,10 @@ def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
             for c in ("hybrid", "prior")
         }
         row["rest, hybrid / prior"] = interval(rest["hybrid"] - rest["prior"])
+    if np.isfinite(np.hstack(hm.load_scenario(name).control.state_range)).any():
+        row |= {
+            f"over a soft limit, {c}": f"{np.max([r['soft'] for r in found]):.3g}" for c, found in own.items()
+        }
     row["beyond limits"] = max(0.0, *(r["beyond"] for found in own.values() for r in found))
     return row
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import OCP, Fault, Task
-from scenarios.common import moves
+from scenarios.common import moves, quintic
 
 Array = NDArray[np.float64]
 START = (0.0, 0.0, 0.0, 0.3, 0.0)
@@ -26,10 +26,9 @@ def states(along: Array, across: Array) -> Array:
 
 
 def lanes(t: Array) -> Array:
-    """0.3 m/s along x, 0.25 m to one side, then to the other, as fast as the recordings."""
-    return states(
-        np.column_stack([0.3 * t, np.full_like(t, 0.3)]), moves(t, (0.0, 0.25, -0.25, 0.0), 3.0, 2.5)
-    )
+    """0.3 m/s along x, 0.15 m to one side, then to the other, no faster than the recordings."""
+    along = np.column_stack([0.3 * t, np.full_like(t, 0.3)])
+    return states(along, moves(t, (0.0, 0.15, -0.15, 0.0), 5.5, 5.0))
 
 
 def slalom(speed: float) -> Callable[[Array], Array]:
@@ -41,18 +40,18 @@ def slalom(speed: float) -> Callable[[Array], Array]:
         x = 0.3 * t + gained * (ramp**2 / 4 + t - ramp)
         rate = 0.3 + gained * ramp / 2
         turn = 2 * np.pi / 3.0
-        fade, slope = np.clip(x / 2.0, 0.0, 1.0), np.where(x < 2.0, 0.5, 0.0)
+        fade, slope = quintic(x / 3.0)
         across = 0.2 * fade * np.sin(turn * x)
-        by_x = 0.2 * (slope * np.sin(turn * x) + fade * turn * np.cos(turn * x))
+        by_x = 0.2 * (slope / 3.0 * np.sin(turn * x) + fade * turn * np.cos(turn * x))
         return states(np.column_stack([x, rate]), np.column_stack([across, by_x * rate]))
 
     return path
 
 
 TASKS = (
-    Task("lanes", "Change lanes as fast as the recordings", 12.0, START, lanes),
+    Task("lanes", "Change lanes no faster than the recordings", 20.0, START, lanes),
     Task("slalom", "Slalom at 0.8 m/s, twice as fast as the recordings", 8.0, START, slalom(0.8)),
     Task("fast_slalom", "Slalom at 1.5 m/s, where the tyres slip", 8.0, START, slalom(1.5)),
-    Task("crooked", "Change lanes although the wheels do not point where they are told", 12.0, START, lanes,
+    Task("crooked", "Change lanes although the wheels do not point where they are told", 20.0, START, lanes,
          faults=(Fault(1.0, np.inf, "input_offset", 0.05, "steering_command"),)),
 )  # fmt: skip

@@ -18,6 +18,7 @@ from scenarios.heat_exchanger.plant import HeatExchangerPlant
 from scenarios.heat_exchanger.tasks import DAY, saw_tooth
 from scenarios.race_car import scenario as car
 from scenarios.race_car.plant import RaceCarPlant
+from scenarios.race_car.prior import WHEELBASE
 from scenarios.temperature_lab import scenario as lab
 from scenarios.temperature_lab.plant import TemperatureLabPlant
 
@@ -203,6 +204,20 @@ def test_no_recording_changes_the_noise_that_a_scenario_declares():
     assert found[1] == exchanger.state_noise["cold"]
     assert found[0] in (0.02, pytest.approx(0.06))
     assert tuned_noise(model, exchanger, base, [still], observer=False)[1] >= 0.7
+
+
+@pytest.mark.parametrize("task", car.tasks, ids=lambda task: task.name)
+def test_wheels_that_roll_can_follow_the_paths(task):
+    """Without slip no path asks for more steering than there is; its speeds are those of its positions."""
+    t = car.data.dt * np.arange(round(task.duration / car.data.dt))
+    x, y, heading, speed = task.reference(t)[:, :4].T
+    np.testing.assert_allclose(
+        np.gradient(x, t), speed * np.cos(heading), atol=0.01
+    )  # differences over two periods
+    np.testing.assert_allclose(np.gradient(y, t), speed * np.sin(heading), atol=0.02)
+    wheels = np.arctan(WHEELBASE * np.gradient(heading, t) / speed)
+    assert np.max(np.abs(wheels)) < FITTED["race_car"]["k"] * car.control.u_max[0]
+    assert np.max(speed) < car.control.u_max[1]
 
 
 def test_levels_ask_for_a_full_upper_tank():
