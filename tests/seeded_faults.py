@@ -203,13 +203,12 @@ FAULTS = (
     ),
     fault(
         "control", "the gradient's price of the first change lacks the period",
-        "gradient[: u_prev.size] -= 2 * self.model.dt * self.ocp.r_delta * u_prev",
-        "gradient[: u_prev.size] -= 2 * self.ocp.r_delta * u_prev",
+        "2 * model.dt * ocp.r, 2 * model.dt * ocp.r_delta", "2 * model.dt * ocp.r, 2 * ocp.r_delta",
         "lq",
     ),
     fault(
         "control", "a bound on states is held a period too early",
-        "np.repeat(np.arange(1, n + 1), chosen.size)", "np.repeat(np.arange(n), chosen.size)",
+        "np.repeat(np.arange(n) + (b == 0), size)", "np.repeat(np.arange(n), size)",
         "soft",
     ),
     fault(

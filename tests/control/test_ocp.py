@@ -247,7 +247,7 @@ JSON = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dicti
 ), max_leaves=12)  # fmt: skip
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.dictionaries(st.sampled_from(list(plain(full()))), JSON, max_size=3))
 def test_any_json_is_a_problem_or_refused(changes):
     try:

@@ -118,7 +118,10 @@ class Killed(BaseException):
     """As Ctrl-C: no part of a search catches it."""
 
 
-@pytest.mark.parametrize(("trial", "step"), [(0, 20), (2, 400), (12, 60), (24, 100)])
+@pytest.mark.parametrize(
+    ("trial", "step"),
+    [(0, 20), (12, 60), *(pytest.param(*case, marks=pytest.mark.full) for case in ((2, 400), (24, 100)))],
+)
 def test_a_killed_search_goes_on_as_if_nothing_had_been(quick, whole, data, tmp_path, trial, step):
     def kill(number, done, total, error):
         if (number, done) == (trial, step):

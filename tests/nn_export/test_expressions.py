@@ -58,7 +58,7 @@ CHOICES = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(choices=CHOICES, symbols=st.sampled_from([ca.SX, ca.MX]), seed=st.integers(0, 2**31))
 def test_random_expressions_come_back(choices, symbols, seed):
     f = expression(symbols, choices)

@@ -63,8 +63,11 @@ FULL = pytest.mark.full
     ("z", "torch_cell"),
     [
         (1, True),
-        (32, False),
-        *(pytest.param(*case, marks=FULL) for case in ((1, False), (8, True), (8, False), (32, True))),
+        (4, False),
+        *(
+            pytest.param(*case, marks=FULL)
+            for case in ((1, False), (8, True), (8, False), (32, True), (32, False))
+        ),
     ],
 )
 def test_parity_of_the_step(z, torch_cell):

@@ -102,7 +102,7 @@ class Twice(nn.Module):
 
 MODULES = {
     "hybrid step": (lambda: Step(6, True), examples(6)),
-    "paper's cell": (lambda: Step(6, False), examples(6)),
+    "paper's cell": (lambda: Step(2, False), examples(2)),
     "cells in series": (TwoLayers, (torch.zeros(2), torch.zeros(9))),
     "layer and batch": (Layer, (torch.zeros(2, 2), torch.zeros(2, 3))),
     "bare cell": (lambda: nn.GRUCell(2, 3, bias=False), (torch.zeros(1, 2), torch.zeros(1, 3))),
