@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.control import targets
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.control.problem import Problem, SoftRows
+from hybrid_mpc.control.problem import KNOTS, Problem, SoftRows
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
 from hybrid_mpc.embedded.cut import Cut, cut
 from hybrid_mpc.embedded.scalar import c_function, table
@@ -23,11 +24,19 @@ from hybrid_mpc.model.riccati import dare
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
-SOURCES = ("hmpc_model.c", "hmpc_qp.c", "hmpc_mpc.c", "hmpc_estimator.c")
+SOURCES = ("hmpc_model.c", "hmpc_qp.c", "hmpc_targets.c", "hmpc_mpc.c", "hmpc_estimator.c")
 HEADERS = ("hmpc.h", "hmpc_math.h")
 GENERATED = ("hmpc_config.h", "hmpc_tables.h", "hmpc_expressions.h")
 FIRST = 25
 """Iterations of the first plan: an RTI step halves what is left, or better."""
+SEARCH: Mapping[str, tuple[str, str]] = {
+    "STEADY": (repr(targets.STEADY), "1e-5"), "STILL": (repr(targets.STILL), "1e-4"),
+    "NEAR": (repr(targets.NEAR), "1e-3"), "REACHED": (repr(targets.REACHED), "1e-3"),
+    "RANK": (repr(targets.RANK), "1e-5"), "FREE": (repr(targets.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
+    "STALLED": (repr(targets.STALLED), repr(targets.STALLED)), "VIOLATED": ("1e-12", "1e-6"),
+    "ROUNDING": ("1e-15", "1e-7"),
+}  # fmt: skip
+"""What the search for steady states goes by, in double and in single precision; see ``hybrid_mpc.control.targets``."""
 MAX_AGE = 5
 """Periods a plan is followed without a successful solve, as :class:`~hybrid_mpc.control.safeguard.SafeController`."""
 
@@ -43,7 +52,7 @@ class Sources:
 
 def make_sources(
     model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
-    safe_input: Array | None = None, single: bool = False, targets: bool = False,
+    safe_input: Array | None = None, single: bool = False,
 ) -> Sources:  # fmt: skip
     """The generated files of a controller.
 
@@ -54,12 +63,11 @@ def make_sources(
         fallback: The prior, see :class:`~hybrid_mpc.control.safeguard.SafeController`. Default: none.
         safe_input: Likewise.
         single: Whether numbers are ``float``. Default: ``double``.
-        targets: Whether steady states for set-points of outputs are handed to it. Default: no.
 
     Raises:
         InputError: If something of them has no C, all at once, by name.
     """
-    refused = _refused(model, ocp, estimator, targets)
+    refused = _refused(model, ocp, estimator)
     parts: Cut | None = None
     try:
         parts = cut(model)
@@ -78,7 +86,8 @@ def make_sources(
         "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": states.size, "SOFT_E": expressions, "MODES": len(modes),
         "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": MAX_AGE, "FIRST": FIRST,
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
-        "OUTPUT_COST": int(ocp.n_y > 0), "SOFT_D": int(ocp.y_min.size > 0),
+        "OUTPUT_COST": int(ocp.n_y > 0), "SOFT_D": int(ocp.y_min.size > 0), "TARGET_KNOTS": KNOTS,
+        "TARGET_ITERATIONS": targets.ITERATIONS, "TARGET_SETTLING": targets.SETTLING, "TARGET_WITHIN": targets.WITHIN,
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
         model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0
@@ -89,10 +98,9 @@ def make_sources(
     return Sources(texts, operations, sizes)
 
 
-def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, targets: bool) -> list[str]:
+def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None) -> list[str]:
     """What of a controller has no C yet, in words."""
     cases = {
-        "weights on outputs (q_y), which need the target calculator": ocp.n_y > 0 and not targets,
         "an economic stage cost": ocp.economic is not None,
         "several first plans (starts)": bool(ocp.starts),
         "hard bounds": bool(ocp.hard),
@@ -129,7 +137,8 @@ def _config(sizes: Mapping[str, int], single: bool) -> str:
     exact = ("2e-5", "1e-4", "2e-3", "1e-3") if single else (
         "1e-10", "1e-12", repr(KKT_TOLERANCE), repr(BOUND_TOLERANCE)
     )  # fmt: skip
-    tolerances = zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE"), exact, strict=True)
+    tolerances = [*zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE"), exact, strict=True)]
+    tolerances += [(f"TARGET_{name}", value[single]) for name, value in SEARCH.items()]
     return (
         "/* Sizes of this controller, generated. */\n#ifndef HMPC_CONFIG_H\n#define HMPC_CONFIG_H\n"
         + ("#define HMPC_FLOAT\n" if single else "")
@@ -358,6 +367,12 @@ def _tables(
         reals |= {"output_x": c, "output_d": by_u @ on_u + on_y, "disturbs_y": on_y}
         rest = model.output(model.x0, model.u0, model.w, model.p).full().ravel()
         reals |= {"q_y": ocp.q_y * dt, "output_u": by_u, "y_rest": rest} if ocp.n_y else {}
+    if problem.targets is not None:
+        own = problem.targets
+        reals |= {
+            "target_scale": own.scale, "target_root": np.sqrt(ocp.q_y), "target_starts": np.array(own.beside),
+            "target_x_range": np.array(own.x_range).T, "target_y_range": np.array(own.y_range).T,
+        }  # fmt: skip
     if estimator is not None:
         modes = _modes(estimator)
         switching = estimator if isinstance(estimator, SwitchingFilter) else None
@@ -369,7 +384,7 @@ def _tables(
         }  # fmt: skip
     whole = {
         "block_of": np.repeat(np.arange(starts.size), lengths), "block_start": starts, "block_length": lengths,
-        "soft_state": states,
+        "soft_state": states, "target_knots": np.linspace(0, n, KNOTS).astype(int),
     }  # fmt: skip
     text = "".join(table(name, value) for name, value in reals.items())
     text += "".join(table(name, value, "int") for name, value in whole.items())

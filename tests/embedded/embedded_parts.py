@@ -12,6 +12,7 @@ import pytest
 from hybrid_mpc import OCP, Disturbance, ExtendedKalmanFilter, SoftBound, SwitchingFilter, with_input_delay
 from hybrid_mpc.embedded.generate import make_sources
 from hybrid_mpc.embedded.native import FLAGS, State, goal_of, load_library
+from hybrid_mpc.kit.assembly import disturbance_sizes
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 SOURCES = ("MPC", "PLAN", "FALLBACK", "SAFE", "HELD")
@@ -65,7 +66,7 @@ def delayed():
 
 def filters_of(model, ocp):
     """A switching filter of three modes."""
-    span = ocp.input_range if model.disturbance_model is None else np.array([1e-4])
+    span = disturbance_sizes(model, ocp)
     size = np.where(model.x0 != 0, np.abs(model.x0), 0.3)
     modes = [
         ExtendedKalmanFilter(
@@ -116,11 +117,12 @@ class CLoop:
         self.call("decide", goal, None)
 
 
-def goal(reference, weight=None, limits=None):
-    """A goal whose arrays live as long as it."""
-    arrays = [None if v is None else np.ascontiguousarray(v, dtype=float) for v in (reference, weight)]
-    found = goal_of(*arrays, *((None, None) if limits is None else (limits.u_min, limits.u_max)))
-    found.kept = arrays, limits
+def goal(reference, weight=None, limits=None, *, ocp=None):
+    """A goal whose arrays live as long as it; ``ocp`` says whether the reference is one of outputs."""
+    rows, weight = (None if v is None else np.ascontiguousarray(v, dtype=float) for v in (reference, weight))
+    x, y = (None, rows) if ocp is not None and ocp.n_y else (rows, None)
+    found = goal_of(x, weight, *((None, None) if limits is None else (limits.u_min, limits.u_max)), y=y)
+    found.kept = rows, weight, limits
     return found
 
 

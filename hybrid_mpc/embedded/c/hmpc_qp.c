@@ -1,6 +1,7 @@
 /* Dense dual active-set solver for the condensed QP. The multipliers of the bounds in the working set move towards
    those that keep these bounds exactly; who reaches zero leaves; the bound that is violated most comes in. A soft bound
-   is an exact penalty l s + r s s / 2 of its slack s: up to the multiplier l it acts as a hard one, beyond it gives way.
+   is an exact penalty l s + r s s / 2 of its slack s: up to the multiplier l it acts as a hard one, beyond it gives
+   way.
 
    Bounds, all as a's <= b, by number: upper and lower limits of the unknowns; upper and lower limits of their changes;
    upper and lower soft bounds.
@@ -28,6 +29,7 @@ static const real *soft_row(const hmpc_qp *qp, const hmpc_linear *linear, int ro
   }
 #endif
 #if HMPC_SOFT_E > 0
+  (void)linear;
   *kind = HMPC_SOFT_X + (row - SOFT_STATES) % HMPC_SOFT_E;
   return qp->slope[row - SOFT_STATES];
 #else
