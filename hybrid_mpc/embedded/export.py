@@ -71,10 +71,11 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     """A short loop from the operating point towards a set-point beside it, on the model itself."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.state_sizes
-    goal = safe.controller.problem.standing()[0]
-    goal += (
+    tolerated = (
         1.0 / np.sqrt(np.where(ocp.q_y > 0, ocp.q_y, np.inf)) if ocp.n_y else np.where(ocp.q > 0, size, 0.0)
     )
+    goal = safe.controller.problem.standing()[0]
+    goal[: tolerated.size] += tolerated
     rng = np.random.default_rng(0)
     z, n_x = np.concatenate([model.x0, np.zeros(model.n_h)]), model.n_x
     sigma = np.zeros(model.n_y) if estimator is None else np.sqrt(_noise(estimator))

@@ -19,7 +19,8 @@
 #define HMPC_LD HMPC_ROUND(HMPC_NV)          /* length of a row over the unknowns */
 #define HMPC_LZ HMPC_ROUND(HMPC_NZ)          /* length of a row over z, the rest zero */
 #define HMPC_LJ (HMPC_LZ + HMPC_NU)          /* row of a stage's Jacobian: by z, then by u */
-#define HMPC_SOFT (HMPC_N * (HMPC_SOFT_X + HMPC_SOFT_E)) /* rows of soft bounds: a period's states, then expressions */
+#define HMPC_SOFT (HMPC_N * (HMPC_SOFT_X + HMPC_SOFT_E)) /* rows of these bounds: a period's states, then expressions */
+#define HMPC_KINDS (HMPC_SOFT_X + HMPC_SOFT_E) /* bounds besides the inputs', soft and hard */
 #define HMPC_MOST (HMPC_NV + HMPC_SOFT)      /* most active bounds */
 #define HMPC_NE (HMPC_NZ + HMPC_ND)          /* what the estimator estimates: x, h, d */
 #define HMPC_LE HMPC_ROUND(HMPC_NE)
@@ -47,7 +48,8 @@ typedef enum {
 typedef struct {
   const hmpc_real *x;      /* reference of the states, rows of HMPC_NX; where outputs are weighed it does not matter */
   const hmpc_real *y;      /* where outputs are weighed (HMPC_OUTPUT_COST): theirs, rows of HMPC_NY */
-  int rows;                /* of x, or y */
+  const hmpc_real *p;      /* what bounds that move depend on, rows of HMPC_NP; NULL: zero */
+  int rows;                /* of x or y, and of p */
   const hmpc_real *weight; /* factors on the states' weights, HMPC_N + 1 rows of HMPC_NX */
   const hmpc_real *u_min;  /* tighter limits of the inputs, HMPC_NU */
   const hmpc_real *u_max;
@@ -81,6 +83,7 @@ typedef struct {
   int definite;
   hmpc_real gradient[HMPC_LD];
   hmpc_real lower[HMPC_LD], upper[HMPC_LD], change_lower[HMPC_LD], change_upper[HMPC_LD];
+  int strict;                          /* hard bounds do not give way */
   hmpc_real value[HMPC_DIM(HMPC_SOFT)];                  /* soft bounds: values without a step, */
   hmpc_real slope[HMPC_DIM(HMPC_SOFT_E) * HMPC_N][HMPC_LD]; /* and derivatives of those that are expressions */
   hmpc_real step[HMPC_LD];
@@ -100,7 +103,9 @@ typedef struct {
 
 typedef struct {
   hmpc_real u[HMPC_N][HMPC_NU], z[HMPC_N + 1][HMPC_LZ], d[HMPC_DIM(HMPC_ND)], w[HMPC_N][HMPC_DIM(HMPC_NW)];
-  hmpc_real cost, excess;
+  hmpc_real cost, excess;                   /* excess: largest violation of a soft bound */
+  hmpc_real given_way[HMPC_DIM(HMPC_KINDS)]; /* of each hard bound: largest violation, 0 if it is kept; hmpc_config.h
+                                                says which is which */
 } hmpc_plan;
 
 #if HMPC_OUTPUT_COST

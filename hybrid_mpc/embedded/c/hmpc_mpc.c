@@ -46,6 +46,7 @@ void hmpc_run_free(hmpc_state *s, const real *u, int rows) {
   for (int k = 0; k < HMPC_N && !fine; ++k) memcpy(plan->z[k + 1], plan->z[0], sizeof plan->z[0]);
   plan->cost = R(NAN);
   plan->excess = R(NAN);
+  memset(plan->given_way, 0, sizeof plan->given_way);
   s->steady.steady = 0;
   s->prepared = 0;
   s->pending = 0;
@@ -147,18 +148,22 @@ static void make_hessian(hmpc_state *s) {
   hmpc_qp_factor(qp);
 }
 
-/* Soft bounds along the plan; those of outputs depend on the disturbances. */
-static void make_soft(hmpc_state *s, const real *d) {
 #if HMPC_SOFT > 0
+/* Soft and hard bounds along the plan; those of outputs depend on the disturbances, those that move on the goal. */
+static void make_soft(hmpc_state *s, const real *d, const hmpc_goal *goal) {
   hmpc_linear *const linear = &s->linear;
+#if HMPC_SOFT_E > 0
+  static const real none[HMPC_DIM(HMPC_NP)];
+#endif
   for (int k = 0; k < HMPC_N; ++k) {
 #if HMPC_SOFT_X > 0
     for (int i = 0; i < HMPC_SOFT_X; ++i) linear->soft[k * HMPC_SOFT_X + i] = linear->z[k + 1][soft_state[i]];
 #endif
 #if HMPC_SOFT_E > 0
     real value[HMPC_SOFT_E], by_u[HMPC_SOFT_E][HMPC_NU];
+    const real *const p = goal && goal->p ? goal->p + (k < goal->rows ? k : goal->rows - 1) * HMPC_NP : none;
     memset(by_u, 0, sizeof by_u);
-    soft_expressions(linear->z[k], linear->u[k], linear->w[k], d, value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
+    soft_expressions(linear->z[k], linear->u[k], linear->w[k], d, p, value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
     for (int e = 0; e < HMPC_SOFT_E; ++e) {
       const int row = k * HMPC_SOFT_E + e;
       real *const slope = s->qp.slope[row];
@@ -169,11 +174,10 @@ static void make_soft(hmpc_state *s, const real *d) {
     }
 #endif
   }
-#else
-  (void)s;
-#endif
   (void)d;
+  (void)goal;
 }
+#endif
 
 static void set_weights(hmpc_linear *linear, const hmpc_goal *goal) {
   const real *const given = goal ? goal->weight : (const real *)0;
@@ -206,7 +210,9 @@ static void linearize(hmpc_state *s, int append) {
   }
   condense(s);
   make_hessian(s);
-  make_soft(s, linear->d);
+#if HMPC_SOFT > 0 && HMPC_NP == 0
+  make_soft(s, linear->d, (const hmpc_goal *)0);
+#endif
   s->prepared = 1;
 }
 
@@ -324,7 +330,7 @@ static void set_soft(hmpc_state *s) {
 #endif
 }
 
-/* Cost of the plan that qp.step makes of the prepared one, and the largest violation of a soft bound. */
+/* Cost of the plan that qp.step makes of the prepared one, and the largest violations of soft and of hard bounds. */
 static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_goal) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
@@ -358,6 +364,7 @@ static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_go
   }
 #endif
   real excess = R(0.0);
+  memset(s->plan.given_way, 0, sizeof s->plan.given_way);
 #if HMPC_SOFT > 0
   for (int row = 0; row < HMPC_SOFT; ++row) {
 #if HMPC_SOFT_X > 0 && HMPC_SOFT_E > 0
@@ -365,19 +372,27 @@ static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_go
 #else
     const int states = HMPC_SOFT_X > 0;
 #endif
-    int kind;
+    int kind, period;
     const real *slope;
     if (states) {
       kind = row % HMPC_DIM(HMPC_SOFT_X);
+      period = row / HMPC_DIM(HMPC_SOFT_X);
       slope = linear->from_u[row / HMPC_DIM(HMPC_SOFT_X) + 1][soft_state[kind]];
     } else {
       const int e = row - HMPC_N * HMPC_SOFT_X;
       kind = HMPC_SOFT_X + e % HMPC_DIM(HMPC_SOFT_E);
+      period = e / HMPC_DIM(HMPC_SOFT_E);
       slope = s->qp.slope[e];
     }
+    if (period < soft_first[kind]) continue;
     const real value = s->qp.value[row] + hmpc_dot(slope, step, HMPC_NV);
-    const real over = hmpc_max(R(0.0), hmpc_max(value - soft_upper[kind], soft_lower[kind] - value));
-    excess = hmpc_max(excess, over);
+    const real beyond = hmpc_max(value - soft_upper[kind], soft_lower[kind] - value);
+    const real over = hmpc_max(R(0.0), beyond - (soft_hard[kind] ? HMPC_KEPT * soft_scale[kind] : R(0.0)));
+    if (soft_hard[kind]) {
+      s->plan.given_way[kind] = hmpc_max(s->plan.given_way[kind], over);
+    } else {
+      excess = hmpc_max(excess, over);
+    }
     total += (soft_linear[kind] + R(0.5) * soft_quadratic[kind] / soft_scale[kind] * over) * over / soft_scale[kind];
   }
 #endif
@@ -394,6 +409,7 @@ static hmpc_status failed(hmpc_state *s, hmpc_status status) {
   memcpy(s->plan.w, linear->w, sizeof s->plan.w);
   s->plan.cost = R(NAN);
   s->plan.excess = R(NAN);
+  memset(s->plan.given_way, 0, sizeof s->plan.given_way);
   s->pending = 0;
   s->working.count = 0;
   return s->status = status;
@@ -465,7 +481,9 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
           R(2.0) * (r[j] * (u - goal_u) + r_delta[j] * ((u - before) - (after - u))) * u_scale[j];
     }
   for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
-  if (HMPC_SOFT_D && memcmp(linear->d, s->d, sizeof linear->d) != 0) make_soft(s, s->d);
+#if HMPC_SOFT > 0 && (HMPC_SOFT_D || HMPC_NP > 0)
+  if (HMPC_NP > 0 || memcmp(linear->d, s->d, sizeof linear->d) != 0) make_soft(s, s->d, goal);
+#endif
   set_soft(s);
   set_bounds(s, goal);
   int fine = hmpc_all_finite(qp->gradient, HMPC_NV) && hmpc_all_finite(s->x, HMPC_NX) &&
