@@ -19,7 +19,7 @@ PRIMAL_TOLERANCE = 1e-9
 CHANGES = 25
 """Most changes of the whole set; from the last plan's it takes 1 to 10."""
 STEPS = 10
-"""Most steps of the method that changes a row at a time, for each unknown."""
+"""Most steps of the method that changes a row at a time, for each row."""
 DEPENDENT = 1e-12
 """Share of a row's size in the dual below which its pivot says that it depends on the others."""
 
@@ -180,7 +180,7 @@ class ActiveSet:
         qp, size = self._qp, np.sqrt(np.maximum(np.sum(self._rows() ** 2, axis=1), 1e-300))
         multipliers, active = start.multipliers.copy(), start.active.copy()
         row, sign = -1, 0.0
-        for _ in range(STEPS * self._n):
+        for _ in range(STEPS * qp.lower.size):
             acts = np.flatnonzero(multipliers)
             s = self._free - (multipliers[acts] @ self._reduced[acts]) @ self._inverse
             values = qp.values(s)
@@ -189,7 +189,7 @@ class ActiveSet:
                 worst = np.where((active == 0) & (excess > PRIMAL_TOLERANCE), excess / size, 0.0)
                 row = int(np.argmax(worst))
                 if worst[row] <= 0:
-                    return Found(s, multipliers, active)
+                    return self._refined(Found(s, multipliers, active))
                 sign = 1.0 if values[row] > qp.upper[row] else -1.0
             on = self._on(active)
             if on is None:
@@ -297,6 +297,23 @@ class ActiveSet:
             self._reduced[row] = self._qp.a[row - self._n] @ self._inverse.T
             self._known[new] = True
         return self._reduced
+
+    def _refined(self, found: Found) -> Found:
+        """The answer without what rounding left on a long way; multipliers of rows that give way are large."""
+        qp, multipliers = self._qp, found.multipliers.copy()
+        on = self._on(found.active)
+        if on is None or not on.rows.size:
+            return found
+        rows, side = on.rows, np.sign(on.side)
+        bound = np.where(side > 0, qp.upper[rows], qp.lower[rows])
+        linear = np.where(np.abs(on.side) > 1, qp.linear[rows], 0.0)
+        s = found.s
+        for _ in range(2):
+            slack = np.where(np.abs(on.side) > 1, multipliers[rows] - side * linear, 0.0) * qp.give[rows]
+            change = dpotrs(on.pivots, qp.values(s)[rows] - bound - slack, 1)[0]
+            multipliers[rows] += change
+            s = s - (change @ on.chosen) @ self._inverse
+        return Found(s, multipliers, found.active)
 
     def _answer(self, active: Active, on: _On) -> Found:
         multipliers = np.zeros(active.size)

@@ -36,6 +36,8 @@ STALLED, WITHIN = 0.9, 5
 that arrive do many times over."""
 STILL = 1e-6
 """Largest lack of a steady state, in the states' scales, that is rounding."""
+NEAR = 1e-5
+"""Largest step, in scales of the unknowns, that rounding may keep from helping."""
 LEAST_SHARE = 1e-3
 """Smallest share of a step that is tried."""
 
@@ -130,12 +132,15 @@ class Targets:
         self._on_u, self._on_x, self._on_y = model.disturbed
         self._tracked = np.flatnonzero(ocp.q_y > 0)
         self._root = np.sqrt(ocp.q_y[self._tracked])
-        self._scale = np.concatenate([state_sizes(model, ocp), np.ones(model.n_h), ocp.input_scale])
+        self.scale: Array = np.concatenate([state_sizes(model, ocp), np.ones(model.n_h), ocp.input_scale])
+        """What 1 means of the unknowns ``(x, h, u)`` ``(n_z + n_u,)``."""
         ranges = [np.array([(s.lower, s.upper) for s in group]).T for group in (model.states, model.outputs)]
         x_min, x_max = ocp.state_range
         y_min, y_max = ocp.output_range(model.n_y)
-        self._x_range = np.maximum(x_min, ranges[0][0]), np.minimum(x_max, ranges[0][1])
-        self._y_range = np.maximum(y_min, ranges[1][0]), np.minimum(y_max, ranges[1][1])
+        self.x_range: tuple[Array, Array] = np.maximum(x_min, ranges[0][0]), np.minimum(x_max, ranges[0][1])
+        """Lower and upper bounds of the states ``(n_x,)``."""
+        self.y_range: tuple[Array, Array] = np.maximum(y_min, ranges[1][0]), np.minimum(y_max, ranges[1][1])
+        """Likewise of the outputs ``(n_y,)``."""
 
     def at(
         self,
@@ -177,14 +182,14 @@ class Targets:
         return best
 
     def _firsts(self, given: Steady | None, most: int | None) -> Iterator[Array]:
-        """Points at which a descent begins: the given one and ``most`` of :attr:`_beside`, which is asked if needed."""
+        """Points at which a descent begins: the given one and ``most`` of :attr:`beside`, which is asked if needed."""
         if given is not None:
             yield np.concatenate([given.x, given.h, given.u])
         if most != 0:
-            yield from self._beside[:most]
+            yield from self.beside[:most]
 
     @cached_property
-    def _beside(self) -> list[Array]:
+    def beside(self) -> list[Array]:
         """The operating point, and points with one input more or less; hidden states, which may take a thousand steps
         to settle, at rest there.
         """
@@ -204,7 +209,7 @@ class Targets:
             step = self._newton(at, goal, bounded)
             if step is None or not np.all(np.isfinite(step)):
                 break
-            size = float(np.max(np.abs(step / self._scale)))
+            size = float(np.max(np.abs(step / self.scale)))
             if size <= STEADY:
                 done = at.lacks <= STILL
                 break
@@ -214,7 +219,7 @@ class Targets:
                 share *= 0.5
                 after = self._settled(at.v + share * step, goal, d, w)
             if not after.merit < at.merit:
-                done = size < 1e-5 and at.lacks <= STILL  # rounding is all that is left
+                done = size < NEAR and at.lacks <= STILL  # rounding is all that is left
                 break
             at = after
             lacks.append(at.lacks)
@@ -226,7 +231,7 @@ class Targets:
 
     def _newton(self, at: _Point, goal: Array, bounded: bool) -> Array | None:
         """The step that the linearization asks for; None where its QP has no answer."""
-        m, scale, v, y, rest = self.model, self._scale, at.v, at.y, at.rest
+        m, scale, v, y, rest = self.model, self.scale, at.v, at.y, at.rest
         n_z, n_x = self._n_z, m.n_x
         e, j = at.rest_by_v * scale, at.y_by_v * scale
         if not (np.all(np.isfinite(e)) and np.all(np.isfinite(j)) and np.all(np.isfinite(rest))):
@@ -249,8 +254,8 @@ class Targets:
         values = [(v[n_z:], np.arange(n_z, v.size), self._ocp.u_min, self._ocp.u_max)]
         rows, lower, upper = [], [], []
         if bounded:
-            values.append((v[:n_x], np.arange(n_x), *self._x_range))
-            low, high = self._y_range
+            values.append((v[:n_x], np.arange(n_x), *self.x_range))
+            low, high = self.y_range
             k = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
             rows.append(j[k] @ along)
             lower.append(low[k] - y[k] - j[k] @ onto)
@@ -286,7 +291,7 @@ class Targets:
         """What descents need to know of ``v``; the merit is infinite where something is not finite."""
         rest, rest_by_v = self._rest(v, d, w)
         y, y_by_v = self._outputs(v, d, w)
-        lacks = float(np.sum(np.abs(rest / self._scale[: self._n_z])))
+        lacks = float(np.sum(np.abs(rest / self.scale[: self._n_z])))
         merit = 100.0 * lacks + float(np.linalg.norm(self._root * (y - goal)[self._tracked]))
         return _Point(v, rest, rest_by_v, y, y_by_v, lacks, merit if np.isfinite(merit) else np.inf)
 

@@ -28,6 +28,12 @@ VECTORS = 25
 TOLERANCE = {False: 1e-9, True: 1e-3}
 """Of inputs by their range and of states by their size; of single precision what its seven digits leave of a QP."""
 OTHERS = ("hmpc_test.c", "Makefile", "CMakeLists.txt")
+TARGETS_README = """\
+The goal is one of outputs, `goal.y`. Their steady state is sought in every step (`s.steady`): from the last one in two
+or three steps, where a set-point or a disturbance jumps in some more, and where there is none from every start, up to
+`HMPC_TARGET_ITERATIONS` from each.
+
+"""
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,11 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     """A short loop from the operating point towards a set-point beside it, on the model itself."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.state_sizes
-    goal = model.x0 + np.where(ocp.q > 0, size, 0.0)
+    tolerated = (
+        1.0 / np.sqrt(np.where(ocp.q_y > 0, ocp.q_y, np.inf)) if ocp.n_y else np.where(ocp.q > 0, size, 0.0)
+    )
+    goal = safe.controller.problem.standing()[0]
+    goal[: tolerated.size] += tolerated
     rng = np.random.default_rng(0)
     z, n_x = np.concatenate([model.x0, np.zeros(model.n_h)]), model.n_x
     sigma = np.zeros(model.n_y) if estimator is None else np.sqrt(_noise(estimator))
@@ -139,7 +149,10 @@ def operations(found: Sources) -> dict[str, int]:
     )
     stage += units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) + 2 * n["HEAD"] * units * (padded + n["NU"])
     n_e = n_z + n["ND"]
-    return {
+    n_t = n_z + n["NU"]
+    newton = 2 * n_z**2 * n_t + 4 * n_z * n_t * n["NU"] + 2 * n["NH"] ** 3 // 3
+    search = {"step: steady state, a step of its search": stage + newton} if n["OUTPUT_COST"] else {}
+    return search | {
         "prepare: stages' Jacobians": n["N"] * stage,
         "prepare: condensing": int(2 * n_z**2 * np.sum(-(-active // 8) * 8)),
         "prepare: Hessian and its factor": int(n["NX"] * np.sum(active**2)) + n_v**3,
@@ -164,6 +177,7 @@ def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single:
         "NAME": model.name, "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
         "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
         "DT": model.dt, "TOLERANCE": TOLERANCE[single],
+        "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
         "ESTIMATOR": f"{n['MODES']} Kalman filters side by side" if n["MODES"] else "none: it is given an estimate",
         "FILES": ", ".join(f"`{name}`" for name in GENERATED),
     }  # fmt: skip

@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.control import targets
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.control.problem import Problem, SoftRows
+from hybrid_mpc.control.problem import KEPT, KNOTS, Problem, SoftRows
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
 from hybrid_mpc.embedded.cut import Cut, cut
 from hybrid_mpc.embedded.scalar import c_function, table
@@ -23,11 +24,19 @@ from hybrid_mpc.model.riccati import dare
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
-SOURCES = ("hmpc_model.c", "hmpc_qp.c", "hmpc_mpc.c", "hmpc_estimator.c")
+SOURCES = ("hmpc_model.c", "hmpc_qp.c", "hmpc_targets.c", "hmpc_mpc.c", "hmpc_estimator.c")
 HEADERS = ("hmpc.h", "hmpc_math.h")
 GENERATED = ("hmpc_config.h", "hmpc_tables.h", "hmpc_expressions.h")
 FIRST = 25
 """Iterations of the first plan: an RTI step halves what is left, or better."""
+SEARCH: Mapping[str, tuple[str, str]] = {
+    "STEADY": (repr(targets.STEADY), "1e-5"), "STILL": (repr(targets.STILL), "1e-4"),
+    "NEAR": (repr(targets.NEAR), "1e-3"), "REACHED": (repr(targets.REACHED), "1e-3"),
+    "RANK": (repr(targets.RANK), "1e-5"), "FREE": (repr(targets.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
+    "STALLED": (repr(targets.STALLED), repr(targets.STALLED)), "VIOLATED": ("1e-12", "1e-6"),
+    "ROUNDING": ("1e-15", "1e-7"),
+}  # fmt: skip
+"""What the search for steady states goes by, in double and in single precision; see ``hybrid_mpc.control.targets``."""
 MAX_AGE = 5
 """Periods a plan is followed without a successful solve, as :class:`~hybrid_mpc.control.safeguard.SafeController`."""
 
@@ -43,7 +52,7 @@ class Sources:
 
 def make_sources(
     model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
-    safe_input: Array | None = None, single: bool = False, targets: bool = False,
+    safe_input: Array | None = None, single: bool = False,
 ) -> Sources:  # fmt: skip
     """The generated files of a controller.
 
@@ -54,12 +63,11 @@ def make_sources(
         fallback: The prior, see :class:`~hybrid_mpc.control.safeguard.SafeController`. Default: none.
         safe_input: Likewise.
         single: Whether numbers are ``float``. Default: ``double``.
-        targets: Whether steady states for set-points of outputs are handed to it. Default: no.
 
     Raises:
         InputError: If something of them has no C, all at once, by name.
     """
-    refused = _refused(model, ocp, estimator, targets)
+    refused = _refused(model, ocp, estimator, single)
     parts: Cut | None = None
     try:
         parts = cut(model)
@@ -69,34 +77,35 @@ def make_sources(
         raise InputError("no C for this controller: " + "; ".join(refused))
     problem = Problem(model, ocp)
     soft = SoftRows(ocp, model)
-    states = np.flatnonzero(np.isfinite(ocp.x_min) | np.isfinite(ocp.x_max))
     expressions = sum(int(f.numel_out(0)) for f in soft.functions)
     modes = () if estimator is None else _modes(estimator)
     starts = ocp.block_starts
     sizes = {
         "NX": model.n_x, "NH": model.n_h, "NU": model.n_u, "NY": model.n_y, "NW": model.n_w, "ND": model.n_d,
-        "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": states.size, "SOFT_E": expressions, "MODES": len(modes),
+        "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": soft.states.size, "SOFT_E": expressions, "MODES": len(modes),
         "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": MAX_AGE, "FIRST": FIRST,
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
-        "OUTPUT_COST": int(ocp.n_y > 0), "SOFT_D": int(ocp.y_min.size > 0),
+        "NP": ocp.n_p, "HARD": int(np.any(soft.hard)), "OUTPUT_COST": int(ocp.n_y > 0), "TARGET_KNOTS": KNOTS,
+        "SOFT_D": int(any(np.any(np.array(f.jac_sparsity(0, 2).get_triplet()[1]) < model.n_d) for f in soft.functions)),
+        "TARGET_ITERATIONS": targets.ITERATIONS, "TARGET_SETTLING": targets.SETTLING, "TARGET_WITHIN": targets.WITHIN,
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
         model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0
     )
     sizes |= model_sizes
-    tables = _tables(model, ocp, problem, soft, states, fallback, safe_input, estimator)
-    texts = {"hmpc_config.h": _config(sizes, single), "hmpc_tables.h": tables, "hmpc_expressions.h": code}
+    tables = _tables(model, ocp, problem, soft, fallback, safe_input, estimator)
+    config = _config(sizes, single, bound_names(soft, ocp.horizon))
+    texts = {"hmpc_config.h": config, "hmpc_tables.h": tables, "hmpc_expressions.h": code}
     return Sources(texts, operations, sizes)
 
 
-def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, targets: bool) -> list[str]:
+def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, single: bool) -> list[str]:
     """What of a controller has no C yet, in words."""
     cases = {
-        "weights on outputs (q_y), which need the target calculator": ocp.n_y > 0 and not targets,
         "an economic stage cost": ocp.economic is not None,
         "several first plans (starts)": bool(ocp.starts),
-        "hard bounds": bool(ocp.hard),
-        "bounds that move with the reference (p)": ocp.economic is None and ocp.n_p > 0,
+        "hard bounds in single precision, whose seven digits their penalties leave no room in": bool(ocp.hard)
+        and single,
         "a forecast of measured disturbances (preview_w)": ocp.preview_w and model.n_w > 0,
     }
     found = [what for what, wrong in cases.items() if wrong]
@@ -123,19 +132,47 @@ def _modes(estimator: Filter) -> tuple[ExtendedKalmanFilter, ...]:
     return estimator.filters if isinstance(estimator, SwitchingFilter) else (estimator,)
 
 
-def _config(sizes: Mapping[str, int], single: bool) -> str:
-    names = "".join(f"#define HMPC_{name} {value}\n" for name, value in sizes.items())
+def kinds_of(soft: SoftRows, horizon: int) -> list[int]:
+    """The rows of the last period, where all bounds hold: of the states' bounds, then of each expression's."""
+    sizes = [soft.states.size, *(int(f.numel_out(0)) for f in soft.functions)]
+    ends = horizon * np.cumsum(sizes)
+    return [row for end, size in zip(ends, sizes, strict=True) for row in range(end - size, end)]
+
+
+def bound_names(soft: SoftRows, horizon: int) -> list[str]:
+    """Names of the hard bounds by their place in ``given_way``, empty for soft ones."""
+    return [soft.names[row] if soft.hard[row] else "" for row in kinds_of(soft, horizon)]
+
+
+def _first_periods(soft: SoftRows, horizon: int) -> list[int]:
+    """The first period in which each bound holds, by its place among those of a period."""
+    bounded = np.isfinite(soft.lower) | np.isfinite(soft.upper)
+    first, at = [], 0
+    for size in (soft.states.size, *(int(f.numel_out(0)) for f in soft.functions)):
+        rows = bounded[at : at + horizon * size].reshape(horizon, size)
+        first += [int(np.argmax(column)) for column in rows.T]
+        at += horizon * size
+    return first
+
+
+def _config(sizes: Mapping[str, int], single: bool, names: list[str]) -> str:
+    defined = "".join(f"#define HMPC_{name} {value}\n" for name, value in sizes.items())
+    hard = "".join(f"   {i}: {name.replace('*/', '')}\n" for i, name in enumerate(names) if name)
+    defined += f"/* Hard bounds by their place in given_way:\n{hard}*/\n" if hard else ""
     # A float has seven digits: the QP is as exact as that allows.
-    exact = ("2e-5", "1e-4", "2e-3", "1e-3") if single else (
-        "1e-10", "1e-12", repr(KKT_TOLERANCE), repr(BOUND_TOLERANCE)
+    exact = ("2e-5", "1e-4", "2e-3", "1e-3", "1e-3") if single else (
+        "1e-10", "1e-12", repr(KKT_TOLERANCE), repr(BOUND_TOLERANCE), repr(KEPT)
     )  # fmt: skip
-    tolerances = zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE"), exact, strict=True)
+    tolerances = [
+        *zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE", "KEPT"), exact, strict=True)
+    ]
+    tolerances += [(f"TARGET_{name}", value[single]) for name, value in SEARCH.items()]
     return (
         "/* Sizes of this controller, generated. */\n#ifndef HMPC_CONFIG_H\n#define HMPC_CONFIG_H\n"
         + ("#define HMPC_FLOAT\n" if single else "")
         + "#ifdef HMPC_FLOAT\ntypedef float hmpc_real;\n#define HMPC_HUGE 3.402823466e+38F\n#else\n"
         + "typedef double hmpc_real;\n#define HMPC_HUGE 1.7976931348623157e308\n#endif\n"
-        + names
+        + defined
         + "".join(f"#define HMPC_{name} R({value})\n" for name, value in tolerances)
         + f"#define HMPC_NEGLIGIBLE {NEGLIGIBLE!r}\n"
         + "#define HMPC_QP_CAP (10 * HMPC_MOST + 100) /* iterations of the QP */\n#endif\n"
@@ -224,9 +261,9 @@ def _expressions(
     add("after_slope", [*point, "real *z_next", "real *slope", "real *by_out"], inputs, outs, cleared)
     sizes["CORRECTED"] = len(corrected)
     texts.append(table("corrected", np.array(corrected, dtype=float), "int"))
-    x, d = ca.SX.sym("x", n_x), ca.SX.sym("d", model.n_d)
+    x, d, p = ca.SX.sym("x", n_x), ca.SX.sym("d", model.n_d), ca.SX.sym("p", ocp.n_p)
     if soft.functions:
-        values, e = [], ca.vertcat(d, w)
+        values, e = [], ca.vertcat(d, w, p)
         for f in soft.functions:
             values.append(_scalar(f"soft bound {f.name()}", f)(x, u, e))
         value = ca.densify(ca.vertcat(*values))
@@ -239,10 +276,10 @@ def _expressions(
                 for j in range(width)
             ]
         arguments = [
-            *(f"const real *{name}" for name in "xuwd"),
+            *(f"const real *{name}" for name in "xuwdp"),
             *(f"real *{name}" for name in ("value", "by_x", "by_u")),
         ]
-        add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d}, outs)
+        add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d, "p": p}, outs)
     if measured:
         y = _scalar("the output", model.output)(x, u, w, ca.DM(model.p))
         outs = [(f"y[{i}]", y[i]) for i in range(model.n_y)]
@@ -325,20 +362,15 @@ def _scalar(what: str, f: ca.Function) -> ca.Function:
 
 
 def _tables(
-    model: HybridModel, ocp: OCP, problem: Problem, soft: SoftRows, states: NDArray[np.int64],
-    fallback: HybridModel | None, safe_input: Array | None, estimator: Filter | None,
+    model: HybridModel, ocp: OCP, problem: Problem, soft: SoftRows, fallback: HybridModel | None,
+    safe_input: Array | None, estimator: Filter | None,
 ) -> str:  # fmt: skip
     """All numbers of the problem and the estimator."""
     dt, n = model.dt, ocp.horizon
     on_u, on_x, on_y = model.disturbed
     starts = ocp.block_starts
     lengths = np.diff(np.append(starts, n))
-    per_period = len(states)
-    # the rows of one period: of the states' bounds, then of each expression's
-    kinds, at = [*range(per_period)], n * per_period
-    for f in soft.functions:
-        kinds += range(at, at + f.numel_out(0))
-        at += n * f.numel_out(0)
+    kinds = kinds_of(soft, n)
     scale, linear, quadratic = (v[kinds] for v in (soft.scale, soft.linear, soft.quadratic))
     reals: dict[str, Array] = {
         "u_min": ocp.u_min, "u_max": ocp.u_max, "u_scale": ocp.input_scale, "u_rest": model.u0, "x_rest": model.x0,
@@ -358,6 +390,12 @@ def _tables(
         reals |= {"output_x": c, "output_d": by_u @ on_u + on_y, "disturbs_y": on_y}
         rest = model.output(model.x0, model.u0, model.w, model.p).full().ravel()
         reals |= {"q_y": ocp.q_y * dt, "output_u": by_u, "y_rest": rest} if ocp.n_y else {}
+    if problem.targets is not None:
+        own = problem.targets
+        reals |= {
+            "target_scale": own.scale, "target_root": np.sqrt(ocp.q_y), "target_starts": np.array(own.beside),
+            "target_x_range": np.array(own.x_range).T, "target_y_range": np.array(own.y_range).T,
+        }  # fmt: skip
     if estimator is not None:
         modes = _modes(estimator)
         switching = estimator if isinstance(estimator, SwitchingFilter) else None
@@ -367,9 +405,10 @@ def _tables(
             "switches": np.ones((1, 1)) if switching is None else switching.transition,
             "first_probability": np.ones(1) if switching is None else switching.first_probability,
         }  # fmt: skip
-    whole = {
+    whole: dict[str, Array | NDArray[np.int64] | NDArray[np.bool_] | list[int]] = {
         "block_of": np.repeat(np.arange(starts.size), lengths), "block_start": starts, "block_length": lengths,
-        "soft_state": states,
+        "soft_state": soft.states, "soft_first": _first_periods(soft, n), "soft_hard": soft.hard[kinds],
+        "target_knots": np.linspace(0, n, KNOTS).astype(int),
     }  # fmt: skip
     text = "".join(table(name, value) for name, value in reals.items())
     text += "".join(table(name, value, "int") for name, value in whole.items())

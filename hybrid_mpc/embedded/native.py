@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status
-from hybrid_mpc.embedded.generate import SOURCES, Sources, make_sources, template
+from hybrid_mpc.control.targets import Steady
+from hybrid_mpc.embedded.generate import SOURCES, Sources, bound_names, make_sources, template
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.model import HybridModel
 from nn_export.codegen import compile_library
@@ -30,22 +31,24 @@ _BRIDGE = """
 const size_t hmpc_places[] = {
   sizeof(hmpc_state), PLACE(x), PLACE(h), PLACE(d), PLACE(w), PLACE(plan.u), PLACE(plan.z), PLACE(plan.w),
   PLACE(plan.cost), PLACE(plan.excess), PLACE(working.kkt), PLACE(linear.largest_defect), PLACE(u), PLACE(status),
-  PLACE(source), PLACE(age), PLACE(working.iterations)
+  PLACE(source), PLACE(age), PLACE(working.iterations), PLACE(steady.x), PLACE(steady.h), PLACE(steady.u),
+  PLACE(steady.y), PLACE(steady.reached), PLACE(steady.steady), PLACE(plan.given_way)
 };
 """
 """What the state's fields are found by."""
 FIELDS = (
     "x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect", "u", "status", "source", "age",
-    "iterations",
+    "iterations", "steady_x", "steady_h", "steady_u", "steady_y", "reached", "steady", "given_way",
 )  # fmt: skip
+WHOLE = ("status", "source", "age", "iterations", "reached", "steady")
 
 
 class Goal(ctypes.Structure):
     """``hmpc_goal``."""
 
     _fields_ = (
-        ("x", ctypes.c_void_p), ("rows", ctypes.c_int), ("weight", ctypes.c_void_p), ("u", ctypes.c_void_p),
-        ("y", ctypes.c_void_p), ("u_min", ctypes.c_void_p), ("u_max", ctypes.c_void_p),
+        ("x", ctypes.c_void_p), ("y", ctypes.c_void_p), ("p", ctypes.c_void_p), ("rows", ctypes.c_int),
+        ("weight", ctypes.c_void_p), ("u_min", ctypes.c_void_p), ("u_max", ctypes.c_void_p),
     )  # fmt: skip
 
 
@@ -79,8 +82,9 @@ class NativeController(SplitController):
 
     def __init__(self, model: HybridModel, ocp: OCP, *, flags: Sequence[str] = FLAGS) -> None:
         self.problem = Problem(model, ocp)
-        self._library = load_library(make_sources(model, ocp, targets=True), flags)
+        self._library = load_library(make_sources(model, ocp), flags)
         self._state = State(self._library)
+        self._names = bound_names(self.problem.soft, ocp.horizon)
         self._ticket = 0
 
     def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
@@ -103,21 +107,18 @@ class NativeController(SplitController):
         start = perf_counter()
         self._ticket += 1
         view, m, problem = self._state.view, self.model, self.problem
-        u = y = steady = None
-        if problem.targets is None:
-            rows = np.ascontiguousarray(np.asarray(reference, dtype=np.float64))
-            if rows.ndim != 2 or len(rows) < 1 or rows.shape[1] != m.n_x:
-                problem.target(reference)  # says what is wrong
-        else:
-            target = problem.target(reference, None, estimate, w, prepared.previous.steady)
-            rows, u, y = (np.ascontiguousarray(v) for v in (target.x, target.u, target.y))
-            steady = target.steady
+        rows = np.ascontiguousarray(np.asarray(reference, dtype=np.float64))
+        if rows.ndim != 2 or len(rows) < 1 or rows.shape[1] != self.ocp.columns:
+            problem.target(reference)  # says what is wrong
+        columns = self.ocp.columns - self.ocp.n_p
+        followed, p = np.ascontiguousarray(rows[:, :columns]), np.ascontiguousarray(rows[:, columns:])
+        x, y = (None, followed) if self.ocp.n_y else (followed, None)
         view["x"][:], view["h"][:], view["d"][:] = estimate.x, estimate.h, estimate.d
         if m.n_w:
             view["w"][:] = estimate.w
         ahead = np.ascontiguousarray(problem.forecast(w, estimate)) if m.n_w else None
         bounds = (None, None) if limits is None else (limits.u_min, limits.u_max)
-        goal = goal_of(rows, prepared.weight, *bounds, u=u, y=y)
+        goal = goal_of(x, prepared.weight, *bounds, y=y, p=p)
         status = STATUS[
             self._library.c.hmpc_feedback(
                 self._state.at,
@@ -134,7 +135,7 @@ class NativeController(SplitController):
             plan, z[:, :n_x], z[:, n_x:], d, float(view["cost"][0]), status, float(view["kkt"][0]),
             float(view["defect"][0]), {"prepare": prepared.milliseconds, "feedback": spent},
             float(view["excess"][0]), w=view["plan_w"][:, :n_w].copy(),
-            steady=steady if status.ok else prepared.previous.steady,
+            steady=self._steady() if status.ok else prepared.previous.steady, given_way=self._given_way(),
         )  # fmt: skip
 
     def solve(
@@ -153,18 +154,38 @@ class NativeController(SplitController):
             for v in (plan.u, z, plan.d, w if m.n_w else np.zeros(1))
         ]
         self._library.c.hmpc_load_plan(self._state.at, *(v.ctypes.data for v in given))
+        view, steady = self._state.view, plan.steady
+        view["steady"][0] = steady is not None and steady.steady
+        if steady is not None:
+            view["steady_x"][:], view["steady_h"][:], view["steady_u"][:] = steady.x, steady.h, steady.u
+
+    def _given_way(self) -> dict[str, float]:
+        """Largest violation of each hard bound that the plan exceeds, by name."""
+        found: dict[str, float] = {}
+        for name, value in zip(self._names, self._state.view["given_way"].tolist(), strict=False):
+            if name and value > 0:
+                found[name] = max(found.get(name, 0.0), value)
+        return found
+
+    def _steady(self) -> Steady | None:
+        """The steady state that the last solve found for the first row of an outputs' reference."""
+        if not self.ocp.n_y:
+            return None
+        x, h, u, y = (self._state.view[f"steady_{name}"].copy() for name in "xhuy")
+        return Steady(x, h, u, y, *(bool(self._state.view[name][0]) for name in ("reached", "steady")))
 
 
 def goal_of(
     x: Array | None = None, weight: Array | None = None, u_min: Array | None = None, u_max: Array | None = None,
-    *, u: Array | None = None, y: Array | None = None,
+    *, y: Array | None = None, p: Array | None = None,
 ) -> Goal:  # fmt: skip
     """What a plan is to follow; the arrays, row by row, must outlive it."""
 
     def at(array: Array | None) -> int | None:
         return None if array is None else array.ctypes.data
 
-    return Goal(at(x), 1 if x is None else len(x), at(weight), at(u), at(y), at(u_min), at(u_max))
+    rows = x if y is None else y
+    return Goal(at(x), at(y), at(p), 1 if rows is None else len(rows), at(weight), at(u_min), at(u_max))
 
 
 @dataclass(frozen=True)
@@ -185,6 +206,8 @@ class State:
         shapes: dict[str, tuple[int, ...]] = {
             "x": (n["NX"],), "h": (n["NH"],), "d": (n["ND"],), "w": (n_w,), "plan_u": (n["N"], n["NU"]),
             "plan_z": (n["N"] + 1, -(-n_z // 8) * 8), "plan_w": (n["N"], max(1, n_w)), "u": (n["NU"],),
+            "steady_x": (n["NX"],), "steady_h": (n["NH"],), "steady_u": (n["NU"],), "steady_y": (n["NY"],),
+            "given_way": (max(1, n["SOFT_X"] + n["SOFT_E"]),),
         }  # fmt: skip
         size, *places = library.places
         memory = np.zeros(size + 64, dtype=np.uint8)
@@ -192,7 +215,7 @@ class State:
         self.at = ctypes.c_void_p(memory.ctypes.data + start)
         self.view: dict[str, NDArray[Any]] = {}
         for name, place in zip(FIELDS, places, strict=True):
-            kind = np.dtype(np.int32 if name in ("status", "source", "age", "iterations") else np.float64)
+            kind = np.dtype(np.int32 if name in WHOLE else np.float64)
             shape = shapes.get(name, (1,))
             field = memory[start + place :][: kind.itemsize * int(np.prod(shape))]
             self.view[name] = field.view(kind).reshape(shape)

@@ -9,9 +9,18 @@ import numpy as np
 import online_models
 import pytest
 
-from hybrid_mpc import OCP, Disturbance, ExtendedKalmanFilter, SoftBound, SwitchingFilter, with_input_delay
+from hybrid_mpc import (
+    OCP,
+    Disturbance,
+    ExtendedKalmanFilter,
+    HardBound,
+    SoftBound,
+    SwitchingFilter,
+    with_input_delay,
+)  # fmt: skip
 from hybrid_mpc.embedded.generate import make_sources
 from hybrid_mpc.embedded.native import FLAGS, State, goal_of, load_library
+from hybrid_mpc.kit.assembly import disturbance_sizes
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 SOURCES = ("MPC", "PLAN", "FALLBACK", "SAFE", "HELD")
@@ -57,6 +66,41 @@ def heaters():
     return model, ocp
 
 
+def bounded():
+    """Soft and hard bounds on the same states, an expression, outputs, blocks, limited changes, a hidden state."""
+    model, ocp = coupled()
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+    power = HardBound(
+        ca.Function("power", [x, u], [ca.vertcat(u[0] * x[1], x[2])]), [-0.3, -0.8], [0.3, 0.8], 1
+    )
+    hard = [
+        HardBound("x", [-0.9, -0.8, -np.inf], [0.9, np.inf, 1.0]),
+        power,
+        HardBound("y", [-1.5] * 2, [1.5] * 2, 2),
+    ]
+    return model, ocp.changed(hard=hard)
+
+
+def band():
+    """Outputs are controlled, and may not leave a band that a sensor's offset moves; one bound follows a parameter."""
+    model, ocp = heaters()
+    x, u, w, p = ca.SX.sym("x", 2), ca.SX.sym("u", 2), ca.SX.sym("w", 0), ca.SX.sym("p", 2)
+    power = SoftBound(
+        ca.Function("power", [x, u, w, p], [u[0] + u[1] - p[0]]), [-np.inf], [0.0], [5.0], [1.0]
+    )
+    apart = HardBound(ca.Function("apart", [x, u, w, p], [x[0] - x[1] - p[1]]), [-np.inf], [0.0], 1)
+    band = HardBound("y", model.x0 - 8.0, model.x0 + 8.0)
+    return model, ocp.changed(hard=[apart, band], soft=[power])
+
+
+def cart(hard, *, delay=0.0, horizon=25, **options):
+    """A cart without friction, pushed by 3 m/s^2 at most."""
+    a, b = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
+    model = online_models.linear_model(a, b, np.eye(2)[:1], dt=0.1)
+    model = with_input_delay(model, delay) if delay else model
+    return model, OCP(horizon, [10.0, 0.1], [0.01], [0.0], [-3.0], [3.0], hard=hard, **options)
+
+
 def delayed():
     """The pendulum with a GRU written in scalars, whose torque acts one and a half periods later."""
     model = with_input_delay(online_models.pendulum_model(z=4, seed=1), 0.03)
@@ -65,7 +109,7 @@ def delayed():
 
 def filters_of(model, ocp):
     """A switching filter of three modes."""
-    span = ocp.input_range if model.disturbance_model is None else np.array([1e-4])
+    span = disturbance_sizes(model, ocp)
     size = np.where(model.x0 != 0, np.abs(model.x0), 0.3)
     modes = [
         ExtendedKalmanFilter(
@@ -116,11 +160,12 @@ class CLoop:
         self.call("decide", goal, None)
 
 
-def goal(reference, weight=None, limits=None):
-    """A goal whose arrays live as long as it."""
-    arrays = [None if v is None else np.ascontiguousarray(v, dtype=float) for v in (reference, weight)]
-    found = goal_of(*arrays, *((None, None) if limits is None else (limits.u_min, limits.u_max)))
-    found.kept = arrays, limits
+def goal(reference, weight=None, limits=None, *, ocp=None):
+    """A goal whose arrays live as long as it; ``ocp`` says whether the reference is one of outputs."""
+    rows, weight = (None if v is None else np.ascontiguousarray(v, dtype=float) for v in (reference, weight))
+    x, y = (None, rows) if ocp is not None and ocp.n_y else (rows, None)
+    found = goal_of(x, weight, *((None, None) if limits is None else (limits.u_min, limits.u_max)), y=y)
+    found.kept = rows, weight, limits
     return found
 
 

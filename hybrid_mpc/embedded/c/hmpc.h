@@ -19,10 +19,13 @@
 #define HMPC_LD HMPC_ROUND(HMPC_NV)          /* length of a row over the unknowns */
 #define HMPC_LZ HMPC_ROUND(HMPC_NZ)          /* length of a row over z, the rest zero */
 #define HMPC_LJ (HMPC_LZ + HMPC_NU)          /* row of a stage's Jacobian: by z, then by u */
-#define HMPC_SOFT (HMPC_N * (HMPC_SOFT_X + HMPC_SOFT_E)) /* rows of soft bounds: a period's states, then expressions */
+#define HMPC_SOFT (HMPC_N * (HMPC_SOFT_X + HMPC_SOFT_E)) /* rows of these bounds: a period's states, then expressions */
+#define HMPC_KINDS (HMPC_SOFT_X + HMPC_SOFT_E) /* bounds besides the inputs', soft and hard */
 #define HMPC_MOST (HMPC_NV + HMPC_SOFT)      /* most active bounds */
 #define HMPC_NE (HMPC_NZ + HMPC_ND)          /* what the estimator estimates: x, h, d */
 #define HMPC_LE HMPC_ROUND(HMPC_NE)
+#define HMPC_NT (HMPC_NZ + HMPC_NU)          /* unknowns of a steady state: z, u */
+#define HMPC_TARGET_ROWS (2 * (HMPC_NX + HMPC_NU + HMPC_NY)) /* its bounds */
 
 typedef enum {
   HMPC_INITIAL,    /* a first plan, not optimised */
@@ -43,14 +46,21 @@ typedef enum {
 /* What a plan is to follow. Rows are periods from now on, the last one holds; NULL: the operating point, factors 1,
    the problem's own limits. */
 typedef struct {
-  const hmpc_real *x;      /* reference of the states, rows of HMPC_NX */
-  int rows;                /* of x */
+  const hmpc_real *x;      /* reference of the states, rows of HMPC_NX; where outputs are weighed it does not matter */
+  const hmpc_real *y;      /* where outputs are weighed (HMPC_OUTPUT_COST): theirs, rows of HMPC_NY */
+  const hmpc_real *p;      /* what bounds that move depend on, rows of HMPC_NP; NULL: zero */
+  int rows;                /* of x or y, and of p */
   const hmpc_real *weight; /* factors on the states' weights, HMPC_N + 1 rows of HMPC_NX */
-  const hmpc_real *u;      /* target inputs, HMPC_N rows of HMPC_NU */
-  const hmpc_real *y;      /* where outputs are weighed, their reference, HMPC_N rows of HMPC_NY */
   const hmpc_real *u_min;  /* tighter limits of the inputs, HMPC_NU */
   const hmpc_real *u_max;
 } hmpc_goal;
+
+/* A steady state. */
+typedef struct {
+  hmpc_real x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], u[HMPC_NU], y[HMPC_NY];
+  int reached; /* outputs that are weighed are the set-point's; 0: the nearest that limits and bounds allow */
+  int steady;  /* 0: none was found, and the operating point is held */
+} hmpc_steady;
 
 /* The working set of the QP, and the Cholesky factor of its rows' products. */
 typedef struct {
@@ -73,6 +83,7 @@ typedef struct {
   int definite;
   hmpc_real gradient[HMPC_LD];
   hmpc_real lower[HMPC_LD], upper[HMPC_LD], change_lower[HMPC_LD], change_upper[HMPC_LD];
+  int strict;                          /* hard bounds do not give way */
   hmpc_real value[HMPC_DIM(HMPC_SOFT)];                  /* soft bounds: values without a step, */
   hmpc_real slope[HMPC_DIM(HMPC_SOFT_E) * HMPC_N][HMPC_LD]; /* and derivatives of those that are expressions */
   hmpc_real step[HMPC_LD];
@@ -92,8 +103,31 @@ typedef struct {
 
 typedef struct {
   hmpc_real u[HMPC_N][HMPC_NU], z[HMPC_N + 1][HMPC_LZ], d[HMPC_DIM(HMPC_ND)], w[HMPC_N][HMPC_DIM(HMPC_NW)];
-  hmpc_real cost, excess;
+  hmpc_real cost, excess;                   /* excess: largest violation of a soft bound */
+  hmpc_real given_way[HMPC_DIM(HMPC_KINDS)]; /* of each hard bound: largest violation, 0 if it is kept; hmpc_config.h
+                                                says which is which */
 } hmpc_plan;
+
+#if HMPC_OUTPUT_COST
+/* References over the horizon. */
+typedef struct {
+  hmpc_real x[HMPC_N + 1][HMPC_NX], u[HMPC_N][HMPC_NU], y[HMPC_N + 1][HMPC_NY];
+} hmpc_target;
+
+/* A point of the search for a steady state: v = (z, u), F(z, u) - z and the model's Jacobian, outputs; how far it is
+   from a steady state, and what a descent lowers. */
+typedef struct {
+  hmpc_real v[HMPC_NT], rest[HMPC_NZ], slope[HMPC_NZ][HMPC_LJ], y[HMPC_NY], lacks, merit;
+} hmpc_point;
+
+/* Its memory, see hmpc_targets.c. */
+typedef struct {
+  hmpc_point at, after, settled;
+  hmpc_real a[HMPC_NZ][HMPC_NT], half[HMPC_NZ], diagonal[HMPC_NZ], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];
+  hmpc_real h[HMPC_NT][HMPC_NT], gram[HMPC_NT][HMPC_NT];
+  hmpc_real bound[HMPC_TARGET_ROWS][HMPC_NT], end[HMPC_TARGET_ROWS], seen[HMPC_TARGET_ROWS][HMPC_NT];
+} hmpc_search;
+#endif
 
 #if HMPC_MODES > 0
 typedef struct {
@@ -111,12 +145,18 @@ typedef struct {
   int age;              /* periods since the last successful solve */
   hmpc_real x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)]; /* the estimate */
   hmpc_plan plan;
+  hmpc_steady steady; /* where outputs are weighed: what holds the first row of their reference */
   /* its own */
   int prepared, pending;
   hmpc_linear linear;
   hmpc_qp qp;
   hmpc_working working;
   hmpc_real dz[HMPC_N + 1][HMPC_LZ], scratch[2][HMPC_NZ][HMPC_LD];
+#if HMPC_OUTPUT_COST
+  hmpc_steady aimed;
+  hmpc_target target;
+  hmpc_search search;
+#endif
 #if HMPC_MODES > 0
   hmpc_filter filter[HMPC_MODES], predicted[HMPC_MODES], mixed;
   hmpc_real probability[HMPC_MODES];
@@ -130,7 +170,7 @@ typedef struct {
    operating point's, in hmpc_step the one decided last. */
 void hmpc_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
 void hmpc_step(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
-/* The part of the next step that needs no sample; hmpc_step calls it if nobody did. Of the goal it takes the weights. */
+/* The part of the next step that needs no sample; hmpc_step does it if nobody did. Of the goal it takes the weights. */
 void hmpc_finish(hmpc_state *s, const hmpc_goal *goal);
 
 /* The estimator alone: s->x, h, d, w. */
@@ -148,6 +188,14 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const hmpc_real 
 void hmpc_complete(hmpc_state *s); /* hidden states of the plan; hmpc_prepare calls it */
 void hmpc_begin(hmpc_state *s, const hmpc_real *applied, const hmpc_goal *goal); /* the first plan and input */
 void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const hmpc_real *applied); /* s->u */
+
+#if HMPC_OUTPUT_COST
+/* The steady state for a set-point of outputs under measured disturbances w and s->d; start: where to begin, or NULL;
+   wide: whether to begin elsewhere, too. */
+void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
+                       hmpc_steady *found);
+void hmpc_aim(hmpc_state *s, const hmpc_goal *goal); /* s->target, for the measured disturbances of s->linear */
+#endif
 
 /* The model: a period, and its Jacobian (HMPC_NZ rows of HMPC_LJ; entries that are always zero are not written). */
 void hmpc_model(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *z_next);

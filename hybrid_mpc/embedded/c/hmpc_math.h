@@ -28,6 +28,11 @@ static inline real hmpc_sqrt(real x) { return HMPC_LIBM(sqrt)(x); }
 static inline real hmpc_max(real a, real b) { return a > b ? a : b; }
 static inline real hmpc_min(real a, real b) { return a < b ? a : b; }
 static inline int hmpc_finite(real x) { return hmpc_abs(x) <= HMPC_HUGE; }
+static inline int hmpc_all_finite(const real *v, int n) {
+  int fine = 1;
+  for (int i = 0; i < n; ++i) fine &= hmpc_finite(v[i]);
+  return fine;
+}
 static inline real hmpc_clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
 
 static inline real hmpc_true(real x) { return x < R(0.0) || x > R(0.0) ? R(1.0) : R(0.0); }
@@ -69,7 +74,8 @@ static inline real hmpc_exp(real x) {
   const real n = R(k), r = (x - n * R(6.93145751953125e-1)) - n * R(1.42860682030941723212e-6), s = r * r;
   const real p = r * ((R(1.26177193074810590878e-4) * s + R(3.02994407707441961300e-2)) * s + R(1.0));
   const real q =
-      ((R(3.00198505138664455042e-6) * s + R(2.52448340349684104192e-3)) * s + R(2.27265548208155028766e-1)) * s + R(2.0);
+      ((R(3.00198505138664455042e-6) * s + R(2.52448340349684104192e-3)) * s + R(2.27265548208155028766e-1)) * s +
+      R(2.0);
   return (R(1.0) + R(2.0) * (p / (q - p))) * hmpc_power_of_two(k);
 }
 

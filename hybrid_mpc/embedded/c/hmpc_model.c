@@ -93,7 +93,8 @@ void hmpc_model_slope(const real *z, const real *u, const real *w, real *z_next,
     }
   }
   for (int i = 0; i < HMPC_UNITS; ++i)
-    for (int k = 0; k < HMPC_HEAD; ++k) hmpc_add(through[k], head[k][i], slope + (HMPC_HIDDEN_NEXT + i) * HMPC_LJ, HMPC_LJ);
+    for (int k = 0; k < HMPC_HEAD; ++k)
+      hmpc_add(through[k], head[k][i], slope + (HMPC_HIDDEN_NEXT + i) * HMPC_LJ, HMPC_LJ);
   reduce(c.next, out);
   after_slope(z, u, w, out, z_next, slope, &by_out[0][0]);
   memcpy(z_next + HMPC_HIDDEN_NEXT, c.next, sizeof c.next);

@@ -4,12 +4,6 @@
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
 
-static int all_finite(const real *v, int n) {
-  int fine = 1;
-  for (int i = 0; i < n; ++i) fine &= hmpc_finite(v[i]);
-  return fine;
-}
-
 /* What acts: inputs with what the unmeasured disturbances add to them. */
 static void acting(const real *u, const real *d, real *v) {
   for (int i = 0; i < HMPC_NU; ++i) {
@@ -47,11 +41,13 @@ void hmpc_run_free(hmpc_state *s, const real *u, int rows) {
     memset(plan->z[k + 1], 0, sizeof plan->z[k + 1]);
     hmpc_model(plan->z[k], v, plan->w[k], plan->z[k + 1]);
     disturb_state(plan->d, plan->z[k + 1]);
-    fine &= all_finite(plan->z[k + 1], HMPC_NZ);
+    fine &= hmpc_all_finite(plan->z[k + 1], HMPC_NZ);
   }
   for (int k = 0; k < HMPC_N && !fine; ++k) memcpy(plan->z[k + 1], plan->z[0], sizeof plan->z[0]);
   plan->cost = R(NAN);
   plan->excess = R(NAN);
+  memset(plan->given_way, 0, sizeof plan->given_way);
+  s->steady.steady = 0;
   s->prepared = 0;
   s->pending = 0;
 }
@@ -99,14 +95,14 @@ static int output_row(const hmpc_linear *linear, int k, int i, real *row) {
 }
 
 /* Outputs of period k without a step, less their reference. */
-static void output_error(const hmpc_state *s, const hmpc_goal *goal, int k, real *error) {
+static void output_error(const hmpc_state *s, int k, real *error) {
   real x[HMPC_NX], v[HMPC_NU];
   for (int i = 0; i < HMPC_NX; ++i) x[i] = s->linear.z[k][i] + s->dz[k][i];
   acting(s->linear.u[k], s->d, v);
   outputs(x, v, s->linear.w[k], error);
   for (int i = 0; i < HMPC_NY; ++i) {
     for (int j = 0; j < HMPC_ND; ++j) error[i] += disturbs_y[i][j] * s->d[j];
-    error[i] -= goal && goal->y ? goal->y[k * HMPC_NY + i] : y_rest[i];
+    error[i] -= s->target.y[k][i];
   }
 }
 #endif
@@ -152,18 +148,22 @@ static void make_hessian(hmpc_state *s) {
   hmpc_qp_factor(qp);
 }
 
-/* Soft bounds along the plan; those of outputs depend on the disturbances. */
-static void make_soft(hmpc_state *s, const real *d) {
 #if HMPC_SOFT > 0
+/* Soft and hard bounds along the plan; those of outputs depend on the disturbances, those that move on the goal. */
+static void make_soft(hmpc_state *s, const real *d, const hmpc_goal *goal) {
   hmpc_linear *const linear = &s->linear;
+#if HMPC_SOFT_E > 0
+  static const real none[HMPC_DIM(HMPC_NP)];
+#endif
   for (int k = 0; k < HMPC_N; ++k) {
 #if HMPC_SOFT_X > 0
     for (int i = 0; i < HMPC_SOFT_X; ++i) linear->soft[k * HMPC_SOFT_X + i] = linear->z[k + 1][soft_state[i]];
 #endif
 #if HMPC_SOFT_E > 0
     real value[HMPC_SOFT_E], by_u[HMPC_SOFT_E][HMPC_NU];
+    const real *const p = goal && goal->p ? goal->p + (k < goal->rows ? k : goal->rows - 1) * HMPC_NP : none;
     memset(by_u, 0, sizeof by_u);
-    soft_expressions(linear->z[k], linear->u[k], linear->w[k], d, value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
+    soft_expressions(linear->z[k], linear->u[k], linear->w[k], d, p, value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
     for (int e = 0; e < HMPC_SOFT_E; ++e) {
       const int row = k * HMPC_SOFT_E + e;
       real *const slope = s->qp.slope[row];
@@ -174,11 +174,10 @@ static void make_soft(hmpc_state *s, const real *d) {
     }
 #endif
   }
-#else
-  (void)s;
-#endif
   (void)d;
+  (void)goal;
 }
+#endif
 
 static void set_weights(hmpc_linear *linear, const hmpc_goal *goal) {
   const real *const given = goal ? goal->weight : (const real *)0;
@@ -211,7 +210,9 @@ static void linearize(hmpc_state *s, int append) {
   }
   condense(s);
   make_hessian(s);
-  make_soft(s, linear->d);
+#if HMPC_SOFT > 0 && HMPC_NP == 0
+  make_soft(s, linear->d, (const hmpc_goal *)0);
+#endif
   s->prepared = 1;
 }
 
@@ -329,8 +330,8 @@ static void set_soft(hmpc_state *s) {
 #endif
 }
 
-/* Cost of the plan that qp.step makes of the prepared one, and the largest violation of a soft bound. */
-static void assess(hmpc_state *s, const hmpc_goal *goal_of, const real *x_goal, int rows, const real *u_goal) {
+/* Cost of the plan that qp.step makes of the prepared one, and the largest violations of soft and of hard bounds. */
+static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_goal) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
   real total = R(0.0), error[HMPC_NX], before[HMPC_NU];
@@ -354,17 +355,16 @@ static void assess(hmpc_state *s, const hmpc_goal *goal_of, const real *x_goal, 
 #if HMPC_OUTPUT_COST
   for (int k = 0; k < HMPC_N; ++k) {
     real row[HMPC_LD], off[HMPC_NY];
-    output_error(s, goal_of, k, off);
+    output_error(s, k, off);
     for (int i = 0; i < HMPC_NY; ++i) {
       const int m = output_row(linear, k, i, row);
       const real all = off[i] + hmpc_dot(row, step, m);
       if (q_y[i] > R(0.0)) total += q_y[i] * all * all;
     }
   }
-#else
-  (void)goal_of;
 #endif
   real excess = R(0.0);
+  memset(s->plan.given_way, 0, sizeof s->plan.given_way);
 #if HMPC_SOFT > 0
   for (int row = 0; row < HMPC_SOFT; ++row) {
 #if HMPC_SOFT_X > 0 && HMPC_SOFT_E > 0
@@ -372,19 +372,27 @@ static void assess(hmpc_state *s, const hmpc_goal *goal_of, const real *x_goal, 
 #else
     const int states = HMPC_SOFT_X > 0;
 #endif
-    int kind;
+    int kind, period;
     const real *slope;
     if (states) {
       kind = row % HMPC_DIM(HMPC_SOFT_X);
+      period = row / HMPC_DIM(HMPC_SOFT_X);
       slope = linear->from_u[row / HMPC_DIM(HMPC_SOFT_X) + 1][soft_state[kind]];
     } else {
       const int e = row - HMPC_N * HMPC_SOFT_X;
       kind = HMPC_SOFT_X + e % HMPC_DIM(HMPC_SOFT_E);
+      period = e / HMPC_DIM(HMPC_SOFT_E);
       slope = s->qp.slope[e];
     }
+    if (period < soft_first[kind]) continue;
     const real value = s->qp.value[row] + hmpc_dot(slope, step, HMPC_NV);
-    const real over = hmpc_max(R(0.0), hmpc_max(value - soft_upper[kind], soft_lower[kind] - value));
-    excess = hmpc_max(excess, over);
+    const real beyond = hmpc_max(value - soft_upper[kind], soft_lower[kind] - value);
+    const real over = hmpc_max(R(0.0), beyond - (soft_hard[kind] ? HMPC_KEPT * soft_scale[kind] : R(0.0)));
+    if (soft_hard[kind]) {
+      s->plan.given_way[kind] = hmpc_max(s->plan.given_way[kind], over);
+    } else {
+      excess = hmpc_max(excess, over);
+    }
     total += (soft_linear[kind] + R(0.5) * soft_quadratic[kind] / soft_scale[kind] * over) * over / soft_scale[kind];
   }
 #endif
@@ -401,6 +409,7 @@ static hmpc_status failed(hmpc_state *s, hmpc_status status) {
   memcpy(s->plan.w, linear->w, sizeof s->plan.w);
   s->plan.cost = R(NAN);
   s->plan.excess = R(NAN);
+  memset(s->plan.given_way, 0, sizeof s->plan.given_way);
   s->pending = 0;
   s->working.count = 0;
   return s->status = status;
@@ -409,9 +418,13 @@ static hmpc_status failed(hmpc_state *s, hmpc_status status) {
 hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows) {
   hmpc_linear *const linear = &s->linear;
   hmpc_qp *const qp = &s->qp;
-  const real *const u_goal = goal ? goal->u : (const real *)0;
-  const real *const x_goal = goal && goal->x ? goal->x : x_rest;
+#if HMPC_OUTPUT_COST
+  const real *const u_goal = s->target.u[0], *const x_goal = s->target.x[0];
+  const int rows = HMPC_N + 1;
+#else
+  const real *const u_goal = (const real *)0, *const x_goal = goal && goal->x ? goal->x : x_rest;
   const int rows = goal && goal->x ? goal->rows : 1;
+#endif
   if (!s->prepared) hmpc_prepare(s, goal);
 #if HMPC_NW > 0
   int other = 0;
@@ -424,6 +437,9 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
 #else
   (void)w;
   (void)w_rows;
+#endif
+#if HMPC_OUTPUT_COST
+  hmpc_aim(s, goal);
 #endif
   s->prepared = 0;
   memcpy(s->plan.d, s->d, sizeof s->plan.d);
@@ -448,7 +464,7 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
 #if HMPC_OUTPUT_COST
   for (int k = 0; k < HMPC_N; ++k) {
     real row[HMPC_LD], error[HMPC_NY];
-    output_error(s, goal, k, error);
+    output_error(s, k, error);
     for (int i = 0; i < HMPC_NY; ++i) {
       const int m = output_row(linear, k, i, row);
       if (q_y[i] > R(0.0)) hmpc_add(qp->gradient, R(2.0) * q_y[i] * error[i], row, m);
@@ -465,16 +481,18 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
           R(2.0) * (r[j] * (u - goal_u) + r_delta[j] * ((u - before) - (after - u))) * u_scale[j];
     }
   for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
-  if (HMPC_SOFT_D && memcmp(linear->d, s->d, sizeof linear->d) != 0) make_soft(s, s->d);
+#if HMPC_SOFT > 0 && (HMPC_SOFT_D || HMPC_NP > 0)
+  if (HMPC_NP > 0 || memcmp(linear->d, s->d, sizeof linear->d) != 0) make_soft(s, s->d, goal);
+#endif
   set_soft(s);
   set_bounds(s, goal);
-  int fine = all_finite(qp->gradient, HMPC_NV) && all_finite(s->x, HMPC_NX) && all_finite(s->d, HMPC_ND) &&
-             all_finite(s->h, HMPC_NH) && all_finite(qp->value, HMPC_SOFT);
-  for (int k = 0; k <= HMPC_N; ++k) fine = fine && all_finite(row_of(x_goal, rows, k, HMPC_NX), HMPC_NX);
+  int fine = hmpc_all_finite(qp->gradient, HMPC_NV) && hmpc_all_finite(s->x, HMPC_NX) &&
+             hmpc_all_finite(s->d, HMPC_ND) && hmpc_all_finite(s->h, HMPC_NH) && hmpc_all_finite(qp->value, HMPC_SOFT);
+  for (int k = 0; k <= HMPC_N; ++k) fine = fine && hmpc_all_finite(row_of(x_goal, rows, k, HMPC_NX), HMPC_NX);
   if (!fine) return failed(s, HMPC_NOT_FINITE);
   const hmpc_status status = hmpc_qp_solve(qp, &s->working, linear);
   if (status != HMPC_SOLVED) return failed(s, status);
-  assess(s, goal, x_goal, rows, u_goal);
+  assess(s, x_goal, rows, u_goal);
   if (!hmpc_finite(s->plan.cost)) return failed(s, HMPC_NOT_FINITE);
   for (int k = 0; k < HMPC_N; ++k) {
     real low[HMPC_NU], high[HMPC_NU];
@@ -484,6 +502,9 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
           hmpc_clip(linear->u[k][j] + qp->step[block_of[k] * HMPC_NU + j] * u_scale[j], low[j], high[j]);
   }
   memcpy(s->plan.w, linear->w, sizeof s->plan.w);
+#if HMPC_OUTPUT_COST
+  s->steady = s->aimed;
+#endif
   s->pending = 1;
   return s->status = HMPC_SOLVED;
 }
@@ -500,20 +521,37 @@ static void saturate(const hmpc_goal *goal, const real *u, const real *held, rea
 }
 
 /* The stabilising feedback on the prior, around what holds the goal best; 0 if it is not finite. */
-static int fallback(const hmpc_state *s, const hmpc_goal *goal, real *u) {
+static int fallback(hmpc_state *s, const hmpc_goal *goal, real *u) {
 #if HMPC_FALLBACK_GAIN
-  const real *target = goal && goal->x ? goal->x : x_rest;
   real best[HMPC_NU];
-  if (!all_finite(target, HMPC_NX)) target = x_rest;
-  equilibrium(target, s->w, best);
-  for (int i = 0; i < HMPC_NU; ++i)
-    for (int j = 0; j < HMPC_ND; ++j) best[i] -= disturbs_u[i][j] * s->d[j];
+#if HMPC_OUTPUT_COST
+  const real *const wanted = goal && goal->y ? goal->y : y_rest;
+  const real *target = x_rest;
+  hmpc_steady found;
+  real y[HMPC_NY];
+  for (int i = 0; i < HMPC_NY; ++i) y[i] = q_y[i] > R(0.0) ? wanted[i] : R(0.0);
+  const int fine = hmpc_all_finite(y, HMPC_NY);
+  if (fine) {
+    hmpc_steady_state(s, y, s->w, &s->steady, 1, &found);
+    if (found.steady) target = found.x;
+    for (int i = 0; i < HMPC_NU; ++i) best[i] = found.steady ? found.u[i] : hmpc_clip(u_rest[i], u_min[i], u_max[i]);
+  }
+#else
+  const int fine = 0;
+  const real *target = goal && goal->x ? goal->x : x_rest;
+  if (!hmpc_all_finite(target, HMPC_NX)) target = x_rest;
+#endif
+  if (!fine) {
+    equilibrium(target, s->w, best);
+    for (int i = 0; i < HMPC_NU; ++i)
+      for (int j = 0; j < HMPC_ND; ++j) best[i] -= disturbs_u[i][j] * s->d[j];
+  }
   for (int i = 0; i < HMPC_NU; ++i) {
     u[i] = best[i];
     for (int j = 0; j < HMPC_NX; ++j) u[i] -= gain[i][j] * (s->x[j] - target[j]);
     for (int j = 0; j < HMPC_DELAYED; ++j) u[i] -= gain[i][HMPC_NX + j] * (s->h[j] - best[j % HMPC_NU]);
   }
-  return all_finite(u, HMPC_NU);
+  return hmpc_all_finite(u, HMPC_NU);
 #else
   (void)s;
   (void)goal;
@@ -538,10 +576,10 @@ void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const real *applied) {
     s->age = 0;
     return;
   }
-  const int known = all_finite(s->x, HMPC_NX) && all_finite(s->h, HMPC_NH) && all_finite(s->d, HMPC_ND) &&
-                    all_finite(s->w, HMPC_NW);
+  const int known = hmpc_all_finite(s->x, HMPC_NX) && hmpc_all_finite(s->h, HMPC_NH) &&
+                    hmpc_all_finite(s->d, HMPC_ND) && hmpc_all_finite(s->w, HMPC_NW);
   if (s->age < 1000000) ++s->age;
-  if (s->age <= HMPC_MAX_AGE && all_finite(s->plan.u[0], HMPC_NU)) {
+  if (s->age <= HMPC_MAX_AGE && hmpc_all_finite(s->plan.u[0], HMPC_NU)) {
     memcpy(u, s->plan.u[0], sizeof u);
     s->source = HMPC_PLAN;
   } else if (known && fallback(s, goal, u)) {

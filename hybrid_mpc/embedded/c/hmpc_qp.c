@@ -1,6 +1,8 @@
 /* Dense dual active-set solver for the condensed QP. The multipliers of the bounds in the working set move towards
    those that keep these bounds exactly; who reaches zero leaves; the bound that is violated most comes in. A soft bound
-   is an exact penalty l s + r s s / 2 of its slack s: up to the multiplier l it acts as a hard one, beyond it gives way.
+   is an exact penalty l s + r s s / 2 of its slack s: up to the multiplier l it acts as a hard one, beyond it gives
+   way. A hard bound has a penalty far above what it may cost to keep; where one gives way, the QP is solved once more
+   with those that never do, and that answer taken if there is one.
 
    Bounds, all as a's <= b, by number: upper and lower limits of the unknowns; upper and lower limits of their changes;
    upper and lower soft bounds.
@@ -28,6 +30,7 @@ static const real *soft_row(const hmpc_qp *qp, const hmpc_linear *linear, int ro
   }
 #endif
 #if HMPC_SOFT_E > 0
+  (void)linear;
   *kind = HMPC_SOFT_X + (row - SOFT_STATES) % HMPC_SOFT_E;
   return qp->slope[row - SOFT_STATES];
 #else
@@ -45,6 +48,14 @@ static int soft_kind(int row) {
 #endif
   return row % HMPC_DIM(HMPC_SOFT_X);
 }
+
+/* Whether a row's bounds hold in its period: hard ones do from the first on that an input reaches. */
+static int holds(int row) {
+#if HMPC_SOFT_E > 0
+  if (row >= SOFT_STATES) return (row - SOFT_STATES) / HMPC_SOFT_E >= soft_first[soft_kind(row)];
+#endif
+  return row / HMPC_DIM(HMPC_SOFT_X) >= soft_first[soft_kind(row)];
+}
 #endif
 
 static int soft_of(int id) { return id < SOFT_UPPER ? -1 : (id - SOFT_UPPER) % HMPC_DIM(HMPC_SOFT); }
@@ -54,6 +65,10 @@ static real penalty(const hmpc_qp *qp, int id, real *yields) {
 #if HMPC_SOFT > 0
   if (id >= SOFT_UPPER) {
     const int kind = soft_kind(soft_of(id));
+    if (qp->strict && soft_hard[kind]) {
+      *yields = R(0.0);
+      return HMPC_HUGE;
+    }
     *yields = qp->size / soft_quadratic[kind];
     return soft_linear[kind] / qp->size;
   }
@@ -72,6 +87,7 @@ static real limit(const hmpc_qp *qp, int id) {
   if (id < SOFT_UPPER) return -qp->change_lower[id - CHANGE_LOWER];
 #if HMPC_SOFT > 0
   const int row = soft_of(id), kind = soft_kind(row);
+  if (!holds(row)) return R(INFINITY);
   return id < SOFT_LOWER ? (soft_upper[kind] - qp->value[row]) / soft_scale[kind]
                          : (qp->value[row] - soft_lower[kind]) / soft_scale[kind];
 #else
@@ -284,7 +300,7 @@ static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_workin
     largest = hmpc_max(largest, w->multiplier[k]);
   }
   /* rounding grows with the multipliers */
-  *by = hmpc_min(HMPC_VIOLATED * R(1e-3) * largest, R(0.5) * HMPC_BOUND_TOLERANCE);
+  *by = hmpc_min(HMPC_VIOLATED * R(1e-3) * largest, R(0.1) * HMPC_KEPT);
   for (int i = 0; i < HMPC_NV; ++i) {
     const real before = i >= HMPC_NU ? s[i - HMPC_NU] : R(0.0);
     const real over[4] = {s[i] - qp->upper[i], qp->lower[i] - s[i], (s[i] - before) - qp->change_upper[i],
@@ -299,6 +315,7 @@ static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_workin
 #if HMPC_SOFT > 0
   for (int row = 0; row < HMPC_SOFT; ++row) {
     int kind;
+    if (!holds(row)) continue;
     const real *const slope = soft_row(qp, linear, row, &kind);
     const real value = qp->value[row] + hmpc_dot(slope, s, HMPC_NV);
     const real above = (value - soft_upper[kind]) / soft_scale[kind];
@@ -330,7 +347,7 @@ static hmpc_status checked(const hmpc_qp *qp, const hmpc_linear *linear, hmpc_wo
     add_bound(qp, linear, w->id[k], w->multiplier[k], rest);
     if (!(w->multiplier[k] >= R(0.0))) largest = hmpc_max(largest, -w->multiplier[k]);
     largest = hmpc_max(largest, hmpc_min(hmpc_abs(w->multiplier[k]), hmpc_abs(room)));
-    violation = hmpc_max(violation, -room);
+    if (!(from < HMPC_HUGE)) violation = hmpc_max(violation, -room); /* what gives way has no violation */
   }
   if (worst(qp, linear, w, s, &by) >= 0) violation = hmpc_max(violation, by);
   real sum = R(0.0); /* NaN where anything is */
@@ -357,6 +374,19 @@ static void towards(const hmpc_qp *qp, hmpc_working *w, const real *y, real *mov
   backward(w, w->count, move);
 }
 
+/* The bounds of the working set met more exactly than the sum of large multipliers does it. */
+static void polish(const hmpc_qp *qp, hmpc_working *w, real *y, real *s) {
+  real move[HMPC_MOST];
+  for (int round = 0; round < 2; ++round) {
+    towards(qp, w, y, move);
+    for (int k = 0; k < w->count; ++k) {
+      w->multiplier[k] += move[k];
+      hmpc_add(y, -move[k], w->row[k], HMPC_NV);
+    }
+  }
+  for (int i = 0; i < HMPC_NV; ++i) s[i] = hmpc_dot(qp->inverse[i] + i, y + i, HMPC_NV - i);
+}
+
 /* The bounds that were active, as far as they fit; multipliers stay: any that are not negative may begin. */
 static void warm(const hmpc_qp *qp, const hmpc_linear *linear, hmpc_working *w) {
   const int n = w->count;
@@ -375,7 +405,7 @@ static void warm(const hmpc_qp *qp, const hmpc_linear *linear, hmpc_working *w) 
   }
 }
 
-hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linear) {
+static hmpc_status solved(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linear) {
   real start[HMPC_LD] = {R(0.0)}, y[HMPC_LD], move[HMPC_MOST];
   w->iterations = 0;
   w->kkt = R(NAN);
@@ -398,7 +428,10 @@ hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
     primal(qp, w, start, y, qp->step);
     real by;
     const int id = worst(qp, linear, w, qp->step, &by);
-    if (id < 0 && refined) return checked(qp, linear, w, qp->step);
+    if (id < 0 && refined) {
+      polish(qp, w, y, qp->step);
+      return checked(qp, linear, w, qp->step);
+    }
     refined = id < 0; /* once more, for what rounding left of the way */
     if (refined) continue;
     if (w->count == HMPC_MOST) break;
@@ -450,6 +483,34 @@ hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
   }
   w->count = 0;
   return HMPC_INACCURATE;
+}
+
+hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linear) {
+  qp->strict = 0;
+  const hmpc_status status = solved(qp, w, linear);
+#if HMPC_HARD > 0
+  real step[HMPC_LD], multiplier[HMPC_MOST];
+  int id[HMPC_MOST], give_way = status != HMPC_SOLVED;
+  const int count = w->count;
+  const real kkt = w->kkt;
+  for (int k = 0; k < count; ++k) {
+    id[k] = w->id[k];
+    multiplier[k] = w->multiplier[k];
+    give_way |= w->beyond[k] && id[k] >= SOFT_UPPER && soft_hard[soft_kind(soft_of(id[k]))];
+  }
+  if (!give_way) return status;
+  memcpy(step, qp->step, sizeof step);
+  qp->strict = 1;
+  if (solved(qp, w, linear) == HMPC_SOLVED) return HMPC_SOLVED;
+  memcpy(qp->step, step, sizeof step);
+  for (int k = 0; k < count; ++k) { /* with what the next solve begins */
+    w->id[k] = id[k];
+    w->multiplier[k] = multiplier[k];
+  }
+  w->count = count;
+  w->kkt = kkt;
+#endif
+  return status;
 }
 
 /* The working set one period later. */

@@ -7,7 +7,11 @@
 static hmpc_state state; /* 8-byte numbers at the machine's ease; the library itself has no such thing */
 
 int main(void) {
+#if HMPC_OUTPUT_COST
+  const hmpc_goal goal = {.y = vector_goal[0], .rows = 1};
+#else
   const hmpc_goal goal = {.x = vector_goal[0], .rows = 1};
+#endif
   real largest = R(0.0);
   hmpc_clear(&state);
   for (int k = 0; k < VECTORS; ++k) {

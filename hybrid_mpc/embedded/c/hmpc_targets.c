@@ -1,0 +1,519 @@
+/* Target calculator: the steady state z = F(z, u, w, d) at which outputs are a set-point, or as near to it as limits
+   and bounds allow; of several inputs that do equally well that nearest to the operating point's. Gauss-Newton's
+   method, the steady states eliminated by their null space; bounds are an active set. All loops end after a fixed
+   number of rounds.
+
+   Source: Rawlings, Mayne, Diehl, Model Predictive Control, 2017, section 1.5; Golub and Van Loan, Matrix Computations,
+   2013, sections 5.4 and 5.5. */
+#include "hmpc_math.h"
+#include "hmpc_tables.h"
+#include "hmpc_expressions.h"
+
+#if HMPC_OUTPUT_COST
+
+enum {
+  NT = HMPC_NT,
+  HALVINGS = 10, /* of a step that does not help */
+  SWEEPS = 30,   /* of Jacobi's rotations */
+  ROUNDS = 10 * HMPC_TARGET_ROWS,
+  STARTS = 1 + 2 * HMPC_NU
+};
+
+/* What a descent needs to know of v. */
+static void look(const hmpc_state *s, const real *v, const real *goal, const real *w, hmpc_point *p) {
+  real acts[HMPC_NU], z[HMPC_LZ] = {R(0.0)}, next[HMPC_LZ] = {R(0.0)}, off = R(0.0);
+  memcpy(p->v, v, sizeof p->v);
+  memcpy(z, v, sizeof(real) * HMPC_NZ);
+  for (int i = 0; i < HMPC_NU; ++i) {
+    acts[i] = v[HMPC_NZ + i];
+    for (int j = 0; j < HMPC_ND; ++j) acts[i] += disturbs_u[i][j] * s->d[j];
+  }
+  hmpc_model_slope(z, acts, w, next, p->slope[0]);
+  for (int i = 0; i < HMPC_NX; ++i)
+    for (int j = 0; j < HMPC_ND; ++j) next[i] += disturbs_x[i][j] * s->d[j];
+  p->lacks = R(0.0);
+  for (int i = 0; i < HMPC_NZ; ++i) {
+    p->rest[i] = next[i] - v[i];
+    p->lacks += hmpc_abs(p->rest[i] / target_scale[i]);
+  }
+  outputs(z, acts, w, p->y);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    for (int j = 0; j < HMPC_ND; ++j) p->y[i] += disturbs_y[i][j] * s->d[j];
+    if (q_y[i] > R(0.0)) off += target_root[i] * target_root[i] * (p->y[i] - goal[i]) * (p->y[i] - goal[i]);
+  }
+  p->merit = R(100.0) * p->lacks + hmpc_sqrt(off);
+  if (!hmpc_finite(p->merit)) p->merit = R(INFINITY);
+}
+
+#if HMPC_NH > 0
+/* a x = b in place, by elimination with row exchanges; 0 if a is singular. Rows of a are NT long. */
+static int solve(real (*a)[NT], real *b, int n) {
+  for (int k = 0; k < n; ++k) {
+    int pivot = k;
+    for (int i = k + 1; i < n; ++i)
+      if (hmpc_abs(a[i][k]) > hmpc_abs(a[pivot][k])) pivot = i;
+    if (!(hmpc_abs(a[pivot][k]) > R(0.0))) return 0;
+    if (pivot != k) {
+      const real kept = b[k];
+      b[k] = b[pivot];
+      b[pivot] = kept;
+      for (int j = k; j < n; ++j) {
+        const real entry = a[k][j];
+        a[k][j] = a[pivot][j];
+        a[pivot][j] = entry;
+      }
+    }
+    for (int i = k + 1; i < n; ++i) {
+      const real factor = a[i][k] / a[k][k];
+      b[i] -= factor * b[k];
+      for (int j = k + 1; j < n; ++j) a[i][j] -= factor * a[k][j];
+    }
+  }
+  for (int i = n - 1; i >= 0; --i) {
+    for (int j = i + 1; j < n; ++j) b[i] -= a[i][j] * b[j];
+    b[i] /= a[i][i];
+  }
+  return 1;
+}
+#endif
+
+/* The point v with the hidden state at rest under its state and input, or as it is where that is no better. */
+static void settle(hmpc_state *s, const real *v, const real *goal, const real *w, hmpc_point *to) {
+  look(s, v, goal, w, to);
+#if HMPC_NH > 0
+  hmpc_search *const work = &s->search;
+  work->settled = *to;
+  for (int round = 0; round < HMPC_TARGET_SETTLING; ++round) {
+    hmpc_point *const at = &work->settled;
+    real move[HMPC_NH], most = R(0.0), there[NT];
+    for (int i = 0; i < HMPC_NH; ++i) {
+      move[i] = -at->rest[HMPC_NX + i];
+      most = hmpc_max(most, hmpc_abs(move[i]));
+      for (int j = 0; j < HMPC_NH; ++j)
+        work->a[i][j] = at->slope[HMPC_NX + i][HMPC_NX + j] - (i == j ? R(1.0) : R(0.0));
+    }
+    if (!hmpc_all_finite(at->rest, HMPC_NZ) || most < HMPC_TARGET_STEADY) break;
+    if (!solve(work->a, move, HMPC_NH)) return;
+    memcpy(there, at->v, sizeof there);
+    hmpc_add(there + HMPC_NX, R(1.0), move, HMPC_NH);
+    look(s, there, goal, w, at);
+  }
+  if (work->settled.merit < to->merit) *to = work->settled;
+#endif
+}
+
+/* Householder's factors of work->a, the largest row first: a = (l, 0) q', where l has the rank's columns, in work->a in
+   front of its row's reflector; order says which row is where. */
+static int factorize(hmpc_search *work, int *order) {
+  real first = R(0.0);
+  int rank = 0;
+  for (int i = 0; i < HMPC_NZ; ++i) order[i] = i;
+  for (int k = 0; k < HMPC_NZ; ++k, ++rank) {
+    int best = k;
+    real largest = R(-1.0);
+    for (int i = k; i < HMPC_NZ; ++i) {
+      const real size = hmpc_dot(work->a[i] + k, work->a[i] + k, NT - k);
+      if (size > largest) {
+        largest = size;
+        best = i;
+      }
+    }
+    const real size = hmpc_sqrt(largest);
+    if (k == 0) first = size;
+    if (!(size > HMPC_TARGET_RANK * first)) break;
+    if (best != k) {
+      const int kept = order[k];
+      real row[NT];
+      order[k] = order[best];
+      order[best] = kept;
+      memcpy(row, work->a[k], sizeof row);
+      memcpy(work->a[k], work->a[best], sizeof row);
+      memcpy(work->a[best], row, sizeof row);
+    }
+    real *const v = work->a[k];
+    const real diagonal = v[k] > R(0.0) ? -size : size;
+    v[k] -= diagonal; /* the reflector 1 - v v' / half, where v[k] is at least size */
+    work->half[k] = R(0.5) * hmpc_dot(v + k, v + k, NT - k);
+    work->diagonal[k] = diagonal;
+    for (int i = k + 1; i < HMPC_NZ; ++i)
+      hmpc_add(work->a[i] + k, -hmpc_dot(v + k, work->a[i] + k, NT - k) / work->half[k], v + k, NT - k);
+  }
+  return rank;
+}
+
+/* x = q x */
+static void rotate(const hmpc_search *work, int rank, real *x) {
+  for (int k = rank - 1; k >= 0; --k)
+    hmpc_add(x + k, -hmpc_dot(work->a[k] + k, x + k, NT - k) / work->half[k], work->a[k] + k, NT - k);
+}
+
+/* The shortest of those x that leave the least of a x - b, from the factors. */
+static void shortest(hmpc_search *work, int rank, const int *order, const real *b, real *x) {
+  const int left = HMPC_NZ - rank;
+  real lacks[HMPC_NZ];
+  memset(x, 0, sizeof(real) * NT);
+  if (left > 0) { /* rows that depend on those before: k = l2 l1^-1, and w = b1 + k' (1 + k k')^-1 (b2 - k b1) */
+    for (int i = 0; i < left; ++i) {
+      real *const row = work->a[rank + i];
+      for (int j = rank - 1; j >= 0; --j) {
+        for (int m = j + 1; m < rank; ++m) row[j] -= row[m] * work->a[m][j];
+        row[j] /= work->diagonal[j];
+      }
+      lacks[i] = b[order[rank + i]];
+      for (int j = 0; j < rank; ++j) lacks[i] -= row[j] * b[order[j]];
+    }
+    for (int i = 0; i < left; ++i)
+      for (int j = 0; j <= i; ++j) {
+        const real entry = hmpc_dot(work->a[rank + i], work->a[rank + j], rank) + (i == j ? R(1.0) : R(0.0));
+        const real rest = entry - hmpc_dot(work->h[i], work->h[j], j);
+        work->h[i][j] = i == j ? hmpc_sqrt(rest) : rest / work->h[j][j];
+      }
+    for (int i = 0; i < left; ++i) lacks[i] = (lacks[i] - hmpc_dot(work->h[i], lacks, i)) / work->h[i][i];
+    for (int i = left - 1; i >= 0; --i) {
+      for (int j = i + 1; j < left; ++j) lacks[i] -= work->h[j][i] * lacks[j];
+      lacks[i] /= work->h[i][i];
+    }
+  }
+  for (int i = 0; i < rank; ++i) {
+    real value = b[order[i]];
+    for (int j = 0; j < left; ++j) value += work->a[rank + j][i] * lacks[j];
+    x[i] = (value - hmpc_dot(work->a[i], x, i)) / work->diagonal[i];
+  }
+  rotate(work, rank, x);
+}
+
+/* Rows of n entries made orthogonal by rotations: their lengths are the singular values. */
+static void orthogonal(real (*rows)[NT], int count, int n) {
+  for (int sweep = 0; sweep < SWEEPS; ++sweep) {
+    int turned = 0;
+    for (int i = 0; i < count; ++i)
+      for (int j = i + 1; j < count; ++j) {
+        const real a = hmpc_dot(rows[i], rows[i], n), b = hmpc_dot(rows[j], rows[j], n);
+        const real both = hmpc_dot(rows[i], rows[j], n);
+        if (!(hmpc_abs(both) > HMPC_TARGET_ROUNDING * hmpc_sqrt(a) * hmpc_sqrt(b))) continue;
+        const real ratio = (b - a) / (R(2.0) * both);
+        const real tangent = R(1.0) / (hmpc_abs(ratio) + hmpc_sqrt(R(1.0) + ratio * ratio));
+        const real c = R(1.0) / hmpc_sqrt(R(1.0) + tangent * tangent), d = ratio < R(0.0) ? -c * tangent : c * tangent;
+        for (int k = 0; k < n; ++k) {
+          const real x = rows[i][k], y = rows[j][k];
+          rows[i][k] = c * x - d * y;
+          rows[j][k] = d * x + c * y;
+        }
+        turned = 1;
+      }
+    if (!turned) return;
+  }
+}
+
+/* A row <= end of the QP over the m unknowns eta, scaled to length 1; 0 if no eta keeps it. */
+static int bound(hmpc_search *work, int m, int sign, real end, int *count) {
+  real *const row = work->bound[*count];
+  const real size = hmpc_sqrt(hmpc_dot(row, row, m));
+  if (!hmpc_finite(end)) return 1;
+  if (!(size > R(0.0))) return end >= R(0.0);
+  for (int k = 0; k < m; ++k) row[k] *= R(sign) / size;
+  work->end[*count] = end / size;
+  ++*count;
+  return 1;
+}
+
+/* Both bounds of a value now + sum of row eta, in its scale. */
+static int bounds(hmpc_search *work, int m, const real *row, real now, real low, real high, int *count) {
+  memcpy(work->bound[*count], row, sizeof(real) * (size_t)m);
+  if (!bound(work, m, 1, high - now, count)) return 0;
+  memcpy(work->bound[*count], row, sizeof(real) * (size_t)m);
+  return bound(work, m, -1, now - low, count);
+}
+
+/* min 1/2 e'he + g'e with bound e <= end: the point nearest to the free answer in L' e, where h = L L'. Goldfarb and
+   Idnani's dual method, its small systems solved anew in every round. 0 if there is none. */
+static int least_squares(hmpc_search *work, int m, real *g, int count, real *eta) {
+  int active[NT + 1], n = 0;
+  real multiplier[NT + 1], share[NT], start[NT], y[NT];
+  for (int i = 0; i < m; ++i)
+    for (int j = 0; j <= i; ++j) { /* L in place */
+      const real rest = work->h[i][j] - hmpc_dot(work->h[i], work->h[j], j);
+      if (i == j && !(rest > R(0.0) && rest <= HMPC_HUGE)) return 0;
+      work->h[i][j] = i == j ? hmpc_sqrt(rest) : rest / work->h[j][j];
+    }
+  for (int i = 0; i < m; ++i) start[i] = (-g[i] - hmpc_dot(work->h[i], start, i)) / work->h[i][i];
+  for (int r = 0; r < count; ++r)
+    for (int i = 0; i < m; ++i)
+      work->seen[r][i] = (work->bound[r][i] - hmpc_dot(work->h[i], work->seen[r], i)) / work->h[i][i];
+  for (int round = 0;; ++round) {
+    memcpy(y, start, sizeof y);
+    for (int k = 0; k < n; ++k) hmpc_add(y, -multiplier[k], work->seen[active[k]], m);
+    real largest = HMPC_TARGET_VIOLATED;
+    int worst = -1;
+    for (int r = 0; r < count; ++r) {
+      int inside = 0;
+      for (int k = 0; k < n; ++k) inside |= active[k] == r;
+      const real over = hmpc_dot(work->seen[r], y, m) - work->end[r];
+      if (!inside && over > largest) {
+        largest = over;
+        worst = r;
+      }
+    }
+    if (worst < 0) break;
+    if (round == ROUNDS) return 0;
+    const real *const own = work->seen[worst];
+    real given = R(0.0);
+    for (int step = 0;; ++step) { /* its multiplier grows until it is kept; others that come to zero leave */
+      real rate = hmpc_dot(own, own, m);
+      const real size = rate;
+      for (int i = 0; i < n; ++i) {
+        for (int j = 0; j <= i; ++j) {
+          const real product = hmpc_dot(work->seen[active[i]], work->seen[active[j]], m);
+          const real rest = product - hmpc_dot(work->gram[i], work->gram[j], j);
+          work->gram[i][j] = i == j ? hmpc_sqrt(hmpc_max(rest, R(1e-30))) : rest / work->gram[j][j];
+        }
+        share[i] = hmpc_dot(work->seen[active[i]], own, m) - hmpc_dot(work->gram[i], share, i);
+        share[i] /= work->gram[i][i];
+        rate -= share[i] * share[i];
+      }
+      for (int i = n - 1; i >= 0; --i) {
+        for (int j = i + 1; j < n; ++j) share[i] -= work->gram[j][i] * share[j];
+        share[i] /= work->gram[i][i];
+      }
+      memcpy(y, start, sizeof y);
+      for (int k = 0; k < n; ++k) hmpc_add(y, -multiplier[k], work->seen[active[k]], m);
+      hmpc_add(y, -given, own, m);
+      const real over = hmpc_max(hmpc_dot(own, y, m) - work->end[worst], R(0.0));
+      real length = n < m && rate > HMPC_DEPENDENT * size ? over / rate : HMPC_HUGE;
+      int leaves = -1;
+      for (int k = 0; k < n; ++k)
+        if (share[k] > R(0.0) && multiplier[k] / share[k] < length) {
+          length = multiplier[k] / share[k];
+          leaves = k;
+        }
+      if (!(length < HMPC_HUGE) || step > count) return 0;
+      for (int k = 0; k < n; ++k) multiplier[k] -= length * share[k];
+      given += length;
+      if (leaves < 0) break;
+      --n;
+      for (int k = leaves; k < n; ++k) {
+        active[k] = active[k + 1];
+        multiplier[k] = multiplier[k + 1];
+      }
+    }
+    active[n] = worst;
+    multiplier[n] = given;
+    ++n;
+  }
+  for (int i = m - 1; i >= 0; --i) {
+    eta[i] = y[i];
+    for (int j = i + 1; j < m; ++j) eta[i] -= work->h[j][i] * eta[j];
+    eta[i] /= work->h[i][i];
+  }
+  return 1;
+}
+
+/* The step that the linearization at work->at asks for; 0 where its QP has no answer. */
+static int newton(hmpc_search *work, const real *goal, int bounded, real *step) {
+  const hmpc_point *const at = &work->at;
+  const real *const u = at->v + HMPC_NZ;
+  real onto[NT], sees[HMPC_NY][NT] = {{R(0.0)}}, error[HMPC_NY], g[NT], row[NT], eta[NT];
+  real trace = R(0.0), size = R(1e-30);
+  int order[HMPC_NZ], tracked = 0, count = 0;
+  for (int i = 0; i < HMPC_NZ; ++i) {
+    for (int j = 0; j < HMPC_NZ; ++j)
+      work->a[i][j] = (at->slope[i][j] - (i == j ? R(1.0) : R(0.0))) * target_scale[j];
+    for (int j = 0; j < HMPC_NU; ++j) work->a[i][HMPC_NZ + j] = at->slope[i][HMPC_LZ + j] * target_scale[HMPC_NZ + j];
+    if (!hmpc_all_finite(work->a[i], NT) || !hmpc_finite(at->rest[i])) return 0;
+    row[i] = -at->rest[i];
+  }
+  const int rank = factorize(work, order), m = NT - rank;
+  shortest(work, rank, order, row, onto); /* to the steady states */
+  for (int k = 0; k < m; ++k) {           /* and along them */
+    memset(work->along[k], 0, sizeof work->along[k]);
+    work->along[k][rank + k] = R(1.0);
+    rotate(work, rank, work->along[k]);
+  }
+  for (int i = 0; i < HMPC_NY; ++i) {
+    if (!(q_y[i] > R(0.0))) continue;
+    for (int j = 0; j < NT; ++j) row[j] = R(0.0);
+    for (int j = 0; j < HMPC_NX; ++j) row[j] = output_x[i][j] * target_scale[j];
+    for (int j = 0; j < HMPC_NU; ++j) row[HMPC_NZ + j] = output_u[i][j] * target_scale[HMPC_NZ + j];
+    for (int k = 0; k < m; ++k) sees[tracked][k] = target_root[i] * hmpc_dot(row, work->along[k], NT);
+    error[tracked] = target_root[i] * (goal[i] - at->y[i] - hmpc_dot(row, onto, NT));
+    ++tracked;
+  }
+  memcpy(work->turned, sees, sizeof sees);
+  orthogonal(work->turned, tracked, m);
+  for (int i = 0; i < tracked; ++i) size = hmpc_max(size, hmpc_sqrt(hmpc_dot(work->turned[i], work->turned[i], m)));
+  memset(work->h, 0, sizeof work->h);
+  memset(g, 0, sizeof g);
+  for (int i = 0; i < tracked; ++i) {
+    const real factor = R(1.0) / size / size;
+    for (int k = 0; k < m; ++k) {
+      g[k] -= sees[i][k] * error[i] * factor;
+      hmpc_add(work->h[k], sees[i][k] * factor, sees[i], m);
+    }
+  }
+  for (int j = 0; j < HMPC_NU; ++j) { /* what outputs do not see goes towards the operating point's input */
+    const real far = (u_rest[j] - u[j]) / target_scale[HMPC_NZ + j] - onto[HMPC_NZ + j];
+    for (int k = 0; k < m; ++k) row[k] = work->along[k][HMPC_NZ + j];
+    memcpy(eta, row, sizeof eta);
+    for (int i = 0; i < tracked; ++i) {
+      const real *const seen = work->turned[i];
+      const real length = hmpc_dot(seen, seen, m);
+      if (hmpc_sqrt(length) > HMPC_TARGET_RANK * size) hmpc_add(row, -hmpc_dot(eta, seen, m) / length, seen, m);
+    }
+    for (int k = 0; k < m; ++k) {
+      g[k] -= HMPC_TARGET_FREE * row[k] * far;
+      hmpc_add(work->h[k], HMPC_TARGET_FREE * row[k], row, m);
+    }
+  }
+  for (int k = 0; k < m; ++k) trace += work->h[k][k];
+  for (int k = 0; k < m; ++k) work->h[k][k] += HMPC_TARGET_DAMPING * trace + R(0.01) * HMPC_TARGET_DAMPING;
+  for (int k = 0; k < m; ++k)
+    if (!hmpc_all_finite(work->h[k], m) || !hmpc_finite(g[k])) return 0;
+  for (int j = 0; j < HMPC_NU; ++j) {
+    const real scale = target_scale[HMPC_NZ + j];
+    for (int k = 0; k < m; ++k) row[k] = work->along[k][HMPC_NZ + j];
+    if (!bounds(work, m, row, u[j] / scale + onto[HMPC_NZ + j], u_min[j] / scale, u_max[j] / scale, &count)) return 0;
+  }
+  for (int j = 0; j < HMPC_NX && bounded; ++j) {
+    const real scale = target_scale[j], *const range = target_x_range[j];
+    for (int k = 0; k < m; ++k) row[k] = work->along[k][j];
+    if (!bounds(work, m, row, at->v[j] / scale + onto[j], range[0] / scale, range[1] / scale, &count)) return 0;
+  }
+  for (int i = 0; i < HMPC_NY && bounded; ++i) {
+    real slope[NT] = {R(0.0)};
+    for (int j = 0; j < HMPC_NX; ++j) slope[j] = output_x[i][j] * target_scale[j];
+    for (int j = 0; j < HMPC_NU; ++j) slope[HMPC_NZ + j] = output_u[i][j] * target_scale[HMPC_NZ + j];
+    for (int k = 0; k < m; ++k) row[k] = hmpc_dot(slope, work->along[k], NT);
+    const real now = at->y[i] + hmpc_dot(slope, onto, NT);
+    if (!bounds(work, m, row, now, target_y_range[i][0], target_y_range[i][1], &count)) return 0;
+  }
+  if (!least_squares(work, m, g, count, eta)) return 0;
+  for (int k = 0; k < m; ++k) hmpc_add(onto, eta[k], work->along[k], NT);
+  for (int i = 0; i < NT; ++i) step[i] = onto[i] * target_scale[i];
+  return hmpc_all_finite(step, NT);
+}
+
+/* Gauss-Newton from v; bounded: within the bounds of states and outputs. */
+static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_steady *found) {
+  hmpc_search *const work = &s->search;
+  hmpc_point *const at = &work->at, *const after = &work->after;
+  real step[NT], there[NT], lacks[HMPC_TARGET_ITERATIONS + 1], off = R(0.0);
+  int done = 0;
+  look(s, v, goal, w, at);
+  lacks[0] = at->lacks;
+  for (int k = 1; k <= HMPC_TARGET_ITERATIONS; ++k) {
+    real size = R(0.0), share = R(1.0);
+    if (!newton(work, goal, bounded, step)) break;
+    for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs(step[i] / target_scale[i]));
+    if (size <= HMPC_TARGET_STEADY) {
+      done = at->lacks <= HMPC_TARGET_STILL;
+      break;
+    }
+    for (int half = 0; half <= HALVINGS; ++half, share *= R(0.5)) {
+      for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
+      settle(s, there, goal, w, after);
+      if (after->merit < at->merit) break;
+    }
+    if (!(after->merit < at->merit)) { /* rounding is all that is left, or it gets nowhere */
+      done = size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
+      break;
+    }
+    *at = *after;
+    lacks[k] = at->lacks;
+    if (k < HMPC_TARGET_WITHIN) continue;
+    if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[k - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL)) break;
+  }
+  for (int i = 0; i < HMPC_NY; ++i)
+    if (q_y[i] > R(0.0)) off = hmpc_max(off, target_root[i] * hmpc_abs(at->y[i] - goal[i]));
+  memcpy(found->x, at->v, sizeof found->x);
+  if (HMPC_NH > 0) memcpy(found->h, at->v + HMPC_NX, sizeof(real) * HMPC_NH);
+  for (int j = 0; j < HMPC_NU; ++j) found->u[j] = hmpc_clip(at->v[HMPC_NZ + j], u_min[j], u_max[j]);
+  memcpy(found->y, at->y, sizeof found->y);
+  found->steady = done;
+  found->reached = done && off <= HMPC_TARGET_REACHED;
+}
+
+/* The steady state for outputs y, all finite where they are weighed: from a steady start, then, where wide or there is
+   no such start, at the operating point and beside it. Where none keeps the bounds of states and outputs, these are
+   left out. */
+void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
+                       hmpc_steady *found) {
+  hmpc_steady trial;
+  real given[NT];
+  const int known = start && start->steady;
+  if (known) {
+    memcpy(given, start->x, sizeof start->x);
+    if (HMPC_NH > 0) memcpy(given + HMPC_NX, start->h, sizeof(real) * HMPC_NH);
+    memcpy(given + HMPC_NZ, start->u, sizeof start->u);
+  }
+  for (int bounded = 1; bounded >= 0; --bounded) {
+    const int beside = wide && bounded ? STARTS : (wide || !known);
+    for (int k = known ? -1 : 0; k < beside; ++k) {
+      descend(s, k < 0 ? given : target_starts[k], y, w, bounded, &trial);
+      if (trial.steady || (bounded && k == (known ? -1 : 0))) *found = trial; /* the first answer if none is steady */
+      if (trial.steady) return;
+    }
+  }
+}
+
+static void set_target(hmpc_target *to, int k, const real *x, const real *u, const real *y) {
+  memcpy(to->x[k], x, sizeof to->x[k]);
+  memcpy(to->y[k], y, sizeof to->y[k]);
+  if (k < HMPC_N) memcpy(to->u[k], u, sizeof to->u[k]);
+}
+
+/* References of states, inputs and outputs over the horizon, under the measured disturbances s->linear.w: a steady
+   state for each change of the preview; of one that changes more often for so many rows, and between them
+   interpolated. */
+void hmpc_aim(hmpc_state *s, const hmpc_goal *goal) {
+  hmpc_target *const to = &s->target;
+  const real(*const w)[HMPC_DIM(HMPC_NW)] = s->linear.w;
+  const int rows = goal && goal->y ? goal->rows : 1;
+  const real *const given = goal && goal->y ? goal->y : y_rest;
+  hmpc_steady start = s->steady, found;
+  real x[HMPC_TARGET_KNOTS][HMPC_NX], u[HMPC_TARGET_KNOTS][HMPC_NU], off[HMPC_TARGET_KNOTS][HMPC_NY];
+  int knots[HMPC_TARGET_KNOTS + 1] = {0}, count = 1, wide = 1, fine = hmpc_all_finite(s->d, HMPC_ND);
+  for (int k = 0; k <= HMPC_N; ++k) {
+    const int last = k < HMPC_N ? k : HMPC_N - 1, other = last > 0 ? last - 1 : 0;
+    const real *const row = given + (k < rows ? k : rows - 1) * HMPC_NY;
+    int changes = k > 0 && k < HMPC_N && HMPC_NW > 0 && memcmp(w[last], w[other], sizeof(real) * HMPC_NW) != 0;
+    for (int i = 0; i < HMPC_NY; ++i) {
+      to->y[k][i] = q_y[i] > R(0.0) ? row[i] : R(0.0);
+      fine &= hmpc_finite(to->y[k][i]);
+      if (k > 0) changes |= to->y[k][i] < to->y[k - 1][i] || to->y[k][i] > to->y[k - 1][i];
+    }
+    fine &= hmpc_all_finite(w[last], HMPC_NW);
+    if (changes && count <= HMPC_TARGET_KNOTS) knots[count < HMPC_TARGET_KNOTS ? count : HMPC_TARGET_KNOTS] = k;
+    if (changes && count <= HMPC_TARGET_KNOTS) ++count;
+  }
+  if (!fine) {
+    for (int k = 0; k <= HMPC_N; ++k)
+      for (int i = 0; i < HMPC_NX; ++i) to->x[k][i] = R(NAN);
+    for (int k = 0; k < HMPC_N; ++k) memcpy(to->u[k], u_rest, sizeof to->u[k]);
+    return;
+  }
+  const int often = count > HMPC_TARGET_KNOTS;
+  if (often) count = HMPC_TARGET_KNOTS;
+  for (int n = 0; n < count; ++n) {
+    const int k = knots[n] = often ? target_knots[n] : knots[n];
+    hmpc_steady_state(s, to->y[k], w[k < HMPC_N ? k : HMPC_N - 1], &start, wide, &found);
+    wide = found.steady; /* where nothing was found, the rest of the horizon is not searched as widely again */
+    if (found.steady) start = found;
+    if (n == 0) s->aimed = found;
+    for (int i = 0; i < HMPC_NX; ++i) x[n][i] = found.steady ? found.x[i] : x_rest[i];
+    for (int i = 0; i < HMPC_NU; ++i) u[n][i] = found.steady ? found.u[i] : hmpc_clip(u_rest[i], u_min[i], u_max[i]);
+    for (int i = 0; i < HMPC_NY; ++i)
+      off[n][i] = q_y[i] > R(0.0) && found.steady && !found.reached ? found.y[i] - to->y[k][i] : R(0.0);
+  }
+  for (int k = 0, n = 0; k <= HMPC_N; ++k) {
+    real x_k[HMPC_NX], u_k[HMPC_NU], y_k[HMPC_NY];
+    while (n + 1 < count && knots[n + 1] <= k) ++n;
+    const int next = often && n + 1 < count ? n + 1 : n;
+    const real share = next > n ? R(k - knots[n]) / R(knots[next] - knots[n]) : R(0.0);
+    for (int i = 0; i < HMPC_NX; ++i) x_k[i] = x[n][i] + share * (x[next][i] - x[n][i]);
+    for (int i = 0; i < HMPC_NU; ++i) u_k[i] = u[n][i] + share * (u[next][i] - u[n][i]);
+    for (int i = 0; i < HMPC_NY; ++i) y_k[i] = to->y[k][i] + (off[n][i] + share * (off[next][i] - off[n][i]));
+    set_target(to, k, x_k, u_k, y_k);
+  }
+}
+
+#endif

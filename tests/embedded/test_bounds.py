@@ -1,0 +1,103 @@
+"""Hard bounds and bounds that move: the generated C keeps them, and lets them give way, as Python does."""
+
+from dataclasses import replace
+
+import casadi as ca
+import embedded_parts as parts
+import numpy as np
+import pytest
+from embedded_parts import needs_compiler
+
+from hybrid_mpc import CondensedController, HardBound, SoftBound, TrueState
+from hybrid_mpc.embedded.native import NativeController
+
+pytestmark = needs_compiler
+X, U, W, P = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("w", 0), ca.SX.sym("p")
+
+
+def thrown(ocp, rng, k):
+    """A state at up to 3 m/s, now and then towards a wall that no plan keeps it from; the goal is behind it."""
+    return rng.uniform([-0.5, -1.0], [0.52, 3.0]), np.array([[1.0, 0.0]])
+
+
+def with_walls(ocp, rng, k):
+    """The same with one to 31 rows of where the wall is."""
+    z, rows = rng.uniform([-0.5, -0.5], [0.4, 2.0]), (1, 5, ocp.horizon + 1)[k % 3]
+    return z, np.column_stack([np.ones(rows), np.zeros(rows), rng.uniform(0.4, 1.0, rows)])
+
+
+def around(ocp, rng, k):
+    """States and references that jump."""
+    return 0.6 * rng.standard_normal(3), 0.5 * rng.standard_normal((1 + k % 2, 3))
+
+
+def asked(ocp, rng, k):
+    """Set-points within and beyond the band, and the parameters' values."""
+    rest, rows = np.array([42.7, 38.5]), 1 + k % 3
+    columns = rest + 8.0 * rng.standard_normal((rows, 2)), rng.uniform([12.0, 4.0], [22.0, 9.0], (rows, 2))
+    return rest + 4.0 * rng.standard_normal(2), np.hstack(columns)
+
+
+WALL = HardBound("x", [-np.inf, -np.inf], [0.5, np.inf])
+FAST = HardBound("x", [-0.6, -1.0], [np.inf, 1.0])
+GENTLE = HardBound(ca.Function("gentle", [X, U], [U]), [-1.0], [np.inf], priority=1)
+LATE = HardBound("x", [-np.inf, -np.inf], [0.5, np.inf], priority=2)
+AWAY = ca.Function("wall", [X, U, W, P], [X[0] - P])
+NEAR = SoftBound(ca.Function("near", [X, U, W, P], [X[0] - 0.9 * P]), [-np.inf], [0.0], [1.0], [1.0])
+TARGET = HardBound("x", [0.2, -0.05], [0.3, 0.05], at_end=True)
+KEPT = {"band": 1e-8}
+"""Of an input's range, where all are kept; steady states within a band are found to 1e-9 of their scales."""
+GIVEN = 1e-6
+"""Where a bound gives way: its penalty is 1e5 times the cost or more, so that rounding moves it. 4e-8 was found."""
+CASES = {
+    "wall": (lambda: parts.cart([WALL, FAST]), thrown),
+    "wall last": (lambda: parts.cart([WALL, GENTLE]), thrown),
+    "wall first": (lambda: parts.cart([GENTLE, LATE], du_max=[1.5]), thrown),
+    "delayed": (lambda: parts.cart([WALL], delay=0.25), thrown),
+    "at the end": (lambda: parts.cart([TARGET], horizon=12), thrown),
+    "moving wall": (lambda: parts.cart([HardBound(AWAY, [-np.inf], [0.0])], soft=[NEAR]), with_walls),
+    "bounded": (parts.bounded, around),
+    "band": (parts.band, asked),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bounds_are_kept_and_give_way_as_in_python(name):
+    """From states thrown at random, each with the last plan to begin with: inputs, and the record of what gave way."""
+    make, draw = CASES[name]
+    model, ocp = make()
+    python, native = CondensedController(model, ocp), NativeController(model, ocp, flags=parts.QUICK)
+    rng, seen = np.random.default_rng(5), {"kept": 0, "given": 0, "active": 0}
+    plan = python.initial(TrueState(model).start(np.concatenate([model.x0, np.zeros(model.n_h)])))
+    for k in range(60):
+        x, reference = draw(ocp, rng, k)
+        e = TrueState(model).start(np.concatenate([x, 0.1 * rng.standard_normal(model.n_h)]))
+        e = replace(e, d=0.05 * parts.disturbance_sizes(model, ocp) * rng.standard_normal(model.n_d))
+        wanted, found = (c.solve(plan, e, reference) for c in (python, native))
+        assert found.status is wanted.status, k
+        assert bool(found.given_way) == bool(wanted.given_way), k
+        off = np.max(np.abs(found.u - wanted.u) / ocp.input_range)
+        assert off < (GIVEN if wanted.given_way else KEPT.get(name, 1e-9)), k
+        for key in {*found.given_way, *wanted.given_way}:
+            assert found.given_way.get(key, 0.0) == pytest.approx(wanted.given_way.get(key, 0.0), abs=1e-6), (
+                k,
+                key,
+            )
+        assert found.cost == pytest.approx(wanted.cost, rel=1e-6 if wanted.given_way else 1e-8), k
+        assert found.excess == pytest.approx(wanted.excess, abs=1e-6)
+        seen["kept"] += not wanted.given_way
+        seen["given"] += bool(wanted.given_way)
+        seen["active"] += wanted.active is not None and bool(np.any(wanted.active))
+        plan = wanted
+    assert seen["active"] > 30, seen
+    assert min(seen.values()) > 3, seen
+
+
+def test_the_names_are_in_the_generated_files():
+    """What a user of the C finds given_way by."""
+    model, ocp = parts.cart(
+        [WALL, GENTLE], soft=[SoftBound(ca.Function("soft", [X, U], [X[0]]), [-1], [1], [1], [1])]
+    )
+    found = parts.make_sources(model, ocp)
+    assert "given_way:\n   0: x0\n   2: gentle\n*/" in found.texts["hmpc_config.h"]
+    assert found.sizes["HARD"] == 1

@@ -1,0 +1,149 @@
+"""Set-points of outputs: the steady states that the generated C finds are those of Python's target calculator."""
+
+from dataclasses import replace
+
+import casadi as ca
+import embedded_parts as parts
+import machines
+import numpy as np
+import pytest
+from embedded_parts import needs_compiler
+
+from hybrid_mpc import OCP, CondensedController, Disturbance, HybridModel, Signal, TrueState, with_input_delay
+from hybrid_mpc.embedded.native import NativeController
+
+pytestmark = needs_compiler
+RANGE = {"r": [1e6], "r_delta": [1e6], "u_min": [5e-5], "u_max": [4e-4]}
+
+
+def level(delay=0.0, **options):
+    """The lower of two tanks, of which one may leak; what is asked for is often beyond the pump."""
+    model = machines.two_tanks(disturbance_model=(Disturbance("rate", "lower", 1e-3),))
+    model = with_input_delay(model, delay) if delay else model
+    return model, OCP(20, [0.0, 0.0], **RANGE, q_y=[1.0], **options), 0.35
+
+
+def motor():
+    """Current and speed by one voltage: the nearest."""
+    ocp = OCP(12, [0.0, 0.0], [0.1], [0.1], [-12.0], [12.0], q_y=[1.0, 1.0])
+    return machines.dc_motor(), ocp, np.array([1.0, 30.0])
+
+
+def written(name, states, inputs, x_next, xdot, **options):
+    """A model of ``x_next(x, u)`` whose states are its outputs."""
+    x, u = ca.SX.sym("x", len(states)), ca.SX.sym("u", len(inputs))
+    signals = tuple(Signal(s, "m") for s in states)
+    return HybridModel.of(
+        name, 1.0, signals, tuple(Signal(i, "-") for i in inputs), signals, x=x, u=u, y=x, x_next=x_next(x, u),
+        xdot=xdot(x, u), **options,
+    )  # fmt: skip
+
+
+def pumps():
+    """Two pumps for one level: of all that hold it the inputs nearest to the operating point's."""
+    rates = (lambda x, u: 0.5 * x + u[0] + u[1], lambda x, u: -x + u[0] + u[1])
+    model = written("pumps", ["level"], ["a", "b"], *rates, nominal_x=[2.0], nominal_u=[0.6, 0.4])
+    return model, OCP(8, [0.0], [1.0, 1.0], [0.1, 0.1], [0.0, 0.0], [2.0, 1.0], q_y=[1.0]), 1.0
+
+
+def two_levels():
+    """Two levels that one pump fills and nothing empties: the equations of rest depend on each other."""
+    fills = lambda x, u: ca.vertcat(u[0], -2.0 * u[0])  # noqa: E731
+    model = written("levels", ["a", "b"], ["pump"], lambda x, u: x + fills(x, u), fills)
+    ocp = OCP(8, [1.0, 0.0], [1.0], [0.1], [-1.0], [1.0], q_y=[1.0, 0.0], terminal=np.diag([1.0, 0.0]))
+    return model, ocp, 2.0
+
+
+def sticking():
+    """At 0.05 the rate has its least magnitude near rest, as with a machine that sticks: it begins beside that."""
+    rate = lambda x, u: u**3 - 0.0075 * u + 7.2e-4  # noqa: E731
+    model = written("sticking", ["x"], ["u"], lambda x, u: x + rate(x, u), rate)
+    return model, OCP(5, [0.0], [1.0], [0.1], [-1.0], [1.0], q_y=[1.0], terminal=[[1.0]]), 0.3
+
+
+def restless():
+    """No steady state at all: the operating point is held."""
+    rate = lambda x, u: (u - 0.3) ** 2 + 0.01  # noqa: E731
+    model = written("restless", ["x"], ["u"], lambda x, u: x + rate(x, u), rate)
+    return model, OCP(9, [0.0], [1.0], [0.1], [-1.0], [1.0], q_y=[1.0], terminal=[[1.0]]), 0.3
+
+
+def memory(units=12, seed=1):
+    """A tank with a wall, of whose rates a saturated memory of level and inflow takes a part."""
+    rng = np.random.default_rng(seed)
+    x, h, u = ca.SX.sym("x", 2), ca.SX.sym("h", units), ca.SX.sym("u", 2)
+    w_h = rng.normal(size=(units, units)) * 0.9 / np.sqrt(units)
+    w_x, out = 4.0 * rng.normal(size=(units, 4)), 0.2 * rng.normal(size=(2, units)) / np.sqrt(units)
+    h_next = ca.tanh(w_h @ h + w_x @ ca.vertcat(x, u) + rng.normal(size=units))
+    rate = ca.vertcat(u[0] - ca.sqrt(0.1 + x[0] ** 2), u[1] - u[0] * x[1]) + out @ h_next
+    levels = (Signal("level", "m", -2, 2), Signal("heat", "K", -2, 2))
+    model = HybridModel.of(
+        "memory", 0.1, levels, (Signal("in", "m/s"), Signal("power", "K/s")), levels,
+        x=x, h=h, u=u, x_next=x + 0.02 * rate, h_next=h_next, xdot=rate, y=x,
+        nominal_x=(0.5, 0.5), nominal_u=(0.6, 0.4),
+    )  # fmt: skip
+    ocp = OCP(
+        15,
+        [0.0, 0.0],
+        [0.1, 0.1],
+        [0.1, 0.1],
+        [-3.0, -3.0],
+        [3.0, 3.0],
+        q_y=[100.0, 100.0],
+        terminal=np.eye(2),
+    )
+    return model, ocp, np.array([0.3, 0.3])
+
+
+CASES = {
+    "heaters": lambda: (*parts.heaters(), 8.0),
+    "level": level,
+    "delayed level": lambda: level(7.0),
+    "bounded level": lambda: level(y_max=[0.4], x_min=[0.1, 0.0]),
+    "motor": motor,
+    "pumps": pumps,
+    "two levels": two_levels,
+    "sticking": sticking,
+    "restless": restless,
+    "memory": memory,
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_steady_states_are_those_of_python(name):
+    """Set-points within and beyond reach, held, stepping and moving all the time, under disturbances that change."""
+    model, ocp, reach = CASES[name]()
+    python, native = CondensedController(model, ocp), NativeController(model, ocp, flags=parts.QUICK)
+    rng, standing, n = np.random.default_rng(3), python.problem.standing()[0], ocp.horizon
+    size, ends = python.problem.targets.scale, {"reached": 0, "steady": 0}
+    plan = python.initial(TrueState(model).start(np.concatenate([model.x0, np.zeros(model.n_h)]), w=model.w))
+    for k in range(24):
+        z = (
+            np.concatenate([model.x0, plan.h[0]])
+            + 0.02 * size[: model.n_x + model.n_h] * rng.standard_normal()
+        )
+        e = TrueState(model).start(z, w=model.w * (1 + 0.3 * (k % 5 == 4)))
+        e = replace(e, d=0.05 * parts.disturbance_sizes(model, ocp) * rng.standard_normal(model.n_d))
+        rows = (1, n + 1, n // 2 + 1, 3)[k % 4]
+        course = np.cumsum(rng.standard_normal((rows, standing.size)), axis=0)
+        if k % 4 == 2:
+            course = np.where(np.arange(rows) < n // 3, course[0, 0], course[-1, 0])[:, None]
+        reference = standing + reach * course / (1 + np.max(np.abs(course)))
+        wanted, found = (c.solve(plan, e, reference) for c in (python, native))
+        assert (found.status, found.steady.steady) == (wanted.status, wanted.steady.steady), k
+        assert found.steady.reached == wanted.steady.reached, k
+        if wanted.steady.steady:
+            for key, scale in (
+                ("x", size[: model.n_x]),
+                ("h", 1.0),
+                ("u", ocp.input_range),
+                ("y", np.max(reach)),
+            ):
+                off = np.abs(getattr(found.steady, key) - getattr(wanted.steady, key)) / scale
+                assert np.max(off, initial=0.0) < 1e-9, (k, key)
+        assert np.max(np.abs(found.u - wanted.u) / ocp.input_range) < 1e-9, k
+        ends["reached"] += wanted.steady.reached
+        ends["steady"] += wanted.steady.steady
+        plan = wanted
+    assert (ends["steady"] == 0) == (name == "restless")
+    assert (ends["reached"] > 0) == (name not in ("restless", "motor"))
