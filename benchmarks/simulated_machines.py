@@ -91,7 +91,7 @@ def linear_model(model: hm.HybridModel) -> hm.HybridModel:
     x_next, h_next = after[: model.n_x], after[model.n_x :]
     linear = hm.HybridModel.of(
         "linear", model.dt, model.states, model.inputs, model.outputs, x=x, h=h, u=u, w=w, x_next=x_next,
-        h_next=h_next, xdot=(x_next - x) / model.dt, y=y0 + c @ dz[: model.n_x] + d @ du,
+        h_next=h_next, xdot=(x_next - x) / model.dt, y=y0 + c @ (x - model.x0) + d @ du,
         disturbances=model.disturbances, nominal_x=model.nominal_x, nominal_u=model.nominal_u,
         nominal_w=model.nominal_w, disturbance_model=model.disturbance_model,
     )  # fmt: skip

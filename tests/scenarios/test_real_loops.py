@@ -1,6 +1,8 @@
 """Loops of real machines on simulated plants: how each plant differs from its prior, and that its tasks can be done."""
 
 from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -218,6 +220,24 @@ def test_wheels_that_roll_can_follow_the_paths(task):
     wheels = np.arctan(WHEELBASE * np.gradient(heading, t) / speed)
     assert np.max(np.abs(wheels)) < FITTED["race_car"]["k"] * car.control.u_max[0]
     assert np.max(speed) < car.control.u_max[1]
+
+
+@pytest.mark.full
+def test_the_benchmarks_linear_model_is_the_tangent_of_a_delayed_one(monkeypatch):
+    """At the operating point both step alike, delayed input and all; beside it they part by the curvature alone."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    model = fitted_model("heat_exchanger")
+    linear = import_module("simulated_machines").linear_model(model)
+    assert (linear.n_h, linear.delay_states) == (1, 1)
+
+    def apart(size):
+        x, u, w = model.x0 + size * np.array([1.0, 0.5]), model.u0 + 0.1 * size, model.w + size
+        h = model.u0 - 0.05 * size
+        after = [np.vstack([v.full() for v in m.step(x, h, u, w, m.p)]) for m in (linear, model)]
+        return np.abs(after[0] - after[1]).max()
+
+    assert apart(0.0) < 1e-12
+    assert apart(0.1) == pytest.approx(apart(0.2) / 4, rel=0.3)  # of second order, and what comes after
 
 
 def test_levels_ask_for_a_full_upper_tank():
