@@ -17,8 +17,8 @@ SMALL = TrainingSettings(
 """A training of a second."""
 
 
-Pendulum = Swing
-"""The prior that these runs are for."""
+class Pendulum(Swing):
+    """The prior that these runs are for."""
 
 
 def record(seed, seconds=4.0, role="train", extra=lambda phi, v: 0.0, noise=0.0, size=0.6):
