@@ -7,14 +7,14 @@ from nn_export import trace
 
 
 class Call(nn.Module):
-    """A function of tensors as a module."""
+    """A function of one tensor as a module."""
 
     def __init__(self, f):
         super().__init__()
         self.f = f
 
-    def forward(self, *tensors):
-        return self.f(*tensors)
+    def forward(self, x):
+        return self.f(x)
 
 
 class Cell(nn.Module):

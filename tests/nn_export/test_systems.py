@@ -4,10 +4,20 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
-from export_parts import Call
 
 from nn_export import ExportError, to_casadi
 from nn_export.operators.value import constant
+
+
+class Of(torch.nn.Module):
+    """A function of tensors as a module."""
+
+    def __init__(self, f):
+        super().__init__()
+        self.f = f
+
+    def forward(self, a, b):
+        return self.f(a, b)
 
 
 def spd(a):
@@ -57,7 +67,7 @@ def evaluated(module, a, b):
 def test_values_and_derivatives_are_those_of_torch(form, n):
     rng = np.random.default_rng(n)
     a, b = (torch.tensor(rng.normal(size=s)) for s in ((n, n), (n, 2)))
-    module = Call(FORMS[form])
+    module = Of(FORMS[form])
     want = module(a, b).numpy()
     exact = torch.autograd.functional.jacobian(lambda x: module(x, b), a).numpy().reshape(want.size, -1)
     value, slopes = evaluated(module, a, b)
@@ -70,7 +80,7 @@ def test_values_and_derivatives_are_those_of_torch(form, n):
 def test_rows_are_exchanged_where_a_pivot_is_zero(n):
     rng = np.random.default_rng(n)
     a = torch.tensor(np.eye(n)[rng.permutation(n)] * rng.uniform(1, 2, n))
-    module = Call(lambda a, b: torch.linalg.solve(a, b) * torch.linalg.det(a))
+    module = Of(lambda a, b: torch.linalg.solve(a, b) * torch.linalg.det(a))
     b = torch.tensor(rng.normal(size=(n, 2)))
     np.testing.assert_allclose(evaluated(module, a, b)[0], module(a, b).numpy(), rtol=1e-13)
 
@@ -78,11 +88,11 @@ def test_rows_are_exchanged_where_a_pivot_is_zero(n):
 def test_a_singular_matrix_gives_no_number():
     """Torch raises; inside a controller nothing may raise, and what is not finite is noticed there."""
     a, b = torch.eye(2).double(), torch.eye(2).double()
-    found = to_casadi(Call(torch.linalg.solve), (a, b))(np.ones((2, 2)), np.eye(2))
+    found = to_casadi(Of(torch.linalg.solve), (a, b))(np.ones((2, 2)), np.eye(2))
     assert not np.isfinite(found.full()).any()
 
 
 def test_a_large_matrix_is_refused_with_the_limit():
     a = torch.eye(9).double()
     with pytest.raises(ExportError, match=r"9 rows.* 8 can be exported"):
-        to_casadi(Call(torch.linalg.solve), (a, a))
+        to_casadi(Of(torch.linalg.solve), (a, a))
