@@ -29,8 +29,8 @@ checks that its numbers cost what the library's problem does.
   condenses before it, has a feedback between the two.
 - ``cost``: mean over the closed loop's states of what the plans cost when the library's model runs on their inputs;
   ``KKT``: largest residual in the library's QP of answers from the same last plan, of the largest gradient;
-  ``input differs``: how far these are from those of ``rti``. On random weights one step a period is far from
-  convergence, and plans of their own part by and by.
+  ``input differs``: how far these are from those of ``rti``; ``answered``: the share of them with the status solved.
+  On random weights one step a period is far from convergence, and plans of their own part by and by.
 """
 
 from __future__ import annotations
@@ -365,28 +365,30 @@ def residual(case: Case, at: Recorded, u: Array, tolerance: float = 1e-5) -> flo
     return float(np.max(np.abs(found.fun)))
 
 
-def answers(case: Case, solver: Any, cases: Sequence[Recorded]) -> list[Array]:
-    """What a solver answers to QPs from the same last plans ``(N, 1)`` each."""
+def answers(case: Case, solver: Any, cases: Sequence[Recorded]) -> tuple[list[Array], list[bool]]:
+    """What a solver answers to QPs from the same last plans ``(N, 1)`` each, and whether it says it solved them."""
     if not isinstance(solver, Worker):
-        return [solver.solve(at.plan, at.estimate, REFERENCE).u for at in cases]
+        plans = [solver.solve(at.plan, at.estimate, REFERENCE) for at in cases]
+        return [plan.u for plan in plans], [plan.status.ok for plan in plans]
     given = []
     for at in cases:
         held = np.concatenate([at.plan.u[0], at.u.ravel()])  # known before a period, the first is now
         x0 = np.concatenate([at.estimate.x, at.estimate.h, at.plan.u[0]])
         z = np.hstack([at.z, held[: len(at.z), None]])
         given.append({"u": at.u.ravel().tolist(), "z": z.tolist(), "x0": x0.tolist()})
-    return [np.array(u)[:, None] for u in solver.ask("replay", cases=given)["plans"]]
+    found = solver.ask("replay", cases=given)
+    return [np.array(u)[:, None] for u in found["plans"]], found["ok"]
 
 
 def quality(case: Case, solver: Any, cases: Sequence[Recorded]) -> Measured:
     """How right its answers are."""
-    found = answers(case, solver, cases)
+    found, ok = answers(case, solver, cases)
     size = max(float(np.max(np.abs(at.gradient))) for at in cases)
+    both = list(zip(cases, found, strict=True))
     return {
-        "KKT": max(residual(case, at, u) for at, u in zip(cases, found, strict=True)) / size,
-        "input differs": max(
-            float(np.max(np.abs(u - at.answer))) for at, u in zip(cases, found, strict=True)
-        ),
+        "answered": float(np.mean(ok)),
+        "KKT": max(residual(case, at, u) for at, u in both) / size,
+        "input differs": max(float(np.max(np.abs(u - at.answer))) for at, u in both),
     }
 
 
@@ -525,7 +527,7 @@ def compared(
             if isinstance(solver, Worker):
                 solver.close()
     empty = statistics({k: np.full(1, np.nan) for k in ("whole", "feedback", "QP")})
-    none = dict.fromkeys(("solved", "cost", "KKT", "input differs"), float("nan"))
+    none = dict.fromkeys(("solved", "cost", "answered", "KKT", "input differs"), float("nan"))
     return rows + [{"z": z, "solver": name, **empty, **none} for name in failed], tried
 
 
