@@ -627,7 +627,7 @@ class Kit:
             task: Whose control problem it solves. Default: the common one.
             solver: ``"rti"``, ``"native"`` (the same as compiled C), ``"sqp"`` or ``"ipopt"``.
             iterations: Linearizations a period of ``rti``, most iterations a solve of ``sqp`` and ``ipopt``; ``native``
-            has one. Default: the solver's own, one of ``rti``.
+                has one. Default: the solver's own, one of ``rti``.
 
         Raises:
             InputError: If there is no such model, task or solver, none of so many iterations, or no control problem.
