@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimate.kalman import START_LIMIT, Estimate, ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import dare
+from hybrid_mpc.model.riccati import dare, hidden_fixed_point
 
 Array = NDArray[np.float64]
+BESIDE = 0.1
+"""Share of its range by which each state lies beside the operating point where a load is looked for in motion."""
 ROUNDING = 1e-9
 """Share of a state's size below which a model's error is rounding: no filter assumes less noise."""
 
@@ -125,8 +128,9 @@ def most_likely(
 def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
     """Share of each constant disturbance that a filter has not found after ``periods``, ``(n_d,)``.
 
-    At the model's operating point, with the gain of the settled covariance. Of a filter whose covariance does not
-    settle there nobody can tell: zeros.
+    With the gain of the settled covariance, at the model's operating point and beside it, every state moved by a tenth
+    of its range (one without a range by its first deviation). The smaller share counts: dry friction at rest hides a
+    load that shows in motion. Of a filter whose covariance settles at neither nobody can tell: zeros.
 
     Example:
         >>> import casadi as ca
@@ -141,12 +145,22 @@ def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
     Source: Anderson and Moore, *Optimal Filtering*, 1979, section 4.4.
     """
     model = ekf.model
-    f, c = ekf.tangent(ekf.start(np.full(model.n_y, np.nan)), model.u0)
+    rest = ekf.start(np.full(model.n_y, np.nan))
+    ranges = np.array([s.upper - s.lower for s in model.states])
+    x = rest.x + np.where(np.isfinite(ranges), BESIDE * ranges, np.sqrt(ekf.first[: model.n_x]))
+    moving = replace(rest, x=x, h=hidden_fixed_point(model, x, model.u0, limit=START_LIMIT))
+    found = [left for at in (rest, moving) if (left := _load_left(ekf, at, periods)) is not None]
+    return np.min(found, axis=0) if found else np.zeros(model.n_d)
+
+
+def _load_left(ekf: ExtendedKalmanFilter, at: Estimate, periods: int) -> Array | None:
+    """:func:`load_left` at one point; None where the covariance does not settle."""
+    f, c = ekf.tangent(at, ekf.model.u0)
     noise, noise_y = ekf.noise
     try:
         p, _ = dare(f.T, c.T, np.diag(noise), np.diag(noise_y))  # of the predicted estimate
     except InputError:
-        return np.zeros(model.n_d)
+        return None
     gain = np.linalg.solve(c @ p @ c.T + np.diag(noise_y), c @ p).T
     left = np.linalg.matrix_power(f - gain @ c @ f, periods)
-    return np.abs(np.diag(left)[len(left) - model.n_d :])
+    return np.abs(np.diag(left)[len(left) - ekf.model.n_d :])

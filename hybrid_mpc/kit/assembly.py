@@ -46,7 +46,7 @@ it finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
 FOUND_HORIZONS, MOST_DOUBLED = 4.0, 5
 """Horizons of the controller within which the quiet filter has found two thirds of a constant load, and how often its
 step is doubled for that at most. A load that a jump does not show takes as long to be compensated. The golf robot takes
-1.3 horizons, the disk 3.3, so neither is doubled; a limit is needed since sticking friction hides a load altogether."""
+1.3 horizons, the disk 3.3, so neither is doubled. Quick steps make a loop hunt around sticking friction."""
 JUMP_SHARE = 0.05
 """The same when a load comes or goes. A load of a twentieth of what the drive can do is ordinary; for a larger one
 the filter needs a few periods."""
@@ -204,7 +204,7 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: in
     """Steps ``(n_d,)`` of the loads in the quiet filter a period, as shares of their sizes.
 
     Each is :data:`QUIET_SHARE`, doubled until the filter has found two thirds of a constant load of that kind after
-    ``periods``, at the operating point; at most :data:`MOST_DOUBLED` times.
+    ``periods``, at rest or in motion; at most :data:`MOST_DOUBLED` times.
     """
     shares = np.full(n_d, QUIET_SHARE)
     for _ in range(MOST_DOUBLED):

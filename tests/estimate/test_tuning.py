@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise
-from hybrid_mpc.estimate.tuning import load_left, log_likelihood, most_likely
+from hybrid_mpc.estimate.tuning import _load_left, load_left, log_likelihood, most_likely
 from hybrid_mpc.kit.assembly import MOST_DOUBLED, QUIET_SHARE, quiet_shares
 
 DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
@@ -108,6 +108,29 @@ def test_the_quiet_filter_finds_a_constant_load_in_time(noise, periods):
     if doubled:  # no more than it takes
         assert load_left(observer_of(shares / 2, (0.0, noise)), periods)[0] > np.exp(-1)
     assert doubled == {5000: 0, 400: 3, 100: 5}[periods]
+
+
+def test_friction_that_hides_a_load_at_rest_does_not_make_the_filter_quick():
+    """A mass whose dry friction changes its sign over 1 mm/s: at rest a load moves it by an eleventh of what it does in
+    motion."""
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    rate = ca.vertcat(x[1], u - 0.1 * ca.tanh(x[1] / 1e-3))
+    moved = ca.vertcat(x[0] + DT * x[1], (x[1] + DT * u) / (1 + DT * 100 * (1 - ca.tanh(x[1] / 1e-3) ** 2)))
+    model = HybridModel.of(
+        "sticks", DT, (Signal("q", "m", -5, 5), Signal("v", "m/s", -5, 5)), (Signal("F", "N"),), (Signal("q", "m"),),
+        x=x, u=u, x_next=moved, xdot=rate, y=x[0],
+    )  # fmt: skip
+
+    def filter_of(shares):
+        return ExtendedKalmanFilter(
+            model, sigma_y=[SIGMA_Y], sigma_x=[0.0, 0.005], sigma_x0=[SIGMA_Y, 0.1], sigma_d=shares
+        )
+
+    quiet, periods = np.array([QUIET_SHARE]), 500
+    ekf = filter_of(quiet)
+    at_rest = _load_left(ekf, ekf.start(np.full(1, np.nan)), periods)
+    assert at_rest[0] > np.exp(-1) > load_left(ekf, periods)[0]
+    assert quiet_shares(filter_of, periods, 1).tolist() == quiet.tolist()
 
 
 def test_a_filter_that_does_not_settle_keeps_its_step():
