@@ -24,7 +24,7 @@ from hybrid_mpc.control.soft import (
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.limits import input_limits, numbers
 from hybrid_mpc.model.model import output_with_jacobian
-from hybrid_mpc.model.riccati import dare, linearization, vector
+from hybrid_mpc.model.riccati import coming_back, dare, linearization, unmoved, vector
 from hybrid_mpc.records import known
 
 if TYPE_CHECKING:
@@ -381,7 +381,12 @@ class OCP:
         if not isinstance(self.terminal, str):
             return self.terminal
         n_x = self.n_x
-        p, _ = dare(*self.linear_quadratic(model))
+        a, b, q, r = self.linear_quadratic(model)
+        try:
+            p, _ = dare(a, b, q, r)
+        except InputError as error:
+            why = coming_back(unmoved(model, a, b))
+            raise InputError(f"{error}{why and '; ' + why}") from None
         if not model.n_h:
             return p
         reduced = (

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
-from hybrid_mpc.model.riccati import hidden_fixed_point, vector
+from hybrid_mpc.model.riccati import coming_back, hidden_fixed_point, unmoved, vector
 
 Array = NDArray[np.float64]
 AROUND = 5
@@ -30,6 +30,7 @@ class OffsetFree:
         needed: ``n_z + n_d``: with less the outputs cannot tell the disturbances from the states.
         target_rank: Of ``[[A - I, B], [C_c, D_c]]``, ``c`` the controlled outputs.
         target_needed: ``n_z + n_c``: with less not every set-point has a steady state.
+        unmoved: States that no input moves and that never come to rest (:func:`~hybrid_mpc.model.riccati.unmoved`).
     """
 
     n_d: int
@@ -38,6 +39,7 @@ class OffsetFree:
     needed: int
     target_rank: int
     target_needed: int
+    unmoved: tuple[str, ...] = ()
 
     @property
     def detectable(self) -> bool:
@@ -50,21 +52,31 @@ class OffsetFree:
         return not self.why
 
     @property
+    def reachable(self) -> bool:
+        """Whether the inputs can hold the controlled outputs at every set-point nearby."""
+        return self.target_rank == self.target_needed
+
+    @property
     def why(self) -> str:
         """What is missing for that; empty: nothing."""
-        found = []
-        if not self.detectable:
-            found.append(
-                f"the outputs cannot tell the disturbances from the states (rank {self.rank}, needed {self.needed})"
-            )
-        if self.n_d != self.n_y:
-            found.append(f"{self.n_d} disturbances for {self.n_y} outputs; as many are needed")
-        if self.target_rank < self.target_needed:
-            found.append(
-                "the inputs cannot hold the controlled outputs anywhere they are asked to be (rank of the targets "
-                f"{self.target_rank}, needed {self.target_needed})"
-            )
-        return "; ".join(found)
+        few = f"{self.n_d} disturbances for {self.n_y} outputs; as many are needed"
+        parts = (self.why_undetectable, few * (self.n_d != self.n_y), self.why_unreachable)
+        return "; ".join(part for part in parts if part)
+
+    @property
+    def why_undetectable(self) -> str:
+        """Why a filter cannot find the disturbances; empty: it can."""
+        ranks = f"(rank {self.rank}, needed {self.needed})"
+        return f"the outputs cannot tell the disturbances from the states {ranks}" * (not self.detectable)
+
+    @property
+    def why_unreachable(self) -> str:
+        """Why the inputs cannot hold the outputs where they are asked to be; empty: they can."""
+        if self.reachable:
+            return ""
+        ranks = f"(rank of the targets {self.target_rank}, needed {self.target_needed})"
+        why = coming_back(self.unmoved) or "weigh other outputs in q_y"
+        return f"the inputs cannot hold the controlled outputs anywhere they are asked to be {ranks}; {why}"
 
 
 def offset_free(
@@ -119,6 +131,7 @@ def offset_free(
         model.n_d, model.n_y,
         _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d,
         _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen),
+        tuple(unmoved(model, a, b)),
     )  # fmt: skip
 
 

@@ -183,7 +183,7 @@ def make_estimator(
     first, span = first_deviations(model, scenario), disturbance_sizes(model, control)
     if observer and not (found := distinguishable(model)).detectable:
         raise InputError(
-            f"an observer of model {model.name}: at its operating point {found.why}; declare others: "
+            f"an observer of model {model.name}: at its operating point {found.why_undetectable}; declare others: "
             'Scenario(disturbance_model=(Disturbance("output", ...), ...)), no more than there are outputs'
         )
 
@@ -311,10 +311,8 @@ def make_controller(
     ocp = make_ocp(prior, control)
     if control.n_y == prior.n_y and 0 < np.count_nonzero(control.q_y) <= prior.n_u:
         found = offset_free(prior, np.flatnonzero(control.q_y).tolist())
-        if found.target_rank < found.target_needed:
-            raise InputError(
-                f"control problem: at the operating point {found.why}; weigh other outputs in q_y"
-            )
+        if not found.reachable:
+            raise InputError(f"control problem: at the operating point {found.why_unreachable}")
     if iterations is not None and solver == "native":
         raise InputError(
             "solver native linearizes once a period: leave iterations out, or take rti, sqp or ipopt"

@@ -58,10 +58,15 @@ def disturbance_matrices(
     outputs ``(n_y, n_d)``. None: one at each input.
 
     Raises:
-        InputError: If a signal is unknown, or two are the same.
+        InputError: If there is none, a signal is unknown, or two are the same.
     """
     if chosen is None:
         chosen = [Disturbance("input", s.name) for s in inputs]
+    if not chosen:
+        raise InputError(
+            "disturbance model: none is given; leave disturbance_model out for one at each input, or name at least one "
+            "(as many as there are outputs leave no offset): an estimator without would take every load for a motion"
+        )
     places = {"input": (inputs, 1.0), "rate": (states, dt), "output": (outputs, 1.0)}
     if len({(d.at, d.signal) for d in chosen}) < len(chosen):
         raise InputError(f"disturbance model: two are the same: {[(d.at, d.signal) for d in chosen]}")

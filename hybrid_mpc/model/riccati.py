@@ -12,6 +12,9 @@ from hybrid_mpc.model.model import HybridModel
 Array = NDArray[np.float64]
 SETTLED = 1e-10
 """Largest change in a step of a hidden state that counts as settled."""
+UNDAMPED = 1e-9
+"""How near to the unit circle a mode counts as undamped, and how small a singular value, as a share of the largest, as
+one that no input reaches."""
 
 
 def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array, Array]:
@@ -79,6 +82,52 @@ def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array,
     assert model.with_jacobian is not None
     _, _, a, b = model.with_jacobian(x, h, u, model.w, model.p)
     return a.full(), b.full(), h
+
+
+def unmoved(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
+    """Names of the states that no input moves and that never come to rest by themselves.
+
+    They stand in modes of ``z+ = A z + B u`` on the unit circle or beyond that ``B`` does not reach (Hautus' test):
+    set-points have no steady state then, and the Riccati equation has no stabilising solution.
+
+    Args:
+        model: The model.
+        a: ``(n_z, n_z)`` by ``z = (x, h)``.
+        b: ``(n_z, n_u)``.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> v, u = ca.MX.sym("v", 2), ca.MX.sym("u")
+        >>> room = HybridModel.of("room", 1.0, (Signal("oven", "degC"), Signal("room", "degC")), (Signal("u", "W"),),
+        ...     (Signal("oven", "degC"),), x=v, u=u, y=v[0], x_next=ca.vertcat(0.9 * v[0] + 0.1 * v[1] + u, v[1]),
+        ...     xdot=ca.vertcat(u, 0))
+        >>> unmoved(room, *linearization(room, [20.0, 20.0], [0.0])[:2])
+        ('room',)
+    """
+    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+        return ()
+    size = np.concatenate([np.where(model.x0 != 0, np.abs(model.x0), 1.0), np.ones(model.n_h)])
+    a, b = a * size / size[:, None], b / size[:, None]
+    share = np.zeros(len(a))
+    for mode in np.linalg.eigvals(a):
+        if abs(mode) < 1.0 - UNDAMPED:
+            continue
+        left, sizes, _ = np.linalg.svd(np.hstack([a - mode * np.eye(len(a)), b]))
+        share = np.maximum(share, np.max(np.abs(left) * (sizes < UNDAMPED * sizes[0]), axis=1))
+    least = 0.5 * max(np.max(share), 1e-3)
+    return tuple(s.name for s, part in zip(model.states, share, strict=False) if part > least)
+
+
+def coming_back(names: tuple[str, ...]) -> str:
+    """What to do about states that :func:`unmoved` names; empty for none."""
+    if not names:
+        return ""
+    name = names[0]
+    return (
+        f"no input moves {', '.join(names)} and nothing brings it back: let it return slowly to its usual value in "
+        f"xdot, such as (usual - x.{name}) / 86400 for a day of seconds, or make it a measured disturbance"
+    )
 
 
 def lqr(

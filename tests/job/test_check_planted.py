@@ -280,6 +280,22 @@ PLANTED = {
         cart_with(tasks=(replace(TASK, x0=(0.0, 9.0)),)),
         ["task hold: x0: v [m/s] is 9 at 0 s, outside its range from -5 to 5"],
     ),
+    "a state that nothing brings back": (
+        lambda: replace(
+            kettle(
+                states=(*Kettle.states, Signal("room", "K", -20.0, 40.0)), disturbances=(), balances=Prior.balances,
+                xdot=lambda self, x, u, w, p: (*Kettle.xdot(self, x, u, x, p), 0.0),
+                operating_point=OperatingPoint((0.25, 20.0, 20.0), (0.1, 0.0)),
+            )(),
+            data=replace(KETTLE.data, disturbances=()), sensor_sigma=(1e-3, 0.1),
+            control=OCP(10, (1, 1, 0), (1, 1), (1, 1), (0, 0), (0.2, 4e6)),
+        ),
+        ["control: controller", "no input moves room and nothing brings it back", "(usual - x.room) / 86400"],
+    ),
+    "no disturbance that is unmeasured": (
+        cart_with(disturbance_model=()),
+        ["disturbance model: none is given; leave disturbance_model out for one at each input"],
+    ),
     "no sensor_sigma": (cart_with(sensor_sigma=()), ["sensor_sigma needs 1 numbers, got 0"]),
 }  # fmt: skip
 """How each error is planted, and words of what is told of it: what was given, and the remedy."""
