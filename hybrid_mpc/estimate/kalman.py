@@ -174,7 +174,7 @@ class ExtendedKalmanFilter:
         operating point says alone: the filter does not find out.
         """
         model, u = self.model, self.model.u0
-        w = self._known(None, w)
+        w = self.known_w(None, w)
         target = np.asarray(y, dtype=float).ravel()
         x = self._fitting(model.x0, target, u, w)
         h = hidden_fixed_point(model, x, u, w=w, limit=START_LIMIT)
@@ -221,7 +221,7 @@ class ExtendedKalmanFilter:
             x, (error, by_x, size) = moved, after
         return x, size if np.isfinite(size) else np.inf, whole
 
-    def _known(self, estimate: Estimate | None, w: ArrayLike | None) -> Array:
+    def known_w(self, estimate: Estimate | None, w: ArrayLike | None) -> Array:
         """Measured disturbances ``(n_w,)``: what was measured, else the last ones, else the operating point's."""
         n_w = self.model.n_w
         last = estimate.w if estimate is not None and estimate.w.size == n_w else self.model.w
@@ -237,7 +237,11 @@ class ExtendedKalmanFilter:
         x, h, *_ = self._step.outputs  # of the next call
         p = f @ estimate.P @ f.T
         p.flat[:: p.shape[0] + 1] += self._noise
-        empty, t, w = np.full(self.model.n_y, np.nan), estimate.t + self.model.dt, self._known(estimate, None)
+        empty, t, w = (
+            np.full(self.model.n_y, np.nan),
+            estimate.t + self.model.dt,
+            self.known_w(estimate, None),
+        )
         return Estimate(t, x + self._on_x @ estimate.d, h.copy(), estimate.d, p, empty, float("nan"), w=w)
 
     def tangent(self, estimate: Estimate, u: ArrayLike) -> tuple[Array, Array]:
@@ -250,7 +254,7 @@ class ExtendedKalmanFilter:
         n_z = n_x + n_h
         step.inputs[0][:], step.inputs[1][:] = estimate.x, estimate.h
         step.inputs[2][:] = np.asarray(u, dtype=float).ravel() + self._on_u @ estimate.d
-        step.inputs[3][:] = self._known(estimate, None)
+        step.inputs[3][:] = self.known_w(estimate, None)
         step()
         _, _, a, b = step.outputs
         f = np.eye(n_z + n_d)
@@ -313,12 +317,12 @@ class ExtendedKalmanFilter:
 
     def measuring(self, predicted: Estimate, w: ArrayLike | None) -> Estimate:
         """The prediction with the disturbances ``w`` ``(n_w,)`` that were measured at its instant."""
-        return predicted if w is None else replace(predicted, w=self._known(predicted, w))
+        return predicted if w is None else replace(predicted, w=self.known_w(predicted, w))
 
     def _predicted(self, estimate: Estimate, u: ArrayLike | None) -> tuple[Array, Array]:
         """Output ``(n_y,)`` of an estimate and its Jacobian by ``(x, h, d)``."""
         held = self.model.u0 if u is None else np.asarray(u, dtype=float).ravel()
-        y, c_x, c_u = self._measured(estimate.x, held + self._on_u @ estimate.d, self._known(estimate, None))
+        y, c_x, c_u = self._measured(estimate.x, held + self._on_u @ estimate.d, self.known_w(estimate, None))
         on_d = c_u @ self._on_u + self._on_y
         return y + self._on_y @ estimate.d, np.hstack([c_x, np.zeros((y.size, self._sizes[1])), on_d])
 

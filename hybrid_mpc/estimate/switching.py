@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
+from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.model import output_with_jacobian
 
 Array = NDArray[np.float64]
 NEGLIGIBLE = 0.01
@@ -25,10 +27,30 @@ load that comes or goes or a part that breaks every 40 s; each lasts a period or
 
 @dataclass(frozen=True)
 class SwitchingEstimate(Estimate):
-    """Estimates of several filters and the probability ``(m,)`` of each; its own fields are their weighted means."""
+    """Estimates of several filters; its own fields are their weighted means.
 
-    modes: tuple[Estimate, ...]
+    Args:
+        z: ``(x, h, d)`` of each filter ``(m, n)``.
+        covariances: Of each ``(m, n, n)``.
+        innovations: Of each ``(m, n_y)``.
+        nis_each: Normalised innovation squared of each ``(m,)``.
+        probability: Of each ``(m,)``.
+    """
+
+    z: Array
+    covariances: Array
+    innovations: Array
+    nis_each: Array
     probability: Array
+
+    @property
+    def modes(self) -> tuple[Estimate, ...]:
+        """The estimate of each filter."""
+        n_x, n_z = self.x.size, self.x.size + self.h.size
+        each = zip(self.z, self.covariances, self.innovations, self.nis_each.tolist(), strict=True)
+        return tuple(
+            Estimate(self.t, z[:n_x], z[n_x:n_z], z[n_z:], p, y, nis, w=self.w) for z, p, y, nis in each
+        )
 
 
 class SwitchingFilter:
@@ -36,7 +58,8 @@ class SwitchingFilter:
 
     One Kalman filter is either quiet or quick: the step that it allows a disturbance makes it follow a sudden load, and
     lets the sensor's noise through at all times. Here each filter assumes one mode of the noise, a Markov chain says
-    how often modes change, and the measurements say which one is likely now. No method changes the object.
+    how often modes change, and the measurements say which one is likely now. No method changes what the object gives;
+    not for several threads at once (it reuses its buffers).
 
     Args:
         filters: The modes; same model.
@@ -71,36 +94,67 @@ class SwitchingFilter:
             raise InputError(
                 f"transition: probabilities of shape {(m, m)} whose rows sum to 1 needed, got {p.tolist()}"
             )
-        self.model, self.filters, self.transition = filters[0].model, tuple(filters), p
+        model = filters[0].model
+        self.model, self.filters, self.transition = model, tuple(filters), p
         self.first_probability = _stationary(p)
         """Probability ``(m,)`` of each mode at the start."""
+        n_z = model.n_x + model.n_h
+        self._ends, self._on = (model.n_x, n_z), model.disturbed
+        noises = [f.noise for f in filters]
+        self._noise, self._noise_y = (np.stack(one) for one in zip(*noises, strict=True))
+        self._most = np.array([f.most for f in filters])
+        self._unit = np.tile(np.eye(n_z + model.n_d), (m, 1, 1))
+        assert model.with_jacobian is not None
+        self._step, self._output = (
+            BufferedFunction(f.map(m)) for f in (model.with_jacobian, output_with_jacobian(model))
+        )
+        self._step_at, self._output_at = (
+            [given.reshape(m, -1) for given in f.inputs] for f in (self._step, self._output)
+        )
+        self._step_at[4][:] = model.p
 
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> SwitchingEstimate:
         """Estimate at rest at ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.start`."""
-        empty = np.full(self.model.n_y, np.nan)
-        return _together(
-            [f.start(y, t, w=w) for f in self.filters], self.first_probability, empty, float("nan")
+        found = [f.start(y, t, w=w) for f in self.filters]
+        z = np.stack([np.concatenate([e.x, e.h, e.d]) for e in found])
+        return self._together(
+            found[0].t, found[0].w, z, np.stack([e.P for e in found]), self.first_probability
         )
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> SwitchingEstimate:
         """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
-        modes, probability = self._predicted(self._own(estimate), u)
-        return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
+        before = self._own(estimate)
+        w = self._w(before, None)
+        return self._together(before.t + self.model.dt, w, *self._predicted(before, u))
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
-    def _predicted(self, before: SwitchingEstimate, u: ArrayLike) -> tuple[list[Estimate], Array]:
-        """Estimate of each filter one period later, and the filters' probabilities ``(m,)``."""
+    def _predicted(self, before: SwitchingEstimate, u: ArrayLike) -> tuple[Array, Array, Array]:
+        """``(x, h, d)`` of each filter one period later, their covariances, the filters' probabilities ``(m,)``."""
+        m, (n_x, n_z), (on_u, on_x, _) = len(self.filters), self._ends, self._on
         joint = before.probability[:, None] * self.transition
         after = joint.sum(axis=0)
         share = joint / np.where(after > 0, after, 1.0)
         share = np.where(share < NEGLIGIBLE, 0.0, share)
-        share = share / share.sum(axis=0)
-        modes = [
-            f.predict(_mixed(before.modes, share[:, j]), u) if after[j] > 0 else f.predict(before.modes[j], u)
-            for j, f in enumerate(self.filters)
-        ]
-        return modes, after
+        share = np.where(
+            after > 0, share / share.sum(axis=0), np.eye(m)
+        ).T  # of mode i in the past of mode j, (j, i)
+        mean = share @ before.z
+        off = before.z - mean[:, None]
+        p = (share @ before.covariances.reshape(m, -1)).reshape(before.covariances.shape)
+        p = p + (off * share[:, :, None]).transpose(0, 2, 1) @ off
+        x, h, v, w, _ = self._step_at
+        d = mean[:, n_z:]
+        x[:], h[:] = mean[:, :n_x], mean[:, n_x:n_z]
+        v[:], w[:] = np.asarray(u, dtype=float).ravel() + d @ on_u.T, self._w(before, None)
+        self._step()
+        x_next, h_next, a, b = (found.reshape(m, -1) for found in self._step.outputs)
+        f = self._unit.copy()
+        f[:, :n_z, :n_z] = a.reshape(m, n_z, n_z).transpose(0, 2, 1)
+        f[:, :n_z, n_z:] = b.reshape(m, -1, n_z).transpose(0, 2, 1) @ on_u
+        f[:, :n_x, n_z:] += on_x
+        p = np.asarray(f @ p @ f.transpose(0, 2, 1))
+        p.reshape(m, -1)[:, :: len(self._unit[0]) + 1] += self._noise
+        return np.hstack([x_next + d @ on_x.T, h_next, d]), p, after
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> SwitchingEstimate:
         """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`."""
@@ -111,31 +165,59 @@ class SwitchingFilter:
         self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None
     ) -> tuple[SwitchingEstimate, float]:
         """:meth:`correct`, and the log-likelihood of the measurement, without its constant."""
-        before = self._own(estimate)
-        if not np.any(np.isfinite(np.asarray(y, dtype=float))):
+        before, y = self._own(estimate), np.asarray(y, dtype=float).ravel()
+        if not np.isfinite(y).any():
             return before, 0.0
-        return self._assessed(before.modes, before.probability, y, u)
+        return self._assessed(before.t, before.w, before.z, before.covariances, before.probability, y, u)
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def _assessed(
-        self, predicted: Sequence[Estimate], probability: Array, y: ArrayLike, u: ArrayLike | None
+        self, t: float, w: Array, z: Array, p: Array, probability: Array, y: Array, u: ArrayLike | None
     ) -> tuple[SwitchingEstimate, float]:
         """Estimate after a measurement of which something is there, and its log-likelihood."""
-        found = [f.assess(e, y, u) for f, e in zip(self.filters, predicted, strict=True)]
-        likelihood = np.array([value for _, value in found])
-        largest = float(np.max(np.where(np.isfinite(likelihood), likelihood, -np.inf)))
-        weight = probability * np.exp(np.where(np.isfinite(likelihood), likelihood, -np.inf) - largest)
+        y_hat, c = self._measured(z, u, w)
+        seen = np.isfinite(y)
+        innovations = np.where(seen, y - y_hat, np.nan)
+        step, nis, size = np.zeros(z.shape), np.zeros(len(z)), np.zeros(len(z))
+        for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
+            row, noise = c[:, i], self._noise_y[:, i]
+            pc = np.einsum("mij,mj->mi", p, row)
+            s = np.sum(row * pc, axis=1) + noise
+            gain, error = pc / s[:, None], innovations[:, i] - np.sum(row * step, axis=1)
+            i_kc = self._unit - gain[:, :, None] * row[:, None]
+            p = i_kc @ p @ i_kc.transpose(0, 2, 1) + (noise[:, None] * gain)[:, :, None] * gain[:, None]
+            step, nis, size = step + gain * error[:, None], nis + error / s * error, size + np.log(s)
+        p = 0.5 * (p + p.transpose(0, 2, 1))
+        likelihood = -0.5 * (nis + size)
+        likelihood = np.where(np.isfinite(likelihood), likelihood, -np.inf)
+        largest = float(np.max(likelihood))
+        weight = probability * np.exp(likelihood - largest)
         if not np.sum(weight) > 0:  # absurd to every filter: it says nothing of the modes
             weight, largest = probability, -np.inf
-        modes, share = [e for e, _ in found], weight / weight.sum()
-        innovation = probability @ np.stack([e.innovation for e in modes])
-        nis = float(share @ np.array([e.nis for e in modes]))
-        return _together(modes, share, innovation, nis), largest + float(np.log(weight.sum()))
+        share = weight / weight.sum()
+        after = self._together(
+            t, w, z + step, p, share, probability @ innovations, float(share @ nis), (innovations, nis)
+        )
+        return after, largest + float(np.log(weight.sum()))
+
+    def _measured(self, z: Array, u: ArrayLike | None, w: Array) -> tuple[Array, Array]:
+        """Outputs of each filter ``(m, n_y)`` and their Jacobians by ``(x, h, d)`` ``(m, n_y, n)``."""
+        m, n_y, (n_x, n_z), (on_u, _, on_y) = len(z), self.model.n_y, self._ends, self._on
+        x, v, held = self._output_at
+        d = z[:, n_z:]
+        x[:], held[:] = z[:, :n_x], w
+        v[:] = (self.model.u0 if u is None else np.asarray(u, dtype=float).ravel()) + d @ on_u.T
+        self._output()
+        y, by_x, by_u = self._output.outputs
+        c = np.zeros((m, n_y, z.shape[1]))
+        c[:, :, :n_x] = by_x.reshape(m, n_x, n_y).transpose(0, 2, 1)
+        c[:, :, n_z:] = by_u.reshape(m, -1, n_y).transpose(0, 2, 1) @ on_u + on_y
+        return y.reshape(m, n_y) + d @ on_y.T, c
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
         """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation; that of the mixture."""
         return self.filters[0].innovation_covariance(estimate, u)
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what overflows is lost
     def update(
         self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
     ) -> SwitchingEstimate:
@@ -144,50 +226,50 @@ class SwitchingFilter:
 
         A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
         """
-        modes, probability = self._predicted(self._own(estimate), u_prev)
-        modes = [f.measuring(e, w) for f, e in zip(self.filters, modes, strict=True)]
-        if not np.any(np.isfinite(np.asarray(y, dtype=float))):
-            return _together(modes, probability, np.full(self.model.n_y, np.nan), float("nan"))
-        if any(f.lost(e) for f, e in zip(self.filters, modes, strict=True)):
-            return self.start(y, modes[0].t, w=modes[0].w)
-        return self._assessed(modes, probability, y, u_prev)[0]
+        before, y = self._own(estimate), np.asarray(y, dtype=float).ravel()
+        z, p, probability = self._predicted(before, u_prev)
+        t, w = before.t + self.model.dt, self._w(before, w)
+        if not np.isfinite(y).any():
+            return self._together(t, w, z, p, probability)
+        variances = np.max(np.diagonal(p, axis1=1, axis2=2), axis=1)
+        if not (np.isfinite(z).all() and np.isfinite(w).all() and (variances <= self._most).all()):
+            return self.start(y, t, w=w)
+        return self._assessed(t, w, z, p, probability, y, u_prev)[0]
 
     def measuring(self, predicted: Estimate, w: ArrayLike | None) -> SwitchingEstimate:
         """The prediction with the disturbances ``w`` ``(n_w,)`` that were measured at its instant."""
         before = self._own(predicted)
-        modes = [f.measuring(e, w) for f, e in zip(self.filters, before.modes, strict=True)]
-        return _together(modes, before.probability, predicted.innovation, predicted.nis)
+        return before if w is None else replace(before, w=self._w(before, w))
+
+    def _w(self, estimate: Estimate, w: ArrayLike | None) -> Array:
+        return self.filters[0].known_w(estimate, w)
 
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
-        if not isinstance(estimate, SwitchingEstimate) or len(estimate.modes) != len(self.filters):
+        if not isinstance(estimate, SwitchingEstimate) or len(estimate.z) != len(self.filters):
             raise InputError("SwitchingFilter goes on from its own estimates only; begin with start()")
         return estimate
+
+    def _together(
+        self, t: float, w: Array, z: Array, p: Array, probability: Array, innovation: Array | None = None,
+        nis: float = float("nan"), each: tuple[Array, Array] | None = None,
+    ) -> SwitchingEstimate:  # fmt: skip
+        """The filters' estimates with one Gaussian that has the mean and the covariance of their mixture."""
+        n_x, n_z = self._ends
+        mean = probability @ z
+        off = z - mean
+        whole = (probability @ p.reshape(len(z), -1)).reshape(p.shape[1:]) + (
+            off * probability[:, None]
+        ).T @ off
+        if innovation is None or each is None:
+            innovation = np.full(self.model.n_y, np.nan)
+            each = np.tile(innovation, (len(z), 1)), np.full(len(z), np.nan)
+        return SwitchingEstimate(
+            t, mean[:n_x], mean[n_x:n_z], mean[n_z:], whole, innovation, nis, z, p, *each, probability, w=w
+        )
 
 
 Filter: TypeAlias = ExtendedKalmanFilter | SwitchingFilter
 """A filter on one model: it predicts, corrects, and knows the likelihood of its measurements."""
-
-
-def _mixed(modes: Sequence[Estimate], share: Array) -> Estimate:
-    """One Gaussian with mean and covariance of a mixture."""
-    first = modes[0]
-    z = np.stack([np.concatenate([e.x, e.h, e.d]) for e in modes])
-    mean = share @ z
-    off = z - mean
-    variances = np.stack([e.P for e in modes])
-    p = (share @ variances.reshape(len(share), -1)).reshape(variances.shape[1:]) + (
-        off * share[:, None]
-    ).T @ off
-    n_x, n_z = first.x.size, first.x.size + first.h.size
-    empty = np.full(first.innovation.size, np.nan)
-    return Estimate(first.t, mean[:n_x], mean[n_x:n_z], mean[n_z:], p, empty, float("nan"), w=first.w)
-
-
-def _together(
-    modes: Sequence[Estimate], probability: Array, innovation: Array, nis: float
-) -> SwitchingEstimate:
-    m = _mixed(modes, probability)
-    return SwitchingEstimate(m.t, m.x, m.h, m.d, m.P, innovation, nis, tuple(modes), probability, w=m.w)
 
 
 def _stationary(transition: Array) -> Array:
