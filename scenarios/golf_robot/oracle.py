@@ -19,11 +19,11 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
 
     Its ``h`` is (bristle [-], motor torque [N m], belt twist [rad], motor speed / 4 [rad/s]). All of it is
     smooth but for ``|phi_dot|`` in the bristle's equation and the drag, so its Jacobian exists through stiction
-    and backlash. Its derivatives are compiled where there is a C compiler, else CasADi's virtual machine makes them.
-    50 RK4 steps of 0.4 ms at 20 ms are stable to about 6 rad/s. Its energy balance is the prior's.
+    and backlash. Steps and derivatives are compiled where there is a C compiler, else CasADi's virtual machine makes
+    them. 50 RK4 steps of 0.4 ms at 20 ms are stable to about 6 rad/s. Its energy balance is the prior's.
     """
     p = parameters or RigParameters()
-    run = steps(p, sub_steps)
+    run = _compiled(steps(p, sub_steps), derivatives=True)
     x, h, u, rate = ca.MX.sym("x", 2), ca.MX.sym("h", N_STATES - 2), ca.MX.sym("u"), ca.MX.sym("rate", 2)
     after = run(ca.vertcat(x, h), u, dt / sub_steps)
     end, a, b = steps_with_jacobian(p, sub_steps)(ca.vertcat(x, h), u, dt / sub_steps)
@@ -38,12 +38,12 @@ def oracle(dt: float, parameters: RigParameters | None = None, sub_steps: int = 
     )  # fmt: skip
 
 
-def _compiled(f: ca.Function) -> ca.Function:
+def _compiled(f: ca.Function, *, derivatives: bool = False) -> ca.Function:
     """The function as C; as it is where there is no compiler or it does not work: both compute the same."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         try:
-            return compile_function(f)
+            return compile_function(f, derivatives=derivatives)
         except CompileError:
             return f
 
