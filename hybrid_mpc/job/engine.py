@@ -269,12 +269,16 @@ def run_jobs(
     on_progress: Callable[[str, int, int, str], None],
     workers: int,
     on_result: Callable[[str, Any], None] = lambda name, result: None,
+    *,
+    fresh: bool = True,
 ) -> dict[str, Any]:
     """Run ``function(*args, report)`` for each job on this machine and return the results by name.
 
     A job calls ``report(done, total, text)`` as it goes, which ``on_progress`` gets with its name. Jobs start in the
     order given, ``workers`` at a time, each in a fresh process with the environment's number of threads, so results do
     not depend on how many run side by side. ``on_result`` is called as each job ends, also beside one that fails.
+    ``fresh=False``: a process computes one job after the other, for jobs that leave nothing behind that the next would
+    notice and that load the same things for seconds.
 
     Raises:
         InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
@@ -289,21 +293,25 @@ def run_jobs(
     """
     _check(workers)
     queue, results = list(jobs), {}
-    running: dict[str, _Job] = {}
+    running: dict[str, _Worker] = {}
+    idle: list[_Worker] = []
     try:
         while queue or running:
             while queue and len(running) < workers:
                 name = queue.pop(0)
-                running[name] = _Job(*jobs[name])
-            wait([job.reports for job in running.values()], REPORT_S)
+                running[name] = idle.pop() if idle else _Worker()
+                running[name].start(*jobs[name])
+            wait([worker.reports for worker in running.values()], REPORT_S)
             failed: dict[str, Exception] = {}
-            for name, job in list(running.items()):
-                ended = job.ended()
-                for report in job.new_reports(rest=ended is not None):
+            for name, worker in list(running.items()):
+                ended = worker.ended()
+                for report in worker.new_reports(rest=ended is not None):
                     on_progress(name, *report)
                 if ended is None:
                     continue
-                running.pop(name).close()
+                idle.append(running.pop(name))
+                if fresh:
+                    idle.pop().close()
                 value, error = ended
                 if error is None:
                     results[name] = value
@@ -314,25 +322,28 @@ def run_jobs(
                 name, error = next(iter(failed.items()))
                 raise error if isinstance(error, InputError) else RuntimeError(f"{name} failed:\n{error}")
     finally:
-        for job in running.values():
-            job.close()
+        for worker in (*running.values(), *idle):
+            worker.close()
     return results
 
 
-class _Job:
-    """A job that runs, and its reports.
+class _Worker:
+    """A process that computes one job after the other, and its reports.
 
-    It has an engine, and so a process, of its own: the number of threads that a training sets in torch, what modules
-    keep, and the memory of one job must not reach the next.
+    It has an engine of its own: the number of threads that a training sets in torch, what modules keep, and the memory
+    of one process must not reach another.
     """
 
-    def __init__(self, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    def __init__(self) -> None:
         self.reports, self._theirs = Pipe(duplex=False)
         self._engine = LocalEngine(_run, 1, begin=partial(_report_to, self._theirs))
+
+    def start(self, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        """Begin a job; the one before has ended."""
         self._engine.submit((function, args))
 
     def ended(self) -> tuple[Any, Exception | None] | None:
-        """Its value, or what it failed by; None while it runs."""
+        """The job's value, or what it failed by; None while it runs."""
         try:
             found = self._engine.next(timeout=0.0)
         except Exception:  # arguments or a result that do not pickle
@@ -344,8 +355,6 @@ class _Job:
 
     def new_reports(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
         """The next report, if there is one; the ``rest`` of them once the job has ended."""
-        if rest:
-            self._theirs.close()
         try:
             while self.reports.poll():
                 yield self.reports.recv()
@@ -382,8 +391,6 @@ def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, Exceptio
         return None, error
     except BaseException:  # SystemExit too: every failure travels to the parent, which raises it
         return None, RuntimeError(traceback.format_exc())
-    finally:
-        reports.close()
 
 
 def _began(parent: int, begin: Callable[[], None] | None) -> None:

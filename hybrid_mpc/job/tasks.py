@@ -109,6 +109,8 @@ def repeated(
         v1, v0 = (first[pairs[i]], last[pairs[i]]) if i in pairs else (0.0, 0.0)
         curve[i] = _quintic(first[i], last[i], v1, v0, period - length * dt)
 
+    rates_of = {i: polynomial.deriv() for i, polynomial in curve.items() if i in pairs}
+
     def place(t: Array) -> tuple[NDArray[np.int_], Array, NDArray[np.bool_]]:
         number = np.clip(np.floor(t / period + 1e-9).astype(int), 0, None)
         inside = np.maximum(t - number * period, 0.0)
@@ -123,7 +125,7 @@ def repeated(
         for i, polynomial in curve.items():
             rows[~during, i] = polynomial(left)
             if i in pairs:
-                rows[~during, pairs[i]] = polynomial.deriv()(left)
+                rows[~during, pairs[i]] = rates_of[i](left)
         rows[:, :n] = (start + shares[number, None] * (rows - start))[:, :n]
         return rows
 

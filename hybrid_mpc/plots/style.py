@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
+from PIL import Image
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import replacing
@@ -26,6 +28,8 @@ Array = NDArray[np.float64]
 Share = bool | Literal["none", "all", "row", "col"]
 
 DPI = 110
+IN_PALETTE = 256
+"""Colours of a picture's palette: lines and their smoothed edges need no more, and the file is a third as large."""
 INK, FAINT, PALE = "#222222", "#8a8a8a", "#9a9a9a"
 ALARM, GOOD = "#CC79A7", "#009E73"
 
@@ -294,6 +298,9 @@ def save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix != ".png":
         raise InputError(f"figure {path}: figures are written as PNG; end the name in .png")
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
+    picture = Image.open(drawn).convert("RGB").quantize(IN_PALETTE, dither=Image.Dither.NONE)
     with replacing(path) as file:
-        figure.savefig(file, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
+        picture.save(file, format="png")
     return path

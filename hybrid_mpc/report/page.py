@@ -75,6 +75,9 @@ class Table:
 class Section:
     """A section: text, tables, figures with captions, and notes after them.
 
+    A figure with a file ``NAME.json`` beside it (:func:`~hybrid_mpc.plots.interactive.write_interactive`) can be looked
+    at more closely in the browser.
+
     Of the text a plain ``str`` is escaped; ``markupsafe.Markup`` is taken as HTML.
     """
 
@@ -125,11 +128,22 @@ def render(report: Report) -> str:
         >>> "<title>Report &amp; more</title>" in render(Report("Report & more", "", "", ""))
         True
     """
+    figures = [[_figure(s, *f) for f in s.figures] for s in report.sections]
     sections = [
-        {"section": s, "id": f"s{i}-{s.anchor}", "figures": [_figure(s, *f) for f in s.figures]}
-        for i, s in enumerate(report.sections, 1)
+        {"section": s, "id": f"s{i}-{s.anchor}", "figures": own}
+        for i, (s, own) in enumerate(zip(report.sections, figures, strict=True), 1)
     ]
-    return _template("report.html").render(report=report, sections=sections)
+    live = any(figure["live"] for own in figures for figure in own)
+    return _template("report.html").render(
+        report=report, sections=sections, library=_library() if live else ""
+    )
+
+
+def _library() -> Markup:
+    """What draws interactive figures in a browser, as text: the page needs no network."""
+    from bokeh.resources import Resources
+
+    return Markup("\n".join(Resources(mode="inline", components=["bokeh"]).js_raw))
 
 
 def words(file: str) -> dict[str, tuple[Markup, ...]]:
@@ -190,4 +204,12 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
     except UnidentifiedImageError:
         raise InputError(f"report, section {section.title!r}: figure {path} is no PNG or GIF file") from None
     data = base64.b64encode(path.read_bytes()).decode("ascii")
-    return {"uri": f"data:image/{kind};base64,{data}", "caption": caption, "width": width, "height": height}
+    live = path.with_suffix(".json")
+    return {
+        "uri": f"data:image/{kind};base64,{data}",
+        "caption": caption,
+        "width": width,
+        "height": height,
+        # nothing in the text ends the script that holds it
+        "live": Markup(live.read_text("utf-8").replace("<", "\\u003c")) if live.is_file() else "",
+    }

@@ -233,7 +233,7 @@ def run_or_read(
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         part: (run_specs, (*common, parts[part])) for part in missing if part not in alone
     }
-    run_jobs(jobs, context.progress.update, WORKERS, write)
+    run_jobs(jobs, context.progress.update, WORKERS, write, fresh=False)
     return rows
 
 

@@ -30,6 +30,7 @@ from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
+from hybrid_mpc.plots.interactive import over_time, write_interactive
 from hybrid_mpc.plots.style import save
 
 Figures = dict[str, list[tuple[Path, str]]]
@@ -71,12 +72,20 @@ def _draw(context: Context, parts: Sequence[Callable[[Context], Any]]) -> Figure
         context.progress.update("figures", i, len(parts), name_of_part)
         if name_of_part not in context.pictures:
             context.pictures[name_of_part] = [
-                (section, save(figure, context.out / "figures" / f"{name}.png"), caption)
+                (section, _saved(figure, context.out / "figures" / f"{name}.png"), caption)
                 for section, name, figure, caption in part(context)
             ]
         for section, path, caption in context.pictures[name_of_part]:
             figures.setdefault(section, []).append((path, caption))
     return figures
+
+
+def _saved(figure: Figure, path: Path) -> Path:
+    """A picture, and beside it its interactive form if it lies over time."""
+    save(figure, path)
+    if over_time(figure):
+        write_interactive(figure, path)
+    return path
 
 
 def _data(context: Context) -> Any:
