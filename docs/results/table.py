@@ -143,8 +143,10 @@ def rest(results: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Print all tables."""
-    for path in sorted(p for p in HERE.glob("*.json") if not p.stem.endswith("identification")):
+    for path in sorted(HERE.glob("*.json")):
         results = json.loads(path.read_text())
+        if "identification" not in results:  # of a benchmark, not of a run
+            continue
         print(f"\n### {path.name}\n")
         for part in (identification, files, control, strokes, limits, rest):
             print("\n".join([*part(results), ""]))

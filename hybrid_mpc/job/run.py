@@ -37,8 +37,8 @@ STAGES: tuple[Stage[Any], ...] = (
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
 SECONDS = {
-    "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 4, "export": 9, "noise": 8, "control": 62,
-    "on_model": 20, "estimation": 1, "residuals": 7, "monitor": 7, "guard": 28, "analysis": 4, "report": 6,
+    "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4, "control": 42,
+    "on_model": 14, "estimation": 1, "residuals": 6, "monitor": 6, "guard": 20, "analysis": 1, "report": 9,
 }  # fmt: skip
 """What each stage of `make demo` takes on two idle cores [s], ``on_model`` where there is no plant: how long the rest
 of a run may take follows from what its first stages took."""
