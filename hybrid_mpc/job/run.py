@@ -122,7 +122,7 @@ def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
 
     Example:
         >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["guard", "analysis", "report"])
-        ' (about 80 s left)'
+        ' (about 60 s left)'
         >>> remaining({"data": 4.0}, ["prior"])
         ''
     """

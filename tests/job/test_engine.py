@@ -99,18 +99,31 @@ def test_every_job_has_a_process_of_its_own_and_the_threads_of_the_environment(m
     assert threads == ("3", "3", "3")
 
 
-def test_all_reports_come_in_order_in_the_callers_thread_before_the_result():
+def test_processes_may_serve_one_job_after_the_other():
+    found = run_jobs(dict.fromkeys("abcde", (work.leaves, ())), quiet, 2, fresh=False)
+    pids, left, _ = zip(*found.values(), strict=True)
+    assert len(set(pids)) == 2
+    assert os.getpid() not in pids
+    assert max(left) >= 3  # five jobs in two processes
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_all_reports_come_in_order_in_the_callers_thread_before_the_result(fresh):
     seen = []
 
     def told(name, *report):
         assert threading.current_thread() is threading.main_thread()
         seen.append((name, report))
 
-    jobs = {"a": (work.tells, (3000,)), "b": (work.tells, (2,))}  # more than a pipe holds
-    results = run_jobs(jobs, told, 2, lambda name, result: seen.append((name, result)))
+    jobs = {
+        "a": (work.tells, (3000,)),
+        "b": (work.tells, (2,)),
+        "c": (work.tells, (4,)),
+    }  # more than a pipe holds
+    results = run_jobs(jobs, told, 2, lambda name, result: seen.append((name, result)), fresh=fresh)
     for name, n in results.items():
         assert [what for who, what in seen if who == name] == [*((i, n, "") for i in range(n)), n]
-    assert results == {"a": 3000, "b": 2}
+    assert results == {"a": 3000, "b": 2, "c": 4}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")

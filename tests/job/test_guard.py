@@ -166,7 +166,9 @@ def resumed(context):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare_job, "run_specs", lambda *args: pytest.fail(f"runs {args} again"))
         patch.setattr(
-            compare_job, "run_jobs", lambda jobs, *args: jobs and pytest.fail(f"runs {list(jobs)} again")
+            compare_job,
+            "run_jobs",
+            lambda jobs, *args, **more: jobs and pytest.fail(f"runs {list(jobs)} again"),
         )
         context.keep(GUARD, {}, guard_stage(context))
     return context.read(GUARD)
