@@ -74,18 +74,20 @@ def jobs_here():
 @pytest.fixture(scope="session")
 def finished(arguments, shared) -> Path:
     """Folder of a finished run, by the command itself but in this process."""
+    return shared("finished", lambda folder: finish(folder, arguments)) / "run"
+
+
+def finish(folder: Path, arguments: list[str]) -> None:
+    """A run into ``run`` of a folder, and what it told, by the command itself but in this process."""
     from typer.testing import CliRunner
 
     from hybrid_mpc.cli.main import app
 
-    def make(folder: Path) -> None:
-        with jobs_in_this_process():
-            done = CliRunner().invoke(app, [*arguments, "--out", str(folder / "run")])
-        assert done.exit_code == 0, done.output
-        assert "report.html" in done.stdout
-        (folder / "told.txt").write_text(done.stdout)
-
-    return shared("finished", make) / "run"
+    with jobs_in_this_process():
+        done = CliRunner().invoke(app, [*arguments, "--out", str(folder / "run")])
+    assert done.exit_code == 0, done.output
+    assert "report.html" in done.stdout
+    (folder / "told.txt").write_text(done.stdout)
 
 
 @pytest.fixture(scope="session")
@@ -122,9 +124,6 @@ def bare_tanks(shared) -> Path:
 
 
 def write_bare_tanks(folder: Path) -> None:
-    import subprocess
-    import sys
-
     from scenarios.simulated.two_tanks import EXPERIMENT
 
     (folder / "tanks.py").write_text(BARE)
@@ -134,9 +133,4 @@ def write_bare_tanks(folder: Path) -> None:
         path = write(folder / f"{name}.csv", table)
         words += ["--data", str(path)] if name != "later" else []
     skipped = [word for stage in ("estimation", "residuals", "analysis") for word in ("--skip", stage)]
-    command = [sys.executable, "-m", "hybrid_mpc.cli", "run", str(folder / "tanks.py"), *words, *skipped]
-    done = subprocess.run(
-        [*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=900
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    (folder / "told.txt").write_text(done.stdout)
+    finish(folder, ["run", str(folder / "tanks.py"), *words, *skipped])
