@@ -14,7 +14,7 @@ from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS
-from hybrid_mpc.job.stage import Stage, source_of
+from hybrid_mpc.job.stage import Absent, Stage, source_of
 from hybrid_mpc.job.stages.advice import advice
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
@@ -36,6 +36,7 @@ from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL
 from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import (
+    REPORTED,
     Analysis,
     Control,
     Data,
@@ -52,7 +53,9 @@ from hybrid_mpc.job.stages.results import (
     identification,
     recordings,
 )
+from hybrid_mpc.job.step_response import step_responses
 from hybrid_mpc.job.summary import Summary
+from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
@@ -236,7 +239,11 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "models": [_prior_table(context)],
         "free_run": [*_score_tables(context, found), _choice_table(found), _band_table(context, found)],
         "export": [_export_table(results.export)],
-        "control": [_control_table(results.control), _tracking_table(results.control)],
+        "control": [
+            _control_table(results.control),
+            _tracking_table(results.control),
+            _response_table(context),
+        ],
         "on_model": _on_model_tables(results.on_model),
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
@@ -582,6 +589,32 @@ def _tracking_table(control: Control) -> Table | None:
         "where references are theirs."
     )
     return Table(("task", "controller", *(f"RMSE of {s}" for s in signals)), rows, caption)
+
+
+def _response_table(context: Context) -> Table | None:
+    """Rise, settling, overshoot and offset in tasks that end at a set-point."""
+    scenario, found = context.scenario, context.find(CONTROL)
+    if isinstance(found, Absent) or scenario.control is None:
+        return None
+    drawn, prior = [row for row in found.drawn if row.arrays], scenario.prior()
+    names = {controller: name for name, controller in REPORTED.items()}
+    rows = [
+        (
+            task.name, names[row.controller], signal.label, answer.rise, answer.settling, answer.overshoot,
+            answer.offset,
+        )
+        for task in tasks_of(scenario, context.budget.tasks)
+        for row in drawn
+        if row.task == task.name and row.controller in names
+        for signal, answer in step_responses(task.control or scenario.control, prior, row.arrays).items()
+    ]  # fmt: skip
+    caption = (
+        "Answers to the last set-point of each task that ends at one, first seed: time from 10 to 90 % of the step, "
+        "time until it stays within 5 % of it, how far it goes beyond, and the mean deviation over the last fifth, in "
+        "the signal's unit. A dash: there is no clear step, as where a load is rejected."
+    )
+    heads = ("task", "controller", "signal", "rise [s]", "settling [s]", "overshoot [%]", "offset")
+    return Table(heads, rows, caption)
 
 
 def _on_model_tables(found: OnModel) -> list[Table | None]:

@@ -1,0 +1,108 @@
+"""What a closed loop's answer to a set-point is like: rise, settling, overshoot, offset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+AT_REST = 0.2
+"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean."""
+SETTLED = 0.05
+"""Share of a step within which a signal has settled."""
+CLEAR = 10.0
+"""Size of a step, in standard deviations of the signal at the end, from which it tells of a rise."""
+
+JUMP = 0.5
+"""Share of a step that the reference must make at once: one that came there slowly asks for no rise."""
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """The answer of a signal to its last set-point.
+
+    Args:
+        offset: Mean deviation over the last fifth [the signal's unit].
+        rise: Time from 10 to 90 % of the step [s]; None where there is no clear step, or it is not reached.
+        settling: Time until it stays within 5 % of the step [s]; None likewise.
+        overshoot: By how much it goes beyond, in per cent of the step; None where there is no clear step.
+    """
+
+    offset: float
+    rise: float | None = None
+    settling: float | None = None
+    overshoot: float | None = None
+
+
+def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> StepResponse | None:
+    """The answer to the last set-point; None where the reference moves until the end.
+
+    Args:
+        t: Instants ``(n,)`` [s].
+        values: The signal ``(n,)``; NaN where it was not measured.
+        reference: Its reference ``(n,)``.
+
+    Example:
+        >>> t = np.linspace(0.0, 10.0, 1001)
+        >>> found = step_response(t, 2.0 - 2.0 * np.exp(-t), np.full(1001, 2.0))
+        >>> round(found.rise, 2), round(found.settling, 1), found.overshoot, round(found.offset, 4)
+        (2.2, 3.0, 0.0, -0.0003)
+        >>> step_response(t, np.sin(t), np.sin(t)) is None
+        True
+    """
+    import control
+
+    t, y, r = (np.asarray(v, dtype=np.float64) for v in (t, values, reference))
+    there = np.isfinite(y) & np.isfinite(r)
+    t, y, r = t[there], y[there], r[there]
+    if len(t) < 10:
+        return None
+    late = t >= t[-1] - AT_REST * (t[-1] - t[0])
+    if np.ptp(r[late]) > 1e-9 * max(1.0, float(np.max(np.abs(r)))):
+        return None
+    moved = np.flatnonzero(np.abs(r - r[-1]) > 1e-9 * max(1.0, float(np.max(np.abs(r)))))
+    begin = int(moved[-1]) + 1 if moved.size else 0
+    offset = float(np.mean(y[late]) - r[-1])
+    size = r[-1] - y[begin]
+    jump = abs(r[begin] - r[begin - 1]) if begin else abs(size)
+    if abs(size) <= CLEAR * max(float(np.std(y[late])), abs(offset)) or jump < JUMP * abs(size):
+        return StepResponse(offset)
+    answer = (y[begin:] - y[begin]) * np.sign(size)
+    info = control.step_info(answer, T=t[begin:] - t[begin], yfinal=abs(size), SettlingTimeThreshold=SETTLED)
+    rise, settling, overshoot = (float(info[key]) for key in ("RiseTime", "SettlingTime", "Overshoot"))
+    return StepResponse(
+        offset, *(value if np.isfinite(value) else None for value in (rise, settling, overshoot))
+    )
+
+
+def step_responses(
+    problem: OCP, machine: Prior | HybridModel, loop: Mapping[str, Array]
+) -> dict[Signal, StepResponse]:
+    """Answers of all signals of a loop that the problem weighs and that end at a set-point.
+
+    Args:
+        problem: The control problem: outputs where it weighs those, else states.
+        machine: Names the signals.
+        loop: Arrays :data:`~hybrid_mpc.job.loops.DRAWN`.
+
+    Example: ``step_responses(kit.problem(task.name), kit.models["prior"], row.arrays)``
+    """
+    if problem.n_y:
+        signals, weights, values, references = machine.outputs, problem.q_y, loop["y"], loop["y_ref"]
+    else:
+        signals, weights, values, references = machine.states, problem.q, loop["x"], loop["reference"]
+    found = {}
+    for i, signal in enumerate(signals):
+        if weights[i] > 0:
+            answer = step_response(loop["t"], values[: len(loop["t"]), i], references[: len(loop["t"]), i])
+            if answer is not None:
+                found[signal] = answer
+    return found

@@ -1,0 +1,90 @@
+"""Rise, settling, overshoot and offset against what a second-order answer has in closed form."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import OCP, Signal
+from hybrid_mpc.job.step_response import step_response, step_responses
+
+T = np.arange(0.0, 30.0, 0.005)
+
+
+def second_order(zeta, size=1.0, start=0.0):
+    """Step answer of ``1 / (s^2 + 2 zeta s + 1)`` from 0 s on."""
+    w = math.sqrt(1 - zeta**2)
+    return start + size * (1 - np.exp(-zeta * T) * (np.cos(w * T) + zeta / w * np.sin(w * T)))
+
+
+@pytest.mark.parametrize("zeta", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize(("size", "start"), [(1.0, 0.0), (-4.0, 1.0), (2e-5, 300.0)])
+def test_it_is_that_of_a_second_order_system(zeta, size, start):
+    y = second_order(zeta, size, start)
+    found = step_response(T, y, np.full(T.size, start + size))
+    over = 100 * math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2))
+    assert found.overshoot == pytest.approx(over, rel=2e-3)  # of the grid
+    outside = np.abs(y - start - size) > 0.05 * abs(size)
+    assert found.settling == pytest.approx(T[outside][-1], abs=0.011)
+    inner = (y - start) / size
+    assert found.rise == pytest.approx(T[inner >= 0.9][0] - T[inner >= 0.1][0], abs=0.011)
+    assert abs(found.offset) < 1e-3 * abs(size)
+
+
+def test_the_last_set_point_counts_from_where_it_is_given():
+    reference = np.where(T < 10.0, 0.0, 2.0)
+    y = np.where(T < 10.0, 0.0, 2.0 * (1 - np.exp(-np.maximum(T - 10.0, 0.0))))
+    found = step_response(T, y, reference)
+    assert found.settling == pytest.approx(-math.log(0.05), abs=0.011)
+    assert found.overshoot == pytest.approx(0.0, abs=1e-6)
+
+
+def test_an_offset_that_stays_is_told_with_its_sign():
+    found = step_response(T, 0.97 * (1 - np.exp(-T)), np.ones(T.size))
+    assert found.offset == pytest.approx(-0.03, abs=1e-6)
+    assert found.settling is not None  # within 5 %
+
+
+def test_a_load_that_is_rejected_is_no_step():
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(T.size)
+    found = step_response(T, np.exp(-((T - 5.0) ** 2)) + noise, np.zeros(T.size))
+    assert (found.rise, found.settling, found.overshoot) == (None, None, None)
+
+
+def test_a_reference_that_arrives_slowly_asks_for_no_rise():
+    reference = np.minimum(T / 10.0, 1.0)
+    late = np.interp(T - 1.0, T, reference)  # a second behind: 0.1 is missing where the reference arrives
+    found = step_response(T, late, reference)
+    assert (found.rise, found.settling, found.overshoot) == (None, None, None)
+    assert found.offset == pytest.approx(0.0, abs=1e-12)
+
+
+def test_what_never_arrives_has_no_rise():
+    y = np.minimum(T / 100.0, 0.3) + 0 * T
+    found = step_response(T, y, np.ones(T.size))
+    assert found.settling is None
+
+
+def test_a_reference_that_moves_until_the_end_has_no_answer():
+    assert step_response(T, np.sin(T), np.sin(T)) is None
+    assert step_response(T[:5], T[:5], np.ones(5)) is None
+
+
+def test_samples_that_are_missing_are_left_out():
+    y = second_order(0.5)
+    y[::7] = np.nan
+    assert step_response(T, y, np.ones(T.size)).overshoot == pytest.approx(16.3, abs=0.1)
+
+
+def test_signals_that_the_problem_weighs_have_one():
+    machine = type(
+        "Machine", (), {"states": (Signal("q", "m"), Signal("v", "m/s")), "outputs": (Signal("y", "mm"),)}
+    )
+    loop = {
+        "t": T, "x": np.stack([second_order(0.5), T], axis=1), "reference": np.tile([1.0, 0.0], (T.size, 1)),
+        "y": 1e3 * second_order(0.7)[:, None], "y_ref": np.full((T.size, 1), 1e3),
+    }  # fmt: skip
+    by_state = step_responses(OCP(5, [1.0, 0.0], [1.0], [0.0], [-1.0], [1.0]), machine, loop)
+    assert [s.label for s in by_state] == ["q [m]"]
+    by_output = step_responses(OCP(5, [0.0, 0.0], [1.0], [0.0], [-1.0], [1.0], q_y=[1.0]), machine, loop)
+    assert by_output[machine.outputs[0]].overshoot == pytest.approx(4.6, abs=0.05)
