@@ -63,7 +63,7 @@ def free_run(
     title: str = "",
     band: Mapping[str, tuple[Array, Array]] | None = None,
 ) -> Figure:
-    """A free run and the measurement, with the balances (the paper's Fig. 6).
+    """A free run and the measurement, the errors of prior and hybrid, and the balances (the paper's Fig. 6).
 
     Args:
         t: Times ``(n,)`` [s].
@@ -86,11 +86,15 @@ def free_run(
         >>> energy = BalanceRun("energy", "W", power, power)
         >>> figure = free_run(t, x, {"mopgrnn": x}, u, signals=states, inputs=inputs, balances=[energy])
         >>> len(figure.axes)
-        5
+        7
     """
-    t, n = np.asarray(t, dtype=float), len(signals)
-    figure, panels = new_column([1.6] * n + [0.9] * len(inputs) + [1.2, 0.9] * len(balances), title=title)
+    t, n = np.asarray(t, dtype=float), 2 * len(signals)
+    heights = [1.6, 0.8] * len(signals) + [0.9] * len(inputs) + [1.2, 0.9] * len(balances)
+    figure, every = new_column(heights, title=title)
+    panels, errors = [*every[:n:2], *every[n:]], every[1:n:2]
     _signals(panels, t, measured, predictions, signals)
+    _errors(errors, t, measured, {m: predictions[m] for m in ("phy", hybrid) if m in predictions}, signals)
+    n //= 2
     ink = colour(hybrid)
     for ax, signal in zip(panels, signals, strict=False):
         if band and signal.name in band:
@@ -110,8 +114,24 @@ def free_run(
         under.fill_between(t, gap, color=ink, alpha=0.35, linewidth=0)
         under.plot(t, gap, color=ink, linewidth=0.8)
         under.set_ylabel(f"violation\n[{balance.unit}]")
-    finish_column(figure, panels, columns=6)
+    finish_column(figure, every, columns=6)
     return figure
+
+
+def _errors(
+    panels: Sequence[Axes],
+    t: Array,
+    measured: Array,
+    predictions: Mapping[str, Array],
+    signals: Sequence[Signal],
+) -> None:
+    """Predicted less measured, of the models that are compared."""
+    for i, (ax, signal) in enumerate(zip(panels, signals, strict=True)):
+        ax.axhline(0.0, color=FAINT, linewidth=0.8)
+        for model, run in predictions.items():
+            style = line_style(model) | {"linewidth": 1.0}
+            ax.plot(t, np.asarray(run)[:, i] - np.asarray(measured)[:, i], **style)
+        ax.set_ylabel(f"error\n[{signal.unit}]")
 
 
 def _signals(

@@ -83,13 +83,25 @@ def test_one_colour_per_role():
 
 def test_free_run_draws_every_balance_with_its_violation_and_unit():
     figure = example.free_run_figure()
-    assert len(figure.axes) == len(example.STATES) + len(example.INPUTS) + 2 * 2
+    assert len(figure.axes) == 2 * len(example.STATES) + len(example.INPUTS) + 2 * 2
     for above, below, unit in ((*figure.axes[-4:-2], "W"), (*figure.axes[-2:], "kg/s")):
         balances = [line.get_ydata() for line in above.lines]
         violation = below.lines[0].get_ydata()
         np.testing.assert_array_equal(violation, np.abs(balances[1] - balances[0]))
         for ax in (above, below):
             assert ax.get_ylabel().endswith(f"[{unit}]")
+
+
+def test_free_run_draws_the_errors_of_prior_and_hybrid_below_each_signal():
+    figure = example.free_run_figure()
+    for i, state in enumerate(example.STATES):
+        above, below = figure.axes[2 * i : 2 * i + 2]
+        shown = {line.get_label(): line.get_ydata() for line in above.lines}
+        errors = {line.get_label(): line.get_ydata() for line in below.lines if line.get_label()[0] != "_"}
+        assert set(errors) == {"prior, fitted", "MOPGRNN"}
+        for name, error in errors.items():
+            np.testing.assert_allclose(error, shown[name] - shown["measured"])
+        assert below.get_ylabel() == f"error\n[{state.unit}]"
 
 
 def test_states_that_are_no_positions_and_speeds_are_drawn_over_time():
