@@ -234,9 +234,9 @@ def _expressions(
             table("seen_row", rows, "int") + table("seen_column", [places[j] for j in columns], "int")
         )
         outs = [(f"seen[{i}]", seen[i]) for i in range(seen.numel())]
-        add("before", [*point, "real *seen"], inputs, outs)
+        add("model_before", [*point, "real *seen"], inputs, outs)
         slopes = [(f"by_v[{i}]", v) for i, v in enumerate(values)]
-        add("before_slope", [*point, "real *seen", "real *by_v"], inputs, outs + slopes)
+        add("model_before_slope", [*point, "real *seen", "real *by_v"], inputs, outs + slopes)
     rest = [i for i in range(n_z) if i not in own]
     head, out, z_next = _reduced(parts, model, rest, z, u, w) if units else (np.zeros((0, 0)), g, z_next)
     sizes["HEAD"] = len(head)
@@ -244,7 +244,7 @@ def _expressions(
     inputs = {**inputs, "out": out}
     point.append("const real *out")
     outs = [(f"z_next[{i}]", z_next[i]) for i in rest]
-    add("after", [*point, "real *z_next"], inputs, outs)
+    add("model_after", [*point, "real *z_next"], inputs, outs)
     by_out, by_v = ca.jacobian(z_next, out), ca.jacobian(z_next, ca.vertcat(z, u))
     corrected = [i for i in rest if units and by_out[i, :].nnz()]
     outs += [
@@ -258,7 +258,7 @@ def _expressions(
         for j in range(len(head))
     ]
     cleared = [f"memset(slope + {i * row}, 0, sizeof(real) * HMPC_LJ);" for i in corrected]
-    add("after_slope", [*point, "real *z_next", "real *slope", "real *by_out"], inputs, outs, cleared)
+    add("model_after_slope", [*point, "real *z_next", "real *slope", "real *by_out"], inputs, outs, cleared)
     sizes["CORRECTED"] = len(corrected)
     texts.append(table("corrected", np.array(corrected, dtype=float), "int"))
     x, d, p = ca.SX.sym("x", n_x), ca.SX.sym("d", model.n_d), ca.SX.sym("p", ocp.n_p)
@@ -375,7 +375,7 @@ def _tables(
     reals: dict[str, Array] = {
         "u_min": ocp.u_min, "u_max": ocp.u_max, "u_scale": ocp.input_scale, "u_rest": model.u0, "x_rest": model.x0,
         "w_rest": model.w, "du_max": np.full(model.n_u, np.inf) if ocp.du_max is None else ocp.du_max,
-        "q": ocp.q * dt, "r": ocp.r * dt, "r_delta": ocp.r_delta * dt, "terminal": problem.terminal,
+        "q_x": ocp.q * dt, "r_u": ocp.r * dt, "r_delta": ocp.r_delta * dt, "terminal": problem.terminal,
         "disturbs_u": on_u, "disturbs_x": on_x,
         "soft_lower": soft.lower[kinds], "soft_upper": soft.upper[kinds],
         "soft_scale": scale if scale.size else np.ones(1),

@@ -130,6 +130,18 @@ def test_single_precision(tmp_path, name):
     assert f"agree with Python's to {TOLERANCE[True]} of their range" in (tmp_path / "README.md").read_text()
 
 
+@pytest.mark.full
+@pytest.mark.skipif(shutil.which("cppcheck") is None, reason="there is no cppcheck")
+def test_cppcheck_finds_nothing(folder):
+    """As the page says; ``% 1`` is what a machine of one input makes of a division by its number of inputs."""
+    done = subprocess.run(
+        ["cppcheck", "--enable=warning,style,performance,portability", "--inconclusive", "--std=c11", "--quiet",
+         "--suppress=moduloofone", "--error-exitcode=1", *SOURCES],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
 @needs_compiler
 def test_changed_vectors_are_noticed(folder, tmp_path):
     changed = shutil.copytree(folder, tmp_path / "c")

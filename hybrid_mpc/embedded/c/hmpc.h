@@ -201,9 +201,9 @@ void hmpc_aim(hmpc_state *s, const hmpc_goal *goal); /* s->target, for the measu
 void hmpc_model(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *z_next);
 void hmpc_model_slope(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *z_next, hmpc_real *slope);
 
-hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *working, const hmpc_linear *linear);
+hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linear);
 void hmpc_qp_factor(hmpc_qp *qp);
-void hmpc_qp_shift(hmpc_working *working);
+void hmpc_qp_shift(hmpc_working *w);
 #ifndef HMPC_N
 #error "hmpc_config.h lacks the sizes"
 #endif

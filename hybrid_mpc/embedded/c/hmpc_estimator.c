@@ -28,14 +28,13 @@ static int any_finite(const real *y) {
 
 static void measured(const real *z, const real *u, const real *w, real *y) {
   real v[HMPC_NU];
-  const real *const d = z + HMPC_NZ;
   for (int i = 0; i < HMPC_NU; ++i) {
     v[i] = u[i];
-    for (int j = 0; j < HMPC_ND; ++j) v[i] += disturbs_u[i][j] * d[j];
+    for (int j = 0; j < HMPC_ND; ++j) v[i] += disturbs_u[i][j] * z[HMPC_NZ + j];
   }
   outputs(z, v, w, y);
   for (int i = 0; i < HMPC_NY; ++i)
-    for (int j = 0; j < HMPC_ND; ++j) y[i] += disturbs_y[i][j] * d[j];
+    for (int j = 0; j < HMPC_ND; ++j) y[i] += disturbs_y[i][j] * z[HMPC_NZ + j];
 }
 
 /* One Gaussian with mean and covariance of a mixture. */
@@ -146,19 +145,19 @@ static void correct(hmpc_state *s, hmpc_filter *f, const real *y, const real *u)
   measured(f->z, u, s->w, y_hat);
   f->nis = R(0.0);
   for (int i = 0; i < HMPC_NY; ++i) {
-    real c[HMPC_NE] = {R(0.0)}, pc[HMPC_NE], gain[HMPC_NE];
+    real c[HMPC_NE] = {R(0.0)}, pc[HMPC_NE], kalman[HMPC_NE];
     if (!hmpc_finite(y[i])) continue;
     memcpy(c, output_x[i], sizeof s->x);
     for (int j = 0; j < HMPC_ND; ++j) c[HMPC_NZ + j] = output_d[i][j];
     for (int k = 0; k < HMPC_NE; ++k) pc[k] = hmpc_dot(f->p[k], c, HMPC_NE);
     const real variance = hmpc_dot(c, pc, HMPC_NE) + noise_y[i];
     const real error = (y[i] - y_hat[i]) - hmpc_dot(c, step, HMPC_NE);
-    for (int k = 0; k < HMPC_NE; ++k) gain[k] = pc[k] / variance;
-    for (int k = 0; k < HMPC_NE; ++k) hmpc_add(f->p[k], -gain[k], pc, HMPC_NE);
+    for (int k = 0; k < HMPC_NE; ++k) kalman[k] = pc[k] / variance;
+    for (int k = 0; k < HMPC_NE; ++k) hmpc_add(f->p[k], -kalman[k], pc, HMPC_NE);
     for (int k = 0; k < HMPC_NE; ++k) {
-      const real left = hmpc_dot(f->p[k], c, HMPC_NE) - noise_y[i] * gain[k];
-      hmpc_add(f->p[k], -left, gain, HMPC_NE);
-      step[k] += gain[k] * error;
+      const real left = hmpc_dot(f->p[k], c, HMPC_NE) - noise_y[i] * kalman[k];
+      hmpc_add(f->p[k], -left, kalman, HMPC_NE);
+      step[k] += kalman[k] * error;
     }
     f->nis += error / variance * error;
     size += hmpc_log(variance);

@@ -57,13 +57,13 @@ void hmpc_model(const real *z, const real *u, const real *w, real *z_next) {
 #if HMPC_UNITS > 0
   cell c;
   real seen[HMPC_FEATURES], out[HMPC_DIM(HMPC_HEAD)];
-  before(z, u, w, seen);
+  model_before(z, u, w, seen);
   gru(seen, z + HMPC_HIDDEN, &c);
   reduce(c.next, out);
-  after(z, u, w, out, z_next);
+  model_after(z, u, w, out, z_next);
   memcpy(z_next + HMPC_HIDDEN_NEXT, c.next, sizeof c.next);
 #else
-  after(z, u, w, (const real *)0, z_next);
+  model_after(z, u, w, (const real *)0, z_next);
 #endif
 }
 
@@ -72,7 +72,7 @@ void hmpc_model_slope(const real *z, const real *u, const real *w, real *z_next,
   cell c;
   real seen[HMPC_FEATURES], by_v[HMPC_DIM(HMPC_SEEN_SLOPES)], out[HMPC_DIM(HMPC_HEAD)];
   real by_out[HMPC_DIM(HMPC_CORRECTED)][HMPC_DIM(HMPC_HEAD)], through[HMPC_DIM(HMPC_HEAD)][HMPC_LJ];
-  before_slope(z, u, w, seen, by_v);
+  model_before_slope(z, u, w, seen, by_v);
   gru(seen, z + HMPC_HIDDEN, &c);
   memset(through, 0, sizeof through);
   for (int i = 0; i < HMPC_UNITS; ++i) {
@@ -96,11 +96,11 @@ void hmpc_model_slope(const real *z, const real *u, const real *w, real *z_next,
     for (int k = 0; k < HMPC_HEAD; ++k)
       hmpc_add(through[k], head[k][i], slope + (HMPC_HIDDEN_NEXT + i) * HMPC_LJ, HMPC_LJ);
   reduce(c.next, out);
-  after_slope(z, u, w, out, z_next, slope, &by_out[0][0]);
+  model_after_slope(z, u, w, out, z_next, slope, &by_out[0][0]);
   memcpy(z_next + HMPC_HIDDEN_NEXT, c.next, sizeof c.next);
   for (int k = 0; k < HMPC_CORRECTED; ++k)
     for (int i = 0; i < HMPC_HEAD; ++i) hmpc_add(slope + corrected[k] * HMPC_LJ, by_out[k][i], through[i], HMPC_LJ);
 #else
-  after_slope(z, u, w, (const real *)0, z_next, slope, (real *)0);
+  model_after_slope(z, u, w, (const real *)0, z_next, slope, (real *)0);
 #endif
 }

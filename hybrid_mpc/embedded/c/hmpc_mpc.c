@@ -114,7 +114,7 @@ static void make_hessian(hmpc_state *s) {
   memset(qp->hessian, 0, sizeof qp->hessian);
   for (int k = 1; k < HMPC_N; ++k)
     for (int i = 0; i < HMPC_NX; ++i) {
-      const real factor = R(2.0) * linear->weight[k][i] * q[i];
+      const real factor = R(2.0) * linear->weight[k][i] * q_x[i];
       if (factor < R(0.0) || factor > R(0.0))
         add_product(qp->hessian, factor, linear->from_u[k][i], linear->from_u[k][i], (block_of[k - 1] + 1) * HMPC_NU);
     }
@@ -135,7 +135,7 @@ static void make_hessian(hmpc_state *s) {
     for (int j = 0; j < HMPC_NU; ++j) {
       const int i = b * HMPC_NU + j;
       const real scale = u_scale[j] * u_scale[j], changes = b + 1 < HMPC_BLOCKS ? R(2.0) : R(1.0);
-      qp->hessian[i][i] += R(2.0) * (r[j] * R(block_length[b]) + r_delta[j] * changes) * scale;
+      qp->hessian[i][i] += R(2.0) * (r_u[j] * R(block_length[b]) + r_delta[j] * changes) * scale;
       if (b > 0) qp->hessian[i][i - HMPC_NU] -= R(2.0) * r_delta[j] * scale;
     }
   for (int i = 0; i < HMPC_NV; ++i) size = hmpc_max(size, qp->hessian[i][i]);
@@ -331,6 +331,11 @@ static void set_soft(hmpc_state *s) {
 }
 
 /* Cost of the plan that qp.step makes of the prepared one, and the largest violations of soft and of hard bounds. */
+/* The input that a plan is drawn to: that of the set-point's steady state, or else the operating point's. */
+static real input_goal(const real *u_goal, int period, int input) {
+  return u_goal ? u_goal[period * HMPC_NU + input] : u_rest[input];
+}
+
 static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_goal) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
@@ -342,11 +347,11 @@ static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_go
     for (int i = 0; i < HMPC_NX; ++i)
       error[i] = linear->z[k][i] + s->dz[k][i] + hmpc_dot(linear->from_u[k][i], step, m) - goal[i];
     if (k == HMPC_N) break;
-    for (int i = 0; i < HMPC_NX; ++i) total += linear->weight[k][i] * q[i] * error[i] * error[i];
+    for (int i = 0; i < HMPC_NX; ++i) total += linear->weight[k][i] * q_x[i] * error[i] * error[i];
     for (int j = 0; j < HMPC_NU; ++j) {
       const real u = linear->u[k][j] + step[block_of[k] * HMPC_NU + j] * u_scale[j];
-      const real off = u - (u_goal ? u_goal[k * HMPC_NU + j] : u_rest[j]), change = u - before[j];
-      total += r[j] * off * off + r_delta[j] * change * change;
+      const real off = u - input_goal(u_goal, k, j), change = u - before[j];
+      total += r_u[j] * off * off + r_delta[j] * change * change;
       before[j] = u;
     }
   }
@@ -451,7 +456,7 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
     const real *const x = row_of(x_goal, rows, k, HMPC_NX);
     const int m = (block_of[k - 1] + 1) * HMPC_NU;
     for (int i = 0; i < HMPC_NX; ++i)
-      hmpc_add(qp->gradient, R(2.0) * linear->weight[k][i] * q[i] * (linear->z[k][i] + s->dz[k][i] - x[i]),
+      hmpc_add(qp->gradient, R(2.0) * linear->weight[k][i] * q_x[i] * (linear->z[k][i] + s->dz[k][i] - x[i]),
                linear->from_u[k][i], m);
   }
   const real *const last = row_of(x_goal, rows, HMPC_N, HMPC_NX);
@@ -476,9 +481,9 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
       const int i = block_of[k] * HMPC_NU + j;
       const real u = linear->u[k][j], before = k > 0 ? linear->u[k - 1][j] : linear->u_prev[j];
       const real after = k + 1 < HMPC_N ? linear->u[k + 1][j] : u;
-      const real goal_u = u_goal ? u_goal[k * HMPC_NU + j] : u_rest[j];
+      const real goal_u = input_goal(u_goal, k, j);
       qp->gradient[i] +=
-          R(2.0) * (r[j] * (u - goal_u) + r_delta[j] * ((u - before) - (after - u))) * u_scale[j];
+          R(2.0) * (r_u[j] * (u - goal_u) + r_delta[j] * ((u - before) - (after - u))) * u_scale[j];
     }
   for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
 #if HMPC_SOFT > 0 && (HMPC_SOFT_D || HMPC_NP > 0)
