@@ -145,7 +145,9 @@ def operations(found: Sources) -> dict[str, int]:
     padded = -(-n_z // 8) * 8
     active = np.minimum(np.arange(1, n["N"]) * n["NU"], n_v)
     stage = (
-        code.get("model_before_slope", 0) + code["model_after_slope"] + units * (6 * (n.get("FEATURES", 0) + units) + 110)
+        code.get("model_before_slope", 0)
+        + code["model_after_slope"]
+        + units * (6 * (n.get("FEATURES", 0) + units) + 110)
     )
     stage += units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) + 2 * n["HEAD"] * units * (padded + n["NU"])
     n_e = n_z + n["ND"]

@@ -133,10 +133,10 @@ def test_single_precision(tmp_path, name):
 @pytest.mark.full
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="there is no cppcheck")
 def test_cppcheck_finds_nothing(folder):
-    """As the page says; ``% 1`` is what a machine of one input makes of a division by its number of inputs."""
+    """As the page says. Sizes are constants: ``% 1`` for one input, a comparison with a number of rows that is zero."""
     done = subprocess.run(
         ["cppcheck", "--enable=warning,style,performance,portability", "--inconclusive", "--std=c11", "--quiet",
-         "--suppress=moduloofone", "--error-exitcode=1", *SOURCES],
+         "--suppress=moduloofone", "--suppress=knownConditionTrueFalse", "--error-exitcode=1", *SOURCES],
         cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -118,7 +118,7 @@ static int factorize(hmpc_search *work, int *order) {
         best = i;
       }
     }
-    const real size = hmpc_sqrt(largest);
+    const real size = hmpc_sqrt(hmpc_max(largest, R(0.0)));
     if (k == 0) first = size;
     if (!(size > HMPC_TARGET_RANK * first)) break;
     if (best != k) {
@@ -227,9 +227,9 @@ static int bounds(hmpc_search *work, int m, const real *row, real now, real low,
 
 /* min 1/2 e'he + g'e with bound e <= end: the point nearest to the free answer in L' e, where h = L L'. Goldfarb and
    Idnani's dual method, its small systems solved anew in every round. 0 if there is none. */
-static int least_squares(hmpc_search *work, int m, real *g, int count, real *eta) {
+static int least_squares(hmpc_search *work, int m, const real *g, int count, real *eta) {
   int active[NT + 1], n = 0;
-  real multiplier[NT + 1], share[NT], start[NT], y[NT];
+  real multiplier[NT + 1] = {R(0.0)}, share[NT], start[NT], y[NT];
   for (int i = 0; i < m; ++i)
     for (int j = 0; j <= i; ++j) { /* L in place */
       const real rest = work->h[i][j] - hmpc_dot(work->h[i], work->h[j], j);
@@ -461,6 +461,9 @@ static void set_target(hmpc_target *to, int k, const real *x, const real *u, con
   if (k < HMPC_N) memcpy(to->u[k], u, sizeof to->u[k]);
 }
 
+/* Without measured disturbances there is one empty row of them. */
+#define W_OF(period) (HMPC_NW > 0 ? (period) : 0)
+
 /* References of states, inputs and outputs over the horizon, under the measured disturbances s->linear.w: a steady
    state for each change of the preview; of one that changes more often for so many rows, and between them
    interpolated. */
@@ -475,13 +478,13 @@ void hmpc_aim(hmpc_state *s, const hmpc_goal *goal) {
   for (int k = 0; k <= HMPC_N; ++k) {
     const int last = k < HMPC_N ? k : HMPC_N - 1, other = last > 0 ? last - 1 : 0;
     const real *const row = given + (k < rows ? k : rows - 1) * HMPC_NY;
-    int changes = k > 0 && k < HMPC_N && HMPC_NW > 0 && memcmp(w[last], w[other], sizeof(real) * HMPC_NW) != 0;
+    int changes = k > 0 && k < HMPC_N && HMPC_NW > 0 && memcmp(w[W_OF(last)], w[W_OF(other)], sizeof(real) * HMPC_NW) != 0;
     for (int i = 0; i < HMPC_NY; ++i) {
       to->y[k][i] = q_y[i] > R(0.0) ? row[i] : R(0.0);
       fine &= hmpc_finite(to->y[k][i]);
       if (k > 0) changes |= to->y[k][i] < to->y[k - 1][i] || to->y[k][i] > to->y[k - 1][i];
     }
-    fine &= hmpc_all_finite(w[last], HMPC_NW);
+    fine &= hmpc_all_finite(w[W_OF(last)], HMPC_NW);
     if (changes && count <= HMPC_TARGET_KNOTS) knots[count < HMPC_TARGET_KNOTS ? count : HMPC_TARGET_KNOTS] = k;
     if (changes && count <= HMPC_TARGET_KNOTS) ++count;
   }
@@ -495,7 +498,7 @@ void hmpc_aim(hmpc_state *s, const hmpc_goal *goal) {
   if (often) count = HMPC_TARGET_KNOTS;
   for (int n = 0; n < count; ++n) {
     const int k = knots[n] = often ? target_knots[n] : knots[n];
-    hmpc_steady_state(s, to->y[k], w[k < HMPC_N ? k : HMPC_N - 1], &start, wide, &found);
+    hmpc_steady_state(s, to->y[k], w[W_OF(k < HMPC_N ? k : HMPC_N - 1)], &start, wide, &found);
     wide = found.steady; /* where nothing was found, the rest of the horizon is not searched as widely again */
     if (found.steady) start = found;
     if (n == 0) s->aimed = found;
