@@ -70,6 +70,24 @@ def test_each_finding_is_told_with_what_to_do(results):
     assert all(hint.remedy for case in (slow, noisy, warned, poor, thin) for hint in advice(case)[:1])
 
 
+def test_an_error_that_is_the_sensor_s_noise_is_told(results):
+    found = results.identification
+    (error,) = found.rmse[found.details.choice.recommended].values()
+    said = {
+        factor: [
+            hint.finding
+            for hint in advice(
+                changed(results, smoother=replace(found.details.smoother, sigma=(error / factor,)))
+            )
+            if "noise" in hint.finding
+        ]
+        for factor in (1.2, 2.0)
+    }
+    assert said[2.0] == []
+    (text,) = said[1.2]
+    assert text.startswith("Free runs of phi err by 0.0084 rad, 1.2 of the noise")
+
+
 @pytest.mark.parametrize(
     ("upper", "ratio", "remedy"),
     [

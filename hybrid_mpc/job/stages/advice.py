@@ -13,6 +13,8 @@ EXPLAINED = 60.0
 """FIT [%] of the fitted prior below which it lacks more than a network should have to learn."""
 HELD = (0.10, 0.07)
 """By how much less and more than its share of unseen measurements a band may hold: 80 to 97 % of one for 90 %."""
+FLOOR = 1.5
+"""Error of a free run over the sensor's noise up to which the noise is what is left."""
 MOST = 4
 """Warnings of one kind that are told here; the sections have all."""
 
@@ -25,7 +27,7 @@ def advice(results: Results) -> list[Hint]:
     """
     found = [
         *_recordings(results), *_prior(results.identification), *_choice(results.identification),
-        *_bands(results.identification), *_loops(results), *_watching(results),
+        *_floor(results.identification), *_bands(results.identification), *_loops(results), *_watching(results),
     ]  # fmt: skip
     if not any(hint.verdict == "bad" for hint in found):
         found.append(
@@ -77,6 +79,21 @@ def _choice(found: Identification) -> Iterator[Hint]:
             "What the prior lacks differs from recording to recording, or is noise: look at the residuals of the free "
             "runs for a term of the prior or a curve of the sensor.",
         )  # fmt: skip
+
+
+def _floor(found: Identification) -> Iterator[Hint]:
+    """Outputs whose error is the sensor's own noise."""
+    errors = _by_output(found.rmse.get(found.details.choice.recommended))
+    if len(errors) != len(found.details.smoother.sigma):
+        return
+    for (label, error), noise in zip(errors.items(), found.details.smoother.sigma, strict=True):
+        name, _, unit = label.partition(" [")
+        if error < FLOOR * noise:
+            yield Hint(
+                "good", f"Free runs of {name} err by {error:.2g} {unit.rstrip(']')}, {error / noise:.1f} of the noise "
+                "that the fit finds in its sensor.",
+                "There is nothing left to learn: a better sensor, or harder recordings, would show more.",
+            )  # fmt: skip
 
 
 def _bands(found: Identification) -> Iterator[Hint]:
