@@ -20,6 +20,9 @@ InputColumns: TypeAlias = Annotated[
 OutputColumns: TypeAlias = Annotated[
     list[str] | None, typer.Option(help="Column of a measured output, in the prior's order.")
 ]
+DisturbanceColumns: TypeAlias = Annotated[
+    list[str] | None, typer.Option(help="Column of a measured disturbance: it acts, and nobody commands it.")
+]
 Device: TypeAlias = Annotated[str, typer.Option(help="Where networks are trained: cpu, cuda, cuda:1, ...")]
 ArtifactFolder: TypeAlias = Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")]
 EmptyFolder: TypeAlias = Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")]

@@ -56,7 +56,8 @@ class Column:
 class Draft:
     """What a recording shows: its time, what looks commanded and what measured, and what is neither.
 
-    ``period`` is the sampling time [s]; ``time`` is None where no column looks like one.
+    ``period`` is the sampling time [s]; ``time`` is None where no column looks like one. ``disturbances`` are measured
+    and act on the machine, but nobody commands them; no number tells them from outputs, so they are named or none.
     """
 
     time: Column | None
@@ -64,6 +65,12 @@ class Draft:
     inputs: tuple[Column, ...]
     outputs: tuple[Column, ...]
     left_out: tuple[str, ...]
+    disturbances: tuple[Column, ...] = ()
+
+    @property
+    def drives(self) -> tuple[Column, ...]:
+        """All that acts on the machine."""
+        return (*self.inputs, *self.disturbances)
 
 
 @dataclass(frozen=True)
@@ -78,8 +85,9 @@ class Lag:
 
 
 def write_scenario(
-    path: Path, data: Path, inputs: Sequence[str] = (), outputs: Sequence[str] = (), time: str = ""
-) -> Draft:
+    path: Path, data: Path, inputs: Sequence[str] = (), outputs: Sequence[str] = (), time: str = "",
+    disturbances: Sequence[str] = (),
+) -> Draft:  # fmt: skip
     """Write a scenario for a recording; returned is what it was made from.
 
     Args:
@@ -88,6 +96,7 @@ def write_scenario(
         inputs: Columns of the inputs. Default: those that are held from one sample to the next.
         outputs: Columns of the outputs. Default: all others that move.
         time: Column of the time. Default: one that rises evenly.
+        disturbances: Columns of measured disturbances. Default: none.
 
     Raises:
         InputError: If the file is there, the recording is bad or too short, or shows no input or no output.
@@ -99,7 +108,7 @@ def write_scenario(
         raise InputError(f"{path}: a scenario is a Python file; give a name that ends with .py")
     if path.exists():
         raise InputError(f"{path} is there already; give another name, or remove it")
-    draft = drafted(opened(data), inputs, outputs, time)
+    draft = drafted(opened(data), inputs, outputs, time, disturbances)
     write_text(path, scenario_text(path, data, draft))
     return draft
 
@@ -123,7 +132,9 @@ def left_to_decide(path: Path) -> list[str]:
     return found
 
 
-def drafted(source: Source, inputs: Sequence[str], outputs: Sequence[str], time: str) -> Draft:
+def drafted(
+    source: Source, inputs: Sequence[str], outputs: Sequence[str], time: str, disturbances: Sequence[str] = ()
+) -> Draft:
     """Roles of a recording's columns: as they are given, or as their numbers look."""
     columns, left_out = _columns(source)
     by_name = {column.full: column for column in columns}
@@ -137,7 +148,7 @@ def drafted(source: Source, inputs: Sequence[str], outputs: Sequence[str], time:
     stamps = named([time])[0] if time else next((c for c in columns if _rises(c.values)), None)
     taken = {stamps.full} if stamps else set()
     others = [c for c in columns if c.full not in taken]
-    given = named(inputs), named(outputs)
+    given = named(inputs), named(outputs), named(disturbances)
     chosen = {c.full for group in given for c in group}
     free = [c for c in others if c.full not in chosen]
     held = tuple(c for c in free if _is_held(c.values))
@@ -147,12 +158,12 @@ def drafted(source: Source, inputs: Sequence[str], outputs: Sequence[str], time:
         there = ", ".join(source.header)
         raise InputError(
             f"{source.path}: no column is left for {'an output' if u else 'an input'}; it has {there}. Say which is "
-            "which: --input-column, --output-column"
+            "which: --input-column, --output-column, --disturbance-column"
         )
     scale = 1.0 if stamps is None else _seconds(stamps)
     period = 1.0 if stamps is None else scale * float(np.median(np.diff(stamps.values)))
-    unused = tuple(c.full for c in others if c not in u and c not in y)
-    return Draft(stamps, period, u, y, (*left_out, *unused))
+    unused = tuple(c.full for c in others if c not in (*u, *y, *given[2]))
+    return Draft(stamps, period, u, y, (*left_out, *unused), given[2])
 
 
 def _columns(source: Source) -> tuple[list[Column], tuple[str, ...]]:
@@ -197,7 +208,7 @@ def _seconds(stamps: Column) -> float:
 
 def first_model(draft: Draft, output: Column) -> Lag:
     """A lag of one or two states whose free run is nearest to an output."""
-    every = np.column_stack([output.values, *(c.values for c in draft.inputs)])
+    every = np.column_stack([output.values, *(c.values for c in draft.drives)])
     every = every[np.isfinite(every).all(axis=1)]
     stride = max(1, len(every) // MOST)
     y, u = every[::stride, 0], every[::stride, 1:]
@@ -225,7 +236,7 @@ def first_model(draft: Draft, output: Column) -> Lag:
             best = error, lag
     if best is not None:
         return best[1]
-    return Lag(1, 20 * draft.period, 1.0, (0.0,) * len(draft.inputs), float(np.mean(y)))
+    return Lag(1, 20 * draft.period, 1.0, (0.0,) * len(draft.drives), float(np.mean(y)))
 
 
 def _rounded(value: float, digits: int = 3) -> str:
@@ -260,7 +271,8 @@ def _names(columns: Sequence[Column], taken: set[str]) -> list[str]:
 def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     """The file: signals, a first prior of lags, and how the recording is read."""
     y_names = _names(draft.outputs, set())
-    u_names = _names(draft.inputs, set())
+    u_names, w_names = _names(draft.inputs, set()), _names(draft.disturbances, set())
+    drives = [*(("u", n) for n in u_names), *(("w", n) for n in w_names)]
     lags = [first_model(draft, column) for column in draft.outputs]
     kind = "".join(part.capitalize() for part in re.findall(r"[A-Za-z0-9]+", path.stem)) or "Machine"
     kind = f"Machine{kind}" if kind[0].isdigit() else kind
@@ -269,7 +281,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         text, note = _signal(column, name)
         states.append((text, note))
         unit = column.unit or "-"
-        towards = " + ".join([f"p.rest_{name}", *(f"p.k_{name}_{u} * u.{u}" for u in u_names)])
+        towards = " + ".join([f"p.rest_{name}", *(f"p.k_{name}_{n} * {of}.{n}" for of, n in drives)])
         steady.append(f"{name}_steady = {towards}")
         if lag.states == 1:
             rates.append((f"({name}_steady - x.{name}) / p.T_{name}", "a lag of first order"))
@@ -283,7 +295,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
             parameters.append((f"D_{name}", min(max(lag.damping, 0.01), 5.0), "-", 0.0, 10.0, "damping"))
         middle = min(max(lag.offset, float(lower)), float(upper))
         parameters.append((f"rest_{name}", middle, unit, float(lower), float(upper), "value without inputs"))
-        for u, source, gain in zip(u_names, draft.inputs, lag.gains, strict=True):
+        for (_, u), source, gain in zip(drives, draft.drives, lag.gains, strict=True):
             reach = max(10 * abs(gain), 10 * np.ptp(column.span) / np.ptp(source.span))
             per = f"{unit}/({source.unit})" if source.unit and source.unit != "-" else unit
             parameters.append((f"k_{name}_{u}", gain, per, -float(reach), float(reach), f"gain from {u}"))
@@ -311,6 +323,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     time_note = "rises evenly; in seconds?" if draft.time and not draft.time.unit else ""
     if draft.time is None:
         time_note = "the sampling time [s]; no column of the recording looks like time"
+    point = "x=(...), u=(...)" + (", w=(...)" if w_names else "")
     lines = [
         f'"""{path.stem}: written from {data.name} by hybrid-mpc new. Lines marked {MARK} are yours to decide."""',
         "",
@@ -318,7 +331,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         "",
         "",
         f"class {kind}(Prior):",
-        '    """A first prior: each output is a lag of the inputs."""',
+        '    """A first prior: each output is a lag of all that acts."""',
         "",
         f"    # {MARK}: write the machine's own equations in xdot; its states need not be measured",
         "    states = (",
@@ -331,6 +344,12 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         ),
         "    )",
         f"    outputs = states[:{len(y_names)}]",
+        *(["    disturbances = ("] if w_names else []),
+        *(
+            f"        {text},  # {note}"
+            for text, note in (_signal(c, n) for c, n in zip(draft.disturbances, w_names, strict=True))
+        ),
+        *(["    )"] if w_names else []),
         "    parameters = (  # name, value, unit, bounds of the fit",
         *(
             f'        Parameter("{n}", {_rounded(v)}, "{unit}", {_rounded(low)}, {_rounded(high)}, "{text}"),'
@@ -338,7 +357,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         ),
         "    )",
         f"    corrects = ({', '.join(f'{n!r}' for n in corrected)},)".replace("'", '"'),
-        f"    # {MARK}: operating_point = OperatingPoint(x=(...), u=(...)), if the machine works around one",
+        f"    # {MARK}: operating_point = OperatingPoint({point}), if the machine works around one",
         f"    # {MARK}: balances(self, x, u, w, p), if something is stored: energy, mass, heat",
         "",
         "    def xdot(self, x, u, w, p):",
@@ -362,6 +381,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         f"        max_gap={_rounded(5 * draft.period)},",
         f"        smoothing={_rounded(smoothing)},",
         f"        warm_up={_rounded(warm)},  # s of the past that start a free run",
+        *([f"        disturbances={_tuple(c.full for c in draft.disturbances)},"] if w_names else []),
         "    ),",
         f"    # {MARK}: control=OCP(horizon, q=, r=, r_delta=, u_min=, u_max=), sensor_sigma=, safe_input=, and tasks",
         ")",

@@ -46,6 +46,31 @@ def test_an_oven(call, tmp_path):
     assert len(left) >= 6
 
 
+def test_a_disturbance_that_is_measured(call, tmp_path):
+    """An oven whose room is measured: what it does is learned beside the heater's gain."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([0.0, 400.0, 1000.0], 45), 20)
+    room = 20.0 + np.cumsum(0.2 * rng.standard_normal(900))
+    warmth = [20.0]
+    for power, outside in zip(u[:-1], room[:-1], strict=True):
+        rest = outside + 0.05 * power
+        warmth.append(rest + (warmth[-1] - rest) * np.exp(-2.0 / 40.0))
+    noisy = np.array(warmth) + 0.01 * rng.standard_normal(900)
+    columns = {"time [s]": 2.0 * np.arange(900), "heater [W]": u, "room [K]": room, "warmth [K]": noisy}
+    file, machine = write_csv(tmp_path / "monday.csv", columns), tmp_path / "oven.py"
+    words = ("--input-column", "heater", "--output-column", "warmth", "--disturbance-column", "room")
+    code, told, error = call("new", machine, "--data", file, *words)
+    assert code == 0, error
+    assert "measured disturbances: room [K]" in told
+    prior = load_scenario(str(machine)).prior()
+    assert [(s.name, s.unit) for s in prior.disturbances] == [("room", "K")]
+    assert prior.values["k_warmth_heater"] == pytest.approx(0.05, rel=0.05)
+    assert prior.values["k_warmth_room"] == pytest.approx(1.0, rel=0.1)
+    assert any("w=(...)" in line for line in left_to_decide(machine))
+    code, told, error = call("check", machine, "--data", file)
+    assert code == 0, told + error
+
+
 def test_a_swing_has_two_states(machine, tmp_path):
     draft = write_scenario(tmp_path / "swing.py", machine / "monday.csv")
     assert (draft.time.full, [c.full for c in draft.inputs]) == ("time_s", ["tau_nm"])
