@@ -318,3 +318,45 @@ def measured_as(prior: Prior, y: Array) -> Array:
 
 def _padded(values: Array, length: int) -> Array:
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])
+
+
+def input_correlation(errors: Sequence[Array], inputs: Sequence[Array], lags: int) -> tuple[Array, float]:
+    """What of free runs' errors an input of before explains: their correlation, and the band of independent ones.
+
+    Beyond the band something that this input drives is missing in the model, or has another size or delay there. Both
+    signals remember, so the band is Bartlett's, ``1.96 sqrt(sum_k rho_e(k) rho_u(k) / n)``, with their own
+    autocorrelations.
+
+    Args:
+        errors: Errors of an output in each run ``(n,)``; NaN where it was not measured.
+        inputs: The input beside it ``(n,)``.
+        lags: Longest lag [samples].
+
+    Returns:
+        Correlations at lags 0 to ``lags`` ``(lags + 1,)``, and half the width of the 95 % band; NaN where one of the
+        two does not move.
+
+    Source: Box, Jenkins, Reinsel, Ljung, *Time Series Analysis*, 5th edition, 2015, section 12.1; Ljung, *System
+    Identification*, 2nd edition, 1999, section 16.6.
+
+    Example:
+        >>> u = np.random.default_rng(0).standard_normal(4000)
+        >>> rho, band = input_correlation([np.roll(u, 3)], [u], 5)
+        >>> int(np.argmax(rho)), round(float(rho[3]), 2), round(band, 2)
+        (3, 1.0, 0.04)
+    """
+    pairs = [(e[np.isfinite(e)], u[np.isfinite(e)]) for e, u in zip(errors, inputs, strict=True)]
+    pairs = [(e - e.mean(), u - u.mean()) for e, u in pairs if len(e) > lags + 1]
+    n = sum(len(e) for e, _ in pairs)
+    size = np.sqrt(sum(float(e @ e) for e, _ in pairs) * sum(float(u @ u) for _, u in pairs))
+    if not size > 0:
+        return np.full(lags + 1, np.nan), float("nan")
+
+    def at(lag: int, first: int, second: int) -> float:
+        return sum(float(p[first][lag:] @ p[second][: len(p[second]) - lag]) for p in pairs)
+
+    rho = np.array([at(k, 0, 1) for k in range(lags + 1)]) / size
+    far = max(lags, min(len(e) for e, _ in pairs) // 4)
+    own = [np.array([at(k, i, i) for k in range(far + 1)]) for i in (0, 1)]
+    memory = 2.0 * float((own[0][1:] / own[0][0]) @ (own[1][1:] / own[1][0])) + 1.0
+    return rho, 1.96 * float(np.sqrt(max(memory, 1.0) / n))

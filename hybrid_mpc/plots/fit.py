@@ -118,6 +118,38 @@ def free_run(
     return figure
 
 
+def input_correlations(
+    lags: Array, found: Mapping[str, Mapping[tuple[str, str], tuple[Array, float]]], *, title: str = ""
+) -> Figure:
+    """Correlation of free runs' errors with each input of before, a panel for each pair of input and output.
+
+    Args:
+        lags: Lags ``(m,)`` [s].
+        found: By model and ``(input, output)``: correlations ``(m,)`` and half the width of the band of
+            independent ones.
+        title: Title. Default: none.
+
+    Example:
+        >>> lags = np.arange(3) * 0.1
+        >>> len(input_correlations(lags, {"phy": {("u", "y"): (np.zeros(3), 0.1)}}).axes)
+        1
+    """
+    pairs = list(dict.fromkeys(pair for own in found.values() for pair in own))
+    figure, panels = new_column([1.2] * len(pairs), title=title)
+    for ax, pair in zip(panels, pairs, strict=True):
+        ax.axhline(0.0, color=FAINT, linewidth=0.8)
+        for model, own in found.items():
+            rho, band = own[pair]
+            ax.plot(lags, rho, **line_style(model))
+            for edge in (-band, band):
+                ax.axhline(edge, color=colour(model), linestyle=":", linewidth=1.0)
+        ax.set_ylabel(f"{plain(pair[1])} error\nwith {plain(pair[0])} [-]")
+        ax.set_ylim(-1.0, 1.0)
+    finish_column(figure, panels)
+    panels[-1].set_xlabel("input before by [s]")
+    return figure
+
+
 def _errors(
     panels: Sequence[Axes],
     t: Array,

@@ -37,14 +37,14 @@ STEPS = {"steps-post": "after", "steps-pre": "before", "steps": "before", "steps
 
 
 def over_time(figure: Figure) -> bool:
-    """Whether a figure's panels lie over time.
+    """Whether all of a figure's panels lie over time.
 
     Example:
         >>> from hybrid_mpc.plots.style import new_figure
         >>> over_time(new_figure(1, 1)[0])
         False
     """
-    return any(ax.get_xlabel().startswith("time") for ax in figure.axes)
+    return {ax.get_xlabel() for ax in figure.axes} - {""} == {"time [s]"}
 
 
 def write_interactive(figure: Figure, picture: Path) -> Path:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from hybrid_mpc.identify.evaluate import Scores
+from hybrid_mpc.identify.evaluate import Scores, input_correlation
 from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loop_figures import curves_of, loop_figure
@@ -40,6 +40,8 @@ OBSERVER_TITLES = {
     "hybrid_observer": "Observer on the hybrid",
 }
 SHOWN_RUNS = 2
+LAGS, FEWEST_LAGS = 50, 5
+"""Lags of the correlation of errors with inputs [samples], and so few that a picture of them tells nothing."""
 SHOWN_RECORDINGS = 4
 
 
@@ -82,6 +84,7 @@ def _draw(context: Context, parts: Sequence[Callable[[Context], Any]]) -> Figure
 
 def _saved(figure: Figure, path: Path) -> Path:
     """A picture, and beside it its interactive form if it lies over time."""
+    path.with_suffix(".json").unlink(missing_ok=True)  # of another picture of this name
     save(figure, path)
     if over_time(figure):
         write_interactive(figure, path)
@@ -144,6 +147,7 @@ def _free_runs(context: Context) -> Any:
         )  # fmt: skip
         caption = f"Free run over the unseen piece {run}; the warm-up before it is left out."
         yield "free_run", f"free_run_{run.replace('#', '-')}", figure, caption
+    yield from _unexplained(context, deployed)
     metrics = metrics_of(prior)
     values = {m: _flat(scores.model) for m, scores in found.scores.items()}
     every = {str(m): [_flat(n) for n in found.scores[m].networks] for m in kinds_of(prior)}
@@ -154,6 +158,32 @@ def _free_runs(context: Context) -> Any:
     }
     caption = "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind."
     yield "free_run", "errors", fit.errors_bar(values, metrics, spread=spread), caption
+
+
+def _unexplained(context: Context, deployed: str) -> Any:
+    """What of the errors the inputs explain, for the fitted prior and the hybrid."""
+    found, prior = context.read(EVALUATION), context.scenario.prior()
+    arrays, runs = found.arrays, found.runs
+    shortest = min((len(arrays[f"phy/{run}/t"]) for run in runs), default=0)
+    lags = min(LAGS, shortest // 4)
+    if lags < FEWEST_LAGS:
+        return
+    correlations: dict[str, dict[tuple[str, str], tuple[Any, float]]] = {}
+    for model in ("phy", deployed):
+        for (i, into), (j, output) in product(enumerate(prior.inputs), enumerate(prior.outputs)):
+            errors = [arrays[f"{model}/{run}/y_hat"][:, j] - arrays[f"{model}/{run}/y"][:, j] for run in runs]
+            inputs = [arrays[f"{model}/{run}/u"][:, i] for run in runs]
+            pair = input_correlation(errors, inputs, lags)
+            if np.isfinite(pair[1]):
+                correlations.setdefault(model, {})[into.name, output.name] = pair
+    if set(correlations) != {"phy", deployed} or len({frozenset(own) for own in correlations.values()}) > 1:
+        return
+    figure = fit.input_correlations(context.spec.dt * np.arange(lags + 1.0), correlations)
+    caption = (
+        "Correlation of the errors with the input of before. Beyond the dotted lines (95 % of errors that the input "
+        "does not explain) something that this input drives is missing, or has another size or delay."
+    )
+    yield "free_run", "unexplained", figure, caption
 
 
 def metrics_of(prior: Prior) -> dict[str, str]:
