@@ -401,6 +401,6 @@ def short_runs(spec: DataSpec, test: Sequence[Trajectory]) -> tuple[str, ...]:
         return ()
     return (
         f"free runs of {spec.free_run:g} s are asked for (DataSpec.free_run); the longest piece of test data leaves "
-        f"{max(longest, 0.0):.4g} s behind its warm-up of {spec.warm_up:g} s: models are judged by shorter runs. Give "
-        "longer recordings, or windows of your own",
+        f"{max(longest, 0.0):.4g} s behind its warm-up of {spec.warm_up:g} s: models are evaluated by shorter runs. "
+        "Give longer recordings, or windows of your own",
     )

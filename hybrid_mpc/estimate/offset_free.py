@@ -30,7 +30,8 @@ class OffsetFree:
         needed: ``n_z + n_d``: with less the outputs cannot tell the disturbances from the states.
         target_rank: Of ``[[A - I, B], [C_c, D_c]]``, ``c`` the controlled outputs.
         target_needed: ``n_z + n_c``: with less not every set-point has a steady state.
-        unmoved: States that no input moves and that never come to rest (:func:`~hybrid_mpc.model.riccati.unmoved`).
+        unmoved: Where the targets' rank lacks: states that no input moves and that never come to rest
+            (:func:`~hybrid_mpc.model.riccati.unmoved`).
     """
 
     n_d: int
@@ -127,11 +128,11 @@ def offset_free(
     chosen = list(range(model.n_y)) if controlled is None else list(controlled)
     if not all(0 <= i < model.n_y for i in chosen):
         raise InputError(f"controlled: {chosen} given; needed: places of the {model.n_y} outputs")
+    target_rank, target_needed = _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen)
     return OffsetFree(
         model.n_d, model.n_y,
-        _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d,
-        _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen),
-        tuple(unmoved(model, a, b)),
+        _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d, target_rank, target_needed,
+        unmoved(model, a, b) if target_rank < target_needed else (),
     )  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tupl
     Its blocks agreed by chance on the EMPS, and a hybrid with twice the prior's error was recommended.
 
     Args:
-        runs: What judges a training (:func:`~hybrid_mpc.identify.evaluate.unseen_runs`).
+        runs: What a training is evaluated on (:func:`~hybrid_mpc.identify.evaluate.unseen_runs`).
     """
     files = [t.file for _, them in runs for t in them]
     if len(set(files)) > 1:

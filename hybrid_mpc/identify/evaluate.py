@@ -126,9 +126,9 @@ def unseen_runs(
     smoother: Smoother,
     length: float | None = None,
 ) -> list[tuple[int | None, list[Trajectory]]]:
-    """Trajectories that judge a training by what its networks did not see: the parts that they left out.
+    """Trajectories that a training is evaluated on, which its networks did not see: the parts that they left out.
 
-    The validation does not judge: the networks' weights were chosen by it. It does where nothing could be left out.
+    The validation is none of them: the networks' weights were chosen by it. It is where nothing could be left out.
 
     Args:
         settings: Of the training.

@@ -100,7 +100,7 @@ class FirstStates:
             free. ``"measured"``: outputs that are states, by their names, are exact wherever a run starts; the others
             are free.
             ``"shared"``: all trajectories start from one state, which is free. ``"warm_up"``: a run's first ``seconds``
-            alone tell its first state, and what follows alone counts, as where models are judged.
+            alone tell its first state, and what follows alone counts, as where models are evaluated.
         values: Values [their units] of the states that are known, by name.
         seconds: Length [s] of the warm-up.
 
@@ -776,8 +776,8 @@ def fit_prior(
         train: Training trajectories.
         valid: Validation trajectories (chosen by, not fitted to).
         dt: Model period [s].
-        length: Length [s] of the longest windows: that of the runs that the model will be judged by. Default: 5 of the
-            machine's seconds, or 3 of the nominal prior's largest time constant where that is more.
+        length: Length [s] of the longest windows: that of the runs that the model will be evaluated by. Default: 5 of
+            the machine's seconds, or 3 of the nominal prior's largest time constant where that is more.
         largest_delay: Longest delay [s] of the inputs. Default 0: they act at once.
         start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
             fixed parameters are left out. Default: none.
@@ -843,11 +843,11 @@ def fit_prior(
                 *(f.theta for _, f in found[-1:]),
             ]  # short windows may have led astray
             found.append((name, problem.solve(known[int(np.argmin(problem.explained(known)))])))
-    judges = [problems[-1]] if _longest(guesses[0]) > lengths[-1] + fit.lead else []
+    scoring = [problems[-1]] if _longest(guesses[0]) > lengths[-1] + fit.lead else []
     if _longest(guesses[1]) > lengths[-1] + fit.lead:
-        judges.append(problem_of(guesses[1], lengths[-1]))
+        scoring.append(problem_of(guesses[1], lengths[-1]))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
-    scores = _errors_of([c.theta for _, c in candidates], judges)
+    scores = _errors_of([c.theta for _, c in candidates], scoring)
     on_progress(total - 1, total, "smoothing by the fitted prior")
 
     def best() -> tuple[Fitted, Smoother]:
@@ -866,7 +866,7 @@ def fit_prior(
     if answered > 1.0 and fit.free:
         on_progress(total - 1, total, "predictions, as inputs answer to the outputs")
         candidates.append(("predictions", fit_by_prediction(fit, chosen.theta, train, smoother)))
-        scores += _errors_of([candidates[-1][1].theta], judges)
+        scores += _errors_of([candidates[-1][1].theta], scoring)
         if int(np.argmin(scores)) == len(scores) - 1:
             chosen, smoother = best()
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))

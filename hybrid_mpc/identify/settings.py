@@ -52,7 +52,7 @@ class TrainingSettings:
             by their validation only if this is the same.
         objectives: Names in :data:`~hybrid_mpc.identify.objectives.OBJECTIVES`, of balances of the prior, or
             ``"balances"`` for all of these; the curve has them all, the first one is that of free runs and validation.
-            Default: the outputs, which models are judged by, and all balances.
+            Default: the outputs, which models are evaluated by, and all balances.
         prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each network
             its own. The energy balance of the objective keeps the fitted values.
         prior_replay: Weight of the mean square of the correction (in its own scale) in states that no recording comes

@@ -449,7 +449,7 @@ def _runs(
         model.dt,
     )
     if spec.repeated and spec.length is not None:
-        # behind what is given and what is judged the last input, and the sample that it leads to
+        # behind what is given and what is scored the last input, and the sample that it leads to
         trajectories = in_runs(trajectories, round(warm_up / dt) + round(spec.length / dt) + 2)
     return run_freely(
         prior, fit, model.networks, trajectories, warm_up=warm_up, length=spec.length, linear=model.linear

@@ -20,7 +20,8 @@ SETTLED = 0.05
 """Share of a step within which a signal has settled."""
 CLEAR = 10.0
 """Size of a step, in standard deviations of the signal at the end, from which it tells of a rise."""
-
+LARGEST = 0.5
+"""Share of the largest deviation behind it that a step must have: else a load moves the signal, not the set-point."""
 JUMP = 0.5
 """Share of a step that the reference must make at once: one that came there slowly asks for no rise."""
 
@@ -73,9 +74,12 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
     offset = float(np.mean(y[late]) - r[-1])
     size = r[-1] - y[begin]
     jump = abs(r[begin] - r[begin - 1]) if begin else abs(size)
-    if abs(size) <= CLEAR * max(float(np.std(y[late])), abs(offset)) or jump < JUMP * abs(size):
+    least = max(CLEAR * float(np.std(y[late])), LARGEST * float(np.max(np.abs(y[begin:] - r[-1]))))
+    if abs(size) <= least or jump < JUMP * abs(size):
         return StepResponse(offset)
     answer = (y[begin:] - y[begin]) * np.sign(size)
+    if np.max(answer) < 0.9 * abs(size):  # it never arrives
+        return StepResponse(offset, overshoot=0.0)
     info = control.step_info(answer, T=t[begin:] - t[begin], yfinal=abs(size), SettlingTimeThreshold=SETTLED)
     rise, settling, overshoot = (float(info[key]) for key in ("RiseTime", "SettlingTime", "Overshoot"))
     return StepResponse(

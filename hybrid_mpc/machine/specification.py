@@ -170,7 +170,7 @@ class BenchmarkSpec:
         units: By the name of an output the unit of its figures, and how many of these are one of its own: ``{"x":
             ("mm", 1e3)}`` for an output in metres. Default: every output's own.
         length: Length [s] of a run after what is given. Default: the whole recording.
-        repeated: Whether a recording is judged by as many runs of that length as fit into it one behind the other.
+        repeated: Whether a recording is evaluated by as many runs of that length as fit into it one behind the other.
             Default: by one, from its beginning.
         piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
         cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
@@ -179,7 +179,7 @@ class BenchmarkSpec:
             the others train as wholes. For short runs, whose last second is no fair sample. The files must not have
             windows in the data specification. Fewer files than that are split by it. Default: zero, never.
         fractions: Shares of training, validation and held-back samples, where they are not those of the data
-            specification: a benchmark's test files are of its own, the main job needs a part to judge by. Default:
+            specification: a benchmark's test files are of its own, the main job needs a part to evaluate on. Default:
             those of the data specification.
 
     Raises:

@@ -453,7 +453,7 @@ def replay_residuals(
     )  # fmt: skip
 
 
-def judged(monitor: ResidualMonitor, trace: ResidualTrace, y: Array) -> ResidualTrace:
+def with_alarms(monitor: ResidualMonitor, trace: ResidualTrace, y: Array) -> ResidualTrace:
     """A trace with the alarms of ``monitor``'s limits; ``y`` ``(n, n_y)`` are its measurements.
 
     Residuals do not depend on limits, so nothing is replayed.

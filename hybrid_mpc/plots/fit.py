@@ -88,22 +88,21 @@ def free_run(
         >>> len(figure.axes)
         7
     """
-    t, n = np.asarray(t, dtype=float), 2 * len(signals)
-    heights = [1.6, 0.8] * len(signals) + [0.9] * len(inputs) + [1.2, 0.9] * len(balances)
-    figure, every = new_column(heights, title=title)
-    panels, errors = [*every[:n:2], *every[n:]], every[1:n:2]
-    _signals(panels, t, measured, predictions, signals)
+    t, n = np.asarray(t, dtype=float), len(signals)
+    heights = [1.6, 0.8] * n + [0.9] * len(inputs) + [1.2, 0.9] * len(balances)
+    figure, panels = new_column(heights, title=title)
+    shown, errors, below = panels[: 2 * n : 2], panels[1 : 2 * n : 2], panels[2 * n :]
+    _signals(shown, t, measured, predictions, signals)
     _errors(errors, t, measured, {m: predictions[m] for m in ("phy", hybrid) if m in predictions}, signals)
-    n //= 2
     ink = colour(hybrid)
-    for ax, signal in zip(panels, signals, strict=False):
+    for ax, signal in zip(shown, signals, strict=True):
         if band and signal.name in band:
             low, high = (checked("band", end, len(t)) for end in band[signal.name])
             limits = ax.get_ylim()
             ax.fill_between(t, low, high, color=ink, alpha=0.2, linewidth=0, label="90 % band")
             ax.set_ylim(limits)
-    below = panels[n + len(inputs) :]
-    plot_inputs(panels[n : n + len(inputs)], t, checked("u", u, len(t), len(inputs)), inputs)
+    plot_inputs(below[: len(inputs)], t, checked("u", u, len(t), len(inputs)), inputs)
+    below = below[len(inputs) :]
     for balance, above, under in zip(balances, below[::2], below[1::2], strict=True):
         name = plain(balance.name)
         one, other = (checked(f"balance {name}", e, len(t)) for e in (balance.measured, balance.model))
@@ -114,7 +113,7 @@ def free_run(
         under.fill_between(t, gap, color=ink, alpha=0.35, linewidth=0)
         under.plot(t, gap, color=ink, linewidth=0.8)
         under.set_ylabel(f"violation\n[{balance.unit}]")
-    finish_column(figure, every, columns=6)
+    finish_column(figure, panels, columns=6)
     return figure
 
 

@@ -60,9 +60,15 @@ def test_a_reference_that_arrives_slowly_asks_for_no_rise():
 
 
 def test_what_never_arrives_has_no_rise():
-    y = np.minimum(T / 100.0, 0.3) + 0 * T
-    found = step_response(T, y, np.ones(T.size))
-    assert found.settling is None
+    found = step_response(T, 0.8 * (1 - np.exp(-T)), np.ones(T.size))  # a fifth is missing
+    assert (found.rise, found.settling) == (None, None)
+    assert found.overshoot == pytest.approx(0.0)
+    assert found.offset == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_a_load_that_moves_more_than_the_first_deviation_is_no_step():
+    found = step_response(T, 1e-3 * np.exp(-T) + np.exp(-((T - 5.0) ** 2)), np.zeros(T.size))
+    assert found.overshoot is None
 
 
 def test_a_reference_that_moves_until_the_end_has_no_answer():
@@ -88,3 +94,19 @@ def test_signals_that_the_problem_weighs_have_one():
     assert [s.label for s in by_state] == ["q [m]"]
     by_output = step_responses(OCP(5, [0.0, 0.0], [1.0], [0.0], [-1.0], [1.0], q_y=[1.0]), machine, loop)
     assert by_output[machine.outputs[0]].overshoot == pytest.approx(4.6, abs=0.05)
+
+
+def test_nothing_that_a_loop_may_look_like_raises():
+    """The report is written of whatever came: samples that are missing or infinite, jumps, drift, rest."""
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        n = int(rng.integers(5, 200))
+        t = 0.1 * np.arange(n)
+        y = np.cumsum(rng.standard_normal(n)) * rng.choice([0, 1e-9, 1, 1e6]) + rng.choice([0, 1, -3])
+        if rng.random() < 0.3:
+            y[rng.integers(0, n, 3)] = rng.choice([np.nan, np.inf, 0.0])
+        reference = np.where(
+            t < t[-1] * rng.random(), rng.choice([0.0, 1.0, -2.0]), rng.choice([0.0, 1.0, 5.0])
+        )
+        found = step_response(t, y, reference)
+        assert found is None or np.isfinite(found.offset)

@@ -61,18 +61,18 @@ def choice_stage(context: Context) -> ChoiceResult:
     if all(own is not None for own, _ in runs):
         validation = evaluation_trajectories(context.smoothed("valid"), smoother, warm, spec.free_run)
         calibrating.append((None, validation))
-    judging = sum(len(them) for _, them in runs)
+    n_left_out = sum(len(them) for _, them in runs)
     errors: dict[str, list[Array]] = {}
     bands: dict[str, Bands] = {}
     for i, name in enumerate(candidates):
         context.progress.update("candidates", i, len(candidates), name)
-        judged = [
-            judge
+        runs_scored = [
+            run
             for own, them in calibrating
-            for judge in zip(*runs_of(context, name, phy, them, own), strict=True)
+            for run in zip(*runs_of(context, name, phy, them, own), strict=True)
         ]
-        errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in judged[:judging]]
-        bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*judged, strict=True)), spec.dt))
+        errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in runs_scored[:n_left_out]]
+        bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*runs_scored, strict=True)), spec.dt))
     samples = max(1, round(context.time_unit / spec.dt))
     recordings, evidence = evidence_of(runs)
     found = recommend(

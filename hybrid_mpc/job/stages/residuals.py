@@ -28,9 +28,9 @@ from hybrid_mpc.monitor.residuals import (
     ResidualLimits,
     ResidualMonitor,
     ResidualTrace,
-    judged,
     limits_of,
     replay_residuals,
+    with_alarms,
 )
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ def _on_recordings(
     alarms: list[ChannelAlarm] = []
     on: list[NDArray[np.bool_]] = []
     for recording, levels in zip(recordings, traces, strict=True):
-        trace = judged(monitor, levels, recording.y)
+        trace = with_alarms(monitor, levels, recording.y)
         alarms += [
             ChannelAlarm(recording.name, start, end, trace.named(start, end))
             for start, end in trace.intervals()
