@@ -18,9 +18,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.kit.prediction import SHARE, Bands
-from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 KNOWN = 8
@@ -70,39 +68,28 @@ def variance_parts(
 
 
 def run_variance(
-    prior: Prior,
-    covariance: Array,
     outputs: Array,
-    start: tuple[Array, Array, Array],
+    parameters: Array,
     t: Array,
     sigma: Array,
     spread: Array,
     *,
-    dt: float,
-    substeps: int,
     longest: float = math.inf,
 ) -> Array:
     """Parts of the variance of a free run's errors ``(n, n_y, 4)``, from the runs of all networks.
 
     Args:
-        prior: The fitted prior.
-        covariance: Covariance of its parameters ``(n_p, n_p)``; empty where it is not known.
         outputs: Outputs of the runs of all networks ``(m, n, n_y)``; of the prior a single one.
-        start: First state ``(n_x,)``, acting inputs ``(n, n_u)`` and disturbances ``(n, n_w)``.
+        parameters: Variance by that of the fitted parameters ``(n, n_y)``, see
+            :func:`~hybrid_mpc.identify.fit.parameter_variance`.
         t: Time since the start ``(n,)`` [s].
         sigma: Noise of the sensors ``(n_y,)``.
         spread: Spread of the outputs ``(n_y,)``.
-        dt: Period [s].
-        substeps: Runge-Kutta sub-steps a period.
         longest: As :func:`variance_parts` has it.
     """
-    n_p, limit = len(prior.parameters), np.square(FAR * spread)
-    if not covariance.size:
-        covariance = np.zeros((n_p, n_p))
+    limit = np.square(FAR * spread)
     with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges has a band without end
         networks = np.nan_to_num(outputs.var(axis=0), nan=np.inf)
-        x, u, w = (values[None] for values in start)
-        parameters = parameter_variance(prior, covariance, x, u, w, dt, substeps)[0]
     return variance_parts(
         t, sigma, spread, np.minimum(networks, limit), np.minimum(parameters, limit), longest=longest
     )

@@ -25,7 +25,15 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.delay import NONE, shifted
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.simulation import Points, Simulation, flow_slope, required_substeps, rest_of, visited
+from hybrid_mpc.identify.simulation import (
+    Points,
+    Simulation,
+    flow_slope,
+    required_substeps,
+    rest_of,
+    simulation_of,
+    visited,
+)
 from hybrid_mpc.identify.smooth import SAMPLE, Smoother, fit_smoother, rough_smoother, unseen_states
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
@@ -941,16 +949,20 @@ def parameter_variance(
 
     Args:
         prior: The fitted prior.
-        covariance: Covariance of its parameters ``(n_p, n_p)``.
+        covariance: Covariance of its parameters ``(n_p, n_p)``; empty where it is not known, which counts as none.
         x: First states ``(b, n_x)``.
         u: Inputs ``(b, n, n_u)``.
         w: Disturbances ``(b, n, n_w)``.
         dt: Period [s].
         substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
     """
-    simulation = Simulation(prior.equations.xdot, dt, range(len(prior.parameters)), prior.equations.output)
-    _, slope = simulation.by_parameters(x, u, w, prior.p, substeps or required_substeps(prior, dt))
-    variance = np.einsum("bkip,pq,bkiq->bki", slope, covariance, slope)
+    if not covariance.size:
+        return np.zeros((*u.shape[:2], len(prior.outputs)))
+    free = tuple(range(len(prior.parameters)))
+    simulation = simulation_of(prior.equations.xdot, dt, free, prior.equations.output)
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is as uncertain as can be
+        _, slope = simulation.by_parameters(x, u, w, prior.p, substeps or required_substeps(prior, dt))
+        variance = np.sum((slope @ covariance) * slope, axis=-1)
     return np.asarray(np.nan_to_num(np.maximum(variance, 0.0), nan=np.inf))
 
 

@@ -15,6 +15,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.bands import run_variance
 from hybrid_mpc.identify.delay import lost_samples, shifted
+from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.prediction import SHARE, Predicting
@@ -128,9 +129,12 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     half = np.full(outputs[0].shape, np.nan)
     bands = held.bands.get(name)
     if bands is not None:
+        parameters = parameter_variance(
+            prior, np.array(chosen.covariance), states[0][:1], u[None], w[None], dt, held.substeps
+        )
         parts = run_variance(
-            prior, np.array(chosen.covariance), outputs[1:] if networks else outputs, (states[0][0], u, w), t - t[0],
-            np.array(held.sigma), np.array(held.sizes.y), dt=dt, substeps=held.substeps, longest=held.longest or np.inf,
+            outputs[1:] if networks else outputs, parameters[0], t - t[0], np.array(held.sigma), np.array(held.sizes.y),
+            longest=held.longest or np.inf,
         )  # fmt: skip
         half = bands.half_width(parts)
     y = acting.y[shown]

@@ -93,6 +93,14 @@ class Simulation:
         return ca.Function("period", [z, u, w, p], ca.cse(found))
 
 
+@lru_cache(maxsize=32)
+def simulation_of(
+    xdot: ca.Function, dt: float, free: tuple[int, ...] = (), output: ca.Function | None = None
+) -> Simulation:
+    """The same :class:`Simulation` whenever it is asked for: its functions are built once."""
+    return Simulation(xdot, dt, free, output)
+
+
 def over_time(
     period: ca.Function, first: Array, signals: Sequence[Array], constants: Sequence[Array]
 ) -> tuple[Array, list[Array]]:

@@ -52,7 +52,7 @@ GUARDS = ("", "rest", "adapt", "prior")
 prior's parameters, or which plans with the fitted prior."""
 ARRAYS = (
     "step_ms", "plans",
-    *(f.name for f in fields(ClosedLoopResult) if f.name not in ("dt", "timing_ms", "switches")),
+    *(f.name for f in fields(ClosedLoopResult) if f.name not in ("dt", "timing_ms", "switches", "given_way")),
 )  # fmt: skip
 """What a row may hold of its loop."""
 DRAWN = ("t", "x", "u", "y", "w", "reference", "y_ref")
@@ -230,6 +230,7 @@ class LoopRow:
         switches: Changes of the guard's mode.
         timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
         on_model: Name of the model that stood in for the machine; empty: the loop ran on the scenario's plant.
+        given_way: Share of the periods in which a hard bound had to give way, by its name. Default: none did.
         arrays: What the specification asked to keep. Default: nothing.
     """
 
@@ -252,6 +253,7 @@ class LoopRow:
     switches: tuple[ModeChange, ...]
     timing_ms: Mapping[str, Mapping[str, float]]
     on_model: str = ""
+    given_way: Mapping[str, float] = field(default_factory=dict)
     arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
 
     def plain(self) -> dict[str, Any]:
@@ -270,6 +272,7 @@ class LoopRow:
             **{f"{name} {signal}": v for name in groups for signal, v in getattr(self, name).items()},
             **{f"share_{source}": share for source, share in self.sources.items()},
             **{f"task_{name}": float(value) for name, value in self.figures.items()},
+            **{f"given_way {name}": share for name, share in self.given_way.items()},
             "alarm_share": nan if self.alarm_share is None else self.alarm_share,
             "first_alarm_s": self.alarms[0].start_s if self.alarms else nan,
             "largest_level_w": nan if self.largest_level is None else self.largest_level,
@@ -543,6 +546,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         invalid_s=float(np.sum(~r.valid)) * r.dt if watched else None,
         switches=tuple(ModeChange(s.t, s.before.name, s.after.name, s.why) for s in r.switches),
         timing_ms={key: percentiles(r.timing_ms[key]) for key in TIMES},
+        given_way=share_given_way(r),
     )
 
 
@@ -574,6 +578,12 @@ def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[s
             rest_y = model.output(model.x0, model.u0, model.w, model.p).full()[i, 0]
             used[f"output {signal.name}"] = share_used(seen, low[i], high[i], rest_y)
     return used
+
+
+def share_given_way(r: ClosedLoopResult) -> dict[str, float]:
+    """Share of a loop's periods in which each hard bound had to give way; empty where none did."""
+    names = [name for period in r.given_way for name in period]
+    return {name: names.count(name) / len(r.t) for name in sorted(set(names))}
 
 
 def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:

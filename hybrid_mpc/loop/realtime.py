@@ -257,6 +257,7 @@ class _Run:
             timing_ms={name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED},
             alarm=np.array([row.reading is not None and bool(row.reading.alarm) for row in rows], dtype=bool),
             switches=self._loop.switches if self._periods else (),
+            given_way=tuple(row.decision.solution.given_way for row in rows),
         )  # fmt: skip
 
     def _sample(self) -> Array | None:
@@ -352,6 +353,8 @@ class RunReport:
         timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``, ``prepare``.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode in the whole run. Default: none.
+        given_way: For each period the hard bounds that its plan exceeds, since none keeps them all, with the largest
+            violation in the plan. Default: unknown.
     """
 
     periods: int
@@ -372,6 +375,7 @@ class RunReport:
     timing_ms: Mapping[str, Array]
     alarm: NDArray[np.bool_]
     switches: tuple[Switch, ...] = ()
+    given_way: tuple[Mapping[str, float], ...] = ()
 
     def percentiles(self) -> dict[str, dict[str, float]]:
         """Median, 95th and 99th percentile and maximum [ms] of lateness, applied instant and durations.

@@ -221,6 +221,7 @@ def _result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> Cl
         w=np.array([row.w for row in rows]),
         y_ref=np.array([row.y_ref for row in rows]),
         reached=np.array([row.reached for row in rows]),
+        given_way=tuple(row.given_way for row in rows),
     )
 
 
@@ -245,6 +246,7 @@ class _Row(NamedTuple):
     w: Array
     y_ref: Array
     reached: bool
+    given_way: Mapping[str, float]
 
 
 COLUMNS = _Row._fields[:11]
@@ -256,6 +258,7 @@ def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, fl
     return _Row(
         step.t, step.x, step.y, d.u, e.x, e.h, e.d, goal.x, stage, e.innovation, e.nis, d.source.name,
         d.status.name, step.reading, spent, w, goal.y, goal.reached,
+        d.solution.given_way,
     )  # fmt: skip
 
 
@@ -314,6 +317,8 @@ class ClosedLoopResult:
         w: Measured disturbances ``(n, n_w)`` that acted from ``t_k`` on. Default: none.
         y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN where references are the states'. Default: unknown.
         reached: ``(n,)``, False where the set-point cannot be reached. Default: unknown.
+        given_way: For each period the hard bounds that its plan exceeds, since none keeps them all: largest violation
+            in the plan by name, as in :class:`~hybrid_mpc.control.problem.Solution`. Default: unknown.
 
     Example:
         >>> one = np.ones((2, 1))
@@ -348,6 +353,7 @@ class ClosedLoopResult:
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
     y_ref: Array = field(default_factory=lambda: np.zeros((0, 0)))
     reached: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    given_way: tuple[Mapping[str, float], ...] = ()
 
     @property
     def tracks_outputs(self) -> bool:
@@ -400,6 +406,8 @@ class ClosedLoopResult:
         for name in ("source", "status", "stage_cost", "violation", "level", "alarm"):
             unit = "" if model is None or name not in UNITS else f" [{UNITS[name]}]"
             columns[name + unit] = getattr(self, name)
+        for name in sorted({name for period in self.given_way for name in period}):
+            columns[f"given_way {name}"] = [period.get(name, 0.0) for period in self.given_way]
         unit = "_ms" if model is None else " [ms]"
         columns.update({f"{name}{unit}": values for name, values in self.timing_ms.items()})
         return pd.DataFrame(columns)

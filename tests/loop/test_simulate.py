@@ -16,11 +16,13 @@ from hybrid_mpc import (
     EnergyMonitor,
     ExtendedKalmanFilter,
     Fault,
+    HardBound,
     InputError,
     SafeController,
     TrueState,
     simulate,
 )
+from hybrid_mpc.job.loops import share_given_way
 from hybrid_mpc.loop.plant import SimulatedMachine
 
 
@@ -80,6 +82,23 @@ def test_cost_and_error_are_those_of_the_true_state(model, safe):
     np.testing.assert_allclose(
         other.stage_cost, (result.x[:, 0] - result.reference[:, 0]) ** 2 + result.u[:, 0] ** 2
     )
+
+
+def test_the_record_tells_which_hard_bounds_gave_way(model, safe):
+    """The club starts beyond its bound, so that the first plans cannot keep it; later ones do."""
+    bounded = safe.controller.ocp.changed(hard=[HardBound("x", [-np.inf, -np.inf], [0.05, np.inf])])
+    controller = SafeController(CondensedController(model, bounded), model, safe_input=[0.0])
+    steps = []
+    result = run(model, controller, reference=[0.0, 0.0], on_step=steps.append)
+    assert result.given_way == tuple(step.decision.solution.given_way for step in steps)
+    assert result.given_way[0] == {
+        "phi": pytest.approx(0.05, abs=0.02)
+    }  # as far as it starts beyond, and its noise
+    assert result.given_way[-1] == {}
+    share = share_given_way(result)
+    assert 0 < share["phi"] < 1
+    column = result.to_pandas()["given_way phi"]
+    assert (column > 0).mean() == share["phi"]
 
 
 def replace_weights(ocp):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.identify.bands import FAR, RunParts, fit_bands, run_variance
 from hybrid_mpc.identify.choose import Choice, evidence_of, recommend
 from hybrid_mpc.identify.evaluate import FreeRun, evaluation_trajectories, unseen_runs
+from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
@@ -85,18 +86,29 @@ def choice_stage(context: Context) -> ChoiceResult:
 def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float) -> list[RunParts]:
     """Errors of each run of a model, and the parts of their variance; ``every``: its runs, then each network's."""
     assert fit.sizes is not None
-    covariance, spread = np.array(fit.covariance(phy.parameters)), np.array(fit.sizes.y)
+    spread, parameters = np.array(fit.sizes.y), by_parameters(phy, fit, every[0], dt)
     found = []
-    for runs in zip(*every, strict=True):
+    for i, runs in enumerate(zip(*every, strict=True)):
         own = runs[0]
         error = np.clip(
             np.nan_to_num(own.y_hat - own.y, nan=np.nan, posinf=np.inf), -FAR * spread, FAR * spread
         )
-        parts = run_variance(
-            phy, covariance, np.stack([run.y_hat for run in runs[1:] or runs]), (own.x_hat[0], own.u, own.w),
-            own.t - own.t[0], np.array(fit.sigma), spread, dt=dt, substeps=fit.substeps,
-        )  # fmt: skip
+        outputs = np.stack([run.y_hat for run in runs[1:] or runs])
+        parts = run_variance(outputs, parameters[i], own.t - own.t[0], np.array(fit.sigma), spread)
         found.append(RunParts(error, parts))
+    return found
+
+
+def by_parameters(phy: Prior, fit: PriorFit, runs: Sequence[FreeRun], dt: float) -> list[Array]:
+    """Variance of each run's outputs ``(n, n_y)`` by that of the fitted parameters; runs of a length side by side."""
+    covariance, found = np.array(fit.covariance(phy.parameters)), [np.zeros((0, 0))] * len(runs)
+    for length in sorted({len(run.t) for run in runs}):
+        same = [i for i, run in enumerate(runs) if len(run.t) == length]
+        x, u, w = (
+            np.stack(v) for v in zip(*((runs[i].x_hat[0], runs[i].u, runs[i].w) for i in same), strict=True)
+        )
+        for i, own in zip(same, parameter_variance(phy, covariance, x, u, w, dt, fit.substeps), strict=True):
+            found[i] = own
     return found
 
 
