@@ -130,8 +130,8 @@ def shown(model: hm.HybridModel, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     return np.array([model.output(a, b, model.w, model.p).full().ravel() for a, b in zip(x, u, strict=True)])
 
 
-def loop(runs: Path, machine: str, kind: str, seed: int) -> dict:
-    """Figures of one loop."""
+def loop(runs: Path, machine: str, kind: str, seed: int, also: Callable[[Step], None] | None = None) -> dict:
+    """Figures of one loop; ``also`` is called after each period."""
     case = CASES[machine]
     scenario, model, observer, controller, ocp = parts(runs, machine, kind)
     plant = scenario.plant()
@@ -140,6 +140,8 @@ def loop(runs: Path, machine: str, kind: str, seed: int) -> dict:
     planned = [0.0]
 
     def watch(step: Step) -> None:
+        if also is not None:
+            also(step)
         plan = step.decision.solution
         if not step.decision.status.ok or plan.given_way:
             return
