@@ -132,6 +132,7 @@ class ActiveSet:
         self._at_free = qp.values(self._free)
         self._n = qp.g.size
         self._nearest: Active = np.zeros(qp.lower.size, dtype=np.int8)
+        self._wrong = qp.lower.size + 1
 
     def solve(self, active: Active | None = None) -> Found:
         """The answer, whose residuals are to be looked at; ``active`` are rows to begin with."""
@@ -143,6 +144,7 @@ class ActiveSet:
             return Found(self._free, np.zeros(none.size), none)
         return (
             self.all_at_once(start)
+            or (self.all_at_once(none) if np.any(start) else None)  # after a jump the last set is of no use
             or self.one_at_a_time(self._nearest)
             or self.one_at_a_time(none)
             or Found(self._free, np.zeros(none.size), none)
@@ -151,7 +153,6 @@ class ActiveSet:
     def all_at_once(self, active: Active) -> Found | None:
         """The answer by changes of the whole set; None where they do not end, or no longer come nearer."""
         qp, seen, least, left = self._qp, set(), active.size + 1, PATIENCE
-        self._nearest = active
         for _ in range(CHANGES):
             on = self._on(active)
             if on is None:
@@ -170,10 +171,10 @@ class ActiveSet:
             if np.array_equal(after, active):
                 return found
             wrong = int(np.count_nonzero(after != active))
-            if wrong < least:
-                least, left, self._nearest = wrong, PATIENCE, active
-            else:
-                left -= 1
+            left = PATIENCE if wrong < least else left - 1
+            least = min(least, wrong)
+            if wrong < self._wrong:
+                self._wrong, self._nearest = wrong, active
             key = after.tobytes()
             if left < 0 or key in seen:
                 return None
