@@ -43,10 +43,12 @@ MODES = ("quiet", "slip", "jump")
 QUIET_SHARE = 0.0003
 """Step of the estimated load per period while nothing happens (drift, temperature), as a share of its size. Where
 it finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
-FOUND_HORIZONS, MOST_DOUBLED = 4.0, 5
+FOUND_HORIZONS, MOST_DOUBLED = 1.5, 7
 """Horizons of the controller within which the quiet filter has found two thirds of a constant load, and how often its
 step is doubled for that at most. A load that a jump does not show takes as long to be compensated. The golf robot takes
-1.3 horizons, the disk 3.3, so neither is doubled. Quick steps make a loop hunt around sticking friction."""
+1.3 horizons, the disk less, so neither is doubled: quick steps make a loop hunt around sticking friction, and where a
+model's errors come and go they are taken for loads. Four horizons cost machines that only lag, as heaters and arms, 1.3
+to 1.5 times as much under a load (docs/results/simulated_machines.md)."""
 JUMP_SHARE = 0.05
 """The same when a load comes or goes. A load of a twentieth of what the drive can do is ordinary; for a larger one
 the filter needs a few periods."""
