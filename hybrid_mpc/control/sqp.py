@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.control.active_set import Active
+from hybrid_mpc.control.active_set import PRIMAL_TOLERANCE, Active
 from hybrid_mpc.control.curvature import StageCurvature, convex
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Controller, Solution, Status, Target
@@ -120,6 +120,12 @@ class ReducedCost:
             case.target.p, w=case.target.w,
         )  # fmt: skip
 
+    def rounding(self, values: Array) -> float:
+        """What penalties of values ``(M,)`` may differ by where the QP's rows are exact to its tolerance."""
+        soft = self.problem.soft
+        beyond = soft.excess(values) > 0
+        return PRIMAL_TOLERANCE * self.problem.model.dt * float((soft.linear * soft.scale)[beyond].sum())
+
     def penalty(self, values: Array) -> float:
         """What values of the soft bounds cost."""
         soft = self.problem.soft
@@ -160,6 +166,10 @@ CORRECTIONS = 2
 """Most corrections of a step by what it was found to bend."""
 SLOW = 0.1
 """Share of the residual that the Hessian got wrong, above which second derivatives are taken anew."""
+LIFTED = 14
+"""Most linearizations of a first plan that keep the states as unknowns, with defects, before all iterates are runs."""
+AGREES = 0.01
+"""Share by which the cost of a run may differ from what the QP said of it for that to end."""
 AGAIN = (1, 4, 16, 64)
 """Times at which a hidden state's curvature that hardly mattered is looked at again."""
 
@@ -347,7 +357,7 @@ class Descent:
     def _lost(self, found: _Step) -> None:
         """No step lowers the cost: where it is flat what is left is rounding, else start anew."""
         self.kkt = max(found.answer.kkt, self._residual(found.hessian, found.hessian @ found.answer.step))
-        flat = found.promised <= self._enough
+        flat = found.promised <= self._enough + self._cost.rounding(self.at.run.soft[0])
         self.ended = (flat and self.kkt <= KKT) or self._plain
         self.status = Status.SOLVED if self.ended and flat else Status.STOPPED
         self._stale, self._plain, self._damping = not self._fresh, self._fresh, 0.0
@@ -425,14 +435,46 @@ class SQPController(Controller):
         case = Case(estimate.d, previous.u[0], target, limits)
         u = self._admissible(previous.following, case)
         run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
+        active, lifted = self._cost.inner.qp.later(previous.active), 0
+        if not np.isfinite(previous.cost) and case.target.ok:  # a first plan, far from any that is good
+            given = estimate, reference, weight, limits, w
+            run, active, lifted = self._lifted(previous, run, case, given)
         at = self._cost.at(run, case)
-        active = self._cost.inner.qp.later(previous.active)
         descent = Descent(self._cost, case, at, self._shifted(previous), self._tolerance, active)
+        descent.count = lifted
         if not (np.isfinite(run.cost) and np.all(np.isfinite(at.gradient)) and case.target.ok):
             descent.status, descent.ended = Status.NOT_FINITE, True
         while descent.count < self._iterations and not descent.ended:
             descent.iterate()
         return self._plan(descent, case, start)
+
+    def _lifted(
+        self, previous: Solution, run: Rollout, case: Case,
+        given: tuple[Estimate, Array, Array | None, Limits | None, Array | None],
+    ) -> tuple[Rollout, Active | None, int]:  # fmt: skip
+        """Where to begin: the cheapest run on the plans of Gauss-Newton's multiple shooting, and how many there were.
+
+        Its states leave the model's equations on the way, so that a swing that runs from rest could only creep towards
+        is found in some steps.
+        """
+        inner, (estimate, reference, weight, limits, w) = self._cost.inner, given
+        best, active, count = run, None, 0
+        prepared = inner.prepare(previous, weight)
+        while count < min(LIFTED, self._iterations - 1):
+            count += 1
+            plan = inner.feedback(prepared, estimate, reference, limits, w)
+            if not plan.status.ok:
+                break
+            run = self._cost.run(run.z[0], self._admissible(plan.u, case), case)
+            if run.cost < best.cost or not np.isfinite(best.cost):
+                best, active = run, plan.active
+            if abs(run.cost - plan.cost) <= AGREES * abs(run.cost):
+                break
+            z = np.hstack([plan.x, plan.h])
+            prepared = inner.linearize(
+                plan.u, z, plan.d, prepared.u_prev, prepared.weight, plan.w, plan.steady, plan.active
+            )
+        return best, active, count
 
     def _shifted(self, previous: Solution) -> Array | None:
         """Second derivatives along the previous plan, a period later; None if it has none that fit."""

@@ -21,6 +21,7 @@ from hybrid_mpc import (
     SQPController,
     Status,
 )
+from hybrid_mpc.control import sqp
 
 SOLVERS = [SQPController, IpoptController]
 
@@ -151,6 +152,16 @@ def test_an_iteration_limit_gives_a_plan_that_may_be_applied():
     assert early.cost > late.cost
     run = few.problem.run(np.concatenate([given[0].x, given[0].h]), early.u)
     np.testing.assert_array_equal(run[:, :2], early.x)
+
+
+def test_a_first_plan_takes_half_the_iterations_of_runs_alone(monkeypatch):
+    model, ocp, given = stroke()
+    plan = plan_of(SQPController(model, ocp), *given)
+    monkeypatch.setattr(sqp, "LIFTED", 0)
+    alone = plan_of(SQPController(model, ocp), *given)
+    assert plan.status is alone.status is Status.SOLVED
+    assert plan.iterations <= 8 < 12 <= alone.iterations
+    assert plan.cost == pytest.approx(alone.cost, rel=1e-8)
 
 
 def test_sqp_repairs_a_start_beyond_the_limits_of_the_change():
