@@ -19,6 +19,10 @@ COLOURS = 128
 """Colours of a kept picture: it looks the same and takes half the bytes."""
 LONGEST = 900
 """Most seconds one cell may take, on a machine that is busy otherwise."""
+VARIABLE = "HYBRID_MPC_RECORDINGS"
+"""Environment variable with the folder of real recordings, a folder a machine."""
+RECORDINGS = Path(os.environ.get(VARIABLE, HERE.parents[1] / "shared" / "data"))
+"""That folder; default: the one beside the repository that tests and benchmarks read."""
 
 
 def execute(path: Path) -> nbformat.NotebookNode:
@@ -35,7 +39,8 @@ def execute(path: Path) -> nbformat.NotebookNode:
     with tempfile.TemporaryDirectory() as folder:
         where = {"metadata": {"path": folder}}
         client = NotebookClient(notebook, timeout=LONGEST, resources=where, record_timing=False)
-        client.execute(env={**os.environ, "PYTHONPATH": python, "OMP_NUM_THREADS": "1"})
+        own = {"PYTHONPATH": python, "OMP_NUM_THREADS": "1", VARIABLE: str(RECORDINGS)}
+        client.execute(env={**os.environ, **own})
     return notebook
 
 

@@ -36,6 +36,8 @@ from hybrid_mpc.plots.style import (
 
 Limits: TypeAlias = tuple[Sequence[float] | Array, Sequence[float] | Array]
 """Lower and upper bounds, one a signal."""
+FITS = 16
+"""Characters of a label that are no longer than a panel of an error is high; a longer one gets a line for its unit."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ def closed_loops(
         ax.set_ylabel(axis_label(panel.signal))
     for ax, panel in zip(errors, tracked, strict=True):
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
-        ax.set_ylabel(f"error of\n{axis_label(panel.signal)}")
+        name = axis_label(panel.signal)
+        ax.set_ylabel("error of\n" + (name if len(name) <= FITS else name.replace(" [", "\n[")))
     for i, ax in enumerate(below):
         _bounds(ax, () if limits is None else (limits[0][i], limits[1][i]), "input limits")
     if around.shape[1]:

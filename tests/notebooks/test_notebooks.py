@@ -80,10 +80,23 @@ def test_links_between_the_notebooks(path):
         assert link.startswith("http") or (FOLDER / link).exists(), link
 
 
+def test_a_notebook_on_recordings_says_what_it_needs(monkeypatch, tmp_path):
+    """Without its recordings the first cell ends with where they are from, their columns and where to put them."""
+    monkeypatch.setenv("HYBRID_MPC_RECORDINGS", str(tmp_path))
+    for path in FILES:
+        first, *_ = code(read(path))
+        if "HYBRID_MPC_RECORDINGS" in first.source:
+            cells = re.sub("(?m)^%.*", "", first.source)
+            with pytest.raises(FileNotFoundError, match=r"https://.*columns time_s.*HYBRID_MPC_RECORDINGS"):
+                exec(compile(cells, path.name, "exec"), {})
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_it_runs(path):
     tool = load("execute")
+    if tool.VARIABLE in code(read(path))[0].source and not tool.RECORDINGS.is_dir():
+        pytest.skip("its recordings are not here")
     fresh = tool.clean(tool.execute(path))  # a cell that fails raises
     assert not [m.group() for text in texts(fresh) for m in [ABSOLUTE.search(text)] if m]
     assert [len(c.outputs) > 0 for c in code(fresh)] == [len(c.outputs) > 0 for c in code(read(path))]
