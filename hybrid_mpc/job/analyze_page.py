@@ -329,11 +329,16 @@ def _channel(some: HybridModel, i: int, j: int) -> tuple[str, str]:
 
 def _draw_measured(given: AnalysisInput, part: ResponseAnalysis) -> Named:
     some = _some(given)
-    curves = {"measured": vars(part.machine)} | {name: vars(part.models[name]) for name in _names(given)}
+    found = {"measured": part.machine} | {name: part.models[name] for name in _names(given)}
+    curves = {name: vars(one) | {"trusted": one.trusted} for name, one in found.items()}
     figure = plots.measured_bode(
         curves, input_signal=some.inputs[0], output_signal=some.outputs[0], source=part.source
     )
-    yield "measured", figure, "Machine and models driven by the same inputs; band: two standard deviations."
+    caption = (
+        "Machine and models driven by the same inputs; band: two standard deviations. Faint lines are those whose "
+        "coherence unrelated signals reach, too (one line in a hundred is above it by chance)."
+    )
+    yield "measured", figure, caption
 
 
 def _draw_loops(given: AnalysisInput, part: Mapping[str, Mapping[str, Mapping[str, LoopAnalysis]]]) -> Named:

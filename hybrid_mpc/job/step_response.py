@@ -11,17 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 AT_REST = 0.2
-"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean."""
+"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean; also how long the
+set-point before a step must have been held, as a share of the time after it."""
 SETTLED = 0.05
 """Share of a step within which a signal has settled."""
 CLEAR = 10.0
 """Size of a step, in standard deviations of the signal at the end, from which it tells of a rise."""
 LARGEST = 0.5
 """Share of the largest deviation behind it that a step must have: else a load moves the signal, not the set-point."""
+STILL = 1e-9
+"""Share of a reference's size by which rounding may move it."""
 JUMP = 0.5
 """Share of a step that the reference must make at once: one that came there slowly asks for no rise."""
 
@@ -46,6 +48,9 @@ class StepResponse:
 def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> StepResponse | None:
     """The answer to the last set-point; None where the reference moves until the end.
 
+    A step leads from one set-point that is held to another. A pulse that comes back, or the end of a moving reference,
+    asks for no rise: then there is the offset alone.
+
     Args:
         t: Instants ``(n,)`` [s].
         values: The signal ``(n,)``; NaN where it was not measured.
@@ -67,15 +72,19 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
     if len(t) < 10:
         return None
     late = t >= t[-1] - AT_REST * (t[-1] - t[0])
-    if np.ptp(r[late]) > 1e-9 * max(1.0, float(np.max(np.abs(r)))):
+    scale = max(1.0, float(np.max(np.abs(r))))
+    if np.ptp(r[late]) > STILL * scale:
         return None
-    moved = np.flatnonzero(np.abs(r - r[-1]) > 1e-9 * max(1.0, float(np.max(np.abs(r)))))
+    moved = np.flatnonzero(np.abs(r - r[-1]) > STILL * scale)
     begin = int(moved[-1]) + 1 if moved.size else 0
     offset = float(np.mean(y[late]) - r[-1])
     size = r[-1] - y[begin]
     jump = abs(r[begin] - r[begin - 1]) if begin else abs(size)
     least = max(CLEAR * float(np.std(y[late])), LARGEST * float(np.max(np.abs(y[begin:] - r[-1]))))
-    if abs(size) <= least or jump < JUMP * abs(size):
+    since = int(np.searchsorted(t, t[begin] - AT_REST * (t[-1] - t[begin])))
+    before = r[max(0, min(since, begin - 2)) : begin]
+    stood = not begin or np.ptp(before) <= STILL * scale
+    if abs(size) <= least or jump < JUMP * abs(size) or not stood:
         return StepResponse(offset)
     answer = (y[begin:] - y[begin]) * np.sign(size)
     if np.max(answer) < 0.9 * abs(size):  # it never arrives
@@ -88,25 +97,36 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
 
 
 def step_responses(
-    problem: OCP, machine: Prior | HybridModel, loop: Mapping[str, Array]
+    problem: OCP, machine: Prior, loop: Mapping[str, Array]
 ) -> dict[Signal, StepResponse]:
     """Answers of all signals of a loop that the problem weighs and that end at a set-point.
 
+    Of a speed whose position has a moving reference the offset alone counts: its jumps belong to that motion.
+
     Args:
         problem: The control problem: outputs where it weighs those, else states.
-        machine: Names the signals.
+        machine: Names the signals, and says which are speeds of which.
         loop: Arrays :data:`~hybrid_mpc.job.loops.DRAWN`.
 
-    Example: ``step_responses(kit.problem(task.name), kit.models["prior"], row.arrays)``
+    Example: ``step_responses(scenario.control, scenario.prior(), row.arrays)``
     """
     if problem.n_y:
         signals, weights, values, references = machine.outputs, problem.q_y, loop["y"], loop["y_ref"]
     else:
         signals, weights, values, references = machine.states, problem.q, loop["x"], loop["reference"]
-    found = {}
+    positions = {} if problem.n_y else {speed: position for position, speed in machine.kinematics}
+    n, found = len(loop["t"]), {}
     for i, signal in enumerate(signals):
         if weights[i] > 0:
-            answer = step_response(loop["t"], values[: len(loop["t"]), i], references[: len(loop["t"]), i])
+            answer = step_response(loop["t"], values[:n, i], references[:n, i])
+            if answer is not None and i in positions and _moves(references[:n, positions[i]]):
+                answer = StepResponse(answer.offset)
             if answer is not None:
                 found[signal] = answer
     return found
+
+
+def _moves(reference: Array) -> bool:
+    """Whether a reference ``(n,)`` changes over two periods in a row: a step changes over one."""
+    changes = np.abs(np.diff(reference)) > STILL * max(1.0, float(np.nanmax(np.abs(reference), initial=0.0)))
+    return bool(np.any(changes[1:] & changes[:-1]))

@@ -351,9 +351,11 @@ def measured_bode(
 ) -> Figure:
     """Frequency responses estimated in the same way from a machine and from models.
 
+    Lines that are not trusted are drawn faint, and their phase is not: it would be any.
+
     Args:
         responses: By name (``"measured"`` for the machine): ``omega`` [rad/s], complex ``response``, ``coherence``,
-            ``deviation`` of the magnitude, each ``(n,)``.
+            ``deviation`` of the magnitude, and whether a line is ``trusted``, each ``(n,)``.
         input_signal: The input.
         output_signal: The output.
         source: What was done, for the title.
@@ -363,7 +365,7 @@ def measured_bode(
 
     Example:
         >>> one = {"omega": np.array([1.0, 2.0]), "response": np.array([1 + 0j, -1j]),
-        ...     "coherence": np.ones(2), "deviation": np.zeros(2)}
+        ...     "coherence": np.ones(2), "deviation": np.zeros(2), "trusted": np.ones(2, bool)}
         >>> u, y = Signal("v", "m/s"), Signal("q", "m")
         >>> len(measured_bode({"measured": one}, input_signal=u, output_signal=y, source="a multisine").axes)
         3
@@ -372,21 +374,32 @@ def measured_bode(
         raise InputError("measured response: there is nothing to draw")
     figure, axes = new_figure(3, 1, sharex=True, size=(9, 7.2), heights=(3, 2, 1.2))
     upper, middle, lower = axes[:, 0]
+    doubtful = False
     for name, one in responses.items():
         omega = np.asarray(one["omega"], dtype=float)
         g = np.asarray(one["response"])
         shown = np.isfinite(g)
-        w, size = omega[shown], np.abs(g[shown])
-        machine = name == "measured"
+        w, size, there = omega[shown], np.abs(g[shown]), np.asarray(one["coherence"], dtype=float)[shown]
+        sure = np.asarray(one["trusted"], dtype=bool)[shown]
         style = line_style(name) | {"linewidth": 1.4}
-        if machine:
+        if name == "measured":
             style |= {"linestyle": "none", "marker": "o", "markersize": 4, "markerfacecolor": "none"}
             spread = np.asarray(one["deviation"], dtype=float)[shown]
             band = np.maximum(size - 2 * spread, 1e-3 * size), size + 2 * spread
-            upper.fill_between(w, *band, color=FAINT, alpha=0.25, linewidth=0)
-        upper.loglog(w, size, **style)
-        middle.semilogx(w, np.degrees(np.unwrap(np.angle(g[shown]))), **style)
-        lower.semilogx(w, np.asarray(one["coherence"], dtype=float)[shown], **style)
+            upper.fill_between(w, *band, where=sure, color=FAINT, alpha=0.25, linewidth=0)
+        if not sure.all():
+            doubtful = True
+            faint = style | {"alpha": 0.2, "zorder": 2.0, "label": "_"}
+            upper.loglog(w, size, **faint)
+            lower.semilogx(w, there, **faint)
+        phase = np.full(w.shape, np.nan)
+        phase[sure] = np.degrees(np.unwrap(np.angle(g[shown][sure])))
+        upper.loglog(w, np.where(sure, size, np.nan), **style)
+        middle.semilogx(w, phase, **style)
+        lower.semilogx(w, np.where(sure, there, np.nan), **style)
+    if doubtful:
+        text = "faint, without phase: coherence no higher than that of unrelated signals"
+        lower.plot([], [], color=INK, alpha=0.2, label=text)
     upper.set_ylabel(f"magnitude\n[{ratio_unit(output_signal, input_signal)}]")
     middle.set_ylabel("phase [°]")
     middle.yaxis.set_major_locator(MultipleLocator(90))

@@ -1,5 +1,7 @@
 """Measured responses, interval bounds, contraction, exponents and sensitivities."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -57,6 +59,26 @@ def test_no_coherence_without_a_connection():
     rng = np.random.default_rng(1)
     found = welch_response([(rng.normal(size=20000), rng.normal(size=20000))], 0.1, length=10.0)
     assert np.median(found.coherence) < 3 / found.averages  # its mean is 1 / averages
+
+
+@pytest.mark.parametrize("length", [700.0, 50.0])  # 4 and 79 windows
+def test_unrelated_signals_are_trusted_as_rarely_as_it_is_said(length):
+    """One line in a hundred, or fewer: 4 windows that overlap are a little more than 9/11 of 4 (here 0.25 %)."""
+    rng = np.random.default_rng(2)
+    found = [welch_response([tuple(rng.normal(size=(2, 20000)))], 0.1, length=length) for _ in range(20)]
+    trusted = np.concatenate([one.trusted for one in found])
+    assert trusted.size > 4000
+    assert 0.001 < trusted.mean() < 0.02
+
+
+def test_a_response_is_trusted_where_there_is_one():
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=20000)
+    y = run_model(LAG, [0.0, 0.0])(u) + 0.3 * rng.normal(size=u.size)
+    found = welch_response([(u, y)], 0.1, length=20.0)
+    assert found.trusted[found.omega < 2].all()  # where the lag passes
+    assert not found.trusted[found.omega > 25].all()  # where noise is a hundred times what it passes
+    assert not replace(found, averages=1.0).trusted.any()  # the coherence of one piece is 1 whatever it is
 
 
 def test_too_little_data_is_said():

@@ -5,10 +5,24 @@ import math
 import numpy as np
 import pytest
 
-from hybrid_mpc import OCP, Signal
+from hybrid_mpc import OCP, Prior, Signal
 from hybrid_mpc.job.step_response import step_response, step_responses
 
 T = np.arange(0.0, 30.0, 0.005)
+
+
+class Mass(Prior):
+    """A mass that a force moves; its position is measured in millimetres."""
+
+    states = (Signal("q", "m"), Signal("v", "m/s"))
+    inputs = (Signal("F", "N"),)
+    outputs = (Signal("y", "mm"),)
+
+    def xdot(self, x, u, w, p):
+        return x.v, u.F
+
+    def output(self, x, u, w, p):
+        return (1e3 * x.q,)
 
 
 def second_order(zeta, size=1.0, start=0.0):
@@ -59,6 +73,31 @@ def test_a_reference_that_arrives_slowly_asks_for_no_rise():
     assert found.offset == pytest.approx(0.0, abs=1e-12)
 
 
+def test_a_pulse_that_comes_back_is_no_step():
+    """The speed of a stroke: nothing, at one sample the speed of the impact, then rest."""
+    reference = np.where(np.abs(T - 10.0) < 0.0025, 2.0, 0.0)
+    y = np.where(T < 10.0, 2.0 * np.exp(np.minimum(T - 10.0, 0.0)), 2.0 * np.exp(-np.maximum(T - 10.0, 0.0)))
+    found = step_response(T, y, reference)
+    assert (found.rise, found.settling, found.overshoot) == (None, None, None)
+    assert found.offset == pytest.approx(0.0, abs=1e-6)
+    held = np.where(np.abs(T - 7.5) < 2.5, 2.0, 0.0)  # the same way back from a level that was held
+    assert step_response(T, y, held).settling == pytest.approx(-math.log(0.05), abs=0.011)
+
+
+def test_the_jump_of_a_speed_belongs_to_the_motion_of_its_position():
+    machine = Mass()
+    assert machine.kinematics == ((0, 1),)
+    ocp = OCP(5, [1.0, 1.0], [1.0], [0.0], [-1.0], [1.0])
+    speed = np.where(T < 10.0, 1.0, 0.0)
+    x = np.stack([np.minimum(T, 10.0), np.where(T < 10.0, 1.0, np.exp(-np.maximum(T - 10.0, 0.0)))], axis=1)
+    ramp = np.stack([np.minimum(T, 10.0), speed], axis=1)  # at 10 s it stops
+    found = step_responses(ocp, machine, {"t": T, "x": x, "reference": ramp})
+    assert [answer.settling for answer in found.values()] == [None, None]
+    alone = np.stack([np.zeros(T.size), speed], axis=1)  # the same speed, and nothing is asked of the position
+    _, v = step_responses(ocp, machine, {"t": T, "x": x, "reference": alone}).values()
+    assert v.settling == pytest.approx(-math.log(0.05), abs=0.011)
+
+
 def test_what_never_arrives_has_no_rise():
     found = step_response(T, 0.8 * (1 - np.exp(-T)), np.ones(T.size))  # a fifth is missing
     assert (found.rise, found.settling) == (None, None)
@@ -83,9 +122,7 @@ def test_samples_that_are_missing_are_left_out():
 
 
 def test_signals_that_the_problem_weighs_have_one():
-    machine = type(
-        "Machine", (), {"states": (Signal("q", "m"), Signal("v", "m/s")), "outputs": (Signal("y", "mm"),)}
-    )
+    machine = Mass()
     loop = {
         "t": T, "x": np.stack([second_order(0.5), T], axis=1), "reference": np.tile([1.0, 0.0], (T.size, 1)),
         "y": 1e3 * second_order(0.7)[:, None], "y_ref": np.full((T.size, 1), 1e3),

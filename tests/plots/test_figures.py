@@ -283,3 +283,26 @@ def test_figure_shows_all_samples_and_lags(tmp_path):
 
 def test_innovations_of_a_short_recording_without_any_measurement():
     assert estimation.innovations([np.full(10, np.nan)], np.zeros((2, 1)), **INNOVATIONS).axes
+
+
+def test_lines_of_low_coherence_are_faint_and_have_no_phase():
+    omega = np.array([1.0, 2.0, 4.0, 8.0])
+    measured = {
+        "omega": omega, "response": np.array([1.0, -1j, 0.1, -0.1]), "coherence": np.array([0.9, 0.9, 0.1, 0.9]),
+        "deviation": np.zeros(4), "trusted": np.array([True, True, False, True]),
+    }  # fmt: skip
+    model = measured | {"trusted": np.ones(4, bool)}
+    channel = {"input_signal": Signal("u", "N"), "output_signal": Signal("y", "m"), "source": "test"}
+    figure = analysis.measured_bode({"measured": measured, "prior": model}, **channel)
+    upper, middle, lower = figure.axes
+    for ax, values in ((upper, np.abs(measured["response"])), (lower, measured["coherence"])):
+        faint, sure, whole = (line for line in ax.lines if len(line.get_xdata()))
+        assert faint.get_alpha() < 0.5
+        assert faint.get_zorder() < sure.get_zorder()
+        np.testing.assert_array_equal(faint.get_ydata(), values)
+        np.testing.assert_array_equal(np.isnan(sure.get_ydata()), ~measured["trusted"])
+        np.testing.assert_array_equal(whole.get_ydata(), values)
+    np.testing.assert_allclose(middle.lines[0].get_ydata(), [0.0, -90.0, np.nan, -180.0])
+    assert any("faint" in text.get_text() for text in figure.legends[0].get_texts())
+    clean = analysis.measured_bode({"measured": model}, **channel)
+    assert not any("faint" in text.get_text() for text in clean.legends[0].get_texts())
