@@ -14,8 +14,8 @@ from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 AT_REST = 0.2
-"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean; also how long the
-set-point before a step must have been held, as a share of the time after it."""
+"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean. For that share of
+the time after a step the set-point before it must have been held, too."""
 SETTLED = 0.05
 """Share of a step within which a signal has settled."""
 CLEAR = 10.0
