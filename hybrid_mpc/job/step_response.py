@@ -14,8 +14,8 @@ from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 AT_REST = 0.2
-"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean. For that share of
-the time after a step the set-point before it must have been held, too."""
+"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean. The set-point
+before a step must have been held for that share of the time after it."""
 SETTLED = 0.05
 """Share of a step within which a signal has settled."""
 CLEAR = 10.0
@@ -96,9 +96,7 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
     )
 
 
-def step_responses(
-    problem: OCP, machine: Prior, loop: Mapping[str, Array]
-) -> dict[Signal, StepResponse]:
+def step_responses(problem: OCP, machine: Prior, loop: Mapping[str, Array]) -> dict[Signal, StepResponse]:
     """Answers of all signals of a loop that the problem weighs and that end at a set-point.
 
     Of a speed whose position has a moving reference the offset alone counts: its jumps belong to that motion.

@@ -229,7 +229,7 @@ def errors_bar(
         ax.set_ylabel(metrics[metric])
         ax.set_xticks([])
         ax.grid(False, axis="x")
-    shared_legend(figure, columns=6)
+    shared_legend(figure, columns=2 * columns)
     return figure
 
 
@@ -241,7 +241,9 @@ def _bars(ax: Axes, values: Mapping[str, float], spread: Mapping[str, float]) ->
     for i, (model, value) in enumerate(values.items()):
         height = min(value, 0.93 * top)
         error = spread[model] if spread[model] > 0 and value < top else None
-        ax.bar(i, height, 0.72, color=colour(model), label=name_of(model), yerr=error, capsize=3)
+        look: dict[str, Any] = {"color": colour(model), "edgecolor": "white", "linewidth": 0.0}
+        hatch = "///" if line_style(model)["linestyle"] == "--" else None
+        ax.bar(i, height, 0.72, yerr=error, capsize=3, hatch=hatch, label=name_of(model), **look)
         ax.annotate(
             number(value) + (" ▲" if height < value else ""),
             (i, height + (error or 0.0)),
@@ -372,10 +374,11 @@ def _output(
     signal.plot(t[near], y[near], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
     for name, run in runs.items():
         label = names.get(name, name_of(name))
-        signal.plot(t[near], run[near], **(line_style(name) | {"label": label}))
-        error.plot(t[near], scale * (run - y)[near], color=colour(name), linewidth=1.0, label=label)
+        style = line_style(name) | {"label": label}
+        signal.plot(t[near], run[near], **style)
+        error.plot(t[near], scale * (run - y)[near], **(style | {"linewidth": 1.0}))
         at, course = _course(t, scale * (run - y))
-        below.plot(at, course, color=colour(name), linewidth=1.4)
+        below.plot(at, course, **(style | {"linewidth": 1.4}))
     low, high = np.nanmin(y[near]), np.nanmax(y[near])
     room = 0.3 * max(float(high - low), 1e-9)
     signal.set_ylim(low - room, high + room)  # a model that runs away flattens no other
@@ -503,6 +506,7 @@ def _curve(ax: Axes, model: str, step: Any, values: Any, name: str) -> None:
     array = checked(f"{name} of {model}", values, len(step))
     taken = np.isfinite(array) & (array > 0)
     marker = "o" if name == "validation" else ""
-    ax.plot(step[taken], array[taken], color=colour(model), lw=1.1, marker=marker, ms=3)
+    look = line_style(model) | {"linewidth": 1.1, "label": "_"}
+    ax.plot(step[taken], array[taken], marker=marker, markersize=3, **look)
     if taken.any():
         ax.set_yscale("log")

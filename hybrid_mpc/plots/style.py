@@ -41,7 +41,7 @@ _ROLES = {
     "prior": ("#0072B2", "prior, fitted"),
     "prior_observer": ("#56B4E9", "prior with observer"),
     "rnn": ("#E69F00", "RNN"),
-    "pgrnn": ("#009E73", "PGRNN"),
+    "pgrnn": ("#D55E00", "PGRNN"),
     "mopgrnn": ("#D55E00", "MOPGRNN"),
     "hybrid": ("#D55E00", "hybrid"),
     "hybrid_observer": ("#E69F00", "hybrid with observer"),
@@ -51,10 +51,11 @@ _ROLES = {
     "valid": ("#F0E442", "validation"),
     "test": ("#555555", "test"),
 }
-"""Colour and name of each role or model."""
+"""Colour and name of each role or model. A hybrid has one colour, whatever its networks were trained by and whether it
+runs freely or in a loop; beside a MOPGRNN, a PGRNN is dashed, and its bar is hatched."""
 COLOURS: Mapping[str, str] = MappingProxyType({role: ink for role, (ink, _) in _ROLES.items()})
 NAMES: Mapping[str, str] = MappingProxyType({role: name for role, (_, name) in _ROLES.items()})
-_DASHED = frozenset({"phy_nominal", "reference"})
+_DASHED = frozenset({"phy_nominal", "pgrnn", "reference"})
 _SYMBOLS = {
     "phi": r"$\varphi$",
     "phi_dot": r"$\dot{\varphi}$",

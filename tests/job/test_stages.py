@@ -90,6 +90,28 @@ def test_an_edit_runs_what_reads_it(own, call, pattern, put, stages):
     assert "Another" in (out / "report.html").read_text() or stages != ["report"]
 
 
+def test_a_library_that_draws_otherwise_runs_the_report_alone(own, call, monkeypatch, tmp_path):
+    """A page that an older library made is drawn anew: nothing else reads figures and templates."""
+    _, out, command = own
+    library = tmp_path / "library"
+    for name in report.page_sources():
+        (library / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(report.LIBRARY / name, library / name)
+    kept = report.page_sources()
+    monkeypatch.setattr(report, "LIBRARY", library)
+    assert report.page_sources() == kept  # where it lies does not count
+    before = stamps(out)
+    code, said, message = call(*command)
+    assert (code, rerun(before, stamps(out))) == (0, []), said + message
+    for name in ("report/templates/report.css", "plots/style.py", "job/stages/figures.py"):
+        with (library / name).open("a") as file:
+            file.write("\n")
+        before = stamps(out)
+        code, said, message = call(*command)
+        assert (code, rerun(before, stamps(out))) == (0, ["report"]), said + message
+        assert "stage report runs again: look of the report has changed" in said + message
+
+
 def test_only_and_skip(own, call):
     _, out, command = own
     (out / "checkpoints" / "guard.json").unlink()

@@ -93,7 +93,9 @@ def test_the_jump_of_a_speed_belongs_to_the_motion_of_its_position():
     ramp = np.stack([np.minimum(T, 10.0), speed], axis=1)  # at 10 s it stops
     found = step_responses(ocp, machine, {"t": T, "x": x, "reference": ramp})
     assert [answer.settling for answer in found.values()] == [None, None]
-    alone = np.stack([np.zeros(T.size), speed], axis=1)  # the same speed, and nothing is asked of the position
+    alone = np.stack(
+        [np.zeros(T.size), speed], axis=1
+    )  # the same speed, and nothing is asked of the position
     _, v = step_responses(ocp, machine, {"t": T, "x": x, "reference": alone}).values()
     assert v.settling == pytest.approx(-math.log(0.05), abs=0.011)
 

@@ -73,9 +73,11 @@ def test_the_users_matplotlib_settings_stay():
 
 
 def test_one_colour_per_role():
-    models = ("measured", "phy_nominal", "phy", "rnn", "pgrnn", "mopgrnn", "oracle")
+    models = ("measured", "phy_nominal", "phy", "rnn", "hybrid", "oracle")
     assert len({COLOURS[m] for m in models}) == len(models)
-    assert COLOURS["hybrid"] == COLOURS["mopgrnn"]
+    # whichever is deployed: in free runs it has the colour that it has in loops, and dashes tell the two apart
+    assert COLOURS["hybrid"] == COLOURS["mopgrnn"] == COLOURS["pgrnn"]
+    assert line_style("pgrnn")["linestyle"] != line_style("mopgrnn")["linestyle"]
     assert COLOURS["prior"] == COLOURS["phy"]
     assert line_style("reference")["linestyle"] == line_style("phy_nominal")["linestyle"] == "--"
     assert name_of("my $model") == r"my \$model"
@@ -306,3 +308,10 @@ def test_lines_of_low_coherence_are_faint_and_have_no_phase():
     assert any("faint" in text.get_text() for text in figure.legends[0].get_texts())
     clean = analysis.measured_bode({"measured": model}, **channel)
     assert not any("faint" in text.get_text() for text in clean.legends[0].get_texts())
+
+
+def test_bars_of_two_hybrids_differ_by_their_hatching():
+    figure = fit.errors_bar({"pgrnn": {"level": 1.0}, "mopgrnn": {"level": 2.0}}, {"level": "RMSE [m]"})
+    first, second = figure.axes[0].patches
+    assert first.get_facecolor() == second.get_facecolor()
+    assert (first.get_hatch(), second.get_hatch()) == ("///", None)

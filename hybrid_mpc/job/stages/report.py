@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.files import write_json
+from hybrid_mpc.files import sha256, write_json
 from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
@@ -76,6 +76,15 @@ TITLES: Mapping[str, str] = {
     "analysis": "Linear analysis",
     "glossary": "Names and definitions",
 }
+
+LIBRARY = Path(__file__).parents[2]
+DRAWN_IN = ("plots", "report")
+"""Rooms whose files decide what the report looks like, its templates among them."""
+DRAWN_BY = (
+    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report", "results")),
+    *(f"job/{name}.py" for name in ("loop_figures", "step_response", "summary")),
+)
+"""Modules that do, too."""
 
 # What a run says of its energy guard: in results.json, and as a section of the report.
 
@@ -217,7 +226,19 @@ def what_report_reads(context: Context) -> dict[str, object]:
         "drawing": source_of(scenario.draw),
         "own figures": source_of(scenario.figures),
         "command": command(context, Path(context.settings.scenario).name),
+        "look of the report": page_sources(),
     }
+
+
+def page_sources() -> dict[str, str]:
+    """Hashes of the files that decide what the report looks like, by their places in the library.
+
+    The library's version alone would miss an update between two of them, and no other stage reads these.
+    """
+    found = [LIBRARY / module for module in DRAWN_BY]
+    for room in DRAWN_IN:
+        found += [p for p in (LIBRARY / room).rglob("*") if p.suffix in (".py", ".html", ".css")]
+    return {path.relative_to(LIBRARY).as_posix(): sha256(path) for path in sorted(found)}
 
 
 def command(context: Context, scenario: str = "") -> str:
