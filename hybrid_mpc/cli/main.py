@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from importlib.metadata import entry_points
-from typing import Annotated
+from typing import Annotated, Any
 
 # Before numpy or torch are loaded: arrays here are small, threads inside them only cost time.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -13,6 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 try:
     import typer
     from rich.console import Console
+    from typer.core import TyperCommand
 except ImportError as missing:  # the online half installs without the command line's libraries
     raise SystemExit(
         f"hybrid-mpc: {missing}. Install the command line with: pip install 'hybrid-mpc[all]'"
@@ -53,6 +54,27 @@ SAVED = {
 }
 """What is left where a command was ended by Ctrl-C or by the file system."""
 
+
+class Command(TyperCommand):
+    """A command that says how several files are given: ``--data *.csv`` is what everyone types first."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As typer does it; words that are left over name the options that take one value each time."""
+        given = [word for word in args if word in self._repeated()]
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter:
+            raise
+        except Exception as error:  # typer keeps the class of its errors of usage to itself
+            if given and "unexpected extra argument" in getattr(error, "message", ""):
+                option = given[-1]
+                error.message += f". {option} takes one value; give it once for each: {option} A {option} B"  # type: ignore[attr-defined]
+            raise
+
+    def _repeated(self) -> set[str]:
+        return {name for p in self.params if getattr(p, "multiple", False) for name in p.opts}
+
+
 app = typer.Typer(
     name="hybrid-mpc",
     help="Measurements and an ODE in, a guarded real-time nonlinear MPC out.",
@@ -61,16 +83,16 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command("new", epilog=new.EXAMPLES)(new.new)
-app.command("check", epilog=check.EXAMPLES)(check.check)
-app.command("run", epilog=run.EXAMPLES)(run.run)
-app.command("predict", epilog=predict.EXAMPLES)(predict.predict)
-app.command("control", epilog=control.EXAMPLES)(control.control)
-app.command("analyze", epilog=analyze.EXAMPLES)(analyze.analyze)
-app.command("benchmark", epilog=benchmark.EXAMPLES)(benchmark.benchmark)
-app.command("data", epilog=data.EXAMPLES)(data.data)
-app.command("tune", epilog=tune.EXAMPLES)(tune.tune)
-app.command("monitor", epilog=monitor.EXAMPLES)(monitor.monitor)
+app.command("new", cls=Command, epilog=new.EXAMPLES)(new.new)
+app.command("check", cls=Command, epilog=check.EXAMPLES)(check.check)
+app.command("run", cls=Command, epilog=run.EXAMPLES)(run.run)
+app.command("predict", cls=Command, epilog=predict.EXAMPLES)(predict.predict)
+app.command("control", cls=Command, epilog=control.EXAMPLES)(control.control)
+app.command("analyze", cls=Command, epilog=analyze.EXAMPLES)(analyze.analyze)
+app.command("benchmark", cls=Command, epilog=benchmark.EXAMPLES)(benchmark.benchmark)
+app.command("data", cls=Command, epilog=data.EXAMPLES)(data.data)
+app.command("tune", cls=Command, epilog=tune.EXAMPLES)(tune.tune)
+app.command("monitor", cls=Command, epilog=monitor.EXAMPLES)(monitor.monitor)
 app.command("scenarios")(scenarios.scenarios)
 app.command("doctor")(doctor.doctor)
 app.add_typer(study.app, name="study")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import root
 
 from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.control.ocp import OCP
@@ -209,8 +210,15 @@ def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
     if moving:
         report.add(
             f"prior: operating_point is no equilibrium: at x = {x.tolist()}, u = {u.tolist()} {', '.join(moving)}; "
-            "give the input that holds it there, or the states where this input does"
+            f"give the input that holds it there, or the states where this input does{_nearest(prior, x, u, w)}"
         )
+
+
+def _nearest(prior: Prior, x: Array, u: Array, w: Array) -> str:
+    """The equilibrium that Newton's method finds from a point, to be copied; nothing where it finds none."""
+    found = root(lambda at: prior.equations.xdot(at, u, w, prior.p).full().ravel(), x)
+    inside = all(s.lower <= v <= s.upper for s, v in zip(prior.states, found.x, strict=True))
+    return f": x = {[float(f'{v:.6g}') for v in found.x]}" if found.success and inside else ""
 
 
 def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[Equilibrium, ...]:

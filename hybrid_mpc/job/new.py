@@ -383,11 +383,39 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         f"        warm_up={_rounded(warm)},  # s of the past that start a free run",
         *([f"        disturbances={_tuple(c.full for c in draft.disturbances)},"] if w_names else []),
         "    ),",
-        f"    # {MARK}: control=OCP(horizon, q=, r=, r_delta=, u_min=, u_max=), sensor_sigma=, safe_input=, and tasks",
+        *_first_control(draft, len(states), min(max(round(2 * slowest / dt), 20), 100)),
         ")",
         "",
     ]
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _first_control(draft: Draft, n_x: int, horizon: int) -> list[str]:
+    """A control problem for a first loop, commented out: what only the user knows is marked.
+
+    Outputs are weighed by one over the square of a twentieth of what was recorded, changes of inputs of a tenth
+    (Bryson's rule); inputs stay within what was recorded.
+    """
+
+    def each(columns: Sequence[Column], share: float) -> str:
+        return _numbers(1 / (share * np.ptp(c.span)) ** 2 for c in columns)
+
+    low, high = (_numbers(c.span[i] for c in draft.inputs) for i in (0, 1))
+    free = f"q={_numbers([0.0] * n_x)}, r={_numbers([0.0] * len(draft.inputs))}"
+    return [
+        f"    # {MARK}: what a controller is to do. For a first loop import OCP, and take away the # before:",
+        f"    # control=OCP({horizon}, {free}, u_min={low}, u_max={high},",
+        "    #             # weights: one over the square of a deviation that you tolerate",
+        f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",
+        f"    # sensor_sigma={_numbers(0.005 * np.ptp(c.span) for c in draft.outputs)},  # how much each sensor errs",
+        "    # safe_input=(...),  # the input that does no harm when a sensor is lost: nobody can guess it",
+    ]
+
+
+def _numbers(values: Iterable[float]) -> str:
+    """Numbers as a tuple is written."""
+    given = [_rounded(float(v)) for v in values]
+    return f"({', '.join(given)},)" if len(given) == 1 else f"({', '.join(given)})"
 
 
 def _tuple(names: Iterable[str]) -> str:

@@ -248,7 +248,10 @@ PLANTED = {
     # the operating point
     "an operating point that drifts": (
         kettle(operating_point=OperatingPoint((0.25, 20.0), (0.15, 0.0), (20.0,))),
-        ["operating_point is no equilibrium", "level changes by 0.025 m a second", "give the input that holds it"],
+        [
+            "operating_point is no equilibrium", "level changes by 0.025 m a second", "give the input that holds it",
+            "does: x = [",
+        ],
     ),
     "an operating point beyond a range": (
         kettle(operating_point=OperatingPoint((0.25, 120.0), (0.1, 0.0), (20.0,))),

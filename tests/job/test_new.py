@@ -147,3 +147,33 @@ def test_what_cannot_be_is_refused(tmp_path):
     with pytest.raises(InputError, match="no column has 20 numbers that move"):
         write_scenario(tmp_path / "b.py", short)
     assert not (tmp_path / "b.py").exists()
+
+
+def test_the_control_that_it_proposes_closes_a_first_loop(tmp_path):
+    """Its comments, without their marks, are Python, and the check finds nothing wrong."""
+    file, path = oven(tmp_path / "monday.csv"), tmp_path / "my_oven.py"
+    write_scenario(path, file)
+    text = path.read_text()
+    block = text[text.index("    # control=OCP") :]
+    proposed = "\n".join(line.replace("    # ", "    ", 1) for line in block.splitlines())
+    text = text.replace(block, proposed.replace("(...)", "(0.0,)"))
+    path.write_text(text.replace("import DataSpec", "import OCP, DataSpec"))
+    scenario = load_scenario(str(path))
+    assert scenario.control is not None
+    low, high = (bound[0] for bound in (scenario.control.u_min, scenario.control.u_max))
+    assert (low, high, scenario.safe_input) == (0.0, 1000.0, (0.0,))
+    assert scenario.control.q_y[0] == pytest.approx(
+        1 / (0.05 * 50) ** 2, rel=0.1
+    )  # 50 K are reached but for a tail
+    assert not preflight(scenario).problems
+
+
+def test_several_files_after_one_option_are_explained(call, tmp_path):
+    file, path = oven(tmp_path / "monday.csv"), tmp_path / "my_oven.py"
+    write_scenario(path, file)
+    for command in ("check", "run"):
+        code, _, told = call(command, path, "--data", file, file)
+        assert code == 2
+        assert "--data takes one value; give it once for each: --data A --data B" in told
+    code, _, told = call("check", path, "something")
+    assert (code, "give it once" in told) == (2, False)
