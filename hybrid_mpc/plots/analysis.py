@@ -17,6 +17,7 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     FAINT,
     INK,
+    MUTED,
     Array,
     axis_label,
     checked,
@@ -131,7 +132,7 @@ def _z_grid(ax: Axes, dt: float, spacing: float, reach: float) -> None:
             f"{damping:g}",
             (z[at].real, z[at].imag),
             fontsize=7,
-            color=FAINT,
+            color=MUTED,
             ha="center",
             va="center",
             clip_on=True,
@@ -485,7 +486,7 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
             (working_speed, 0.02),
             xycoords=("data", "axes fraction"),
             fontsize=8,
-            color=FAINT,
+            color=MUTED,
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
         )
         ax.set_xlabel(f"size of the speed [{unit}]")

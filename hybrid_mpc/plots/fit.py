@@ -17,6 +17,7 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     FAINT,
     INK,
+    MUTED,
     Array,
     axis_label,
     checked,
@@ -291,7 +292,7 @@ def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figu
     ax.set_xlabel("absolute difference, trained against exported [SI]")
     ax.set_ylabel("share of numbers below [%]")
     title_axes(ax, "left of its dashed line: passed")
-    ax.title.set_color(FAINT)
+    ax.title.set_color(MUTED)
     shared_legend(figure)
     return figure
 
@@ -501,7 +502,7 @@ def curves(
 
 def _curve(ax: Axes, model: str, step: Any, values: Any, name: str) -> None:
     if values is None:
-        ax.text(0.25, 0.5, "not used", transform=ax.transAxes, ha="center", color=FAINT, fontsize=9)
+        ax.text(0.25, 0.5, "not used", transform=ax.transAxes, ha="center", color=MUTED, fontsize=9)
         return
     array = checked(f"{name} of {model}", values, len(step))
     taken = np.isfinite(array) & (array > 0)

@@ -17,6 +17,7 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
     FAINT,
     INK,
+    MUTED,
     Array,
     axis_label,
     checked,
@@ -290,7 +291,7 @@ def costs(table: Costs) -> Figure:
             ax.axhline(k - 0.5, color="#dddddd", linewidth=0.8, zorder=1)
         if not row:
             note, at = "no cost of the oracle", ax.get_yaxis_transform()
-            ax.text(0.98, k, note, transform=at, color=FAINT, fontsize=9, ha="right", va="center")
+            ax.text(0.98, k, note, transform=at, color=MUTED, fontsize=9, ha="right", va="center")
         for name, (mean, half) in row.items():
             at = k + 0.74 * ((present.index(name) + 0.5) / len(present) - 0.5)
             left = max(mean - half, lowest) if log else mean - half

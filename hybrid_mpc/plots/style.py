@@ -31,6 +31,8 @@ DPI = 110
 IN_PALETTE = 256
 """Colours of a picture's palette: lines and their smoothed edges need no more, and the file is a third as large."""
 INK, FAINT, PALE = "#222222", "#8a8a8a", "#9a9a9a"
+MUTED = "#6b6b6b"
+"""Text that stands back; lines may be fainter, text on white may not (contrast 4.5 to 1)."""
 ALARM, GOOD = "#CC79A7", "#009E73"
 
 _ROLES = {
