@@ -1,6 +1,7 @@
 """The site builds, its links lead somewhere, and every page of docs/ is in it."""
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,30 @@ def test_links_of_the_pages_beside_the_site(page):
         assert link.startswith("http") or (ROOT / link.partition("#")[0]).exists(), link
 
 
+def searched(site, words):
+    """What the search of the built site finds, opened from its folder."""
+    address = f"{(site / 'search.html').as_uri()}?q={words.replace(' ', '+')}"
+    done = subprocess.run(
+        ["chromium", "--headless=new", "--no-sandbox", "--disable-gpu", "--dump-dom", "--virtual-time-budget=8000",
+         address],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    return re.search(r'id="mkdocs-search-results".*?</div>', done.stdout, re.DOTALL)[0]
+
+
+PICTURE = re.compile(r"!\[([^\]]*)\]\(([^)\s]+)\)")
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))], ids=lambda p: p.stem)
+def test_pictures_say_what_is_to_be_seen(page):
+    """Who does not see a picture is told what it shows: a subject, and what of it."""
+    text = page.read_text()
+    assert "<img" not in text
+    for words, target in PICTURE.findall(text):
+        assert len(words.split()) >= 4, f"{page.name}: {words!r} of {target}"
+        assert (page.parent / target).is_file()
+
+
 @pytest.mark.full
 def test_the_site_builds_and_a_broken_link_stops_it(tmp_path):
     build = [sys.executable, "-m", "mkdocs", "build", "--site-dir"]
@@ -38,6 +63,13 @@ def test_the_site_builds_and_a_broken_link_stops_it(tmp_path):
     page = (tmp_path / "site" / "api" / "control.html").read_text()
     assert "CondensedController" in page
     assert "&gt;&gt;&gt;" in page  # examples are shown as code
+    assert not re.findall(
+        r'(?:src|href)="(?:https?:)?//[^"]*[.](?:js|css)"', page
+    )  # it needs nothing from elsewhere
+    if shutil.which("chromium"):
+        found = searched(tmp_path / "site", "offset-free disturbance")
+        assert re.search(r'<a href="[^"]*mpc[.]html', found)
+        assert "<p>No results found" in searched(tmp_path / "site", "xyzzyplugh")
     settings = (ROOT / "mkdocs.yml").read_text().replace("docs_dir: docs", f"docs_dir: {tmp_path}/docs")
     (tmp_path / "docs").mkdir()
     (tmp_path / "docs" / "index.md").write_text("[nowhere](none.md)\n")
