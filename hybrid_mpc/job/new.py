@@ -277,6 +277,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     kind = "".join(part.capitalize() for part in re.findall(r"[A-Za-z0-9]+", path.stem)) or "Machine"
     kind = f"Machine{kind}" if kind[0].isdigit() else kind
     states, rates, parameters, steady = [], [], [], list[str]()
+    gains, offsets = list[list[float]](), list[float]()
     for name, column, lag in zip(y_names, draft.outputs, lags, strict=True):
         text, note = _signal(column, name)
         states.append((text, note))
@@ -294,6 +295,8 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         if lag.states == 2:
             parameters.append((f"D_{name}", min(max(lag.damping, 0.01), 5.0), "-", 0.0, 10.0, "damping"))
         middle = min(max(lag.offset, float(lower)), float(upper))
+        offsets.append(float(_rounded(middle)))
+        gains.append([float(_rounded(gain)) for gain in lag.gains])
         parameters.append((f"rest_{name}", middle, unit, float(lower), float(upper), "value without inputs"))
         for (_, u), source, gain in zip(drives, draft.drives, lag.gains, strict=True):
             reach = max(10 * abs(gain), 10 * np.ptp(column.span) / np.ptp(source.span))
@@ -323,7 +326,9 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     time_note = "rises evenly; in seconds?" if draft.time and not draft.time.unit else ""
     if draft.time is None:
         time_note = "the sampling time [s]; no column of the recording looks like time"
-    point = "x=(...), u=(...)" + (", w=(...)" if w_names else "")
+    x, u, w = _first_rest(draft, np.array(gains), np.array(offsets))
+    point = f"x={_numbers([*x, *[0.0] * (len(states) - len(x))], 6)}, u={_numbers(u)}"
+    point += f", w={_numbers(w)}" if w_names else ""
     lines = [
         f'"""{path.stem}: written from {data.name} by hybrid-mpc new. Lines marked {MARK} are yours to decide."""',
         "",
@@ -357,7 +362,8 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         ),
         "    )",
         f"    corrects = ({', '.join(f'{n!r}' for n in corrected)},)".replace("'", '"'),
-        f"    # {MARK}: operating_point = OperatingPoint({point}), if the machine works around one",
+        f"    # {MARK}: where the machine works (import OperatingPoint); your own equations rest elsewhere: see check",
+        f"    # operating_point = OperatingPoint({point})",
         f"    # {MARK}: balances(self, x, u, w, p), if something is stored: energy, mass, heat",
         "",
         "    def xdot(self, x, u, w, p):",
@@ -390,6 +396,17 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
+def _first_rest(draft: Draft, gains: Array, offsets: Array) -> tuple[Array, Array, Array]:
+    """Outputs, inputs and disturbances at which the lags rest: as near to the recording's middle as they can."""
+    n_u = len(draft.inputs)
+    y, drives = (np.array([np.nanmedian(c.values) for c in cs]) for cs in (draft.outputs, draft.drives))
+    u, w = drives[:n_u], drives[n_u:]
+    missing = y - offsets - gains @ drives
+    u = np.array([float(_rounded(v)) for v in u + np.linalg.pinv(gains[:, :n_u]) @ missing])
+    w = np.array([float(_rounded(v)) for v in w])
+    return offsets + gains @ np.concatenate([u, w]), u, w
+
+
 def _first_control(draft: Draft, n_x: int, horizon: int) -> list[str]:
     """A control problem for a first loop, commented out: what only the user knows is marked.
 
@@ -408,13 +425,13 @@ def _first_control(draft: Draft, n_x: int, horizon: int) -> list[str]:
         "    #             # weights: one over the square of a deviation that you tolerate",
         f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",
         f"    # sensor_sigma={_numbers(0.005 * np.ptp(c.span) for c in draft.outputs)},  # how much each sensor errs",
-        "    # safe_input=(...),  # the input that does no harm when a sensor is lost: nobody can guess it",
+        "    # safe_input=(...),  # within these limits, and no harm when a sensor is lost: nobody can guess it",
     ]
 
 
-def _numbers(values: Iterable[float]) -> str:
+def _numbers(values: Iterable[float], digits: int = 3) -> str:
     """Numbers as a tuple is written."""
-    given = [_rounded(float(v)) for v in values]
+    given = [_rounded(float(v), digits) for v in values]
     return f"({', '.join(given)},)" if len(given) == 1 else f"({', '.join(given)})"
 
 

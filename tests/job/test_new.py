@@ -1,5 +1,6 @@
 """``hybrid-mpc new``: a recording becomes a scenario that passes the check, with what is left to decide."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,9 @@ def test_a_disturbance_that_is_measured(call, tmp_path):
     assert [(s.name, s.unit) for s in prior.disturbances] == [("room", "K")]
     assert prior.values["k_warmth_heater"] == pytest.approx(0.05, rel=0.05)
     assert prior.values["k_warmth_room"] == pytest.approx(1.0, rel=0.1)
-    assert any("w=(...)" in line for line in left_to_decide(machine))
+    assert re.search(
+        r"# operating_point = OperatingPoint\(x=\(.*,\), u=\(.*,\), w=\(.*,\)\)", machine.read_text()
+    )
     code, told, error = call("check", machine, "--data", file)
     assert code == 0, told + error
 
@@ -150,14 +153,15 @@ def test_what_cannot_be_is_refused(tmp_path):
 
 
 def test_the_control_that_it_proposes_closes_a_first_loop(tmp_path):
-    """Its comments, without their marks, are Python, and the check finds nothing wrong."""
+    """Its comments, without their marks, are Python; the check finds nothing wrong, and default tasks are made."""
     file, path = oven(tmp_path / "monday.csv"), tmp_path / "my_oven.py"
     write_scenario(path, file)
     text = path.read_text()
     block = text[text.index("    # control=OCP") :]
     proposed = "\n".join(line.replace("    # ", "    ", 1) for line in block.splitlines())
     text = text.replace(block, proposed.replace("(...)", "(0.0,)"))
-    path.write_text(text.replace("import DataSpec", "import OCP, DataSpec"))
+    text = text.replace("    # operating_point", "    operating_point")
+    path.write_text(text.replace("import DataSpec", "import OCP, OperatingPoint, DataSpec"))
     scenario = load_scenario(str(path))
     assert scenario.control is not None
     low, high = (bound[0] for bound in (scenario.control.u_min, scenario.control.u_max))
@@ -165,7 +169,13 @@ def test_the_control_that_it_proposes_closes_a_first_loop(tmp_path):
     assert scenario.control.q_y[0] == pytest.approx(
         1 / (0.05 * 50) ** 2, rel=0.1
     )  # 50 K are reached but for a tail
-    assert not preflight(scenario).problems
+    found = preflight(scenario)
+    assert not found.problems
+    assert [task.name for task in found.default_tasks] == ["step", "hold"]
+    point = scenario.prior().operating_point
+    assert point.x[0] == pytest.approx(
+        20 + 0.05 * point.u[0], abs=1.0
+    )  # the oven's own rest, but for the fit's noise
 
 
 def test_several_files_after_one_option_are_explained(call, tmp_path):
