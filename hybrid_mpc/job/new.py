@@ -326,9 +326,9 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     time_note = "rises evenly; in seconds?" if draft.time and not draft.time.unit else ""
     if draft.time is None:
         time_note = "the sampling time [s]; no column of the recording looks like time"
-    x, u, w = _first_rest(draft, np.array(gains), np.array(offsets))
-    point = f"x={_numbers([*x, *[0.0] * (len(states) - len(x))], 6)}, u={_numbers(u)}"
-    point += f", w={_numbers(w)}" if w_names else ""
+    x0, u0, w0 = _first_rest(draft, np.array(gains), np.array(offsets))
+    point = f"x={_numbers([*x0, *[0.0] * (len(states) - len(x0))], 6)}, u={_numbers(u0)}"
+    point += f", w={_numbers(w0)}" if w_names else ""
     lines = [
         f'"""{path.stem}: written from {data.name} by hybrid-mpc new. Lines marked {MARK} are yours to decide."""',
         "",
