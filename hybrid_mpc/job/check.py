@@ -155,7 +155,7 @@ def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
     try:
         return default_tasks(scenario)
     except InputError as none:
-        report.warn(f"tasks: {str(none).partition(': ')[2]}")
+        report.warn(f"tasks: none are declared, and no loop will run: {str(none).partition(': ')[2]}")
         return ()
 
 
