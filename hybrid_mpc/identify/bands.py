@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,14 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.kit.prediction import SHARE, Bands
 
 Array = NDArray[np.float64]
+Pair: TypeAlias = tuple[Array, Array]
+"""Errors of an output in a run ``(n,)``, and the parts of their variance ``(n, m)``."""
 KNOWN = 8
 """Independent errors that the validation runs count for at least; more runs count one each."""
 LEAST = 1e-6
 """Least weight of the noise: a variance is never zero."""
+FOLDS = 5
+"""Groups of validation runs, each left out once, that decide whether a band's width varies."""
 FAR = 1e3
 """Spreads of an output beyond which a part of an error's variance says no more."""
 
@@ -100,7 +105,8 @@ def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:
 
     The scale is a quantile of the errors over their standard deviation (split conformal prediction), taken with equal
     weight of every run. Errors within a run hang together: a few runs tell their variance as badly as ``KNOWN`` errors
-    would. So the scale is larger by the ratio of Student's quantile to the normal one.
+    would. So the scale is larger by the ratio of Student's quantile to the normal one. An output's width varies only if
+    that scores better (:func:`interval_score`) on validation runs that its weights were not found on.
 
     Raises:
         InputError: If there is no run, or the share is none.
@@ -124,18 +130,17 @@ def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:
     weights, scale, constant = [], [], []
     for j in range(runs[0].error.shape[1]):
         seen = [np.isfinite(run.error[:, j]) for run in runs]
-        errors = [run.error[s, j] for run, s in zip(runs, seen, strict=True)]
-        parts = [run.parts[s, j] for run, s in zip(runs, seen, strict=True)]
-        own = _weights(np.concatenate(errors), np.concatenate(parts))
-        pairs = list(zip(errors, parts, strict=True))
-        ratios, flat = (
-            np.concatenate([np.abs(e) / np.sqrt(np.maximum(p @ share_of, 1e-300)) for e, p in pairs])
-            for share_of in (own, np.eye(len(own))[0])
-        )
-        each = np.concatenate([np.full(len(e), 1.0 / len(e)) for e in errors if len(e)])
+        pairs = [(run.error[s, j], run.parts[s, j]) for run, s in zip(runs, seen, strict=True) if np.any(s)]
+        flat = np.eye(runs[0].parts.shape[2])[0]
+        if not pairs:  # never measured in these runs: as wide as the sensor's noise
+            weights.append(tuple(flat.tolist()))
+            scale.append(float(norm.ppf(0.5 * (1 + share))))
+            constant.append(scale[-1])
+            continue
+        own = _weights(pairs) if _width_that_varies_is_better(pairs, flat, share) else flat
         weights.append(tuple(own.tolist()))
-        scale.append(_quantile(ratios, each, share, len(errors)))
-        constant.append(_quantile(flat, each, share, len(errors)))
+        scale.append(_scale(pairs, own, share))
+        constant.append(_scale(pairs, flat, share))
     return Bands(tuple(weights), tuple(scale), tuple(constant), share)
 
 
@@ -157,8 +162,36 @@ def interval_score(run: RunParts, bands: Bands) -> Array:
     return np.asarray(np.nanmean(2 * half + 2 / (1 - bands.share) * beyond, axis=0))
 
 
-def _weights(error: Array, parts: Array) -> Array:
-    """Weights of the parts that make the errors most likely, if they were normal."""
+def _width_that_varies_is_better(pairs: Sequence[Pair], flat: Array, share: float) -> bool:
+    """Whether bands whose weights were found on other runs score better than those of a constant width."""
+    folds, score = [pairs[k::FOLDS] for k in range(min(FOLDS, len(pairs)))], np.zeros(2)
+    for k, them in enumerate(folds):
+        others = [pair for i, fold in enumerate(folds) if i != k for pair in fold]
+        if not others:
+            return False
+        for i, own in enumerate((_weights(others), flat)):
+            scale = _scale(others, own, share)
+            for error, parts in them:
+                half = scale * _deviations(parts, own)
+                beyond = np.maximum(np.abs(error) - half, 0.0)
+                score[i] += np.mean(2 * half + 2 / (1 - share) * beyond)
+    return bool(score[0] < score[1])
+
+
+def _deviations(parts: Array, weights: Array) -> Array:
+    return np.asarray(np.sqrt(np.maximum(parts @ weights, 1e-300)))
+
+
+def _scale(pairs: Sequence[Pair], weights: Array, share: float) -> float:
+    """By what standard deviations are to be multiplied to hold the share."""
+    ratios = np.concatenate([np.abs(error) / _deviations(parts, weights) for error, parts in pairs])
+    each = np.concatenate([np.full(len(error), 1.0 / len(error)) for error, _ in pairs])
+    return _quantile(ratios, each, share, len(pairs))
+
+
+def _weights(pairs: Sequence[Pair]) -> Array:
+    """Weights of the parts that make the errors of runs most likely, if they were normal."""
+    error, parts = (np.concatenate(v) for v in zip(*pairs, strict=True))
     size = np.maximum(parts.mean(axis=0), 1e-300)
     known = parts.max(axis=0) > 0
     scaled, squares = parts / size, np.square(error)
