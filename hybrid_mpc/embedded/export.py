@@ -6,9 +6,10 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,20 @@ from numpy.typing import NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
-from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, Sources, make_sources, template
+from hybrid_mpc.embedded.generate import (
+    GENERATED,
+    HEADERS,
+    SOURCES,
+    Sources,
+    make_sources,
+    sources_of,
+    template,
+)
 from hybrid_mpc.embedded.scalar import table
+from hybrid_mpc.embedded.watch import Watch
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -48,6 +59,7 @@ class Footprint:
 def write_controller(
     folder: Path, model: HybridModel, ocp: OCP, *, estimator: Filter | None = None,
     fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
+    monitor: Watch | None = None, guard: Guard | None = None,
 ) -> Sources:  # fmt: skip
     """Write the C of a controller, its test and its README; arguments as :func:`make_sources` takes them.
 
@@ -55,19 +67,24 @@ def write_controller(
         InputError: If something has no C, by name, before anything is written.
     """
     found = make_sources(
-        model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input, single=single
-    )
+        model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input, single=single, monitor=monitor,
+        guard=guard,
+    )  # fmt: skip
     safe = SafeController(CondensedController(model, ocp), fallback, safe_input=safe_input)
     texts = {name: template(name) for name in (*HEADERS, *SOURCES, *OTHERS)} | dict(found.texts)
-    texts["hmpc_vectors.h"] = _vectors(safe, estimator, single)
+    for name in ("Makefile", "CMakeLists.txt"):
+        texts[name] = texts[name].replace("@SOURCES@", " ".join(sources_of(found)))
+    texts["hmpc_vectors.h"] = _vectors(safe, estimator, single, monitor)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text)
-    (folder / "README.md").write_text(_readme(model, found, footprint(folder), single))
+    (folder / "README.md").write_text(
+        _readme(model, found, footprint(folder, sources_of(found)), single, guard)
+    )
     return found
 
 
-def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> str:
+def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monitor: Watch | None) -> str:
     """A short loop from the operating point towards a set-point beside it, on the model itself."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.state_sizes
@@ -80,7 +97,8 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     z, n_x = np.concatenate([model.x0, np.zeros(model.n_h)]), model.n_x
     sigma = np.zeros(model.n_y) if estimator is None else np.sqrt(_noise(estimator))
     estimate: Estimate | None = None
-    decision, rows = None, []
+    decision, rows, readings = None, [], []
+    memory: Any = None if monitor is None else monitor.initial()
     for _ in range(VECTORS):
         u = safe.controller.problem.u_rest if decision is None else decision.u
         y = model.output(z[:n_x], u, model.w, model.p).full().ravel() + sigma * rng.standard_normal(model.n_y)
@@ -91,6 +109,9 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
             estimate = estimator.start(y, w=model.w)
         else:
             estimate = estimator.update(estimate, y, u, w=model.w)
+        if monitor is not None:
+            memory, reading = monitor.update(memory, y, u, estimate)
+            readings.append(_numbers(reading))
         decision = safe.initial(estimate) if decision is None else decision
         decision = safe.decide(decision, estimate, goal[None])
         rows.append((y, model.w, estimate.x, estimate.h, decision.u))
@@ -100,6 +121,11 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     tables = [table(f"vector_{name}", values) for name, values in columns]
     tables += [table("vector_goal", goal[None]), table("vector_x_size", size)]
     tables.append(table("vector_u_size", ocp.input_range))
+    if readings:
+        found = np.array(readings)
+        largest = np.max(np.nan_to_num(np.abs(found)), axis=0)
+        tables.append(table("vector_reading", found))
+        tables.append(table("vector_reading_size", np.where(largest > 0, largest, 1.0)))
     head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({TOLERANCE[single]!r})\n"
     return (
         "/* What the Python controller decided in a short loop, generated. */\n"
@@ -107,19 +133,29 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     )
 
 
+def _numbers(reading: Any) -> Array:
+    """What of a monitor's reading the test program compares: whether it alarms, and its levels."""
+    levels = (
+        [reading.level_w, reading.residual_level]
+        if hasattr(reading, "residual_level")
+        else reading.level[:, 0]
+    )
+    return np.concatenate([[float(reading.alarm)], levels, reading.residual])
+
+
 def _noise(estimator: Filter) -> Array:
     first = estimator.filters[0] if hasattr(estimator, "filters") else estimator
     return first.noise[1]
 
 
-def footprint(folder: Path) -> Footprint | None:
-    """Sizes by gcc -O3 for this machine; None where there is none."""
+def footprint(folder: Path, names: Sequence[str] = SOURCES) -> Footprint | None:
+    """Sizes of the sources ``names`` by gcc -O3 for this machine; None where there is none."""
     gcc, size = shutil.which("gcc"), shutil.which("size")
     if gcc is None or size is None:
         return None
     with tempfile.TemporaryDirectory() as work:
         flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
-        sources = [str((folder / name).resolve()) for name in SOURCES]
+        sources = [str((folder / name).resolve()) for name in names]
         made = subprocess.run([gcc, *flags, "-c", *sources], cwd=work, capture_output=True, check=False)
         test = [str((folder / "hmpc_test.c").resolve()), *sources, "-lm", "-o", "test"]
         linked = subprocess.run([gcc, *flags[:3], *test], cwd=work, capture_output=True, check=False)
@@ -130,7 +166,7 @@ def footprint(folder: Path) -> Footprint | None:
         flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
         frames = [
             int(line.split("\t")[1])
-            for p in Path(work).glob("hmpc_*.su")
+            for p in Path(work).glob("hmp*_*.su")
             for line in p.read_text().splitlines()
         ]
         told = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False).stderr
@@ -164,7 +200,9 @@ def operations(found: Sources) -> dict[str, int]:
     }
 
 
-def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single: bool) -> str:
+def _readme(
+    model: HybridModel, found: Sources, sizes: Footprint | None, single: bool, guard: Guard | None
+) -> str:
     n = found.sizes
     rows = "".join(f"| {name} | {count:,} |\n" for name, count in operations(found).items())
     if sizes is None:
