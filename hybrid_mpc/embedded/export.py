@@ -39,6 +39,20 @@ VECTORS = 25
 TOLERANCE = {False: 1e-9, True: 1e-3}
 """Of inputs by their range and of states by their size; of single precision what its seven digits leave of a QP."""
 OTHERS = ("hmpc_test.c", "Makefile", "CMakeLists.txt")
+MONITOR_README = """\
+`hmpc_finish` looks at the period by @WATCHED@: `s.monitor.alarm` says whether anything alarms, the fields beside it
+what. @REACTION@
+
+"""
+REACTS = """\
+The guard reacts in the next `hmpc_step`: `s.guard.mode` is who decides,
+`s.guard.why` what led there."""
+REACTIONS = {
+    "none": "Nothing reacts: what an alarm means is up to the caller.",
+    "guard": REACTS,
+    "backup": f"""{REACTS} Its second controller, with an estimator of its own, is `hmpb_state backup` in
+the state; its files and names begin with `hmpb`.""",
+}
 TARGETS_README = """\
 The goal is one of outputs, `goal.y`. Their steady state is sought in every step (`s.steady`): from the last one in two
 or three steps, where a set-point or a disturbance jumps in some more, and where there is none from every start, up to
@@ -78,9 +92,7 @@ def write_controller(
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text)
-    (folder / "README.md").write_text(
-        _readme(model, found, footprint(folder, sources_of(found)), single, guard)
-    )
+    (folder / "README.md").write_text(_readme(model, found, footprint(folder, sources_of(found)), single))
     return found
 
 
@@ -174,6 +186,29 @@ def footprint(folder: Path, names: Sequence[str] = SOURCES) -> Footprint | None:
         return Footprint(flash, int(state[1]) if state else 0, sum(frames))
 
 
+def _watching(n: Mapping[str, int], code: Mapping[str, int], step: int) -> int:
+    """Operations of a period of the monitor, near rest, where the energy monitor asks the model most."""
+    if n["MONITOR"] == 2:
+        return 3 * step + code.get("watched_balances", 0) + n["CHANNELS"] * (n["SHORT"] + n["LONG"])
+    rows = n["WINDOW"] * (7 * n["NX"] + 2 * (n["NU"] + n["NW"]))
+    return (
+        3 * step
+        + 12 * (step + code["rates_after"])
+        + 4 * (code["watched_energy"] + code["watched_force"])
+        + 3 * rows
+    )
+
+
+def _monitor_readme(sizes: Mapping[str, int]) -> str:
+    if not sizes["MONITOR"]:
+        return "Nothing watches the loop: it was generated without a monitor.\n\n"
+    watched = (
+        "the energy balance of the model" if sizes["MONITOR"] == 1 else "residuals of outputs and balances"
+    )
+    reaction = REACTIONS["backup" if sizes["BACKUP"] else "guard" if sizes["GUARD"] else "none"]
+    return MONITOR_README.replace("@WATCHED@", watched).replace("@REACTION@", reaction)
+
+
 def operations(found: Sources) -> dict[str, int]:
     """Additions and multiplications of a period, by part; of the QP for one iteration."""
     n, code = found.sizes, found.operations
@@ -190,19 +225,25 @@ def operations(found: Sources) -> dict[str, int]:
     n_t = n_z + n["NU"]
     newton = 2 * n_z**2 * n_t + 4 * n_z * n_t * n["NU"] + 2 * n["NH"] ** 3 // 3
     search = {"step: steady state, a step of its search": stage + newton} if n["OUTPUT_COST"] else {}
-    return search | {
-        "prepare: stages' Jacobians": n["N"] * stage,
-        "prepare: condensing": int(2 * n_z**2 * np.sum(-(-active // 8) * 8)),
-        "prepare: Hessian and its factor": int(n["NX"] * np.sum(active**2)) + n_v**3,
-        "step: estimator": n["MODES"] * (stage + 4 * n_e * padded * n_e + 2 * n["MODES"] * n_e**2),
-        "step: free response, gradient, bounds": 2 * n["N"] * n_z * padded + 6 * n["N"] * n["NX"] * n_v,
-        "step: QP, an iteration": 4 * n_v**2 + 2 * n_v * n["N"] * (n["SOFT_X"] + n["SOFT_E"]),
-    }
+    step_only = (
+        stage - units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) - 2 * n["HEAD"] * units * (padded + n["NU"])
+    )
+    watch = {"finish: monitor": _watching(n, code, step_only)} if n["MONITOR"] else {}
+    return (
+        search
+        | watch
+        | {
+            "prepare: stages' Jacobians": n["N"] * stage,
+            "prepare: condensing": int(2 * n_z**2 * np.sum(-(-active // 8) * 8)),
+            "prepare: Hessian and its factor": int(n["NX"] * np.sum(active**2)) + n_v**3,
+            "step: estimator": n["MODES"] * (stage + 4 * n_e * padded * n_e + 2 * n["MODES"] * n_e**2),
+            "step: free response, gradient, bounds": 2 * n["N"] * n_z * padded + 6 * n["N"] * n["NX"] * n_v,
+            "step: QP, an iteration": 4 * n_v**2 + 2 * n_v * n["N"] * (n["SOFT_X"] + n["SOFT_E"]),
+        }
+    )
 
 
-def _readme(
-    model: HybridModel, found: Sources, sizes: Footprint | None, single: bool, guard: Guard | None
-) -> str:
+def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single: bool) -> str:
     n = found.sizes
     rows = "".join(f"| {name} | {count:,} |\n" for name, count in operations(found).items())
     if sizes is None:
@@ -217,7 +258,7 @@ def _readme(
         "NAME": model.name, "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
         "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
         "DT": model.dt, "TOLERANCE": TOLERANCE[single],
-        "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
+        "MONITOR": _monitor_readme(n), "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
         "ESTIMATOR": f"{n['MODES']} Kalman filters side by side" if n["MODES"] else "none: it is given an estimate",
         "FILES": ", ".join(f"`{name}`" for name in GENERATED),
     }  # fmt: skip

@@ -1,5 +1,7 @@
 """A period of the generated C with monitor and guard is one of the Python loop: readings, alarms, modes, inputs."""
 
+import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,6 +14,7 @@ import replay_parts as replays
 from embedded_parts import needs_compiler
 from replay_parts import Case, Whole, replay
 
+import hybrid_mpc as hm
 from hybrid_mpc import (
     CondensedController,
     ExtendedKalmanFilter,
@@ -23,7 +26,8 @@ from hybrid_mpc import (
     guard_monitor,
     load_scenario,
 )
-from hybrid_mpc.embedded.generate import make_sources, sources_of
+from hybrid_mpc.embedded.generate import CORE, make_sources, sources_of
+from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
 from golden_parts import Parts, faults_of, machine
@@ -156,6 +160,46 @@ def survives(case, folder, periods):
     assert seen.bit_count() > 1
 
 
+WATCHED = {"arm": replays.arm_case, "tanks": replays.tanks_case}
+
+
+@pytest.mark.parametrize(
+    "single", [False, pytest.param(True, marks=pytest.mark.full)], ids=["double", "float"]
+)
+@pytest.mark.parametrize("name", WATCHED)
+def test_vectors_with_readings_and_no_warning(name, single, tmp_path):
+    """The test program of the folder compares readings too; a changed one is noticed."""
+    from test_export import STRICT
+
+    found = parts.write(tmp_path, WATCHED[name](60), single=single)
+    words = ["cc", "-O2", *STRICT, *sources_of(found), "hmpc_test.c", "-lm", "-o", "test"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "test"], capture_output=True, check=False).returncode == 0
+    text = (tmp_path / "hmpc_vectors.h").read_text()
+    changed = re.sub(
+        r"vector_reading_size(\[\d+\]) = \{[^}]*\}", r"vector_reading_size\1 = {R(1e-300)}", text
+    )
+    (tmp_path / "hmpc_vectors.h").write_text(changed.replace("1e-300", "1e-30") if single else changed)
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "test"], capture_output=True, check=False).returncode == 1
+
+
+@pytest.mark.full
+@pytest.mark.skipif(shutil.which("cppcheck") is None, reason="there is no cppcheck")
+@pytest.mark.parametrize("name", [*WATCHED, "golf robot"])
+def test_cppcheck_finds_nothing(name, tmp_path):
+    """In the monitor, the loop and, of the golf robot, the backup's own files."""
+    case = WATCHED[name](60) if name in WATCHED else golden("golf_robot", "heavy", 10)
+    found = parts.write(tmp_path, case)
+    names = [n for n in sources_of(found) if n not in CORE and "qp" not in n]
+    done = subprocess.run(
+        ["cppcheck", "--enable=warning,style,performance,portability", "--inconclusive", "--std=c11", "--quiet",
+         "--suppress=moduloofone", "--suppress=knownConditionTrueFalse", "--error-exitcode=1", *names],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
 def refused(case, match, **changes):
     case = replace(case, **changes)
     controller = case.safe.controller
@@ -182,6 +226,43 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
     )
     guard = Guard(backup=twice, backup_estimator=case.estimator)
     refused(case, both, safe=bare, guard=guard)
+
+
+def test_a_kits_monitor_and_guard(noisy_artifact, tmp_path, call):
+    """Of a run's folder: its monitor by default, its guard where it is asked for."""
+    run = shutil.copytree(noisy_artifact, tmp_path / "model")
+    golf = load_scenario("golf_robot")
+    description = read_description(run)
+    write_description(run, replace(description, loop=loop_settings(golf, description.loop.process_noise)))
+    code, _, err = call("export", "c", run, "--guard", "--out", tmp_path / "early")
+    assert code == 2
+    assert "detector" in err
+    hm.set_calibration(run, machine("golf_robot").calibration)
+    sizes = {}
+    for words in ((), ("--no-monitor",), ("--guard",), ("--adapt",)):
+        folder = tmp_path / "-".join(["c", *words])
+        code, _, err = call("export", "c", run, "--out", folder, *words)
+        assert code == 0, err
+        text = (folder / "hmpc_config.h").read_text()
+        names = ("MONITOR", "GUARD", "ON_MODEL", "BACKUP")
+        sizes[words] = [
+            int(found[1]) if (found := re.search(rf"HMPC_{n} (\d+)", text)) else None for n in names
+        ]
+    assert sizes == {
+        (): [1, 0, None, 0], ("--no-monitor",): [0, 0, None, 0], ("--guard",): [1, 1, int(Mode.NORMAL), 0],
+        ("--adapt",): [1, 1, int(Mode.BACKUP), 1],
+    }  # fmt: skip
+    told = (folder / "README.md").read_text()
+    assert "`hmpb_state backup`" in told
+    done = subprocess.run(
+        ["make", "-s", "-C", folder, "CFLAGS=-O1", "test"], capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    kit = hm.load(run)
+    with pytest.raises(InputError, match="no guard 'both'"):
+        hm.generate_controller(kit, tmp_path / "none", guard="both")
+    with pytest.raises(InputError, match="acts on alarms"):
+        hm.generate_controller(kit, tmp_path / "none", guard="rest", monitor=False)
 
 
 def test_a_guard_counts_whole_periods():
