@@ -51,7 +51,7 @@ REACTIONS = {
     "none": "Nothing reacts: what an alarm means is up to the caller.",
     "guard": REACTS,
     "backup": f"""{REACTS} Its second controller, with an estimator of its own, is `hmpb_state backup` in
-the state; its files and names begin with `hmpb`.""",
+the state; its files and names begin with `hmpb`. Its estimator runs in every period too; the table does not count it.""",
 }
 TARGETS_README = """\
 The goal is one of outputs, `goal.y`. Their steady state is sought in every step (`s.steady`): from the last one in two
@@ -228,7 +228,7 @@ def operations(found: Sources) -> dict[str, int]:
     step_only = (
         stage - units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) - 2 * n["HEAD"] * units * (padded + n["NU"])
     )
-    watch = {"finish: monitor": _watching(n, code, step_only)} if n["MONITOR"] else {}
+    watch = {"finish: monitor, at most": _watching(n, code, step_only)} if n["MONITOR"] else {}
     return (
         search
         | watch
