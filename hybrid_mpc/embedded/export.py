@@ -51,7 +51,8 @@ REACTIONS = {
     "none": "Nothing reacts: what an alarm means is up to the caller.",
     "guard": REACTS,
     "backup": f"""{REACTS} Its second controller, with an estimator of its own, is `hmpb_state backup` in
-the state; its files and names begin with `hmpb`. Its estimator runs in every period too; the table does not count it.""",
+the state; its files and names begin with `hmpb`. Its estimator runs in every period too,
+which the table does not count.""",
 }
 TARGETS_README = """\
 The goal is one of outputs, `goal.y`. Their steady state is sought in every step (`s.steady`): from the last one in two
