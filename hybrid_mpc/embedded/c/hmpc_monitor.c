@@ -137,8 +137,10 @@ static void polynomial(const real (*q)[HMPC_NQ], const real *newest, real *posit
 /* The energy balance at position and speed, if the speed changes at that acceleration. */
 static real balance(const real *state, const real *acceleration, const real *given) {
   real rate[HMPC_NX], value;
-  memcpy(rate, state + NQ, sizeof(real) * HMPC_NQ);
-  memcpy(rate + NQ, acceleration, sizeof(real) * HMPC_NQ);
+  for (int i = 0; i < NQ; ++i) {
+    rate[i] = state[NQ + i];
+    rate[NQ + i] = acceleration[i];
+  }
   watched_energy(state, rate, given, given + HMPC_NU, &value);
   return value;
 }
@@ -182,7 +184,7 @@ static void begin_runs(hmpc_monitor *m) {
 /* A free run one period on: what its balance departs from the measured one. */
 static void go_on(hmpc_free_run *run, const real *u, const real *w, const real *given, const real *speed,
                   real measured) {
-  real next[HMPC_LZ] = {R(0.0)}, state[HMPC_NX], acceleration[HMPC_NQ], v2 = R(0.0), u2 = R(0.0);
+  real next[HMPC_LZ] = {R(0.0)}, state[HMPC_NX] = {R(0.0)}, acceleration[HMPC_NQ] = {R(0.0)}, v2 = R(0.0), u2 = R(0.0);
   static const real none[HMPC_NQ];
   hmpc_model(run->z, u, w, next);
   memcpy(run->z, next, sizeof next);
