@@ -107,7 +107,7 @@ static void guard_decide(hmpc_state *s, const hmpc_goal *given, const real *held
     if (g->planner != HMPC_BACKUP_PLANS) hmpb_take_over(b, s->plan.u[0], held);
     g->planner = HMPC_BACKUP_PLANS;
     hmpb_decide(b, &own, held);
-    memcpy(s->u, b->u, sizeof s->u);
+    for (int i = 0; i < HMPC_NU; ++i) s->u[i] = b->u[i];
     s->status = (hmpc_status)b->status;
     s->source = (hmpc_source)b->source;
     s->age = b->age;
