@@ -1,8 +1,9 @@
 """How many instructions a period of the exported C controller takes, counted by Valgrind's callgrind.
 
 ``python benchmarks/instructions.py [--z 16 32] [--soft] [--out FILE.json]``, with ``apt-get install valgrind``. The
-golf robot with a GRU of random weights, N = 50, |u| bounded, observer of three switching filters; the controller's own
-test runs its 25 periods. A period is an estimate, a decision and a preparation; each is counted call by call. Counts do
+golf robot with a GRU of random weights, N = 50, |u| bounded, observer of three switching filters, the guard's energy
+monitor; the controller's own test runs its 25 periods. A period is an estimate, a decision, a look of the monitor and
+a preparation; each is counted call by call. Counts do
 not depend on what else the machine does; they say nothing of caches. Valgrind knows no AVX-512: the widest that is
 counted is AVX2 (``-march=haswell``).
 """
@@ -17,15 +18,15 @@ from pathlib import Path
 
 import numpy as np
 from native import SOFT
-from parts import arguments, deployed, hybrid_step, problem, report
-from steps import SIGMA_X
+from parts import arguments, report
+from whole_period import watched_controller
 
-from hybrid_mpc import make_estimator
-from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.embedded.generate import SOURCES
-from scenarios.golf_robot import scenario
 
-PARTS = {"estimate": "hmpc_estimate_update", "decision": "hmpc_decide", "preparation": "hmpc_prepare"}
+PARTS = {
+    "estimate": "hmpc_estimate_update", "decision": "hmpc_decide", "monitor": "hmpc_watch",
+    "preparation": "hmpc_prepare",
+}  # fmt: skip
 COMPILED = ("-O2", "-O3", "-O3 -march=haswell")
 
 
@@ -68,12 +69,10 @@ def main() -> None:
         raise SystemExit("valgrind is not installed: apt-get install valgrind")
     rows = []
     for z in given.z:
-        model, ocp = deployed(hybrid_step(z)), problem(given.n, **(SOFT if given.soft else {}))
-        estimator = make_estimator(model, scenario, np.array(SIGMA_X), ocp)
         for single in (False, True):
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder)
-                write_controller(path, model, ocp, estimator=estimator, safe_input=model.u0, single=single)
+                watched_controller(path, z, single, given.n, **(SOFT if given.soft else {}))
                 for options in COMPILED:
                     kind = "float" if single else "double"
                     rows.append({"z": z, "numbers": kind, "compiled": options, **periods(path, options)})

@@ -11,7 +11,8 @@ from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc export c runs/golf --out controller\n\n"
-    "  hybrid-mpc export c runs/golf --task track --float --out controller"
+    "  hybrid-mpc export c runs/golf --task track --float --out controller\n\n"
+    "  hybrid-mpc export c runs/golf --guard --out controller"
 )
 
 app = typer.Typer(
@@ -28,12 +29,25 @@ def c(
     ] = "",
     task: Annotated[str, typer.Option(help="Whose control problem. Default: the common one.")] = "",
     single: Annotated[bool, typer.Option("--float", help="Numbers are float instead of double.")] = False,
+    monitor: Annotated[bool, typer.Option("--monitor/--no-monitor", help="Watch the loop.")] = True,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="React to the monitor: no input while the sensor is frozen.")
+    ] = False,
+    adapt: Annotated[
+        bool,
+        typer.Option(
+            "--adapt", help="--guard, and a second controller that learns what has become of the machine."
+        ),
+    ] = False,
 ) -> None:
-    """Estimator, real-time iteration and safeguards as self-contained C11, with a test program."""
+    """Estimator, real-time iteration, safeguards, monitor and guard as self-contained C11, with a test program."""
     from hybrid_mpc.files import check_folder
     from hybrid_mpc.kit.artifact import load
     from hybrid_mpc.kit.export_c import generate_controller
 
     check_folder(out)
-    folder = generate_controller(load(model), out, model=name, task=task, single=single)
+    reaction = "adapt" if adapt else "rest" if guard else ""
+    folder = generate_controller(
+        load(model), out, model=name, task=task, single=single, monitor=monitor, guard=reaction
+    )
     print(f"C in {folder.resolve()}; README.md has the sizes. Next: make -C {folder} test")

@@ -195,7 +195,7 @@ class CondensedController(SplitController):
         if iterations < 1:
             raise InputError(f"iterations must be at least 1, got {iterations}")
         self.problem = Problem(model, ocp)
-        self._iterations, self._n_x = iterations, ocp.n_x
+        self.iterations, self._n_x = iterations, ocp.n_x
         n, n_u = ocp.horizon, ocp.n_u
         self.stages = stages(model, n, compiled=compiled)
         difference = np.eye(n * n_u) - np.eye(n * n_u, k=-n_u)
@@ -320,7 +320,7 @@ class CondensedController(SplitController):
     ) -> Solution:  # fmt: skip
         """:meth:`feedback`, then linearized anew until there have been ``iterations``; arguments as there."""
         solution = self.feedback(prepared, estimate, reference, limits, w)
-        for i in range(1, self._iterations):
+        for i in range(1, self.iterations):
             if not solution.status.ok:
                 break
             spent = solution.timing

@@ -96,7 +96,7 @@ class SafeController:
         if max_age < 0:
             raise InputError(f"max_age must not be negative, got {max_age}")
         ocp = controller.ocp
-        self.controller, self._max_age = controller, max_age
+        self.controller, self.max_age, self.fallback = controller, max_age, fallback
         self.safe_input = None if safe_input is None else checked_safe_input(safe_input, ocp)
         self._split = controller if isinstance(controller, SplitController) else None
         self._first = controller if first is None else first
@@ -204,7 +204,7 @@ class SafeController:
     def _instead(
         self, failed: Solution, estimate: Estimate, reference: Array, age: int, held: Array
     ) -> tuple[Array, Source]:
-        if age <= self._max_age and np.all(np.isfinite(failed.u[0])):
+        if age <= self.max_age and np.all(np.isfinite(failed.u[0])):
             return failed.u[0], Source.PLAN
         if self._fallback is not None and estimate.finite:
             goal, best = self._goal(estimate, reference, failed)

@@ -34,8 +34,8 @@ class Cell:
 
 @dataclass(frozen=True)
 class Cut:
-    """A step in scalars. ``before`` ``(x, h, u, w) -> features`` and ``cell`` are None without a network; ``after``
-    ``(x, h, u, w, units) -> z_next`` takes the cell's new state.
+    """A step, or rates, in scalars. ``before`` ``(x, h, u, w) -> features`` and ``cell`` are None without a network;
+    ``after`` ``(x, h, u, w, units) -> z_next`` takes the cell's new state.
     """
 
     before: ca.Function | None
@@ -43,8 +43,8 @@ class Cut:
     after: ca.Function
 
 
-def cut(model: HybridModel) -> Cut:
-    """The step of a model, its parameters at their values.
+def cut(model: HybridModel, of: str = "step") -> Cut:
+    """The step of a model, or its rates (``of="xdot"``), its parameters at their values.
 
     Raises:
         InputError: If it holds another network than one GRU cell, by name.
@@ -58,8 +58,8 @@ def cut(model: HybridModel) -> Cut:
     """
     sizes = model.n_x, model.n_h, model.n_u, model.n_w
     point = [ca.MX.sym(name, n) for name, n in zip("xhuw", sizes, strict=True)]
-    z_next: Any = ca.vertcat(*inlined(model.step, [*point, ca.MX(ca.DM(model.p))]))
-    whole = ca.Function("step", point, [z_next])
+    z_next: Any = ca.vertcat(*inlined(getattr(model, of), [*point, ca.MX(ca.DM(model.p))]))
+    whole = ca.Function(of, point, [z_next])
     calls = [
         whole.instruction_MX(k)
         for k in range(whole.n_instructions())
@@ -72,7 +72,7 @@ def cut(model: HybridModel) -> Cut:
             f"model {model.name}: its network has the cells {', '.join(names)}; C is generated for one GRU cell"
         )
     if not cells:
-        return Cut(None, None, _scalar(model, "step", [*point, ca.MX.sym("units", 0)], z_next))
+        return Cut(None, None, _scalar(model, of, [*point, ca.MX.sym("units", 0)], z_next))
     seen: ca.MX = cells[0].dep(0)
     hidden, new = cells[0].dep(1), cells[0].get_output(0)
     units = ca.MX.sym("units", new.shape[0])
@@ -81,7 +81,7 @@ def cut(model: HybridModel) -> Cut:
     weights = _weights(cells[0].which_function())
     return Cut(
         _scalar(model, "features", point, seen), Cell(*weights, first),
-        _scalar(model, "step", [*point, units], behind),
+        _scalar(model, of, [*point, units], behind),
     )  # fmt: skip
 
 
@@ -128,3 +128,55 @@ def _weights(cell: ca.Function) -> tuple[Array, Array, Array, Array]:
         n + update * (h - n), wanted, rtol=1e-12, atol=1e-12
     )  # else nn_export writes cells otherwise
     return w, r, b, c
+
+
+def reduced(
+    parts: Cut, model: HybridModel, rest: list[int], z: ca.SX, u: ca.SX, w: ca.SX
+) -> tuple[Array, ca.SX, ca.SX]:
+    """What the step sees of the cell's new state: ``head`` ``(k, units)``, symbols of the k combinations, and the step
+    with them in place of the units.
+
+    A linear layer behind the cell lets through as many as it has outputs: the row space of the Jacobian, the same at
+    all points. Writing it out unit by unit would make scalar code that grows with the network.
+    """
+    assert parts.cell is not None
+    units, n_x = parts.cell.units, model.n_x
+    g = ca.SX.sym("g", units)
+    step = parts.after(z[:n_x], z[n_x:], u, w, g)
+    slope = ca.Function("slope", [z, u, w, g], [ca.densify(ca.jacobian(step[rest], g))])
+    value = ca.Function("value", [z, u, w, g], [step[rest]])
+    rng = np.random.default_rng(0)
+
+    def point() -> list[Array]:
+        z_k = np.concatenate([model.x0, np.zeros(model.n_h)])
+        near = [v + 0.3 * (np.abs(v) + 1.0) * rng.uniform(-1, 1, v.size) for v in (z_k, model.u0)]
+        return [*near, model.w, rng.uniform(-1, 1, units)]
+
+    found = np.vstack([slope(*point()).full() for _ in range(8)])
+    found = found[np.all(np.isfinite(found), axis=1)]
+    sizes, basis = np.linalg.svd(found)[1:] if len(found) else (np.zeros(0), np.zeros((0, units)))
+    rank = int(np.sum(sizes > 1e-10 * max(1e-300, float(np.max(sizes, initial=0.0)))))
+    pivots = _pivots(basis[:rank])
+    head = np.linalg.solve(basis[:rank][:, pivots], basis[:rank]) if rank else np.zeros((0, units))
+    out, chosen = ca.SX.sym("out", rank), ca.SX.zeros(units)
+    for k, place in enumerate(pivots):
+        chosen[place] = out[k]
+    reduced = parts.after(z[:n_x], z[n_x:], u, w, chosen)
+    again = ca.Function("again", [z, u, w, out], [reduced[rest]])
+    for _ in range(4):
+        *given, units_k = point()
+        wanted, got = value(*given, units_k).full(), again(*given, head @ units_k).full()
+        if not np.allclose(got, wanted, rtol=1e-11, atol=1e-11 * float(np.max(np.abs(wanted), initial=1e-9))):
+            return np.eye(units), g, step
+    return head, out, reduced
+
+
+def _pivots(rows: Array) -> list[int]:
+    """Columns of full rank of ``(k, n)`` rows of full rank."""
+    left, chosen = rows.copy(), []
+    for _ in range(len(rows)):
+        sizes = np.linalg.norm(left, axis=0)
+        chosen.append(int(np.argmax(sizes)))
+        direction = left[:, chosen[-1]] / sizes[chosen[-1]]
+        left = left - np.outer(direction, direction @ left)
+    return chosen

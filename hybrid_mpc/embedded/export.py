@@ -6,9 +6,10 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,20 @@ from numpy.typing import NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
-from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, Sources, make_sources, template
+from hybrid_mpc.embedded.generate import (
+    GENERATED,
+    HEADERS,
+    SOURCES,
+    Sources,
+    make_sources,
+    sources_of,
+    template,
+)
 from hybrid_mpc.embedded.scalar import table
+from hybrid_mpc.embedded.watch import Watch
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -28,6 +39,21 @@ VECTORS = 25
 TOLERANCE = {False: 1e-9, True: 1e-3}
 """Of inputs by their range and of states by their size; of single precision what its seven digits leave of a QP."""
 OTHERS = ("hmpc_test.c", "Makefile", "CMakeLists.txt")
+MONITOR_README = """\
+`hmpc_finish` looks at the period by @WATCHED@: `s.monitor.alarm` says whether anything alarms, the fields beside it
+what. @REACTION@
+
+"""
+REACTS = """\
+The guard reacts in the next `hmpc_step`: `s.guard.mode` is who decides,
+`s.guard.why` what led there."""
+REACTIONS = {
+    "none": "Nothing reacts: what an alarm means is up to the caller.",
+    "guard": REACTS,
+    "backup": f"""{REACTS} Its second controller, with an estimator of its own, is `hmpb_state backup` in
+the state; its files and names begin with `hmpb`. Its estimator runs in every period too,
+which the table does not count.""",
+}
 TARGETS_README = """\
 The goal is one of outputs, `goal.y`. Their steady state is sought in every step (`s.steady`): from the last one in two
 or three steps, where a set-point or a disturbance jumps in some more, and where there is none from every start, up to
@@ -48,6 +74,7 @@ class Footprint:
 def write_controller(
     folder: Path, model: HybridModel, ocp: OCP, *, estimator: Filter | None = None,
     fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
+    monitor: Watch | None = None, guard: Guard | None = None,
 ) -> Sources:  # fmt: skip
     """Write the C of a controller, its test and its README; arguments as :func:`make_sources` takes them.
 
@@ -55,19 +82,22 @@ def write_controller(
         InputError: If something has no C, by name, before anything is written.
     """
     found = make_sources(
-        model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input, single=single
-    )
+        model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input, single=single, monitor=monitor,
+        guard=guard,
+    )  # fmt: skip
     safe = SafeController(CondensedController(model, ocp), fallback, safe_input=safe_input)
     texts = {name: template(name) for name in (*HEADERS, *SOURCES, *OTHERS)} | dict(found.texts)
-    texts["hmpc_vectors.h"] = _vectors(safe, estimator, single)
+    for name in ("Makefile", "CMakeLists.txt"):
+        texts[name] = texts[name].replace("@SOURCES@", " ".join(sources_of(found)))
+    texts["hmpc_vectors.h"] = _vectors(safe, estimator, single, monitor)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text)
-    (folder / "README.md").write_text(_readme(model, found, footprint(folder), single))
+    (folder / "README.md").write_text(_readme(model, found, footprint(folder, sources_of(found)), single))
     return found
 
 
-def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> str:
+def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monitor: Watch | None) -> str:
     """A short loop from the operating point towards a set-point beside it, on the model itself."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.state_sizes
@@ -80,7 +110,8 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     z, n_x = np.concatenate([model.x0, np.zeros(model.n_h)]), model.n_x
     sigma = np.zeros(model.n_y) if estimator is None else np.sqrt(_noise(estimator))
     estimate: Estimate | None = None
-    decision, rows = None, []
+    decision, rows, readings = None, [], []
+    memory: Any = None if monitor is None else monitor.initial()
     for _ in range(VECTORS):
         u = safe.controller.problem.u_rest if decision is None else decision.u
         y = model.output(z[:n_x], u, model.w, model.p).full().ravel() + sigma * rng.standard_normal(model.n_y)
@@ -91,6 +122,9 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
             estimate = estimator.start(y, w=model.w)
         else:
             estimate = estimator.update(estimate, y, u, w=model.w)
+        if monitor is not None:
+            memory, reading = monitor.update(memory, y, u, estimate)
+            readings.append(_numbers(reading))
         decision = safe.initial(estimate) if decision is None else decision
         decision = safe.decide(decision, estimate, goal[None])
         rows.append((y, model.w, estimate.x, estimate.h, decision.u))
@@ -100,6 +134,11 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     tables = [table(f"vector_{name}", values) for name, values in columns]
     tables += [table("vector_goal", goal[None]), table("vector_x_size", size)]
     tables.append(table("vector_u_size", ocp.input_range))
+    if readings:
+        found = np.array(readings)
+        largest = np.max(np.nan_to_num(np.abs(found)), axis=0)
+        tables.append(table("vector_reading", found))
+        tables.append(table("vector_reading_size", np.where(largest > 0, largest, 1.0)))
     head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({TOLERANCE[single]!r})\n"
     return (
         "/* What the Python controller decided in a short loop, generated. */\n"
@@ -107,19 +146,29 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool) -> st
     )
 
 
+def _numbers(reading: Any) -> Array:
+    """What of a monitor's reading the test program compares: whether it alarms, and its levels."""
+    levels = (
+        [reading.level_w, reading.residual_level]
+        if hasattr(reading, "residual_level")
+        else reading.level[:, 0]
+    )
+    return np.concatenate([[float(reading.alarm)], levels, reading.residual])
+
+
 def _noise(estimator: Filter) -> Array:
     first = estimator.filters[0] if hasattr(estimator, "filters") else estimator
     return first.noise[1]
 
 
-def footprint(folder: Path) -> Footprint | None:
-    """Sizes by gcc -O3 for this machine; None where there is none."""
+def footprint(folder: Path, names: Sequence[str] = SOURCES) -> Footprint | None:
+    """Sizes of the sources ``names`` by gcc -O3 for this machine; None where there is none."""
     gcc, size = shutil.which("gcc"), shutil.which("size")
     if gcc is None or size is None:
         return None
     with tempfile.TemporaryDirectory() as work:
         flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
-        sources = [str((folder / name).resolve()) for name in SOURCES]
+        sources = [str((folder / name).resolve()) for name in names]
         made = subprocess.run([gcc, *flags, "-c", *sources], cwd=work, capture_output=True, check=False)
         test = [str((folder / "hmpc_test.c").resolve()), *sources, "-lm", "-o", "test"]
         linked = subprocess.run([gcc, *flags[:3], *test], cwd=work, capture_output=True, check=False)
@@ -130,12 +179,35 @@ def footprint(folder: Path) -> Footprint | None:
         flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
         frames = [
             int(line.split("\t")[1])
-            for p in Path(work).glob("hmpc_*.su")
+            for p in Path(work).glob("hmp*_*.su")
             for line in p.read_text().splitlines()
         ]
         told = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False).stderr
         state = re.search(r"the state has (\d+) bytes", told)
         return Footprint(flash, int(state[1]) if state else 0, sum(frames))
+
+
+def _watching(n: Mapping[str, int], code: Mapping[str, int], step: int) -> int:
+    """Operations of a period of the monitor, near rest, where the energy monitor asks the model most."""
+    if n["MONITOR"] == 2:
+        return 3 * step + code.get("watched_balances", 0) + n["CHANNELS"] * (n["SHORT"] + n["LONG"])
+    rows = n["WINDOW"] * (7 * n["NX"] + 2 * (n["NU"] + n["NW"]))
+    return (
+        3 * step
+        + 12 * (step + code["rates_after"])
+        + 4 * (code["watched_energy"] + code["watched_force"])
+        + 3 * rows
+    )
+
+
+def _monitor_readme(sizes: Mapping[str, int]) -> str:
+    if not sizes["MONITOR"]:
+        return "Nothing watches the loop: it was generated without a monitor.\n\n"
+    watched = (
+        "the energy balance of the model" if sizes["MONITOR"] == 1 else "residuals of outputs and balances"
+    )
+    reaction = REACTIONS["backup" if sizes["BACKUP"] else "guard" if sizes["GUARD"] else "none"]
+    return MONITOR_README.replace("@WATCHED@", watched).replace("@REACTION@", reaction)
 
 
 def operations(found: Sources) -> dict[str, int]:
@@ -154,14 +226,22 @@ def operations(found: Sources) -> dict[str, int]:
     n_t = n_z + n["NU"]
     newton = 2 * n_z**2 * n_t + 4 * n_z * n_t * n["NU"] + 2 * n["NH"] ** 3 // 3
     search = {"step: steady state, a step of its search": stage + newton} if n["OUTPUT_COST"] else {}
-    return search | {
-        "prepare: stages' Jacobians": n["N"] * stage,
-        "prepare: condensing": int(2 * n_z**2 * np.sum(-(-active // 8) * 8)),
-        "prepare: Hessian and its factor": int(n["NX"] * np.sum(active**2)) + n_v**3,
-        "step: estimator": n["MODES"] * (stage + 4 * n_e * padded * n_e + 2 * n["MODES"] * n_e**2),
-        "step: free response, gradient, bounds": 2 * n["N"] * n_z * padded + 6 * n["N"] * n["NX"] * n_v,
-        "step: QP, an iteration": 4 * n_v**2 + 2 * n_v * n["N"] * (n["SOFT_X"] + n["SOFT_E"]),
-    }
+    step_only = (
+        stage - units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) - 2 * n["HEAD"] * units * (padded + n["NU"])
+    )
+    watch = {"finish: monitor, at most": _watching(n, code, step_only)} if n["MONITOR"] else {}
+    return (
+        search
+        | watch
+        | {
+            "prepare: stages' Jacobians": n["N"] * stage,
+            "prepare: condensing": int(2 * n_z**2 * np.sum(-(-active // 8) * 8)),
+            "prepare: Hessian and its factor": int(n["NX"] * np.sum(active**2)) + n_v**3,
+            "step: estimator": n["MODES"] * (stage + 4 * n_e * padded * n_e + 2 * n["MODES"] * n_e**2),
+            "step: free response, gradient, bounds": 2 * n["N"] * n_z * padded + 6 * n["N"] * n["NX"] * n_v,
+            "step: QP, an iteration": 4 * n_v**2 + 2 * n_v * n["N"] * (n["SOFT_X"] + n["SOFT_E"]),
+        }
+    )
 
 
 def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single: bool) -> str:
@@ -179,7 +259,7 @@ def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single:
         "NAME": model.name, "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
         "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
         "DT": model.dt, "TOLERANCE": TOLERANCE[single],
-        "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
+        "MONITOR": _monitor_readme(n), "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
         "ESTIMATOR": f"{n['MODES']} Kalman filters side by side" if n["MODES"] else "none: it is given an estimate",
         "FILES": ", ".join(f"`{name}`" for name in GENERATED),
     }  # fmt: skip

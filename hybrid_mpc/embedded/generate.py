@@ -14,18 +14,32 @@ from hybrid_mpc.control import targets
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import KEPT, KNOTS, Problem, SoftRows
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
-from hybrid_mpc.embedded.cut import Cut, cut
-from hybrid_mpc.embedded.scalar import c_function, table
+from hybrid_mpc.embedded.cut import Cut, cut, reduced
+from hybrid_mpc.embedded.scalar import c_function, number, table
+from hybrid_mpc.embedded.watch import (
+    NOTHING,
+    Watch,
+    Watched,
+    guard_parts,
+    monitor_parts,
+    refused_guard,
+    refused_monitor,
+)
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import NEGLIGIBLE, Filter, SwitchingFilter
+from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
-SOURCES = ("hmpc_model.c", "hmpc_qp.c", "hmpc_targets.c", "hmpc_mpc.c", "hmpc_estimator.c")
+CORE = ("hmpc_model.c", "hmpc_qp.c", "hmpc_targets.c", "hmpc_mpc.c", "hmpc_estimator.c")
+"""A controller and its estimator: what a guard's backup has, too, under names of its own."""
+SOURCES = (*CORE, "hmpc_monitor.c", "hmpc_loop.c")
 HEADERS = ("hmpc.h", "hmpc_math.h")
+BACKUP = "hmpb"
+"""What names of a guard's backup begin with, in place of ``hmpc``."""
 GENERATED = ("hmpc_config.h", "hmpc_tables.h", "hmpc_expressions.h")
 FIRST = 25
 """Iterations of the first plan: an RTI step halves what is left, or better."""
@@ -52,9 +66,10 @@ class Sources:
 
 def make_sources(
     model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
-    safe_input: Array | None = None, single: bool = False,
+    safe_input: Array | None = None, single: bool = False, monitor: Watch | None = None, guard: Guard | None = None,
+    max_age: int = MAX_AGE,
 ) -> Sources:  # fmt: skip
-    """The generated files of a controller.
+    """The generated files of a controller; with a guard's backup all files of that one, too.
 
     Args:
         model: The model that plans, and estimates.
@@ -63,6 +78,9 @@ def make_sources(
         fallback: The prior, see :class:`~hybrid_mpc.control.safeguard.SafeController`. Default: none.
         safe_input: Likewise.
         single: Whether numbers are ``float``. Default: ``double``.
+        monitor: What watches the loop; it needs the estimator. Default: nothing.
+        guard: What an alarm of it does. Default: nothing.
+        max_age: See :class:`~hybrid_mpc.control.safeguard.SafeController`.
 
     Raises:
         InputError: If something of them has no C, all at once, by name.
@@ -73,6 +91,23 @@ def make_sources(
         parts = cut(model)
     except InputError as error:
         refused.append(str(error))
+    watched, backup = NOTHING, None
+    if monitor is not None:
+        refused += refused_monitor(monitor, model)
+        refused += (
+            [] if estimator is not None else ["a monitor without an estimator, whose estimates it reads"]
+        )
+    if guard is not None:
+        refused += refused_guard(guard, monitor is not None, model, ocp, safe_input)
+    try:
+        if not refused and parts is not None:
+            watched = monitor_parts(monitor, model, parts)
+    except InputError as error:
+        refused.append(str(error))
+    try:
+        backup = backup_of(guard, single)
+    except InputError as error:
+        refused.append(f"its guard's backup: {error}")
     if refused or parts is None:
         raise InputError("no C for this controller: " + "; ".join(refused))
     problem = Problem(model, ocp)
@@ -83,20 +118,51 @@ def make_sources(
     sizes = {
         "NX": model.n_x, "NH": model.n_h, "NU": model.n_u, "NY": model.n_y, "NW": model.n_w, "ND": model.n_d,
         "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": soft.states.size, "SOFT_E": expressions, "MODES": len(modes),
-        "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": MAX_AGE, "FIRST": FIRST,
+        "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": max_age, "FIRST": FIRST,
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
         "NP": ocp.n_p, "HARD": int(np.any(soft.hard)), "OUTPUT_COST": int(ocp.n_y > 0), "TARGET_KNOTS": KNOTS,
         "SOFT_D": int(any(np.any(np.array(f.jac_sparsity(0, 2).get_triplet()[1]) < model.n_d) for f in soft.functions)),
         "TARGET_ITERATIONS": targets.ITERATIONS, "TARGET_SETTLING": targets.SETTLING, "TARGET_WITHIN": targets.WITHIN,
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
-        model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0
+        model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0, watched.code
     )
-    sizes |= model_sizes
-    tables = _tables(model, ocp, problem, soft, fallback, safe_input, estimator)
-    config = _config(sizes, single, bound_names(soft, ocp.horizon))
+    guard_sizes, guard_tables = guard_parts(guard, model)
+    sizes |= {**model_sizes, **watched.sizes, **guard_sizes}
+    tables = _tables(
+        model, ocp, problem, soft, fallback, safe_input, estimator, watched.tables + guard_tables
+    )
+    config = _config(sizes, single, bound_names(soft, ocp.horizon), watched)
     texts = {"hmpc_config.h": config, "hmpc_tables.h": tables, "hmpc_expressions.h": code}
-    return Sources(texts, operations, sizes)
+    return Sources(texts | (backup or {}), operations | dict(watched.operations), sizes)
+
+
+def backup_of(guard: Guard | None, single: bool) -> dict[str, str]:
+    """All files of a guard's backup, its names with a prefix of their own; none without one.
+
+    Raises:
+        InputError: As :func:`make_sources`.
+    """
+    if guard is None or guard.backup is None or guard.backup_estimator is None:
+        return {}
+    safe, estimator = guard.backup, guard.backup_estimator
+    if not isinstance(estimator, ExtendedKalmanFilter | SwitchingFilter):
+        raise InputError(f"no C for an estimator of this kind ({type(estimator).__name__})")
+    found = make_sources(
+        safe.controller.model, safe.controller.ocp, estimator=estimator, fallback=safe.fallback,
+        safe_input=safe.safe_input, single=single, max_age=safe.max_age,
+    )  # fmt: skip
+    texts = {name: template(name) for name in (*HEADERS, *CORE)} | dict(found.texts)
+    return {_renamed(name): _renamed(text) for name, text in texts.items()}
+
+
+def _renamed(text: str) -> str:
+    return text.replace("hmpc", BACKUP).replace("HMPC", BACKUP.upper())
+
+
+def sources_of(found: Sources) -> tuple[str, ...]:
+    """Names of all files to compile."""
+    return (*SOURCES, *(_renamed(name) for name in CORE if found.sizes["BACKUP"]))
 
 
 def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, single: bool) -> list[str]:
@@ -155,7 +221,7 @@ def _first_periods(soft: SoftRows, horizon: int) -> list[int]:
     return first
 
 
-def _config(sizes: Mapping[str, int], single: bool, names: list[str]) -> str:
+def _config(sizes: Mapping[str, int], single: bool, names: list[str], watched: Watched) -> str:
     defined = "".join(f"#define HMPC_{name} {value}\n" for name, value in sizes.items())
     hard = "".join(f"   {i}: {name.replace('*/', '')}\n" for i, name in enumerate(names) if name)
     defined += f"/* Hard bounds by their place in given_way:\n{hard}*/\n" if hard else ""
@@ -167,6 +233,7 @@ def _config(sizes: Mapping[str, int], single: bool, names: list[str]) -> str:
         *zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE", "KEPT"), exact, strict=True)
     ]
     tolerances += [(f"TARGET_{name}", value[single]) for name, value in SEARCH.items()]
+    defined += "".join(f"#define HMPC_{name} {number(value)}\n" for name, value in watched.numbers.items())
     return (
         "/* Sizes of this controller, generated. */\n#ifndef HMPC_CONFIG_H\n#define HMPC_CONFIG_H\n"
         + ("#define HMPC_FLOAT\n" if single else "")
@@ -180,7 +247,13 @@ def _config(sizes: Mapping[str, int], single: bool, names: list[str]) -> str:
 
 
 def _expressions(
-    model: HybridModel, parts: Cut, soft: SoftRows, fallback: HybridModel | None, ocp: OCP, measured: bool
+    model: HybridModel,
+    parts: Cut,
+    soft: SoftRows,
+    fallback: HybridModel | None,
+    ocp: OCP,
+    measured: bool,
+    watched: str,
 ) -> tuple[str, dict[str, int], dict[str, int]]:
     """The scalar code, sizes that follow from it, and its operations by function."""
     n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
@@ -238,7 +311,7 @@ def _expressions(
         slopes = [(f"by_v[{i}]", v) for i, v in enumerate(values)]
         add("model_before_slope", [*point, "real *seen", "real *by_v"], inputs, outs + slopes)
     rest = [i for i in range(n_z) if i not in own]
-    head, out, z_next = _reduced(parts, model, rest, z, u, w) if units else (np.zeros((0, 0)), g, z_next)
+    head, out, z_next = reduced(parts, model, rest, z, u, w) if units else (np.zeros((0, 0)), g, z_next)
     sizes["HEAD"] = len(head)
     texts.append(table("head", head))
     inputs = {**inputs, "out": out}
@@ -299,59 +372,7 @@ def _expressions(
         add("equilibrium", ["const real *x", "const real *w", "real *best"], {"x": x, "w": w}, outs)
     guard = "HMPC_EXPRESSIONS_H"
     opening = f"/* Scalar code of this controller, generated. */\n#ifndef {guard}\n#define {guard}\n"
-    return opening + "\n".join(texts) + "\n#endif\n", sizes, operations
-
-
-def _reduced(
-    parts: Cut, model: HybridModel, rest: list[int], z: ca.SX, u: ca.SX, w: ca.SX
-) -> tuple[Array, ca.SX, ca.SX]:
-    """What the step sees of the cell's new state: ``head`` ``(k, units)``, symbols of the k combinations, and the step
-    with them in place of the units.
-
-    A linear layer behind the cell lets through as many as it has outputs: the row space of the Jacobian, the same at
-    all points. Writing it out unit by unit would make scalar code that grows with the network.
-    """
-    assert parts.cell is not None
-    units, n_x = parts.cell.units, model.n_x
-    g = ca.SX.sym("g", units)
-    step = parts.after(z[:n_x], z[n_x:], u, w, g)
-    slope = ca.Function("slope", [z, u, w, g], [ca.densify(ca.jacobian(step[rest], g))])
-    value = ca.Function("value", [z, u, w, g], [step[rest]])
-    rng = np.random.default_rng(0)
-
-    def point() -> list[Array]:
-        z_k = np.concatenate([model.x0, np.zeros(model.n_h)])
-        near = [v + 0.3 * (np.abs(v) + 1.0) * rng.uniform(-1, 1, v.size) for v in (z_k, model.u0)]
-        return [*near, model.w, rng.uniform(-1, 1, units)]
-
-    found = np.vstack([slope(*point()).full() for _ in range(8)])
-    found = found[np.all(np.isfinite(found), axis=1)]
-    sizes, basis = np.linalg.svd(found)[1:] if len(found) else (np.zeros(0), np.zeros((0, units)))
-    rank = int(np.sum(sizes > 1e-10 * max(1e-300, float(np.max(sizes, initial=0.0)))))
-    pivots = _pivots(basis[:rank])
-    head = np.linalg.solve(basis[:rank][:, pivots], basis[:rank]) if rank else np.zeros((0, units))
-    out, chosen = ca.SX.sym("out", rank), ca.SX.zeros(units)
-    for k, place in enumerate(pivots):
-        chosen[place] = out[k]
-    reduced = parts.after(z[:n_x], z[n_x:], u, w, chosen)
-    again = ca.Function("again", [z, u, w, out], [reduced[rest]])
-    for _ in range(4):
-        *given, units_k = point()
-        wanted, got = value(*given, units_k).full(), again(*given, head @ units_k).full()
-        if not np.allclose(got, wanted, rtol=1e-11, atol=1e-11 * float(np.max(np.abs(wanted), initial=1e-9))):
-            return np.eye(units), g, step
-    return head, out, reduced
-
-
-def _pivots(rows: Array) -> list[int]:
-    """Columns of full rank of ``(k, n)`` rows of full rank."""
-    left, chosen = rows.copy(), []
-    for _ in range(len(rows)):
-        sizes = np.linalg.norm(left, axis=0)
-        chosen.append(int(np.argmax(sizes)))
-        direction = left[:, chosen[-1]] / sizes[chosen[-1]]
-        left = left - np.outer(direction, direction @ left)
-    return chosen
+    return opening + "\n".join([*texts, watched]) + "\n#endif\n", sizes, operations
 
 
 def _scalar(what: str, f: ca.Function) -> ca.Function:
@@ -363,9 +384,9 @@ def _scalar(what: str, f: ca.Function) -> ca.Function:
 
 def _tables(
     model: HybridModel, ocp: OCP, problem: Problem, soft: SoftRows, fallback: HybridModel | None,
-    safe_input: Array | None, estimator: Filter | None,
+    safe_input: Array | None, estimator: Filter | None, watched: str,
 ) -> str:  # fmt: skip
-    """All numbers of the problem and the estimator."""
+    """All numbers of the problem and the estimator, and those of monitor and guard as they are given."""
     dt, n = model.dt, ocp.horizon
     on_u, on_x, on_y = model.disturbed
     starts = ocp.block_starts
@@ -412,6 +433,7 @@ def _tables(
     }  # fmt: skip
     text = "".join(table(name, value) for name, value in reals.items())
     text += "".join(table(name, value, "int") for name, value in whole.items())
+    text += watched
     return f"/* Numbers of this controller, generated. */\n#ifndef HMPC_TABLES_H\n#define HMPC_TABLES_H\n{text}#endif\n"
 
 

@@ -254,7 +254,7 @@ def one_file(texts: Mapping[str, str]) -> str:
             name = line.split('"')[1] if line.startswith('#include "') else ""
             if not name:
                 lines.append(line)
-            elif name not in seen:
+            elif name in own and name not in seen:  # a backup's are another controller's: none is in one file
                 seen.add(name)
                 lines.append(written(own[name]))
         return "\n".join(lines)

@@ -9,15 +9,21 @@ import numpy as np
 from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.kit.assembly import make_ocp
+from hybrid_mpc.kit.assembly import make_ocp, make_resting_guard
+from hybrid_mpc.loop.guard import Guard
+from hybrid_mpc.records import known
+
+REACTIONS = ("", "rest", "adapt")
+"""What an alarm does in the C: nothing, :meth:`Kit.guard`, or the same with a backup that adapts."""
 
 
 def generate_controller(
-    kit: Kit, folder: str | Path, *, model: str = "", task: str = "", load: bool = True, single: bool = False
-) -> Path:
-    """Write estimator, real-time iteration and safeguards as C11, with a test program and a README.
+    kit: Kit, folder: str | Path, *, model: str = "", task: str = "", load: bool = True, single: bool = False,
+    monitor: bool = True, guard: str = "",
+) -> Path:  # fmt: skip
+    """Write estimator, real-time iteration, safeguards, monitor and guard as C11, with a test program and a README.
 
-    One period of the C is one of :class:`~hybrid_mpc.loop.loop.Loop`, without monitor and guard.
+    One period of the C is one of :class:`~hybrid_mpc.loop.loop.Loop`.
 
     Args:
         kit: The loaded artifact.
@@ -26,13 +32,17 @@ def generate_controller(
         task: Whose control problem it solves. Default: the common one.
         load: Whether the estimator follows an unknown load, as :meth:`Kit.observer`. Default: yes.
         single: Whether numbers are ``float``. Default: ``double``.
+        monitor: Whether :meth:`Kit.monitor` watches the loop. Default: it does.
+        guard: What its alarms do, which are those of ``kit.monitor(kind="guard")`` then: ``"rest"``, no input while a
+            sensor is frozen; ``"adapt"``, a second controller too that estimates the prior's changed parameters
+            (:meth:`Kit.guard`). Default: nothing, they are told.
 
     Returns:
         The folder.
 
     Raises:
         InputError: If something of the controller has no C, all of it by name; if the folder holds something else; if
-            the kit lacks something that a loop needs.
+            the kit lacks something that a loop, its monitor or its guard needs.
 
     Example:
         ``hm.generate_controller(hm.load("runs/mine"), "controller")``
@@ -42,6 +52,9 @@ def generate_controller(
         raise InputError(f"{place} is a file; give a folder")
     if place.is_dir() and any(place.iterdir()) and not (place / "hmpc.h").is_file():
         raise InputError(f"{place} is not empty; give a new folder")
+    known(guard or "none", ("none", *REACTIONS[1:]), "guard")
+    if guard and not monitor:
+        raise InputError(f"guard {guard!r} acts on alarms; leave monitor=True")
     name = model or kit.recommended
     estimator = kit.observer(name, task=task, load=load)
     prior = kit.models["prior"]
@@ -49,5 +62,13 @@ def generate_controller(
     write_controller(
         place, kit.models[name], make_ocp(prior, kit.problem(task)), estimator=estimator, fallback=prior,
         safe_input=safe, single=single,
+        monitor=kit.monitor(name, task=task, kind="guard" if guard else "") if monitor else None,
+        guard=_guard(kit, name, task, guard),
     )  # fmt: skip
     return place
+
+
+def _guard(kit: Kit, model: str, task: str, reaction: str) -> Guard | None:
+    if reaction == "adapt":
+        return kit.guard(adapt=True, task=task)
+    return make_resting_guard(kit.models[model]) if reaction else None

@@ -76,7 +76,7 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     return replace(
         model,
         step=step_function("step", point, [x_next, ca.vertcat(later, h_next)]),
-        xdot=ca.Function("xdot", point, [model.xdot(x, own, u, w, p)], [*STEP_INPUTS], ["xdot"]),
+        xdot=ca.Function("xdot", point, inlined(model.xdot, [x, own, u, w, p]), [*STEP_INPUTS], ["xdot"]),
         with_jacobian=step_function("with_jacobian", point, [x_slope, ca.vertcat(later, h_slope), *slopes]),
         side_by_side=None
         if model.side_by_side is None

@@ -217,11 +217,13 @@ class EnergyMonitor:
             stored = (part.rest_speed for part in (detector, calibration) if part is not None)
             rest_speed = next((rest for rest in stored if rest is not None), NOTHING_STICKS)
         self.rest_speed = checked_rest(rest_speed, model.n_x // 2, "energy monitor")
-        self._resolution = _positive(resolution, model.n_y)
+        self.resolution = _positive(resolution, model.n_y)
+        """Step of each sensor ``(n_y,)``; empty: unknown."""
         if detector is not None:
             detector.check(model.n_y, bool(self.layout.length), model.dt, model.time_unit)
-        spans = _spans(model, input_range)
-        self._function = BufferedFunction(reading_function(self.layout, self.rest_speed, spans))
+        self.input_range = _spans(model, input_range)
+        """Range ``(n_u,)`` of each input, for the test for freezing near rest."""
+        self._function = BufferedFunction(reading_function(self.layout, self.rest_speed, self.input_range))
         self._sizes = tuple(values.size for values in self._function.inputs[1:5])
 
     @property
@@ -268,7 +270,7 @@ class EnergyMonitor:
         memory, numbers, n_q = outs[0].copy(), outs[1].tolist(), self.model.n_y
         level, residual_level = self._levels(memory)
         alarms = self.alarms(level, residual_level, state.alarms)
-        travels = zip(numbers[3 + n_q : 3 + 2 * n_q], self._resolution, strict=False)
+        travels = zip(numbers[3 + n_q : 3 + 2 * n_q], self.resolution, strict=False)
         frozen = any(abs(travel) > FROZEN_STEPS * step for travel, step in travels)
         energy, seconds = self._older(numbers, left) if left else (math.nan, 0.0)
         detector, detected = state.detector, False

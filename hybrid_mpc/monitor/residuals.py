@@ -233,15 +233,21 @@ class ResidualMonitor:
                 raise InputError(
                     f"residual monitor: resolution needs {model.n_y} positive steps, got {steps.tolist()}"
                 )
-        self._travel = np.maximum(FROZEN_STEPS * steps, 0.0 if limits is None else np.array(limits.travel))
-        self._repeats = np.zeros(model.n_y) if limits is None else np.array(limits.repeats)
+        self.frozen_travel = np.maximum(
+            FROZEN_STEPS * steps, 0.0 if limits is None else np.array(limits.travel)
+        )
+        """How far each output may be predicted to move while its sensor repeats itself ``(n_y,)`` [its unit]."""
+        self.frozen_repeats = np.zeros(model.n_y) if limits is None else np.array(limits.repeats)
+        """For how many samples it may ``(n_y,)``."""
         unit = machine_second(model.dt, model.time_unit)
         self.short, self.long, self.settling = (
             periods(length * unit, model.dt) for length in (SHORT_S, LONG_S, SETTLING_S)
         )
-        self._length = periods(FREE_RUN_S * unit, model.dt, RUNS)
+        self.free_run = periods(FREE_RUN_S * unit, model.dt, RUNS)
+        """Length of a free run [periods]."""
         ends = [s.saturation or (-np.inf, np.inf) for s in model.outputs]
-        self._ends = np.array(ends, dtype=float).T
+        self.sensor_ends = np.array(ends, dtype=float).T
+        """Ends of the sensors' ranges ``(2, n_y)``."""
         if limits is not None:
             self._threshold, self._release = np.array(limits.threshold), np.array(limits.release)
         self._function = BufferedFunction(_residuals(model))
@@ -252,7 +258,7 @@ class ResidualMonitor:
         x, h, w, y = (np.full(size, np.nan) for size in (m.n_x, m.n_h, m.n_w, m.n_y))
         recent, on = np.full((self.long, n), np.nan), np.zeros((n, 2), dtype=bool)
         runs = np.full((RUNS, m.n_x + m.n_h + m.n_d), np.nan)
-        age = tuple(-self.settling - i * self._length // RUNS for i in range(RUNS))
+        age = tuple(-self.settling - i * self.free_run // RUNS for i in range(RUNS))
         return ResidualState(x, h, w, y, recent, np.zeros(m.n_y), np.zeros(m.n_y, dtype=int), on, runs, age)
 
     def update(
@@ -315,7 +321,7 @@ class ResidualMonitor:
         for k, periods_ago in enumerate(age):
             now = periods_ago + 1
             lost = now > 0 and not np.isfinite(ahead[k]).all()
-            if now == 0 or now >= self._length or lost:
+            if now == 0 or now >= self.free_run or lost:
                 ahead[k] = begun
                 now = 0 if np.isfinite(begun).all() else -1  # else try again at the next sample
             following.append(now)
@@ -323,8 +329,8 @@ class ResidualMonitor:
 
     def frozen(self, y: Array, travel: Array, repeats: NDArray[np.int_]) -> NDArray[np.bool_]:
         """Which sensors are frozen ``(n_y,)``: from the measurement, and how far and long each repeated itself."""
-        inside = (y > self._ends[0]) & (y < self._ends[1])
-        return inside & (np.abs(travel) > self._travel) & (repeats > self._repeats)
+        inside = (y > self.sensor_ends[0]) & (y < self.sensor_ends[1])
+        return inside & (np.abs(travel) > self.frozen_travel) & (repeats > self.frozen_repeats)
 
     def alarms(self, level: Array, were_on: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
         """Which alarms are on at levels ``(channels, 2)``, and the largest level over its threshold."""

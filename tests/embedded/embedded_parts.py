@@ -18,6 +18,7 @@ from hybrid_mpc import (
     SwitchingFilter,
     with_input_delay,
 )  # fmt: skip
+from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.embedded.generate import make_sources
 from hybrid_mpc.embedded.native import FLAGS, State, goal_of, load_library
 from hybrid_mpc.kit.assembly import disturbance_sizes
@@ -119,6 +120,15 @@ def filters_of(model, ocp):
         for scale, step in ((1.0, 1e-3), (10.0, 1e-3), (1.0, 0.05))
     ]  # fmt: skip
     return SwitchingFilter(modes, ((0.97, 0.02, 0.01), (0.5, 0.49, 0.01), (0.45, 0.05, 0.5)))
+
+
+def write(folder, case, **options):
+    """The C of a whole loop, of what ``Loop`` is made of."""
+    controller = case.safe.controller
+    return write_controller(
+        folder, controller.model, controller.ocp, estimator=case.estimator, fallback=case.safe.fallback,
+        safe_input=case.safe.safe_input, monitor=case.monitor, guard=case.guard, **options,
+    )  # fmt: skip
 
 
 class CLoop:

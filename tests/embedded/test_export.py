@@ -30,6 +30,7 @@ STRICT = [
     "-Werror",
     "-ffp-contract=off",
 ]
+SANITIZERS = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-ffp-contract=off"]
 MACHINES = {
     "coupled": parts.coupled, "tanks": parts.tanks, "delayed": parts.delayed, "heaters": parts.heaters,
     "bounded": parts.bounded, "band": parts.band, "cart": lambda: parts.cart([AWAY]),
@@ -156,15 +157,8 @@ def rubbish(folder, periods):
     (folder / "rubbish.c").write_text(
         RUBBISH.replace('"hmpc_math.h"', '"hmpc_math.h"\n#include "hmpc_tables.h"')
     )
-    sanitizers = [
-        "-g",
-        "-O1",
-        "-fsanitize=address,undefined",
-        "-fno-sanitize-recover=all",
-        "-ffp-contract=off",
-    ]
     try:
-        program = built(folder, "-std=c11", *sanitizers, main="rubbish.c", out="rubbish")
+        program = built(folder, "-std=c11", *SANITIZERS, main="rubbish.c", out="rubbish")
     except AssertionError as error:
         pytest.skip(f"no sanitizers: {str(error)[-200:]}")
     done = subprocess.run([program, str(periods)], capture_output=True, text=True, check=False)

@@ -5,12 +5,17 @@
      hmpc_start(&s, y, w, NULL, &goal)   once, while the machine rests; s.u is the first input
      every period: write s.u; hmpc_finish(&s, &goal) while it acts; hmpc_step(&s, y, w, NULL, &goal)
 
+   hmpc_finish is where the monitor looks, if there is one: s.monitor.alarm. A guard acts on it in the next hmpc_step.
+
    Numbers never stop it: s.u is within its limits whatever samples, references and the model say.
    All matrices are row by row. Everything of a controller is in one hmpc_state. */
 #ifndef HMPC_H
 #define HMPC_H
 
 #include "hmpc_config.h" /* sizes, and the type hmpc_real */
+#if HMPC_BACKUP
+#include "hmpb.h" /* the guard's second controller: the same functions and types, named hmpb_ */
+#endif
 
 #define HMPC_DIM(n) ((n) > 0 ? (n) : 1) /* C has no empty arrays */
 #define HMPC_ROUND(n) (((n) + 7) / 8 * 8)
@@ -25,6 +30,9 @@
 #define HMPC_NE (HMPC_NZ + HMPC_ND)          /* what the estimator estimates: x, h, d */
 #define HMPC_LE HMPC_ROUND(HMPC_NE)
 #define HMPC_NT (HMPC_NZ + HMPC_NU)          /* unknowns of a steady state: z, u */
+#define HMPC_NQ (HMPC_NX / 2)                /* positions of a machine whose energy is watched */
+#define HMPC_ENERGY 1                        /* values of HMPC_MONITOR; 0: none */
+#define HMPC_RESIDUALS 2
 #define HMPC_TARGET_ROWS (2 * (HMPC_NX + HMPC_NU + HMPC_NY)) /* its bounds */
 
 typedef enum {
@@ -137,6 +145,77 @@ typedef struct {
 } hmpc_filter;
 #endif
 
+#if HMPC_MONITOR
+typedef enum {
+  HMPC_VALID,         /* the reading is a number */
+  HMPC_WARM_UP,       /* its window was not full yet */
+  HMPC_MISSING,       /* a sample or an input in the window was missing */
+  HMPC_NOT_A_READING  /* all was there, and still it is no number: model or estimator is at fault */
+} hmpc_validity;
+#endif
+
+#if HMPC_MONITOR == HMPC_ENERGY
+/* A free run of the model: z, its latest positions, sums of energy, squared speed and squared input, periods left. */
+typedef struct {
+  hmpc_real z[HMPC_LZ], q[HMPC_WINDOW][HMPC_NQ], sum[3];
+  int left;
+} hmpc_free_run;
+
+/* The energy monitor: what it said last, see hybrid_mpc's MonitorReading; then what it remembers. */
+typedef struct {
+  int alarm;                 /* any of: level, residual_level, scores, frozen, blind */
+  int frozen, blind;
+  hmpc_validity validity;
+  hmpc_real model_balance, measured_balance, violation, level; /* W */
+  hmpc_real residual[HMPC_NQ], residual_level;
+  hmpc_real score[2];        /* of the detector, as shares of its thresholds: sum of forces, power of free runs */
+  hmpc_real energy, seconds; /* of the older free run */
+  hmpc_real shown[HMPC_NQ];  /* how far the sensors should have moved since they last did */
+  /* its own */
+  hmpc_real z[HMPC_LZ], w[HMPC_DIM(HMPC_NW)];
+  hmpc_real y[HMPC_WINDOW][HMPC_NQ], row[HMPC_WINDOW - 1][2 * HMPC_NQ + HMPC_NU + HMPC_NW];
+  hmpc_real travel[HMPC_NQ], pushed_speed[HMPC_NQ], pushed[HMPC_NQ], before[HMPC_NU];
+  hmpc_real violations[HMPC_AVERAGE], residuals[HMPC_AVERAGE][HMPC_NQ];
+  hmpc_free_run run[2];
+  hmpc_real up[HMPC_NQ], down[HMPC_NQ];
+  int level_on, residual_on, force_on, energy_on, seen, whole, invalid;
+} hmpc_monitor;
+#elif HMPC_MONITOR == HMPC_RESIDUALS
+/* The monitor of residuals: what it said last, see hybrid_mpc's ResidualReading; then what it remembers. Channels:
+   outputs, balances, measured disturbances, free runs of the outputs. */
+typedef struct {
+  int alarm, frozen, blind;
+  hmpc_validity validity;
+  hmpc_real residual[HMPC_CHANNELS], level[HMPC_CHANNELS][2], share;
+  int on[HMPC_CHANNELS][2]; /* alarms of the short and of the long average */
+  int stuck[HMPC_NY];       /* sensors that are frozen */
+  /* its own */
+  hmpc_real z[HMPC_LZ], w[HMPC_DIM(HMPC_NW)], y[HMPC_NY], travel[HMPC_NY];
+  hmpc_real recent[HMPC_LONG][HMPC_CHANNELS], run[2][HMPC_LZ], run_d[2][HMPC_DIM(HMPC_ND)];
+  int repeats[HMPC_NY], age[2], newest, seen, invalid;
+} hmpc_monitor;
+#endif
+
+#if HMPC_GUARD
+typedef enum { HMPC_NORMAL, HMPC_LIMITED, HMPC_BACKED_UP, HMPC_FALLING_BACK, HMPC_RESTING } hmpc_mode;
+typedef enum {
+  HMPC_QUIET_AGAIN,  /* no alarm for long enough */
+  HMPC_SENSOR,       /* a sensor repeats itself while motion is predicted */
+  HMPC_MODEL,        /* the model does not describe the machine */
+  HMPC_BLIND         /* the monitor has no valid reading */
+} hmpc_reason;
+typedef enum { HMPC_CONTROLLER, HMPC_BACKUP_PLANS, HMPC_NOBODY } hmpc_planner;
+
+/* The guard: the mode that decides, the one of the next period and why; times in periods. */
+typedef struct {
+  hmpc_mode mode, wanted;
+  hmpc_reason why;
+  int since, since_alarm, since_frozen; /* periods */
+  int row;                              /* from the first alarm of a row to the last one */
+  hmpc_planner planner;                 /* whose plan the last one is */
+} hmpc_guard;
+#endif
+
 typedef struct {
   /* to be read */
   hmpc_real u[HMPC_NU]; /* the input to apply */
@@ -146,8 +225,21 @@ typedef struct {
   hmpc_real x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)]; /* the estimate */
   hmpc_plan plan;
   hmpc_steady steady; /* where outputs are weighed: what holds the first row of their reference */
+#if HMPC_MONITOR
+  hmpc_monitor monitor; /* what hmpc_finish saw last */
+#endif
+#if HMPC_GUARD
+  hmpc_guard guard;
+#endif
+#if HMPC_BACKUP
+  hmpb_state backup; /* its estimate and plan; u, status, source and age are above, whoever decides */
+#endif
   /* its own */
   int prepared, pending;
+#if HMPC_MONITOR
+  int watched; /* the monitor has seen this period */
+  hmpc_real sample[HMPC_NY], acted[HMPC_NU];
+#endif
   hmpc_linear linear;
   hmpc_qp qp;
   hmpc_working working;
@@ -170,8 +262,15 @@ typedef struct {
    operating point's, in hmpc_step the one decided last. */
 void hmpc_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
 void hmpc_step(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
-/* The part of the next step that needs no sample; hmpc_step does it if nobody did. Of the goal it takes the weights. */
+/* The monitor, the guard's next mode, and the part of the next step that needs no sample; hmpc_step does it if nobody
+   did. Of the goal it takes the weights. */
 void hmpc_finish(hmpc_state *s, const hmpc_goal *goal);
+
+#if HMPC_MONITOR
+/* The monitor alone, on the sample y, the input that acted before it, and the estimate in s->x, h, d, w. */
+void hmpc_watch_begin(hmpc_state *s);
+void hmpc_watch(hmpc_state *s, const hmpc_real *y, const hmpc_real *u_prev);
+#endif
 
 /* The estimator alone: s->x, h, d, w. */
 void hmpc_estimate_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w);
@@ -189,6 +288,12 @@ void hmpc_complete(hmpc_state *s); /* hidden states of the plan; hmpc_prepare ca
 void hmpc_begin(hmpc_state *s, const hmpc_real *applied, const hmpc_goal *goal); /* the first plan and input */
 void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const hmpc_real *applied); /* s->u */
 
+/* What a guard needs: another controller's plan, HMPC_N rows, taken over one period later; the stabilising feedback in
+   place of a solve; the safe input. */
+void hmpc_take_over(hmpc_state *s, const hmpc_real *plan, const hmpc_real *held);
+void hmpc_fall_back(hmpc_state *s, const hmpc_goal *goal, const hmpc_real *held);
+void hmpc_rest(hmpc_state *s, const hmpc_goal *goal, const hmpc_real *held);
+
 #if HMPC_OUTPUT_COST
 /* The steady state for a set-point of outputs under measured disturbances w and s->d; start: where to begin, or NULL;
    wide: whether to begin elsewhere, too. */
@@ -200,6 +305,10 @@ void hmpc_aim(hmpc_state *s, const hmpc_goal *goal); /* s->target, for the measu
 /* The model: a period, and its Jacobian (HMPC_NZ rows of HMPC_LJ; entries that are always zero are not written). */
 void hmpc_model(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *z_next);
 void hmpc_model_slope(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *z_next, hmpc_real *slope);
+
+#if HMPC_RATES
+void hmpc_rates(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc_real *xdot); /* of x at an instant */
+#endif
 
 hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linear);
 void hmpc_qp_factor(hmpc_qp *qp);

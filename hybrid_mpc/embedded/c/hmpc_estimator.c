@@ -1,5 +1,4 @@
-/* Kalman filters over state, hidden state and unmeasured disturbances, side by side, and how probable each is; and the
-   period of the loop.
+/* Kalman filters over state, hidden state and unmeasured disturbances, side by side, and how probable each is.
 
    Source: Simon, Optimal State Estimation, 2006, section 13.2; Blom and Bar-Shalom, IEEE T-AC 33 (1988). */
 #include "hmpc_math.h"
@@ -233,23 +232,6 @@ void hmpc_estimate_update(hmpc_state *s, const real *y, const real *u_prev, cons
   }
   for (int j = 0; j < HMPC_MODES; ++j) s->probability[j] = weight[j] / sum;
   together(s, s->probability);
-}
-
-void hmpc_start(hmpc_state *s, const real *y, const real *w, const real *applied, const hmpc_goal *goal) {
-  hmpc_clear(s);
-  hmpc_estimate_start(s, y, w);
-  hmpc_begin(s, applied, goal);
-}
-
-void hmpc_step(hmpc_state *s, const real *y, const real *w, const real *applied, const hmpc_goal *goal) {
-  real held[HMPC_NU];
-  for (int i = 0; i < HMPC_NU; ++i) held[i] = applied && hmpc_finite(applied[i]) ? applied[i] : s->u[i];
-  hmpc_estimate_update(s, y, held, w);
-  hmpc_decide(s, goal, held);
-}
-
-void hmpc_finish(hmpc_state *s, const hmpc_goal *goal) {
-  if (!s->prepared) hmpc_prepare(s, goal);
 }
 
 #endif

@@ -104,3 +104,18 @@ void hmpc_model_slope(const real *z, const real *u, const real *w, real *z_next,
   model_after_slope(z, u, w, (const real *)0, z_next, slope, (real *)0);
 #endif
 }
+
+#if HMPC_RATES
+void hmpc_rates(const real *z, const real *u, const real *w, real *xdot) {
+#if HMPC_RATE_HEAD > 0
+  cell c;
+  real seen[HMPC_FEATURES], out[HMPC_RATE_HEAD];
+  rates_before(z, u, w, seen);
+  gru(seen, z + HMPC_HIDDEN, &c);
+  for (int k = 0; k < HMPC_RATE_HEAD; ++k) out[k] = hmpc_dot(rate_head[k], c.next, HMPC_UNITS);
+  rates_after(z, u, w, out, xdot);
+#else
+  rates_after(z, u, w, (const real *)0, xdot);
+#endif
+}
+#endif

@@ -565,26 +565,13 @@ static int fallback(hmpc_state *s, const hmpc_goal *goal, real *u) {
 #endif
 }
 
-void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const real *applied) {
-  real held[HMPC_NU], u[HMPC_NU];
-  for (int i = 0; i < HMPC_NU; ++i) held[i] = applied && hmpc_finite(applied[i]) ? applied[i] : s->u[i];
-  if (memcmp(held, s->plan.u[0], sizeof held) != 0) {
-    hmpc_complete(s);
-    memcpy(s->plan.u[0], held, sizeof held);
-    s->prepared = 0;
-  }
-  const hmpc_status status = hmpc_feedback(s, goal, (const real *)0, 0);
-  if (status == HMPC_SOLVED) {
-    saturate(goal, s->plan.u[0], held, s->u);
-    memcpy(s->plan.u[0], s->u, sizeof s->u);
-    s->source = HMPC_MPC;
-    s->age = 0;
-    return;
-  }
+/* The input where no solution may be applied: of the plan, which is shifted already, if it may be followed, else of the
+   fallback, else the safe one; and the plan from there. */
+static void without(hmpc_state *s, const hmpc_goal *goal, const real *held, int follow) {
+  real u[HMPC_NU];
   const int known = hmpc_all_finite(s->x, HMPC_NX) && hmpc_all_finite(s->h, HMPC_NH) &&
                     hmpc_all_finite(s->d, HMPC_ND) && hmpc_all_finite(s->w, HMPC_NW);
-  if (s->age < 1000000) ++s->age;
-  if (s->age <= HMPC_MAX_AGE && hmpc_all_finite(s->plan.u[0], HMPC_NU)) {
+  if (follow && hmpc_all_finite(s->plan.u[0], HMPC_NU)) {
     memcpy(u, s->plan.u[0], sizeof u);
     s->source = HMPC_PLAN;
   } else if (known && fallback(s, goal, u)) {
@@ -605,8 +592,82 @@ void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const real *applied) {
   }
 }
 
+void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const real *applied) {
+  real held[HMPC_NU];
+  for (int i = 0; i < HMPC_NU; ++i) held[i] = applied && hmpc_finite(applied[i]) ? applied[i] : s->u[i];
+  if (memcmp(held, s->plan.u[0], sizeof held) != 0) {
+    hmpc_complete(s);
+    memcpy(s->plan.u[0], held, sizeof held);
+    s->prepared = 0;
+  }
+  const hmpc_status status = hmpc_feedback(s, goal, (const real *)0, 0);
+  if (status == HMPC_SOLVED) {
+    saturate(goal, s->plan.u[0], held, s->u);
+    memcpy(s->plan.u[0], s->u, sizeof s->u);
+    s->source = HMPC_MPC;
+    s->age = 0;
+    return;
+  }
+  if (s->age < 1000000) ++s->age;
+  without(s, goal, held, s->age <= HMPC_MAX_AGE);
+}
+
+void hmpc_fall_back(hmpc_state *s, const hmpc_goal *goal, const real *held) {
+  hmpc_complete(s);
+  memmove(s->plan.u, s->plan.u + 1, sizeof s->plan.u - sizeof s->plan.u[0]);
+  s->plan.cost = R(NAN);
+  s->plan.excess = R(NAN);
+  memset(s->plan.given_way, 0, sizeof s->plan.given_way);
+  s->working.count = 0;
+  s->prepared = 0;
+  without(s, goal, held, 0);
+  s->status = HMPC_INITIAL;
+  s->age = 0;
+}
+
+void hmpc_rest(hmpc_state *s, const hmpc_goal *goal, const real *held) {
+  saturate(goal, safe_input, held, s->u);
+  for (int k = 0; k < HMPC_N; ++k) memcpy(s->plan.u[k], s->u, sizeof s->u);
+  s->prepared = 0;
+  s->pending = 0;
+  s->source = HMPC_SAFE;
+  s->status = HMPC_INITIAL;
+  s->age = 0;
+}
+
+/* One period earlier, with the held input in it: the preparation shifts it. */
+static void delay_plan(hmpc_state *s, const real *held) {
+  memmove(s->plan.z + 1, s->plan.z, sizeof s->plan.z - sizeof s->plan.z[0]);
+  memmove(s->plan.u + 1, s->plan.u, sizeof s->plan.u - sizeof s->plan.u[0]);
+  memcpy(s->plan.u[0], held, sizeof s->plan.u[0]);
+  s->prepared = 0;
+}
+
+static void make_finite(real *v, int n) {
+  for (int i = 0; i < n; ++i)
+    if (!hmpc_finite(v[i])) v[i] = v[i] > R(0.0) ? HMPC_HUGE : v[i] < R(0.0) ? -HMPC_HUGE : R(0.0);
+}
+
+void hmpc_take_over(hmpc_state *s, const real *plan, const real *held) {
+  real following[HMPC_N][HMPC_NU], x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], d[HMPC_DIM(HMPC_ND)];
+  memcpy(following, plan, sizeof following);
+  memmove(following, following + 1, sizeof following - sizeof following[0]);
+  memcpy(x, s->x, sizeof x);
+  memcpy(h, s->h, sizeof h);
+  memcpy(d, s->d, sizeof d);
+  make_finite(s->x, HMPC_NX);
+  make_finite(s->h, HMPC_NH);
+  make_finite(s->d, HMPC_ND);
+  hmpc_run_free(s, following[0], HMPC_N);
+  memcpy(s->x, x, sizeof x);
+  memcpy(s->h, h, sizeof h);
+  memcpy(s->d, d, sizeof d);
+  delay_plan(s, held);
+  s->working.count = 0;
+  s->age = 0;
+}
+
 void hmpc_begin(hmpc_state *s, const real *applied, const hmpc_goal *goal) {
-  real inputs[HMPC_N][HMPC_NU];
   for (int i = 0; i < HMPC_NU; ++i)
     s->u[i] = hmpc_clip(applied && hmpc_finite(applied[i]) ? applied[i] : u_rest[i], u_min[i], u_max[i]);
   s->source = HMPC_HELD;
@@ -614,12 +675,7 @@ void hmpc_begin(hmpc_state *s, const real *applied, const hmpc_goal *goal) {
   s->working.count = 0;
   hmpc_run_free(s, s->u, 1);
   for (int i = 0; i < HMPC_FIRST; ++i) { /* the first plan has no predecessor: it is iterated */
-    /* one period earlier, with the held input in it: the preparation shifts it */
-    for (int k = HMPC_N; k > 0; --k) memcpy(s->plan.z[k], s->plan.z[k - 1], sizeof s->plan.z[k]);
-    for (int k = HMPC_N - 1; k > 0; --k) memcpy(inputs[k], s->plan.u[k - 1], sizeof inputs[k]);
-    memcpy(inputs[0], s->u, sizeof inputs[0]);
-    memcpy(s->plan.u, inputs, sizeof inputs);
-    s->prepared = 0;
+    delay_plan(s, s->u);
     if (i == HMPC_FIRST - 1) break;
     if (hmpc_feedback(s, goal, (const real *)0, 0) != HMPC_SOLVED) {
       hmpc_run_free(s, s->u, 1);

@@ -6,6 +6,30 @@
 
 static hmpc_state state; /* 8-byte numbers at the machine's ease; the library itself has no such thing */
 
+#if HMPC_MONITOR
+/* Largest deviation of what the monitor says from what Python's said, of its size. */
+static real reading_off(int k) {
+  const hmpc_monitor *const m = &state.monitor;
+  const real *const wanted = vector_reading[k];
+  real largest = R(0.0);
+#if HMPC_MONITOR == HMPC_ENERGY
+  enum { LEVELS = 2, RESIDUALS = HMPC_NQ };
+  const real levels[LEVELS] = {m->level, m->residual_level};
+#else
+  enum { LEVELS = HMPC_CHANNELS, RESIDUALS = HMPC_CHANNELS };
+  real levels[LEVELS];
+  for (int i = 0; i < LEVELS; ++i) levels[i] = m->level[i][0];
+#endif
+  for (int i = 0; i < 1 + LEVELS + RESIDUALS; ++i) {
+    const real found = i == 0 ? R(m->alarm) : i <= LEVELS ? levels[i - 1] : m->residual[i - 1 - LEVELS];
+    const int known = hmpc_finite(found);
+    if (known != hmpc_finite(wanted[i])) return R(INFINITY);
+    if (known) largest = hmpc_max(largest, hmpc_abs(found - wanted[i]) / vector_reading_size[i]);
+  }
+  return largest;
+}
+#endif
+
 int main(void) {
 #if HMPC_OUTPUT_COST
   const hmpc_goal goal = {.y = vector_goal[0], .rows = 1};
@@ -27,6 +51,11 @@ int main(void) {
     memcpy(state.x, vector_x[k], sizeof state.x);
     if (HMPC_NH > 0) memcpy(state.h, vector_h[k], sizeof state.h);
     if (HMPC_NW > 0) memcpy(state.w, vector_w[k], sizeof state.w);
+#endif
+#if HMPC_MONITOR
+    if (k == 0) hmpc_watch_begin(&state);
+    hmpc_watch(&state, vector_y[k], state.u);
+    largest = hmpc_max(largest, reading_off(k));
 #endif
     if (k == 0) hmpc_run_free(&state, state.u, 1);
     hmpc_decide(&state, &goal, (const real *)0);

@@ -1,0 +1,470 @@
+/* The monitor: how far the model lies from what is measured, and whether that is an alarm. Either of the energy, for
+   mechanical machines whose positions are measured, or of the residuals of outputs and balances, for any machine. */
+#include "hmpc_math.h"
+#include "hmpc_tables.h"
+#include "hmpc_expressions.h"
+
+#if HMPC_MONITOR
+
+static int more_seen(int seen, int most) { return seen < most ? seen + 1 : most; }
+
+/* The estimate, for the next period. */
+static void remember(const hmpc_state *s, real *z, real *w) {
+  memset(z, 0, sizeof(real) * HMPC_LZ);
+  memcpy(z, s->x, sizeof s->x);
+  if (HMPC_NH > 0) memcpy(z + HMPC_NX, s->h, sizeof s->h);
+  if (HMPC_NW > 0) memcpy(w, s->w, sizeof s->w);
+}
+
+static void forget(real *v, int n) {
+  for (int i = 0; i < n; ++i) v[i] = R(NAN);
+}
+
+static int all_equal(const real *a, const real *b, int n) {
+  int same = 1;
+  for (int i = 0; i < n; ++i) same &= a[i] <= b[i] && a[i] >= b[i];
+  return same;
+}
+#endif
+
+#if HMPC_MONITOR == HMPC_ENERGY
+
+enum { NQ = HMPC_NQ, GIVEN = HMPC_NU + HMPC_NW, AT_DV = 0, AT_DP = NQ, AT_GIVEN = 2 * NQ };
+
+void hmpc_watch_begin(hmpc_state *s) {
+  hmpc_monitor *const m = &s->monitor;
+  memset(m, 0, sizeof *m);
+  forget(m->z, HMPC_NZ);
+  memcpy(m->w, w_rest, sizeof m->w);
+  forget(m->y[0], HMPC_WINDOW * NQ);
+  forget(m->row[0], (HMPC_WINDOW - 1) * (AT_GIVEN + GIVEN));
+  forget(m->violations, HMPC_AVERAGE);
+  forget(m->residuals[0], HMPC_AVERAGE * NQ);
+  for (int k = 0; k < 2; ++k) {
+    forget(m->run[k].z, HMPC_NZ);
+    forget(m->run[k].q[0], HMPC_WINDOW * NQ);
+    forget(m->run[k].sum, 3);
+    m->run[k].left = k == 0 ? 1 : HMPC_FREE_RUN / 2 + 1;
+  }
+}
+
+/* What the model says of slow motion at z's position: its mean acceleration there, and by how much dry friction and
+   damping slow it; jump is what dry friction can hold at rest. */
+static void near_rest(const real *z, const real *u, const real *w, real *mean, real *slowed, real *jump) {
+  real at[HMPC_LZ], rate[4][HMPC_NX];
+  memcpy(at, z, sizeof at);
+  for (int k = 0; k < 4; ++k) { /* back, forth, and twice as fast */
+    for (int i = 0; i < NQ; ++i)
+      at[NQ + i] = (k % 2 ? R(1.0) : R(-1.0)) * (k < 2 ? rest_speed[i] : R(2.0) * rest_speed[i]);
+    hmpc_rates(at, u, w, rate[k]);
+  }
+  for (int i = 0; i < NQ; ++i) {
+    mean[i] = R(0.5) * (rate[0][NQ + i] + rate[1][NQ + i]);
+    slowed[i] = R(0.5) * (rate[0][NQ + i] - rate[1][NQ + i]);
+    jump[i] = R(2.0) * slowed[i] - R(0.5) * (rate[2][NQ + i] - rate[3][NQ + i]);
+  }
+}
+
+/* Force that the model does not explain; near rest, what dry friction could not hold either. */
+static void residual_force(const real *z, const real *u, const real *w, const real *measured, const real *model,
+                           real *force) {
+  real error[HMPC_NQ], off[HMPC_NQ], slowest = R(INFINITY);
+  for (int i = 0; i < NQ; ++i) {
+    error[i] = measured[i] - model[i];
+    slowest = hmpc_min(hmpc_abs(z[NQ + i]) / rest_speed[i], slowest);
+  }
+  watched_force(z, u, w, error, force);
+  if (slowest >= R(2.0)) return;
+  real mean[HMPC_NQ], slowed[HMPC_NQ], jump[HMPC_NQ], friction[HMPC_NQ], damping[HMPC_NQ], held[HMPC_NQ];
+  near_rest(z, u, w, mean, slowed, jump);
+  watched_force(z, u, w, jump, friction);
+  watched_force(z, u, w, slowed, damping);
+  for (int i = 0; i < NQ; ++i) off[i] = measured[i] - mean[i];
+  watched_force(z, u, w, off, held);
+  for (int i = 0; i < NQ; ++i) {
+    const real speed = z[NQ + i];
+    friction[i] = hmpc_max(friction[i], R(0.0));
+    held[i] += (damping[i] - friction[i]) * speed / rest_speed[i];
+    held[i] = hmpc_sign(held[i]) * hmpc_max(hmpc_abs(held[i]) - friction[i], R(0.0));
+    const real near = hmpc_max(hmpc_min(R(2.0) - hmpc_abs(speed) / rest_speed[i], R(1.0)), R(0.0));
+    force[i] = near * held[i] + (R(1.0) - near) * force[i];
+  }
+}
+
+/* Speed and travel that the input should have caused since the sensors' last step. */
+static void push(hmpc_monitor *m, int still, const real *u) {
+  const real *acting = u;
+  int known = still, strong = 0;
+  if (HMPC_DELAYED > 0) acting = m->z + HMPC_NX; /* the oldest input on its way is the one that has begun to act */
+  for (int i = 0; i < HMPC_NU; ++i) known &= hmpc_abs(m->before[i]) < R(INFINITY);
+  if (!known) memcpy(m->before, acting, sizeof m->before);
+  for (int i = 0; i < HMPC_NU; ++i)
+    strong |= hmpc_abs(acting[i] - m->before[i]) - HMPC_HELD_SHARE * input_span[i] > R(0.0);
+  strong &= still;
+  real alone[HMPC_NQ] = {R(0.0)}, jump[HMPC_NQ] = {R(0.0)}, earlier[HMPC_NQ] = {R(0.0)};
+  if (strong) {
+    real slowed[HMPC_NQ];
+    near_rest(m->z, m->before, m->w, earlier, slowed, jump);
+    near_rest(m->z, acting, m->w, alone, slowed, jump);
+  }
+  for (int i = 0; i < NQ; ++i) {
+    real speed = R(0.0), travel = R(0.0);
+    if (strong) {
+      const real change = alone[i] - earlier[i];
+      const real beyond =
+          hmpc_sign(alone[i]) * hmpc_max(hmpc_abs(alone[i]) - hmpc_max(jump[i], R(0.0)), R(0.0));
+      const real both = hmpc_sign(beyond) * hmpc_min(hmpc_abs(change), hmpc_abs(beyond));
+      speed = m->pushed_speed[i] + HMPC_DT * (both * (beyond * change > R(0.0) ? R(1.0) : R(0.0)));
+    }
+    if (still) travel = m->pushed[i] + HMPC_DT * hmpc_abs(speed);
+    m->pushed_speed[i] = hmpc_abs(speed) < R(INFINITY) ? speed : R(0.0);
+    m->pushed[i] = hmpc_abs(travel) < R(INFINITY) ? travel : R(0.0);
+  }
+}
+
+static void polynomial(const real (*q)[HMPC_NQ], const real *newest, real *position, real *speed, real *acceleration) {
+  for (int i = 0; i < NQ; ++i) {
+    position[i] = speed[i] = acceleration[i] = R(0.0);
+    for (int k = 0; k < HMPC_WINDOW; ++k) {
+      const real value = q[k][i] - newest[i];
+      position[i] += value * fit_position[k];
+      speed[i] += value * fit_speed[k];
+      acceleration[i] += value * fit_acceleration[k];
+    }
+  }
+}
+
+/* The energy balance at position and speed, if the speed changes at that acceleration. */
+static real balance(const real *state, const real *acceleration, const real *given) {
+  real rate[HMPC_NX], value;
+  for (int i = 0; i < NQ; ++i) {
+    rate[i] = state[NQ + i];
+    rate[NQ + i] = acceleration[i];
+  }
+  watched_energy(state, rate, given, given + HMPC_NU, &value);
+  return value;
+}
+
+/* Means of the latest violations, and length of the mean residual; NaN where fewer than half are finite. */
+static void levels(hmpc_monitor *m) {
+  real total = R(0.0), sum[HMPC_NQ] = {R(0.0)}, square = R(0.0);
+  int count = 0, rows = 0;
+  for (int k = 0; k < HMPC_AVERAGE; ++k) {
+    if (hmpc_finite(m->violations[k])) {
+      total += m->violations[k];
+      ++count;
+    }
+    if (hmpc_all_finite(m->residuals[k], HMPC_NQ)) {
+      hmpc_add(sum, R(1.0), m->residuals[k], HMPC_NQ);
+      ++rows;
+    }
+  }
+  for (int i = 0; i < NQ && rows > 0; ++i) square += sum[i] / R(rows) * (sum[i] / R(rows));
+  m->level = count > 0 && 2 * count >= HMPC_AVERAGE ? total / R(count) : R(NAN);
+  m->residual_level = rows > 0 && 2 * rows >= HMPC_AVERAGE ? hmpc_sqrt(square) : R(NAN);
+}
+
+#if HMPC_FREE_RUN > 0
+/* Free runs that have come to their end begin anew, at the estimate of a period ago. */
+static void begin_runs(hmpc_monitor *m) {
+  for (int k = 0; k < 2; ++k) {
+    hmpc_free_run *const run = &m->run[k];
+    if (run->left > 1) {
+      --run->left;
+      continue;
+    }
+    forget(run->q[0], HMPC_WINDOW * NQ);
+    memcpy(run->z, m->z, sizeof run->z);
+    memcpy(run->q[HMPC_WINDOW - 1], m->z, sizeof run->q[0]);
+    memset(run->sum, 0, sizeof run->sum);
+    run->left = hmpc_all_finite(m->z, HMPC_NX) ? HMPC_FREE_RUN : 1; /* else try again at the next sample */
+  }
+}
+
+/* A free run one period on: what its balance departs from the measured one. */
+static void go_on(hmpc_free_run *run, const real *u, const real *w, const real *given, const real *speed,
+                  real measured) {
+  real next[HMPC_LZ] = {R(0.0)}, state[HMPC_NX] = {R(0.0)}, acceleration[HMPC_NQ] = {R(0.0)}, v2 = R(0.0), u2 = R(0.0);
+  static const real none[HMPC_NQ];
+  hmpc_model(run->z, u, w, next);
+  memcpy(run->z, next, sizeof next);
+  memmove(run->q, run->q + 1, sizeof run->q - sizeof run->q[0]);
+  memcpy(run->q[HMPC_WINDOW - 1], next, sizeof run->q[0]);
+  if (run->left > HMPC_FREE_RUN - HMPC_WINDOW + 2) return; /* its window is not full */
+  polynomial((const real(*)[HMPC_NQ])run->q, none, state, state + NQ, acceleration);
+  for (int i = 0; i < NQ; ++i) v2 += speed[i] * speed[i];
+  for (int i = 0; i < HMPC_NU; ++i) u2 += given[i] * given[i];
+  run->sum[0] += HMPC_DT * (balance(state, acceleration, given) - measured);
+  run->sum[1] += HMPC_DT * v2;
+  run->sum[2] += HMPC_DT * u2;
+}
+#endif
+
+#if HMPC_DETECTOR
+/* Cumulative sums of scaled residual forces, and the scaled power of the older free run: whether an alarm is on. */
+static int detect(hmpc_monitor *m, const real *speed, const real *given, const real *sums) {
+  real v2 = R(0.0), u2 = R(0.0), slow = R(0.0), largest = R(0.0), power = R(0.0);
+  for (int i = 0; i < NQ; ++i) {
+    v2 += speed[i] * speed[i];
+    slow += speed[i] * speed[i] / (rest_speed_learned[i] * rest_speed_learned[i]);
+  }
+  for (int i = 0; i < HMPC_NU; ++i) u2 += given[i] * given[i];
+  const real near = R(1.0) / (R(1.0) + slow), most = HMPC_SUM_CAP * HMPC_FORCE_THRESHOLD;
+  for (int i = 0; i < NQ; ++i) {
+    const real *const a = force_scale[i];
+    const real z = m->residual[i] / hmpc_sqrt(a[0] + a[1] * v2 + a[2] * u2 + a[3] * near);
+    if (z <= R(0.0) || z > R(0.0)) { /* not NaN */
+      m->up[i] = hmpc_clip(m->up[i] + z - HMPC_DRIFT, R(0.0), most);
+      m->down[i] = hmpc_clip(m->down[i] - z - HMPC_DRIFT, R(0.0), most);
+    }
+    largest = hmpc_max(largest, hmpc_max(m->up[i], m->down[i]));
+  }
+#if HMPC_FREE_RUN > 0
+  if (HMPC_ENERGY_LEARNED && m->seconds >= HMPC_SHORTEST && (m->energy <= R(0.0) || m->energy > R(0.0))) {
+    const real *const a = energy_scale, t = m->seconds;
+    power = hmpc_abs(m->energy) / t / hmpc_sqrt(a[0] + a[1] * (sums[1] / t) + a[2] * (sums[2] / t) + a[3] / t);
+    power /= HMPC_ENERGY_THRESHOLD;
+  }
+#else
+  (void)sums;
+#endif
+  m->score[0] = largest / HMPC_FORCE_THRESHOLD;
+  m->score[1] = power;
+  m->force_on = m->score[0] > (m->force_on ? HMPC_RELEASE : R(1.0));
+  m->energy_on = m->score[1] > (m->energy_on ? HMPC_RELEASE : R(1.0));
+  return m->force_on || m->energy_on;
+}
+#endif
+
+void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
+  hmpc_monitor *const m = &s->monitor;
+  real next[HMPC_LZ] = {R(0.0)}, *row = m->row[HMPC_WINDOW - 2];
+  const real *const before = m->y[HMPC_WINDOW - 1];
+  /* one step from the estimate of a period ago */
+  hmpc_model(m->z, u_prev, m->w, next);
+  const int still = all_equal(y, before, HMPC_NQ);
+  for (int i = 0; i < NQ; ++i) {
+    const real moved = next[i] - m->z[i];
+    const real ahead = m->travel[i] + moved * (hmpc_abs(moved) > rest_speed[i] * HMPC_DT ? R(1.0) : R(0.0));
+    m->travel[i] = all_equal(y + i, before + i, 1) && hmpc_abs(ahead) < R(INFINITY) ? ahead : R(0.0);
+  }
+  push(m, still, u_prev);
+  memmove(m->row, m->row + 1, sizeof m->row - sizeof m->row[0]);
+  for (int i = 0; i < NQ; ++i) {
+    row[AT_DV + i] = next[NQ + i] - m->z[NQ + i];
+    row[AT_DP + i] = next[i] - m->z[i] - HMPC_DT * m->z[NQ + i];
+  }
+  memcpy(row + AT_GIVEN, u_prev, sizeof(real) * HMPC_NU);
+  if (HMPC_NW > 0) memcpy(row + AT_GIVEN + HMPC_NU, m->w, sizeof m->w);
+  memmove(m->y, m->y + 1, sizeof m->y - sizeof m->y[0]);
+  memcpy(m->y[HMPC_WINDOW - 1], y, sizeof m->y[0]);
+  /* the window's centre */
+  real at[HMPC_LZ], measured[HMPC_NQ], model[HMPC_NQ] = {R(0.0)}, given[HMPC_DIM(GIVEN)] = {R(0.0)};
+  memcpy(at, m->z, sizeof at);
+  polynomial((const real(*)[HMPC_NQ])m->y, y, at, at + NQ, measured);
+  for (int i = 0; i < NQ; ++i) at[i] += y[i];
+  for (int k = 0; k < HMPC_WINDOW - 1; ++k) {
+    for (int i = 0; i < NQ; ++i)
+      model[i] += m->row[k][AT_DV + i] * kernel_speed[k] - m->row[k][AT_DP + i] * kernel_position[k];
+    for (int i = 0; i < GIVEN; ++i) given[i] += m->row[k][AT_GIVEN + i] * kernel_mean[k];
+  }
+  m->model_balance = balance(at, model, given);
+  m->measured_balance = balance(at, measured, given);
+  m->violation = hmpc_abs(m->model_balance - m->measured_balance);
+  residual_force(at, given, given + HMPC_NU, measured, model, m->residual);
+  memmove(m->violations, m->violations + 1, sizeof m->violations - sizeof m->violations[0]);
+  m->violations[HMPC_AVERAGE - 1] = m->violation;
+  memmove(m->residuals, m->residuals + 1, sizeof m->residuals - sizeof m->residuals[0]);
+  memcpy(m->residuals[HMPC_AVERAGE - 1], m->residual, sizeof m->residual);
+  levels(m);
+  m->alarm = 0;
+#if HMPC_POWER_LEVEL
+  m->level_on = m->level > (m->level_on ? HMPC_POWER_RELEASE : HMPC_POWER_THRESHOLD);
+  m->alarm |= m->level_on;
+#endif
+#if HMPC_FORCE_LEVEL
+  m->residual_on = m->residual_level > (m->residual_on ? HMPC_RESIDUAL_RELEASE : HMPC_RESIDUAL_THRESHOLD);
+  m->alarm |= m->residual_on;
+#endif
+  m->frozen = 0;
+  for (int i = 0; i < NQ; ++i) {
+    m->shown[i] = m->pushed[i] > hmpc_abs(m->travel[i]) ? m->pushed[i] : m->travel[i];
+    m->frozen |= hmpc_abs(m->shown[i]) > frozen_travel[i];
+  }
+  const real *older = (const real *)0;
+  m->energy = R(NAN);
+  m->seconds = R(0.0);
+#if HMPC_FREE_RUN > 0
+  begin_runs(m);
+  for (int k = 0; k < 2; ++k) go_on(&m->run[k], u_prev, m->w, given, at + NQ, m->measured_balance);
+  int which = m->run[0].left <= m->run[1].left ? 0 : 1;
+  if (!(m->run[which].sum[0] <= R(0.0) || m->run[which].sum[0] > R(0.0))) which = 1 - which; /* NaN: not begun yet */
+  older = m->run[which].sum;
+  m->energy = older[0];
+  m->seconds = R(HMPC_FREE_RUN - HMPC_WINDOW + 3 - m->run[which].left) * HMPC_DT;
+  if (m->seconds < R(0.0)) m->seconds = R(0.0);
+#endif
+#if HMPC_DETECTOR
+  m->alarm |= detect(m, at + NQ, given, older);
+#else
+  (void)older;
+#endif
+  /* whether this is a reading */
+  const int missing =
+      !hmpc_all_finite(y, HMPC_NY) || (m->seen > 0 && !hmpc_all_finite(u_prev, HMPC_NU));
+  m->seen = more_seen(m->seen, HMPC_WINDOW);
+  m->whole = missing ? 0 : more_seen(m->whole, HMPC_WINDOW);
+  if (hmpc_finite(m->violation) && hmpc_all_finite(m->residual, HMPC_NQ)) {
+    m->validity = HMPC_VALID;
+  } else {
+    m->validity = m->seen < HMPC_WINDOW ? HMPC_WARM_UP : m->whole < HMPC_WINDOW ? HMPC_MISSING : HMPC_NOT_A_READING;
+  }
+  m->invalid = m->validity == HMPC_VALID ? 0 : more_seen(m->invalid, HMPC_WINDOW + HMPC_AVERAGE + 1);
+  m->blind = m->invalid > HMPC_WINDOW + HMPC_AVERAGE;
+  m->alarm = m->alarm || m->frozen || m->blind;
+  remember(s, m->z, m->w);
+}
+
+#elif HMPC_MONITOR == HMPC_RESIDUALS
+
+enum { FIRST_W = HMPC_NY + HMPC_BALANCES, FIRST_FREE = FIRST_W + HMPC_NW };
+
+void hmpc_watch_begin(hmpc_state *s) {
+  hmpc_monitor *const m = &s->monitor;
+  memset(m, 0, sizeof *m);
+  forget(m->z, HMPC_NZ);
+  forget(m->w, HMPC_NW);
+  forget(m->y, HMPC_NY);
+  forget(m->recent[0], HMPC_LONG * HMPC_CHANNELS);
+  for (int k = 0; k < 2; ++k) {
+    forget(m->run[k], HMPC_NZ);
+    forget(m->run_d[k], HMPC_ND);
+    m->age[k] = -HMPC_SETTLING - k * HMPC_FREE_RUN / 2;
+  }
+}
+
+/* A free run one period on, and what was measured less its outputs. */
+static void go_on(const hmpc_monitor *m, const real *u, const real *y, int k, real *next, real *error) {
+  real acting[HMPC_NU];
+  const real *const d = m->run_d[k];
+  for (int i = 0; i < HMPC_NU; ++i) {
+    acting[i] = u[i];
+    for (int j = 0; j < HMPC_ND; ++j) acting[i] += disturbs_u[i][j] * d[j];
+  }
+  memset(next, 0, sizeof(real) * HMPC_LZ);
+  hmpc_model(m->run[k], acting, m->w, next);
+  for (int i = 0; i < HMPC_NX; ++i)
+    for (int j = 0; j < HMPC_ND; ++j) next[i] += disturbs_x[i][j] * d[j];
+  outputs(next, acting, m->w, error);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    error[i] = y[i] - error[i];
+    for (int j = 0; j < HMPC_ND; ++j) error[i] -= disturbs_y[i][j] * d[j];
+  }
+}
+
+/* Error of the older free run; those that are at their end, or lost, begin anew at the estimate. */
+static void run_free(hmpc_state *s, const real *u, const real *y, real *error) {
+  hmpc_monitor *const m = &s->monitor;
+  real next[HMPC_LZ], own[HMPC_NY];
+  const int first = m->age[0] >= m->age[1] ? 0 : 1; /* the older */
+  forget(error, HMPC_NY);
+  for (int k = 0; k < 2; ++k) {
+    go_on(m, u, y, k, next, own);
+    if (k == first && m->age[k] >= 0) memcpy(error, own, sizeof own);
+    memcpy(m->run[k], next, sizeof next);
+  }
+  for (int k = 0; k < 2; ++k) {
+    int now = m->age[k] + 1;
+    const int lost = now > 0 && !(hmpc_all_finite(m->run[k], HMPC_NZ) && hmpc_all_finite(m->run_d[k], HMPC_ND));
+    if (now == 0 || now >= HMPC_FREE_RUN || lost) {
+      memset(m->run[k], 0, sizeof m->run[k]);
+      memcpy(m->run[k], s->x, sizeof s->x);
+      if (HMPC_NH > 0) memcpy(m->run[k] + HMPC_NX, s->h, sizeof s->h);
+      if (HMPC_ND > 0) memcpy(m->run_d[k], s->d, sizeof s->d);
+      now = hmpc_all_finite(m->run[k], HMPC_NZ) && hmpc_all_finite(m->run_d[k], HMPC_ND) ? 0 : -1;
+    }
+    m->age[k] = now;
+  }
+}
+
+/* Mean of a channel's latest residuals that are numbers; NaN where fewer than half are. */
+static real mean_of(const hmpc_monitor *m, int channel, int length) {
+  real total = R(0.0);
+  int count = 0, k = m->newest;
+  for (int i = 0; i < length; ++i) {
+    const real value = m->recent[k][channel];
+    if (hmpc_finite(value)) {
+      total += value;
+      ++count;
+    }
+    k = k > 0 ? k - 1 : HMPC_LONG - 1;
+  }
+  return 2 * count >= length ? total / R(count > 0 ? count : 1) : R(NAN);
+}
+
+void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
+  hmpc_monitor *const m = &s->monitor;
+  real next[HMPC_LZ] = {R(0.0)}, predicted[HMPC_NY], last[HMPC_NY], rate[HMPC_NX], moved[HMPC_NY];
+  /* one step from the estimate of a period ago */
+  hmpc_model(m->z, u_prev, m->w, next);
+  outputs(next, u_prev, m->w, predicted);
+  outputs(m->z, u_prev, m->w, last);
+  for (int i = 0; i < HMPC_NX; ++i) rate[i] = (s->x[i] - next[i]) / HMPC_DT;
+  for (int i = 0; i < HMPC_NY; ++i) {
+    m->residual[i] = y[i] - predicted[i];
+    moved[i] = predicted[i] - last[i];
+  }
+#if HMPC_BALANCES > 0
+  watched_balances(m->z, rate, u_prev, m->w, m->residual + HMPC_NY);
+#else
+  (void)rate;
+#endif
+  for (int i = 0; i < HMPC_NW; ++i) m->residual[FIRST_W + i] = s->w[i] - w_rest[i];
+  run_free(s, u_prev, y, m->residual + FIRST_FREE);
+  for (int i = 0; i < HMPC_CHANNELS; ++i)
+    if (!hmpc_finite(m->residual[i])) m->residual[i] = R(NAN);
+  /* levels */
+  m->seen = more_seen(m->seen, HMPC_SETTLING + HMPC_LONG);
+  m->newest = m->newest + 1 < HMPC_LONG ? m->newest + 1 : 0;
+  forget(m->recent[m->newest], HMPC_CHANNELS);
+  if (m->seen > HMPC_SETTLING) memcpy(m->recent[m->newest], m->residual, sizeof m->residual);
+  m->alarm = 0;
+  m->share = HMPC_LIMITS ? R(0.0) : R(NAN);
+  for (int c = 0; c < HMPC_CHANNELS; ++c)
+    for (int j = 0; j < 2; ++j) {
+      const int length = j == 0 ? HMPC_SHORT : HMPC_LONG;
+      m->level[c][j] = m->seen < HMPC_SETTLING + length ? R(NAN) : mean_of(m, c, length);
+#if HMPC_LIMITS
+      const real size = hmpc_finite(m->level[c][j]) ? hmpc_abs(m->level[c][j])
+                        : m->level[c][j] < R(0.0) || m->level[c][j] > R(0.0) ? HMPC_HUGE : R(0.0);
+      m->on[c][j] = size > (m->on[c][j] ? level_release[c][j] : level_threshold[c][j]);
+      m->share = hmpc_max(m->share, size / level_threshold[c][j]);
+      m->alarm |= m->on[c][j];
+#endif
+    }
+  /* sensors that repeat themselves */
+  m->frozen = 0;
+  for (int i = 0; i < HMPC_NY; ++i) {
+    const int still = all_equal(y + i, m->y + i, 1) && hmpc_finite(moved[i]) && m->seen > HMPC_SETTLING;
+    m->travel[i] = still ? m->travel[i] + moved[i] : R(0.0);
+    m->repeats[i] = still ? more_seen(m->repeats[i], HMPC_REPEATS) : 0;
+    m->stuck[i] = y[i] > sensor_end[0][i] && y[i] < sensor_end[1][i] && hmpc_abs(m->travel[i]) > frozen_travel[i] &&
+                  m->repeats[i] > frozen_repeats[i];
+    m->frozen |= m->stuck[i];
+  }
+  /* whether this is a reading */
+  if (hmpc_all_finite(m->residual, FIRST_FREE)) {
+    m->validity = HMPC_VALID;
+  } else if (m->seen < 2) {
+    m->validity = HMPC_WARM_UP;
+  } else {
+    m->validity = hmpc_all_finite(y, HMPC_NY) && hmpc_all_finite(u_prev, HMPC_NU) ? HMPC_NOT_A_READING : HMPC_MISSING;
+  }
+  m->invalid = m->validity == HMPC_VALID ? 0 : more_seen(m->invalid, 2 * HMPC_SHORT + 1);
+  m->blind = m->invalid > 2 * HMPC_SHORT;
+  m->alarm = m->alarm || m->frozen || m->blind;
+  remember(s, m->z, m->w);
+  memcpy(m->y, y, sizeof m->y);
+}
+
+#endif

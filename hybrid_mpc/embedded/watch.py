@@ -1,0 +1,285 @@
+"""C of a monitor and of a guard: their sizes, tables and scalar code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.safeguard import SafeController
+from hybrid_mpc.embedded.cut import Cut, cut, reduced
+from hybrid_mpc.embedded.scalar import c_function, table
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.loop.guard import TINY, Guard, Mode
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.detector import CAP
+from hybrid_mpc.monitor.energy import FROZEN_STEPS, EnergyMonitor
+from hybrid_mpc.monitor.energy_readings import HELD_SHARE, energy_balance, inertia_of, weights
+from hybrid_mpc.monitor.residuals import ResidualMonitor
+from nn_export.errors import last_line
+
+Array = NDArray[np.float64]
+Watch = EnergyMonitor | ResidualMonitor
+KINDS = {EnergyMonitor: 1, ResidualMonitor: 2}
+"""What ``HMPC_MONITOR`` says."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What a monitor adds to the generated files: whole numbers and real ones of the configuration, tables, code by
+    function and its operations.
+    """
+
+    sizes: Mapping[str, int]
+    numbers: Mapping[str, float]
+    tables: str
+    code: str
+    operations: Mapping[str, int]
+
+
+NOTHING = Watched({"MONITOR": 0, "RATES": 0}, {}, "", "", {})
+
+
+def refused_monitor(monitor: object, model: HybridModel) -> list[str]:
+    """What of a monitor has no C, in words."""
+    if type(monitor) not in KINDS:
+        return [
+            f"a monitor of another kind than EnergyMonitor and ResidualMonitor ({type(monitor).__name__})"
+        ]
+    assert isinstance(monitor, Watch)
+    found = []
+    if not _alike(monitor.model, model):
+        found.append(f"a monitor of another model ({monitor.model.name}) than the one that plans")
+    if isinstance(monitor, EnergyMonitor):
+        if monitor.layout.history:
+            found.append("a monitor that keeps a history for a diagnosis (diagnose=True)")
+        if monitor.detector is not None and monitor.layout.length and not monitor.detector.energy:
+            found.append("a detector without the energy of free runs in a monitor that has them")
+    return found
+
+
+def refused_guard(
+    guard: Guard, monitored: bool, model: HybridModel, ocp: OCP, safe_input: Array | None
+) -> list[str]:
+    """What of a guard has no C, but for its backup's own; in words."""
+    found = [] if monitored else ["a guard without a monitor, on whose alarms it acts"]
+    if Mode.REST in (guard.on_model, guard.on_sensor) and safe_input is None:
+        found.append("a guard's mode REST without a safe input")
+    if guard.backup is None:
+        return found
+    backup = guard.backup.controller
+    if not solves_once(guard.backup):
+        found.append(f"a backup by another solver than rti with one iteration ({type(backup).__name__})")
+    sizes = [(m.n_x, m.n_u, m.n_y, m.n_w, m.dt) for m in (backup.model, model)]
+    shapes = [(o.horizon, o.columns, o.n_y, o.n_p) for o in (backup.ocp, ocp)]
+    if sizes[0] != sizes[1] or shapes[0] != shapes[1]:
+        found.append("a backup whose model or reference has another size than the controller's")
+    return found
+
+
+def solves_once(safe: SafeController) -> bool:
+    """Whether a controller is the real-time iteration with one iteration a period, in Python or as C."""
+    controller = safe.controller
+    return not controller.converges and getattr(controller, "iterations", 1) == 1
+
+
+def monitor_parts(monitor: Watch | None, model: HybridModel, parts: Cut) -> Watched:
+    """What a monitor adds; ``parts`` is the model's step cut at its cell.
+
+    Raises:
+        InputError: If an expression of it has no C.
+    """
+    if monitor is None:
+        return NOTHING
+    return (
+        _energy(monitor, model, parts) if isinstance(monitor, EnergyMonitor) else _residuals(monitor, model)
+    )
+
+
+def guard_parts(guard: Guard | None, model: HybridModel) -> tuple[dict[str, int], str]:
+    """Sizes and tables of a guard; its times in periods."""
+    if guard is None:
+        return {"GUARD": 0, "BACKUP": 0}, ""
+    times = {
+        name.upper(): periods_of(getattr(guard, name), model.dt) for name in ("quiet", "dwell", "patience")
+    }
+    limits = guard.limits
+    sizes = {
+        "GUARD": 1, "BACKUP": int(guard.backup is not None), "GUARD_LIMITS": int(limits is not None),
+        "ON_MODEL": int(guard.on_model), "ON_SENSOR": int(guard.on_sensor), **times,
+    }  # fmt: skip
+    tables = "" if limits is None else table("guard_u_min", limits.u_min) + table("guard_u_max", limits.u_max)
+    return sizes, tables
+
+
+def periods_of(seconds: float, dt: float) -> int:
+    """The least number of periods that last so long, but for the tolerance with which a guard compares times.
+
+    Example:
+        >>> periods_of(0.5, 0.02), periods_of(0.0, 0.02), periods_of(0.5, 0.3)
+        (25, 0, 2)
+    """
+    return max(0, math.ceil((seconds - TINY) / dt))
+
+
+def _alike(own: HybridModel, other: HybridModel) -> bool:
+    """Whether two models take the same steps."""
+    if own is other:
+        return True
+    sizes = [(m.n_x, m.n_h, m.n_u, m.n_w, m.n_y, m.dt, m.nominal_w) for m in (own, other)]
+    if sizes[0] != sizes[1]:
+        return False
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        x, u = (v + rng.uniform(-1, 1, v.size) for v in (own.x0, own.u0))
+        h = rng.uniform(-1, 1, own.n_h)
+        steps = [np.vstack([v.full() for v in m.step(x, h, u, m.w, m.p)]) for m in (own, other)]
+        if not np.array_equal(steps[0], steps[1], equal_nan=True):
+            return False
+    return True
+
+
+def _symbols(model: HybridModel) -> dict[str, ca.SX]:
+    sizes = {"x": model.n_x, "u": model.n_u, "w": model.n_w}
+    return {name: ca.SX.sym(name, n) for name, n in sizes.items()}
+
+
+def _scalar(what: str, given: list[ca.MX], value: ca.MX) -> ca.Function:
+    try:
+        return ca.Function("watched", given, [value]).expand()
+    except RuntimeError as error:
+        raise InputError(f"no C for this monitor: {what} is no scalar code: {last_line(error)}") from error
+
+
+def _energy(monitor: EnergyMonitor, model: HybridModel, parts: Cut) -> Watched:
+    layout, window, detector, n_q = monitor.layout, monitor.window, monitor.detector, model.n_x // 2
+    c, dt = monitor.calibration, model.dt
+    power = c is not None and c.threshold_w is not None and c.release_w is not None
+    force = power and c is not None and c.residual_threshold is not None and c.residual_release is not None
+    sizes = {
+        "MONITOR": 1, "RATES": 1, "WINDOW": window, "AVERAGE": monitor.average, "FREE_RUN": layout.length,
+        "DETECTOR": int(detector is not None), "POWER_LEVEL": int(power), "FORCE_LEVEL": int(force),
+        "ENERGY_LEARNED": int(detector is not None and bool(detector.energy)),
+    }  # fmt: skip
+    numbers: dict[str, float] = {"DT": dt, "HELD_SHARE": HELD_SHARE}
+    if power and c is not None:
+        numbers |= {"POWER_THRESHOLD": c.threshold_w or 0.0, "POWER_RELEASE": c.release_w or 0.0}
+    if force and c is not None:
+        numbers |= {
+            "RESIDUAL_THRESHOLD": c.residual_threshold or 0.0,
+            "RESIDUAL_RELEASE": c.residual_release or 0.0,
+        }
+    position, speed, acceleration, kernel, slope = weights(window, dt)
+    steps = np.array(monitor.resolution) if monitor.resolution else np.full(n_q, np.inf)
+    reals: dict[str, Array] = {
+        "fit_position": position, "fit_speed": speed, "fit_acceleration": acceleration, "kernel_speed": kernel[1:],
+        "kernel_position": slope, "kernel_mean": 0.5 * dt * (kernel[:-1] + kernel[1:]),
+        "rest_speed": np.array(monitor.rest_speed), "input_span": monitor.input_range,
+        "frozen_travel": FROZEN_STEPS * steps,
+    }  # fmt: skip
+    if detector is not None:
+        numbers |= {
+            "SUM_CAP": CAP, "DRIFT": detector.drift, "FORCE_THRESHOLD": detector.force_threshold,
+            "ENERGY_THRESHOLD": detector.energy_threshold, "RELEASE": detector.release, "SHORTEST": detector.shortest,
+        }  # fmt: skip
+        reals |= {
+            "force_scale": np.array(detector.force), "rest_speed_learned": np.array(detector.rest_speed),
+            "energy_scale": np.array(detector.energy or (1.0, 0.0, 0.0, 0.0)),
+        }  # fmt: skip
+    rates, rate_sizes, operations = _rates(model, parts)
+    s = _symbols(model)
+    x, u, w = (ca.MX.sym(name, v.numel()) for name, v in s.items())
+    rate = ca.MX.sym("rate", model.n_x)
+    balance = _scalar("the energy balance", [x, rate, u, w], energy_balance(model, x, rate, ca.vertcat(u, w)))
+    inertia = _scalar("the inertia", [x, u, w], inertia_of(model, x, ca.vertcat(u, w)))
+    r, a = ca.SX.sym("rate", model.n_x), ca.SX.sym("a", n_q)
+    point = {"x": s["x"], "u": s["u"], "w": s["w"]}
+    value, f = balance(s["x"], r, s["u"], s["w"]), ca.densify(inertia(*point.values()) @ a)
+    texts = [rates]
+    functions = (
+        (
+            "watched_energy",
+            ("x", "rate", "u", "w"),
+            "value",
+            {"x": s["x"], "rate": r, "u": s["u"], "w": s["w"]},
+            value,
+        ),
+        ("watched_force", ("x", "u", "w", "a"), "force", {**point, "a": a}, f),
+    )
+    for name, given, out, inputs, values in functions:
+        arguments = [*(f"const real *{key}" for key in given), f"real *{out}"]
+        results = [(f"{out}[{i}]", values[i]) for i in range(values.numel())]
+        text, operations[name] = c_function(name, arguments, inputs, results)
+        texts.append(text)
+    tables = "".join(table(name, values) for name, values in reals.items())
+    return Watched(sizes | rate_sizes, numbers, tables, "\n".join(texts), operations)
+
+
+def _rates(model: HybridModel, parts: Cut) -> tuple[str, dict[str, int], dict[str, int]]:
+    """Code of the model's rates, by the step's own cell; sizes and operations."""
+    own = cut(model, "xdot")
+    cell, seen_by = parts.cell, own.cell
+    if (cell is None) != (seen_by is None) or (
+        cell is not None
+        and seen_by is not None
+        and not (
+            cell.first == seen_by.first
+            and all(
+                np.array_equal(getattr(cell, name), getattr(seen_by, name))
+                for name in ("input_weight", "hidden_weight", "input_bias", "hidden_bias")
+            )
+        )
+    ):
+        raise InputError(f"no C for this monitor: rates and step of model {model.name} have other networks")
+    z, u, w = (
+        ca.SX.sym(name, n) for name, n in (("z", model.n_x + model.n_h), ("u", model.n_u), ("w", model.n_w))
+    )
+    x, h = z[: model.n_x], z[model.n_x :]
+    inputs, point = {"z": z, "u": u, "w": w}, ["const real *z", "const real *u", "const real *w"]
+    texts, operations = [], {}
+    units = 0 if cell is None else cell.units
+    g = ca.SX.sym("g", units)
+    head, out, value = np.zeros((0, 0)), g, own.after(x, h, u, w, g)
+    if own.before is not None:
+        seen = own.before(x, h, u, w)
+        results = [(f"seen[{i}]", seen[i]) for i in range(seen.numel())]
+        text, operations["rates_before"] = c_function("rates_before", [*point, "real *seen"], inputs, results)
+        texts.append(text)
+        head, out, value = reduced(own, model, list(range(model.n_x)), z, u, w)
+        texts.append(table("rate_head", head))
+    results = [(f"xdot[{i}]", ca.densify(value[i])) for i in range(model.n_x)]
+    arguments = [*point, "const real *out", "real *xdot"]
+    text, operations["rates_after"] = c_function("rates_after", arguments, {**inputs, "out": out}, results)
+    return "\n".join([*texts, text]), {"RATE_HEAD": len(head)}, operations
+
+
+def _residuals(monitor: ResidualMonitor, model: HybridModel) -> Watched:
+    limits, names = monitor.limits, model.balances
+    sizes = {
+        "MONITOR": 2, "RATES": 0, "CHANNELS": len(monitor.channels), "BALANCES": len(names),
+        "SHORT": monitor.short, "LONG": monitor.long, "SETTLING": monitor.settling, "FREE_RUN": monitor.free_run,
+        "LIMITS": int(limits is not None), "REPEATS": int(np.max(monitor.frozen_repeats)) + 1,
+    }  # fmt: skip
+    reals = {"frozen_travel": monitor.frozen_travel, "sensor_end": monitor.sensor_ends}
+    if limits is not None:
+        reals |= {"level_threshold": np.array(limits.threshold), "level_release": np.array(limits.release)}
+    tables = "".join(table(name, values) for name, values in reals.items())
+    tables += table("frozen_repeats", monitor.frozen_repeats, "int")
+    code, operations = "", {}
+    if names:
+        s, r = _symbols(model), ca.SX.sym("r", model.n_x)
+        x, u, w = (ca.MX.sym(name, v.numel()) for name, v in s.items())
+        rate, none = ca.MX.sym("r", model.n_x), ca.MX.zeros(model.n_x)
+        rows = [b.residual(x, rate, u, w, model.p) - b.residual(x, none, u, w, model.p) for b in names]
+        f = _scalar("a balance", [x, rate, u, w], ca.vertcat(*rows))
+        values = ca.densify(f(s["x"], r, s["u"], s["w"]))
+        arguments = [*(f"const real *{key}" for key in "xruw"), "real *violation"]
+        results = [(f"violation[{i}]", values[i]) for i in range(values.numel())]
+        inputs = {"x": s["x"], "r": r, "u": s["u"], "w": s["w"]}
+        code, operations["watched_balances"] = c_function("watched_balances", arguments, inputs, results)
+    return Watched(sizes, {"DT": model.dt}, tables, code, operations)

@@ -1,0 +1,276 @@
+"""A period of the generated C with monitor and guard is one of the Python loop: readings, alarms, modes, inputs."""
+
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import embedded_parts as parts
+import numpy as np
+import pytest
+import replay_parts as replays
+from embedded_parts import needs_compiler
+from replay_parts import Case, Whole, replay
+
+import hybrid_mpc as hm
+from hybrid_mpc import (
+    CondensedController,
+    ExtendedKalmanFilter,
+    Guard,
+    InputError,
+    Limits,
+    Mode,
+    SafeController,
+    guard_monitor,
+    load_scenario,
+)
+from hybrid_mpc.embedded.generate import CORE, make_sources, sources_of
+from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
+from golden_parts import Parts, faults_of, machine
+
+pytestmark = needs_compiler
+TOLERANCE = 1e-9
+"""Of an input's range, a state's size, a reading's largest value. Sums of another order: they differed by 1e-12."""
+
+
+def golden(name, loop, periods=300, seed=0, **changes):
+    """A stored loop of a stored machine."""
+    m = machine(name)
+    given = m.data["loops"][loop]
+    problem = given["problem"]
+    estimator, safe, monitor, guard = Parts(m, problem, given["guard"]).made
+    case = Case(
+        estimator, safe, monitor, guard, load_scenario(m.name).plant(), m.reference(problem), given["x0"], periods,
+        m.weight(problem), faults_of(given), seed,
+    )  # fmt: skip
+    return replace(case, **changes)
+
+
+def prior_takes_over(periods=300):
+    """The golf robot, heavier for a while: the fitted prior's own MPC and observer take over, within limits."""
+    m = machine("golf_robot")
+    prior, noise = m.models["prior"], m.data["observer"]
+    estimator = ExtendedKalmanFilter(
+        prior, sigma_y=noise["sigma_y"], sigma_x=noise["modes"][0]["sigma_x"], sigma_x0=noise["sigma_x0"],
+        sigma_d=noise["modes"][0]["sigma_d"], sigma_d0=noise["sigma_d0"],
+    )  # fmt: skip
+    backup = SafeController(CondensedController(prior, m.problem("track")), prior, safe_input=[0.0])
+    guard = Guard(
+        backup=backup, backup_estimator=estimator, limits=Limits([-0.4], [0.4]), dwell=0.3, quiet=0.4
+    )
+    return golden("golf_robot", "heavy", periods, guard=guard)
+
+
+def by_levels(periods=300):
+    """The disk's monitor with thresholds on its levels; no detector, no free runs, no test for freezing."""
+    return golden("unbalanced_disk", "weak", periods, monitor=machine("unbalanced_disk").level_monitor())
+
+
+CASES = {
+    "golf robot, heavier": (lambda: golden("golf_robot", "heavy", 250), {"NORMAL", "BACKUP"}),
+    "golf robot, frozen": (lambda: golden("golf_robot", "frozen"), {"NORMAL", "REST", "BACKUP"}),
+    "golf robot, prior takes over": (prior_takes_over, {"NORMAL", "BACKUP"}),
+    "disk, weak": (lambda: golden("unbalanced_disk", "weak"), {"NORMAL", "LIMITED", "REST"}),
+    "disk, levels": (by_levels, {"NORMAL", "LIMITED"}),
+    "arm": (lambda: replays.arm_case(400), {"NORMAL", "LIMITED", "REST"}),
+    "tanks": (lambda: replays.tanks_case(400), {"NORMAL", "FALLBACK", "REST"}),
+    "heaters": (lambda: replays.heaters_case(400), {"NORMAL", "LIMITED", "REST"}),
+}
+QUICK = ("golf robot, heavier", "arm", "tanks")
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.full) for n in CASES]
+)
+def test_a_loop_with_faults_replayed(name, tmp_path):
+    """The same samples and plans: the same readings, alarms, modes, sources and inputs in every period."""
+    make, modes = CASES[name]
+    case = make()
+    told = replay(Whole(tmp_path, case), case)
+    assert set(told.modes) == modes
+    assert told.alarms > 20
+    assert told.input < TOLERANCE
+    assert told.estimate < TOLERANCE
+    assert told.reading < TOLERANCE
+
+
+def guarded(name):
+    """A machine of the other tests with a monitor and a guard that goes through every mode."""
+    if name == "arm":
+        case = replays.arm_case(100)
+        return replace(case, guard=Guard(Mode.FALLBACK, Mode.REST, dwell=0.1, quiet=0.2))
+    case = replays.tanks_case(100) if name == "tanks" else golden("golf_robot", "heavy", 10)
+    return case
+
+
+def test_what_was_not_watched_is_watched_by_the_next_step(tmp_path):
+    """Without hmpc_finish the next hmpc_step does its work."""
+    case = replays.tanks_case(120)
+    whole = Whole(tmp_path, case)
+    goal = parts.goal(case.reference(np.zeros(1)))
+    rng, found = np.random.default_rng(0), []
+    for finishes in (True, False):
+        rng = np.random.default_rng(0)
+        inputs = []
+        for k in range(60):
+            y = whole.model.x0[1:] + 1e-3 * rng.standard_normal(1) if k % 30 < 20 else np.full(1, np.nan)
+            whole.call("hmpc_step" if k else "hmpc_start", y, whole.model.w, None, goal)
+            if finishes:
+                whole.call("hmpc_finish", goal)
+            inputs.append((float(whole.view["u"][0]), int(whole.view["guard_mode"])))
+        found.append(inputs)
+    assert found[0] == found[1]
+    assert len({mode for _, mode in found[0]}) > 1
+
+
+@pytest.mark.parametrize("name", ["arm", pytest.param("tanks", marks=pytest.mark.full)])
+def test_rubbish_leaves_inputs_within_their_limits(name, tmp_path):
+    survives(guarded(name), tmp_path, 1500)
+
+
+@pytest.mark.full
+def test_rubbish_with_a_backup(tmp_path):
+    survives(guarded("golf"), tmp_path, 3000)
+
+
+def survives(case, folder, periods):
+    """NaN, infinities and 1e308 under the sanitizers: inputs stay within limits, and modes change."""
+    from test_export import RUBBISH, SANITIZERS
+
+    found = parts.write(folder, case)
+    text = RUBBISH.replace('"hmpc_math.h"', '"hmpc_math.h"\n#include "hmpc_tables.h"')
+    text = text.replace("    solved += ", "    seen |= 1 << (int)s.guard.mode;\n    solved += ")
+    text = text.replace("  long periods = 0;", "  long periods = 0;\n  int seen = 0;")
+    text = text.replace('printf("%d %d\\n", outside, solved)', 'printf("%d %d %d\\n", outside, solved, seen)')
+    (folder / "rubbish.c").write_text(text)
+    words = ["cc", "-std=c11", *SANITIZERS, *sources_of(found), "rubbish.c", "-lm", "-o", "rubbish"]
+    made = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    if made.returncode and "sanitize" in made.stderr:
+        pytest.skip("no sanitizers")
+    assert made.returncode == 0, made.stderr
+    done = subprocess.run([folder / "rubbish", str(periods)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+    outside, solved, seen = map(int, done.stdout.split())
+    assert outside == 0
+    assert 0 < solved < periods
+    assert seen.bit_count() > 1
+
+
+WATCHED = {"arm": replays.arm_case, "tanks": replays.tanks_case}
+
+
+@pytest.mark.parametrize(
+    "single", [False, pytest.param(True, marks=pytest.mark.full)], ids=["double", "float"]
+)
+@pytest.mark.parametrize("name", WATCHED)
+def test_vectors_with_readings_and_no_warning(name, single, tmp_path):
+    """The test program of the folder compares readings too; a changed one is noticed."""
+    from test_export import STRICT
+
+    found = parts.write(tmp_path, WATCHED[name](60), single=single)
+    words = ["cc", "-O2", *STRICT, *sources_of(found), "hmpc_test.c", "-lm", "-o", "test"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "test"], capture_output=True, check=False).returncode == 0
+    text = (tmp_path / "hmpc_vectors.h").read_text()
+    changed = re.sub(
+        r"vector_reading_size(\[\d+\]) = \{[^}]*\}", r"vector_reading_size\1 = {R(1e-300)}", text
+    )
+    (tmp_path / "hmpc_vectors.h").write_text(changed.replace("1e-300", "1e-30") if single else changed)
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "test"], capture_output=True, check=False).returncode == 1
+
+
+@pytest.mark.full
+@pytest.mark.skipif(shutil.which("cppcheck") is None, reason="there is no cppcheck")
+@pytest.mark.parametrize("name", [*WATCHED, "golf robot"])
+def test_cppcheck_finds_nothing(name, tmp_path):
+    """In the monitor, the loop and, of the golf robot, the backup's own files."""
+    case = WATCHED[name](60) if name in WATCHED else golden("golf_robot", "heavy", 10)
+    found = parts.write(tmp_path, case)
+    names = [n for n in sources_of(found) if n not in CORE and "qp" not in n]
+    done = subprocess.run(
+        ["cppcheck", "--enable=warning,style,performance,portability", "--inconclusive", "--std=c11", "--quiet",
+         "--suppress=moduloofone", "--suppress=knownConditionTrueFalse", "--error-exitcode=1", *names],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def refused(case, match, **changes):
+    case = replace(case, **changes)
+    controller = case.safe.controller
+    with pytest.raises(InputError, match=match):
+        make_sources(
+            controller.model, controller.ocp, estimator=case.estimator, fallback=case.safe.fallback,
+            safe_input=case.safe.safe_input, monitor=case.monitor, guard=case.guard,
+        )  # fmt: skip
+
+
+def test_what_has_no_c_is_refused_by_name_all_at_once():
+    case = replays.arm_case(10)
+    model, plain = case.safe.controller.model, replace(case, guard=None)
+    refused(plain, "a monitor of another kind.*object", monitor=object())
+    refused(plain, "a history for a diagnosis", monitor=guard_monitor(model, diagnose=True))
+    refused(plain, "a monitor without an estimator", estimator=None)
+    other = guard_monitor(parts.online_models.pendulum_model())
+    refused(plain, "a monitor of another model", monitor=other)
+    refused(case, "a guard without a monitor", monitor=None)
+    bare = SafeController(case.safe.controller, model)
+    both = "mode REST without a safe input.*a backup by another solver.*its guard's backup: no C"
+    twice = CondensedController(
+        model, case.safe.controller.ocp.changed(starts=[np.zeros((12, 2))]), iterations=2
+    )
+    guard = Guard(backup=twice, backup_estimator=case.estimator)
+    refused(case, both, safe=bare, guard=guard)
+
+
+def test_a_kits_monitor_and_guard(noisy_artifact, tmp_path, call):
+    """Of a run's folder: its monitor by default, its guard where it is asked for."""
+    run = shutil.copytree(noisy_artifact, tmp_path / "model")
+    golf = load_scenario("golf_robot")
+    description = read_description(run)
+    write_description(run, replace(description, loop=loop_settings(golf, description.loop.process_noise)))
+    code, _, err = call("export", "c", run, "--guard", "--out", tmp_path / "early")
+    assert code == 2
+    assert "detector" in err
+    hm.set_calibration(run, machine("golf_robot").calibration)
+    sizes = {}
+    for words in ((), ("--no-monitor",), ("--guard",), ("--adapt",)):
+        folder = tmp_path / "-".join(["c", *words])
+        code, _, err = call("export", "c", run, "--out", folder, *words)
+        assert code == 0, err
+        text = (folder / "hmpc_config.h").read_text()
+        names = ("MONITOR", "GUARD", "ON_MODEL", "BACKUP")
+        sizes[words] = [
+            int(found[1]) if (found := re.search(rf"HMPC_{n} (\d+)", text)) else None for n in names
+        ]
+    assert sizes == {
+        (): [1, 0, None, 0], ("--no-monitor",): [0, 0, None, 0], ("--guard",): [1, 1, int(Mode.NORMAL), 0],
+        ("--adapt",): [1, 1, int(Mode.BACKUP), 1],
+    }  # fmt: skip
+    told = (folder / "README.md").read_text()
+    assert "`hmpb_state backup`" in told
+    done = subprocess.run(
+        ["make", "-s", "-C", folder, "CFLAGS=-O1", "test"], capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    kit = hm.load(run)
+    with pytest.raises(InputError, match="no guard 'both'"):
+        hm.generate_controller(kit, tmp_path / "none", guard="both")
+    with pytest.raises(InputError, match="acts on alarms"):
+        hm.generate_controller(kit, tmp_path / "none", guard="rest", monitor=False)
+
+
+def test_a_guard_counts_whole_periods():
+    """Times that are no whole number of periods end with the first period that is not earlier, as Python's do."""
+    case = replays.arm_case(10)
+    guard = Guard(Mode.FALLBACK, Mode.NORMAL, dwell=0.05, quiet=0.06, patience=0.0)
+    found = make_sources(
+        case.safe.controller.model, case.safe.controller.ocp, estimator=case.estimator, fallback=case.safe.fallback,
+        monitor=case.monitor, guard=guard,
+    )  # fmt: skip
+    assert [found.sizes[name] for name in ("DWELL", "QUIET", "PATIENCE")] == [3, 3, 0]
