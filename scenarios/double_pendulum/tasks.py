@@ -19,11 +19,8 @@ more than overcome its dry friction (0.24 and 0.16 N m). Links lifted straight u
 HANGING, UPRIGHT = (0.0, 0.0, 0.0, 0.0), (pi, 0.0, 0.0, 0.0)
 UP_AT = 1.2
 """Time [s] from which a swing-up is to stand, as in the recordings, which take 1.2 to 1.4 s."""
-PUSHES, BACK = (0.12, 0.2, 0.3), (0.15, 0.3)
 PUSHED = 0.5
 """Size of a push [N m], as recorded (0.2 to 0.7)."""
-
-
 # By Bryson's rule: 50 mrad, 1 rad/s, what a joint needs is free but for 10 and 1 N m, which keep the problem regular,
 # 2 N m of change a period at the driven joint. 0.5 s ahead are four of the upright pendulum's time constants. The
 # terminal cost is of a pendulum in motion: at rest the slope of dry friction would pass for strong damping.
@@ -36,25 +33,17 @@ ACROBOT = PENDUBOT.changed(
 )
 
 
-def pumps(driven: int) -> tuple[Array, ...]:
-    """Torques ``(n, 2)`` from which a swing-up is sought: full torque at a joint one way, then back, then none."""
+def shoves() -> tuple[Array, ...]:
+    """Torques ``(n, 2)`` from which a swing-up by the second joint is sought: full torque one way, back, then none."""
     t = DT * np.arange(round(UP_AT / DT))
-    plans = []
-    for sign in (1.0, -1.0):
-        for push in PUSHES:
-            for back in BACK:
-                u = np.zeros((len(t), 2))
-                u[:, driven] = sign * DRIVEN * np.where(t < push, 1.0, np.where(t < push + back, -1.0, 0.0))
-                plans.append(u)
-    return tuple(plans)
+    shove = DRIVEN * np.where(t < 0.2, 1.0, np.where(t < 0.35, -1.0, 0.0))
+    return tuple(np.column_stack([0 * t, sign * shove]) for sign in (1.0, -1.0))
 
 
-def swing(control: OCP, driven: int) -> OCP:
-    """The problem of a swing-up: torque counts (5 N m), the horizon is the swing, inputs are held for two periods."""
+def swing(control: OCP, r: tuple[float, float], starts: tuple[Array, ...] = ()) -> OCP:
+    """The problem of a swing-up: torque counts (5 and 0.5 N m), the horizon is the swing, of two periods a move."""
     n = round(UP_AT / DT)
-    r = np.full(2, 4.0)
-    r[driven] = 0.04
-    return control.changed(horizon=n, r=r, starts=pumps(driven), blocks=(1,) * 20 + (2,) * ((n - 20) // 2))
+    return control.changed(horizon=n, r=r, starts=starts, blocks=(1,) * 20 + (2,) * ((n - 20) // 2))
 
 
 def upright(t: Array) -> Array:
@@ -90,13 +79,13 @@ def pushes(driven: str, other: str) -> tuple[Fault, ...]:
 
 
 TASKS = (
-    Task("pendubot_swing_up", "Swing up by the first joint", 3.0, HANGING, upright, standing, swing(PENDUBOT, 0),
+    Task("pendubot_swing_up", "Swing up by the first joint", 3.0, HANGING, upright, standing, swing(PENDUBOT, (0.04, 4.0)),
          figures=stood),
     Task("pendubot_push", "Stand by the first joint while pushes come", 4.0, UPRIGHT, upright, control=PENDUBOT,
          faults=pushes("tau1", "tau2"), figures=stood),
     Task("pendubot_load", "Stand by the first joint under a constant torque there", 4.0, UPRIGHT, upright,
          control=PENDUBOT, faults=(Fault(1.0, np.inf, "input_offset", 0.3, "tau1"),), figures=stood),
-    Task("acrobot_swing_up", "Swing up by the second joint", 3.0, HANGING, upright, standing, swing(ACROBOT, 1),
+    Task("acrobot_swing_up", "Swing up by the second joint", 3.0, HANGING, upright, standing, swing(ACROBOT, (4.0, 0.04), shoves()),
          figures=stood),
     Task("acrobot_push", "Stand by the second joint while pushes come", 4.0, UPRIGHT, upright, control=ACROBOT,
          faults=pushes("tau2", "tau1"), figures=stood),
