@@ -3,7 +3,7 @@
     python benchmarks/recorded_faults.py DATA [--out FILE.json]
 
 ``DATA`` is the folder of the recordings, one folder a machine. The fitted prior is the model (no network); prior and
-observer are fitted to the machine's recording for identification alone. Limits are learned from its last part, which
+observer are fitted to the machine's recordings for identification alone. Limits are learned from its last part, which
 the prior was not fitted to, and from one clean recording of another day; the other clean one tells false alarms, and
 then the two change places. Which faults there are, and when, is read from the recordings' own columns and description,
 and nothing of them is used but to judge.
@@ -58,7 +58,7 @@ SCALES = (0.3, 1.0, 3.0, 10.0)
 class Machine:
     """Files of a machine: to identify, clean ones that change places, with faults; and what is watched."""
 
-    train: str
+    train: tuple[str, ...]
     clean: tuple[str, str]
     faulty: tuple[str, ...]
     measured: bool = True
@@ -66,14 +66,21 @@ class Machine:
 
 
 MACHINES = {
-    "temperature_lab": Machine("prbs", ("setpoints_1", "setpoints_5"), ("faults_1", "faults_5")),
+    "temperature_lab": Machine(("prbs",), ("setpoints_1", "setpoints_5"), ("faults_1", "faults_5")),
     "heat_exchanger": Machine(
-        "random_steps_jun16", ("staircase_jun10", "staircase_jun11"), ("fault_jun09_heater_off",)
+        ("random_steps_jun16",), ("staircase_jun10", "staircase_jun11"), ("fault_jun09_heater_off",)
     ),
     "heat_exchanger, reservoir not measured": Machine(
-        "random_steps_jun16", ("staircase_jun10", "staircase_jun11"), ("fault_jun09_heater_off",), False
+        ("random_steps_jun16",), ("staircase_jun10", "staircase_jun11"), ("fault_jun09_heater_off",), False
+    ),
+    "double_pendulum": Machine(
+        ("sines_143339", "sines_143524", "sines_143601", "sines_143704"),
+        ("sines_143747", "sines_144003"),
+        ("acrobot_pushed_01", "pendubot_pushed_01"),
     ),
 }
+PUSHED = 0.02
+"""Torque [N m] beyond which a push of the double pendulum counts: its recorded pulses are bells."""
 HEATER_OFF = 4500.0
 """Time [s] from which on the heat exchanger's reservoir is no longer heated (README of the recordings)."""
 
@@ -107,7 +114,11 @@ class Row:
 
 
 def faults_of(path: Path) -> list[Known]:
-    """The faults that a recording of the temperature lab holds, from its columns of offsets; else the reservoir's."""
+    """The faults that a recording holds, from its columns: offsets of the temperature lab, torques that push the double
+    pendulum; else the reservoir's.
+    """
+    if "_pushed_" in path.stem:
+        return pushes_of(path)
     if path.stem.startswith("fault_"):
         return [Known(HEATER_OFF, np.inf, ("reservoir",), "reservoir's heater off")]
     with path.open() as file:
@@ -131,6 +142,20 @@ def faults_of(path: Path) -> list[Known]:
     return found
 
 
+def pushes_of(path: Path) -> list[Known]:
+    """Every push that a recording of the double pendulum holds, in the order of time."""
+    table, found = np.genfromtxt(path, delimiter=",", names=True), []
+    for joint in (1, 2):
+        push, t = table[f"push{joint}_nm"], table["time_s"]
+        for first, last in zip(*stretches(np.abs(push) > PUSHED), strict=True):
+            pulse = push[first : last + 1]
+            most = pulse[np.argmax(np.abs(pulse))]
+            found.append(
+                Known(float(t[first]), float(t[last]), (f"tau{joint}",), f"push at tau{joint} {most:+.2f}")
+            )
+    return sorted(found, key=lambda known: known.start)
+
+
 @dataclass(frozen=True)
 class Assumed:
     """What the filter's first deviations are made of."""
@@ -140,11 +165,11 @@ class Assumed:
 
 
 def identified(
-    scenario: Scenario, path: Path
+    scenario: Scenario, paths: list[Path]
 ) -> tuple[HybridModel, ExtendedKalmanFilter, tuple[Trajectory, ...]]:
     """The fitted prior as a model, its filter, and the part of the recording that the prior was not fitted to."""
     dt, spec = scenario.data.dt, benchmark_of(scenario)
-    known = read_training(scenario, [path])
+    known = read_training(scenario, paths)
     fit = fit_prior(
         scenario.prior, known.train, known.valid, dt=dt, length=spec.length or spec.piece,
         largest_delay=scenario.data.largest_delay,
@@ -204,7 +229,7 @@ def study(name: str, data: Path) -> list[Row]:
     """All rows of a machine."""
     machine, folder = MACHINES[name], data / name.split(",")[0]
     scenario = load_scenario(name.split(",")[0])
-    model, estimator, held = identified(scenario, folder / f"{machine.train}.csv")
+    model, estimator, held = identified(scenario, [folder / f"{stem}.csv" for stem in machine.train])
 
     def read(stem: str) -> list[Trajectory]:
         return [given(run) for run in read_test(scenario, folder / f"{stem}.csv")]
@@ -221,7 +246,7 @@ def study(name: str, data: Path) -> list[Row]:
         print(
             f"limits from {own}: {limits.method}; {dict(zip(limits.channels, limits.threshold, strict=True))}"
         )
-        label = f"{machine.train} (last part), {own}"
+        label = f"{', '.join(machine.train)} (not fitted to), {own}"
         for run in clean[other]:
             trace, _ = watched(monitor, estimator, run)
             starts, _ = stretches(trace.alarm)

@@ -79,14 +79,14 @@ def pushes(driven: str, other: str) -> tuple[Fault, ...]:
 
 
 TASKS = (
-    Task("pendubot_swing_up", "Swing up by the first joint", 3.0, HANGING, upright, standing, swing(PENDUBOT, (0.04, 4.0)),
-         figures=stood),
+    Task("pendubot_swing_up", "Swing up by the first joint", 3.0, HANGING, upright, standing,
+         swing(PENDUBOT, (0.04, 4.0)), figures=stood),
     Task("pendubot_push", "Stand by the first joint while pushes come", 4.0, UPRIGHT, upright, control=PENDUBOT,
          faults=pushes("tau1", "tau2"), figures=stood),
     Task("pendubot_load", "Stand by the first joint under a constant torque there", 4.0, UPRIGHT, upright,
          control=PENDUBOT, faults=(Fault(1.0, np.inf, "input_offset", 0.3, "tau1"),), figures=stood),
-    Task("acrobot_swing_up", "Swing up by the second joint", 3.0, HANGING, upright, standing, swing(ACROBOT, (4.0, 0.04), shoves()),
-         figures=stood),
+    Task("acrobot_swing_up", "Swing up by the second joint", 3.0, HANGING, upright, standing,
+         swing(ACROBOT, (4.0, 0.04), shoves()), figures=stood),
     Task("acrobot_push", "Stand by the second joint while pushes come", 4.0, UPRIGHT, upright, control=ACROBOT,
          faults=pushes("tau2", "tau1"), figures=stood),
 )  # fmt: skip
