@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, Budget, DataSpec, Scenario
 from scenarios.common import LazyPrior
 from scenarios.double_pendulum.plant import DoublePendulumPlant
@@ -21,6 +24,13 @@ SLOW_ROW = 0.03
 """The same of the swing-ups [s]."""
 MEASURED = ("q1_rad", "q2_rad", "dq1_rad_s", "dq2_rad_s")
 SLOW = tuple(f"{robot}_swingup_{k:02d}" for robot in ("acrobot", "pendubot") for k in (1, 2, 3))
+
+
+def draw(x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Both links of the state ``x`` ``(4,)`` as one polyline ``(3, 2)`` [m] from the first joint."""
+    turned = np.array([x[0], x[0] + x[1]])
+    ends = np.array([[0.2], [0.3]]) * np.column_stack([np.sin(turned), -np.cos(turned)])
+    return [np.vstack([np.zeros((1, 2)), np.cumsum(ends, axis=0)])]
 
 
 scenario = Scenario(
@@ -45,6 +55,7 @@ scenario = Scenario(
     sensor_sigma=(3e-4, 3e-4, 0.08, 0.08),
     safe_input=(0.0, 0.0),
     tasks=TASKS,
+    draw=draw,
     budgets={"quick": Budget(8, 4, 0, 150, seeds=2, decay=1000.0),
              "full": Budget(16, 4, 0, 1000, seeds=10, decay=1000.0)},
     beyond_recordings=True,  # those for identification hang; tasks stand

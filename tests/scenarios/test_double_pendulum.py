@@ -50,7 +50,7 @@ def test_without_mujoco_the_plant_says_how_to_install_it(monkeypatch):
 
 
 def test_without_friction_the_links_are_those_of_the_prior(mujoco):
-    """Accelerations in the first 0.5 ms. The prior's rotors couple the joints, by 0.6 % of M_12; the mass matrix is near
+    """Accelerations in the first 0.5 ms. The prior's rotors couple the joints, by 0.6 % of M_12; the matrix is near
     singular, so 2 % come of it.
     """
     p = DoublePendulumPlant(b_1=0.0, b_2=0.0, F_1=0.0, F_2=0.0, late=0.0, rotor=36 * 6.29e-5)
