@@ -41,9 +41,9 @@ def shoves() -> tuple[Array, ...]:
 
 
 def swing(control: OCP, r: tuple[float, float], starts: tuple[Array, ...] = ()) -> OCP:
-    """The problem of a swing-up: torque counts (5 and 0.5 N m), the horizon is the swing, of two periods a move."""
-    n = round(UP_AT / DT)
-    return control.changed(horizon=n, r=r, starts=starts, blocks=(1,) * 20 + (2,) * ((n - 20) // 2))
+    """The problem of a swing-up: torque counts (5 and 0.5 N m), the horizon is the swing, moves of up to 50 ms."""
+    blocks = (1,) * 10 + (2,) * 10 + (5,) * 18
+    return control.changed(horizon=round(UP_AT / DT), r=r, starts=starts, blocks=blocks)
 
 
 def upright(t: Array) -> Array:

@@ -2,6 +2,8 @@
 
 import sys
 from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,3 +127,17 @@ def test_the_figures_tell_standing_from_lying():
     assert figures(Result) == {"up_at_s": pytest.approx(1.0), "hold_rmse_rad": 0.0}
     Result.x = still * 0.5
     assert figures(Result)["up_at_s"] == np.inf
+
+
+def test_recorded_pushes_are_read_from_their_columns(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    t = 0.002 * np.arange(2000)
+    bells = [0.5 * np.exp(-(((t - at) / 0.05) ** 2)) * sign for at, sign in ((1.0, 1.0), (2.0, -1.0))]
+    path = tmp_path / "acrobot_pushed_01.csv"
+    hm.write_csv(path, {"time_s": t, "push1_nm": bells[1], "push2_nm": bells[0]})
+    found = import_module("recorded_faults").faults_of(path)
+    assert [f.words for f in found] == ["push at tau2 +0.50", "push at tau1 -0.50"]
+    assert [f.components for f in found] == [("tau2",), ("tau1",)]
+    half = 0.05 * np.sqrt(np.log(0.5 / 0.02))  # where a bell falls below 0.02 N m, to a row
+    np.testing.assert_allclose([f.start for f in found], [1.0 - half, 2.0 - half], atol=0.003)
+    np.testing.assert_allclose([f.end for f in found], [1.0 + half, 2.0 + half], atol=0.003)
