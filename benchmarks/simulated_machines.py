@@ -321,10 +321,10 @@ def parts(name: str, runs: Path, controller: str, place: int):
         control = task.control or scenario.control
         model = linear_model(prior, control, task.reference(np.array([task.duration]))[0])
         noise = kit.noise("prior_observer")
-        made = hm.make_estimator(model, scenario, noise), hm.make_controller(model, model, control)
+        made = hm.make_estimator(model, scenario, noise, control), hm.make_controller(model, model, control)
         return scenario, model, controlled, made
     planned = "prior" if controller == "blind" else controller
-    made = kit.observer(planned), kit.controller(planned, task=task.name)
+    made = kit.observer(planned, task=task.name), kit.controller(planned, task=task.name)
     return scenario, kit.models[planned], controlled, made
 
 
@@ -354,7 +354,8 @@ def controllers_of(task: hm.Task) -> tuple[str, ...]:
 def loop(name: str, runs: Path, controller: str, place: int, seed: int) -> dict:
     """Cost, rest and largest use of limits of one loop."""
     scenario, model, controlled, made = parts(name, runs, controller, place)
-    task, plant, control = scenario.tasks[place], scenario.plant(), scenario.control
+    task, plant = scenario.tasks[place], scenario.plant()
+    control = task.control or scenario.control
     if controller == "pid":
         x, u = run_pid(scenario, model, made, controlled, task, seed)
     else:
