@@ -19,7 +19,8 @@ Reads the runs and closes loops on the plants, every controller with the same se
   itself, both with seeds of their own. Nobody has so much when he tunes: it is about the best that PI(D) does here.
   A car's steering holds y and its speed x, on top of wheels that roll along the path; each torque of a double
   pendulum holds its joint.
-- ``blind``, in tasks with measured disturbances: ``prior`` without their measurement.
+- ``blind``, in tasks with measured disturbances: ``prior`` without their measurement;
+- ``slippery``, of the double pendulum: ``prior`` without its dry friction, whose slope at rest is a strong damper's.
 
 The cost counts what all pay for alike: weighed outputs without noise, weighed speeds, changes of the input. A ratio is
 the geometric mean over seeds with its 95 % interval (paired, by Student's t of the logarithms). With a constant load,
@@ -323,6 +324,12 @@ def parts(name: str, runs: Path, controller: str, place: int):
         noise = kit.noise("prior_observer")
         made = hm.make_estimator(model, scenario, noise, control), hm.make_controller(model, model, control)
         return scenario, model, controlled, made
+    if controller == "slippery":
+        control, noise = task.control or scenario.control, kit.noise("prior_observer")
+        values = [replace(p, value=0.0) if p.name.startswith("F_") else p for p in prior.parameters]
+        model = replace(prior, parameters=tuple(values))
+        made = hm.make_estimator(model, scenario, noise, control), hm.make_controller(model, model, control)
+        return scenario, model, controlled, made
     planned = "prior" if controller == "blind" else controller
     made = kit.observer(planned, task=task.name), kit.controller(planned, task=task.name)
     return scenario, kit.models[planned], controlled, made
@@ -344,11 +351,11 @@ class Unseen:
         return self.plant.step(state, u, dt, self.w(np.array([state.t]))[0])
 
 
-def controllers_of(task: hm.Task) -> tuple[str, ...]:
+def controllers_of(name: str, task: hm.Task) -> tuple[str, ...]:
     """Those of all tasks, and without measurement where there is one; no PI(D) where the way is free (a swing-up)."""
-    if task.weight is not None:
-        return CONTROLLERS[:-1]
-    return CONTROLLERS if task.w is None else (*CONTROLLERS, "blind")
+    found = CONTROLLERS[:-1] if task.weight is not None else CONTROLLERS
+    found += () if task.w is None else ("blind",)
+    return (*found, "slippery") if name == "double_pendulum" else found
 
 
 def loop(name: str, runs: Path, controller: str, place: int, seed: int) -> dict:
@@ -420,12 +427,12 @@ def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
     """Ratios of cost, offsets, and how the hybrid rests against its prior, of one task."""
     own = {
         c: [r for r in cells if (r["machine"], r["task"], r["controller"]) == (name, task.name, c)]
-        for c in controllers_of(task)
+        for c in controllers_of(name, task)
     }
     costs = {c: np.log([r["cost"] for r in found]) for c, found in own.items()}
     row = {"machine": name, "task": task.name}
     row |= {f"hybrid / {c}": interval(costs["hybrid"] - costs[c]) for c in CONTROLLERS[1:] if c in own}
-    row |= {f"prior / {c}": interval(costs["prior"] - costs[c]) for c in controllers_of(task)[2:]}
+    row |= {f"prior / {c}": interval(costs["prior"] - costs[c]) for c in controllers_of(name, task)[2:]}
     row["cost, prior"] = f"{np.exp(costs['prior'].mean()):.4g}"
     if any(math.isinf(fault.end) for fault in task.faults):
         bound = allowed(name, runs)
@@ -465,7 +472,7 @@ def main() -> None:
         jobs = [
             pool.submit(loop, name, given.runs, controller, place, seed)
             for name, place, task in tasks
-            for controller in controllers_of(task)
+            for controller in controllers_of(name, task)
             for seed in range(given.seeds)
         ]
         cells = [job.result() for job in jobs]

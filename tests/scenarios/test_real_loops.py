@@ -40,7 +40,7 @@ SIGMA_X = {
     "temperature_lab": (0.5, 0.5, 0.03, 0.03, 1e-6),
     "cascaded_tanks": (0.05, 0.04),
     "heat_exchanger": (0.02, exchanger.state_noise["cold"]),
-    "coupled_drives": (0.01, 0.005, 0.1, 0.01),
+    "coupled_drives": (0.008, *drives.state_noise.values()),
     "race_car": (1e-3, 1e-3, 1e-3, 1e-2, 1e-2),
 }
 """Process noise a period, of the size of the models' one-period errors on the recordings."""
@@ -191,7 +191,7 @@ HELD = [
     ("temperature_lab", "weak_heater", 200),
     ("cascaded_tanks", "weak_pump", 400),
     ("heat_exchanger", "weak_valve", 375),
-    ("coupled_drives", "weak_drive", 1000),
+    ("coupled_drives", "weak_drive", 500),
 ]
 
 
