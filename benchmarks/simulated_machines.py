@@ -17,8 +17,10 @@ Reads the runs and closes loops on the plants, every controller with the same se
   where the input is at a limit. Gains and filters are those that make *this very task* cheapest, load included: by
   differential evolution on the fitted prior with its sensors' noise, then by Nelder and Mead's method on the plant
   itself, both with seeds of their own. Nobody has so much when he tunes: it is about the best that PI(D) does here.
-  A car's steering holds y and its speed x, on top of wheels that roll along the path.
-- ``blind``, in tasks with measured disturbances: ``prior`` without their measurement.
+  A car's steering holds y and its speed x, on top of wheels that roll along the path; each torque of a double
+  pendulum holds its joint.
+- ``blind``, in tasks with measured disturbances: ``prior`` without their measurement;
+- ``slippery``, of the double pendulum: ``prior`` without its dry friction, whose slope at rest is a strong damper's.
 
 The cost counts what all pay for alike: weighed outputs without noise, weighed speeds, changes of the input. A ratio is
 the geometric mean over seeds with its 95 % interval (paired, by Student's t of the logarithms). With a constant load,
@@ -54,7 +56,14 @@ from hybrid_mpc.model.riccati import hidden_fixed_point
 from scenarios.race_car.prior import WHEELBASE
 
 MACHINES = ("two_tanks", "dc_motor", "lever", "two_heaters", "two_link_arm", "cart_pole")
-REAL = ("temperature_lab", "cascaded_tanks", "heat_exchanger", "race_car")
+REAL = (
+    "temperature_lab",
+    "cascaded_tanks",
+    "heat_exchanger",
+    "race_car",
+    "coupled_drives",
+    "double_pendulum",
+)
 LOADS = (
     "leak",
     "brake",
@@ -66,9 +75,12 @@ LOADS = (
     "weak_pump",
     "weak_valve",
     "crooked",
+    "weak_drive",
+    "pendubot_load",
 )
-PATHS = {"race_car": [1, 0]}
-"""Machines that follow paths of states, and the output that each input's PI(D) holds: steering y, speed x."""
+STATES = {"race_car": [1, 0], "double_pendulum": [0, 1]}
+"""Machines with references of states, and the output that each input's PI(D) holds: steering y, speed x; torques the
+angles of their joints."""
 CONTROLLERS = ("hybrid", "prior", "linear", "pid")
 TUNED_ON = (1000, 1001)
 """Seeds of the loops that PI(D) are tuned on."""
@@ -79,34 +91,42 @@ FACTORS, TRIALS = (4.0, 1.0, 0.4, 0.15), 25
 """Factors on the gains that the search on the plant begins with, and its loops by number of unknowns."""
 
 
-def linear_model(model: hm.HybridModel) -> hm.HybridModel:
-    """The model linearized at its operating point, exactly as it steps; delayed inputs are hidden states as before."""
+def linear_model(model: hm.HybridModel, control: hm.OCP, rest: np.ndarray | None = None) -> hm.HybridModel:
+    """The model linearized at its operating point, exactly as it steps; delayed inputs are hidden states as before.
+
+    Where the control problem has a working point in motion, slopes are those there, and the state ``rest`` is the
+    equilibrium: at rest the slope of dry friction would pass for strong damping.
+    """
     x, h, u, w = (
         ca.MX.sym(k, n) for k, n in zip("xhuw", (model.n_x, model.n_h, model.n_u, model.n_w), strict=True)
     )
-    z0, moved, a, b, e = step_slopes(model)
-    y0, c, d = (m.full() for m in output_with_jacobian(model)(model.x0, model.u0, model.w))
+    z0, moved, a, b, e = step_slopes(model, control)
+    if control.working_point is not None:
+        moved = z0 = np.concatenate([rest, hidden_fixed_point(model, rest, model.u0)])
+    x0 = z0[: model.n_x]
+    y0, c, d = (m.full() for m in output_with_jacobian(model)(x0, model.u0, model.w))
     dz, du, dw = ca.vertcat(x, h) - z0, u - model.u0, w - model.w
     after = moved + a @ dz + b @ du + (e @ dw if model.n_w else 0)
     x_next, h_next = after[: model.n_x], after[model.n_x :]
     linear = hm.HybridModel.of(
         "linear", model.dt, model.states, model.inputs, model.outputs, x=x, h=h, u=u, w=w, x_next=x_next,
-        h_next=h_next, xdot=(x_next - x) / model.dt, y=y0 + c @ (x - model.x0) + d @ du,
+        h_next=h_next, xdot=(x_next - x) / model.dt, y=y0 + c @ (x - x0) + d @ du,
         disturbances=model.disturbances, nominal_x=model.nominal_x, nominal_u=model.nominal_u,
         nominal_w=model.nominal_w, disturbance_model=model.disturbance_model,
     )  # fmt: skip
     return replace(linear, delay_states=model.delay_states)
 
 
-def step_slopes(model: hm.HybridModel) -> tuple[np.ndarray, ...]:
-    """The operating point ``z = (x, h)``, one step from it, and its slopes by ``z``, input and disturbance."""
-    h0 = hidden_fixed_point(model, model.x0, model.u0)
+def step_slopes(model: hm.HybridModel, control: hm.OCP) -> tuple[np.ndarray, ...]:
+    """The working point ``z = (x, h)``, one step from it, and its slopes by ``z``, input and disturbance."""
+    x0 = model.x0 if control.working_point is None else control.working_point[0]
+    h0 = hidden_fixed_point(model, x0, model.u0)
     z, u, w = (
         ca.MX.sym(k, n) for k, n in zip("zuw", (model.n_x + model.n_h, model.n_u, model.n_w), strict=True)
     )
     after = ca.vertcat(*model.step(z[: model.n_x], z[model.n_x :], u, w, model.p))
     slopes = ca.Function("slopes", [z, u, w], [after, *(ca.jacobian(after, v) for v in (z, u, w))])
-    z0 = np.concatenate([model.x0, h0])
+    z0 = np.concatenate([x0, h0])
     return z0, *(m.full() for m in slopes(z0, model.u0, model.w))
 
 
@@ -126,9 +146,12 @@ def courses(scenario, model, task):
     t = model.dt * np.arange(round(task.duration / model.dt))
     goals = task.reference(t)
     w = np.tile(model.w, (len(t), 1)) if task.w is None else task.w(t)
-    forward = (
-        along_path(model, goals) if scenario.name in PATHS else held_inputs(scenario, model, task, goals, w)
-    )
+    if scenario.name == "race_car":
+        forward = along_path(model, goals)
+    elif scenario.name in STATES:  # no torque at the top
+        forward = np.tile(model.u0, (len(t), 1))
+    else:
+        forward = held_inputs(scenario, model, task, goals, w)
     names = [s.name for s in model.inputs]
     load = np.array([corrupt_input(task.faults, now, np.zeros(model.n_u), names) for now in t])
     return t, goals, forward, w, load
@@ -156,7 +179,7 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
     control, dt, m = task.control or scenario.control, model.dt, len(controlled)
     t, goals, forward, w, load = courses(scenario, model, task)
     # a period: the prior, its PI(D) and their cost
-    z0, _, a, b, _ = step_slopes(model)
+    z0, _, a, b, _ = step_slopes(model, control)
     z, held, memory, own = (
         ca.SX.sym(n, k) for n, k in (("z", len(z0)), ("u", model.n_u), ("m", 2 * m), ("g", 4 * m))
     )
@@ -182,9 +205,10 @@ def tuned_pid(scenario, model, controlled, task) -> list[tuple[float, ...]]:
     )
     course = period.mapaccum("course", len(t), 3)
     y0, c, _ = (v.full() for v in output_with_jacobian(model)(np.array(task.x0), model.u0, w[0]))
-    answer = np.linalg.lstsq(1.05 * np.eye(len(a)) - a, b, rcond=None)[0]
-    steady = np.diag(c[controlled] @ answer[: model.n_x])
     poles, modes = np.linalg.eig(a.T)
+    slow = 1.05 * max(1.0, np.abs(poles).max())  # of a machine that falls, faster than it does
+    answer = np.linalg.lstsq(slow * np.eye(len(a)) - a, b, rcond=None)[0]
+    steady = np.diag(c[controlled] @ answer[: model.n_x])
     moved = (
         np.linalg.norm(modes.T @ b, axis=1) > 1e-9
     )  # a room that comes back in a day is no time constant of these
@@ -256,7 +280,9 @@ def run_pid(scenario, model, gains, controlled, task, seed, course=None):
 
 
 def shown(plant, x, u):
-    """What the sensors would show without noise ``(n, n_y)``."""
+    """What the sensors would show without noise ``(n, n_y)``; in MuJoCo they show the states."""
+    if not hasattr(plant, "outputs"):
+        return x
     return np.array(
         [
             [float(v) for v in plant.outputs(list(plant.start(a)), list(b), [], plant)]
@@ -271,14 +297,15 @@ def cost_of(scenario, model, task, x, u) -> float:
     goals = task.reference(model.dt * np.arange(len(x)))
     du = np.diff(u, axis=0, prepend=np.clip(model.u0, control.u_min, control.u_max)[None])
     if not control.n_y:
-        return float(((x - goals) ** 2 @ control.q + du**2 @ control.r_delta).sum() * model.dt)
+        counts = 1.0 if task.weight is None else task.weight(model.dt * np.arange(len(x)))
+        return float(((counts * (x - goals) ** 2) @ control.q + du**2 @ control.r_delta).sum() * model.dt)
     error = shown(scenario.plant(), x, u) - goals
     return float((error**2 @ control.q_y + x**2 @ control.q + du**2 @ control.r_delta).sum() * model.dt)
 
 
 def controlled_of(scenario) -> list[int]:
     """Places of the outputs that are held, in the order of the inputs that hold them by PI(D)."""
-    return PATHS.get(scenario.name) or np.flatnonzero(scenario.control.q_y).tolist()
+    return STATES.get(scenario.name) or np.flatnonzero(scenario.control.q_y).tolist()
 
 
 @cache
@@ -292,12 +319,19 @@ def parts(name: str, runs: Path, controller: str, place: int):
     if controller == "pid":
         return scenario, prior, controlled, tuned_pid(scenario, prior, controlled, task)
     if controller == "linear":
-        model, control = linear_model(prior), task.control or scenario.control
+        control = task.control or scenario.control
+        model = linear_model(prior, control, task.reference(np.array([task.duration]))[0])
         noise = kit.noise("prior_observer")
-        made = hm.make_estimator(model, scenario, noise), hm.make_controller(model, model, control)
+        made = hm.make_estimator(model, scenario, noise, control), hm.make_controller(model, model, control)
+        return scenario, model, controlled, made
+    if controller == "slippery":
+        control, noise = task.control or scenario.control, kit.noise("prior_observer")
+        values = [replace(p, value=0.0) if p.name.startswith("F_") else p for p in prior.parameters]
+        model = replace(prior, parameters=tuple(values))
+        made = hm.make_estimator(model, scenario, noise, control), hm.make_controller(model, model, control)
         return scenario, model, controlled, made
     planned = "prior" if controller == "blind" else controller
-    made = kit.observer(planned), kit.controller(planned, task=task.name)
+    made = kit.observer(planned, task=task.name), kit.controller(planned, task=task.name)
     return scenario, kit.models[planned], controlled, made
 
 
@@ -317,22 +351,25 @@ class Unseen:
         return self.plant.step(state, u, dt, self.w(np.array([state.t]))[0])
 
 
-def controllers_of(task: hm.Task) -> tuple[str, ...]:
-    """Those of all tasks, and without measurement where there is one."""
-    return CONTROLLERS if task.w is None else (*CONTROLLERS, "blind")
+def controllers_of(name: str, task: hm.Task) -> tuple[str, ...]:
+    """Those of all tasks, and without measurement where there is one; no PI(D) where the way is free (a swing-up)."""
+    found = CONTROLLERS[:-1] if task.weight is not None else CONTROLLERS
+    found += () if task.w is None else ("blind",)
+    return (*found, "slippery") if name == "double_pendulum" else found
 
 
 def loop(name: str, runs: Path, controller: str, place: int, seed: int) -> dict:
     """Cost, rest and largest use of limits of one loop."""
     scenario, model, controlled, made = parts(name, runs, controller, place)
-    task, plant, control = scenario.tasks[place], scenario.plant(), scenario.control
+    task, plant = scenario.tasks[place], scenario.plant()
+    control = task.control or scenario.control
     if controller == "pid":
         x, u = run_pid(scenario, model, made, controlled, task, seed)
     else:
         blind = controller == "blind"
         result = hm.simulate(
             Unseen(plant, task.w) if blind else plant, *made, task.reference, dt=model.dt, duration=task.duration,
-            x0=task.x0, seed=seed, w=None if blind else task.w, faults=task.faults,
+            x0=task.x0, seed=seed, w=None if blind else task.w, faults=task.faults, weight=task.weight,
         )  # fmt: skip
         x, u = result.x, result.u
     error = shown(plant, x, u) - task.reference(model.dt * np.arange(len(x)))[:, : model.n_y]
@@ -390,14 +427,14 @@ def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
     """Ratios of cost, offsets, and how the hybrid rests against its prior, of one task."""
     own = {
         c: [r for r in cells if (r["machine"], r["task"], r["controller"]) == (name, task.name, c)]
-        for c in controllers_of(task)
+        for c in controllers_of(name, task)
     }
     costs = {c: np.log([r["cost"] for r in found]) for c, found in own.items()}
     row = {"machine": name, "task": task.name}
-    row |= {f"hybrid / {c}": interval(costs["hybrid"] - costs[c]) for c in CONTROLLERS[1:]}
-    row |= {f"prior / {c}": interval(costs["prior"] - costs[c]) for c in controllers_of(task)[2:]}
+    row |= {f"hybrid / {c}": interval(costs["hybrid"] - costs[c]) for c in CONTROLLERS[1:] if c in own}
+    row |= {f"prior / {c}": interval(costs["prior"] - costs[c]) for c in controllers_of(name, task)[2:]}
     row["cost, prior"] = f"{np.exp(costs['prior'].mean()):.4g}"
-    if task.faults:
+    if any(math.isinf(fault.end) for fault in task.faults):
         bound = allowed(name, runs)
         share = {c: np.max(np.abs([r["offset"] for r in found]) / bound) for c, found in own.items()}
         row |= {f"offset, {c}": f"{share[c]:.2f}" for c in own}
@@ -435,7 +472,7 @@ def main() -> None:
         jobs = [
             pool.submit(loop, name, given.runs, controller, place, seed)
             for name, place, task in tasks
-            for controller in controllers_of(task)
+            for controller in controllers_of(name, task)
             for seed in range(given.seeds)
         ]
         cells = [job.result() for job in jobs]

@@ -245,6 +245,9 @@ def _home(module: ModuleType) -> Path:
 
 def _collect(module: ModuleType, home: Path, found: dict[str, str]) -> None:
     path = Path(str(module.__file__)).resolve()
+    if path.suffix != ".py":  # compiled: its bytes are its code
+        found[module.__name__] = hashlib.sha256(path.read_bytes()).hexdigest()
+        return
     tree = ast.parse(path.read_text(encoding="utf-8"))
     found[module.__name__] = _code(tree)
     for name in _imported(tree):
@@ -253,7 +256,7 @@ def _collect(module: ModuleType, home: Path, found: dict[str, str]) -> None:
             continue
         other = sys.modules.get(name)
         where = getattr(other, "__file__", None)
-        if other is None or not where or "site-packages" in where:
+        if other is None or not where or "site-packages" in where or "dist-packages" in where:
             continue
         _collect(other, home, found)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +62,7 @@ def run_tuning(
     """
     check_numbers(trials, settings.seed, timeout)
     context = Context(settings, load_scenario(settings.scenario), out, progress or Progress())
-    check_scenario(context.scenario, context.budget)
+    check_scenario(replace(context.scenario, plant=None), context.budget)  # no loop is closed here
     check_data(context)
     with open_folder(out, JobNote("run", settings.identity()), resume=resume):
         for stage in (DATA, PRIOR):

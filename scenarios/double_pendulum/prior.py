@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from hybrid_mpc import MechanicalPrior, Parameter, Signal
+from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Signal
 
 GRAVITY = 9.81
 LINK_1 = 0.2
@@ -52,6 +52,7 @@ class DoublePendulumPrior(MechanicalPrior):
         Parameter("F_1", 0.2, "N m", 0.0, 0.4, "dry friction of the first joint"),
         Parameter("F_2", 0.15, "N m", 0.0, 0.4, "of the second joint"),
     )
+    operating_point: ClassVar[OperatingPoint] = OperatingPoint(x=(0.0, 0.0, 0.0, 0.0), u=(0.0, 0.0))
 
     def mass_matrix(self, q: Any, p: Any) -> Any:
         """Inertias of links and rotors [kg m^2]."""

@@ -7,6 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -312,6 +313,13 @@ def test_source_is_code_without_words(tmp_path):
     assert made(title="b", extra="# a remark") == same
     assert made(g=1.62) != same
     assert made(extra="G = 1") != same
+    (tmp_path / "inside.so").write_bytes(b"\xf7\x00")  # a compiled module counts by its bytes
+    compiled = sys.modules["inside"] = ModuleType("inside")
+    compiled.__file__ = str(tmp_path / "inside.so")
+    before = made(extra="import inside")
+    (tmp_path / "inside.so").write_bytes(b"\xf7\x01")
+    assert before != made(extra="import inside") != same
+    sys.modules.pop("inside")
     sys.modules.pop("falling")
     assert source_of(None) is None
 

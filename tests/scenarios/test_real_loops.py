@@ -15,6 +15,8 @@ from hybrid_mpc.model.delay import with_input_delay
 from scenarios.cascaded_tanks import REST as TANKS_REST
 from scenarios.cascaded_tanks import scenario as tanks
 from scenarios.cascaded_tanks.plant import CascadedTanksPlant
+from scenarios.coupled_drives import scenario as drives
+from scenarios.coupled_drives.plant import CoupledDrivesPlant
 from scenarios.heat_exchanger import scenario as exchanger
 from scenarios.heat_exchanger.plant import HeatExchangerPlant
 from scenarios.heat_exchanger.tasks import DAY, saw_tooth
@@ -30,16 +32,19 @@ FITTED = {
     "cascaded_tanks": {"k_1": 0.0417, "k_2": 0.0389, "k_p": 0.0365, "edge_1": 9.4, "edge_2": 10.45, "share": 1.0,
                        "bend": 0.0571},
     "heat_exchanger": {"k": 0.626, "slope": 4.71, "middle": 0.95, "tau": 36.9},
+    "coupled_drives": {"gain": 0.331, "lag": 0.197, "w": 24.8, "zeta": 0.049, "zeta_v": 0.490, "F": 0.082, "bend": 4.9,
+                       "window": 0.027},
     "race_car": {"k": 0.879, "offset": -0.0129, "tau_v": 0.235, "tau_s": 0.141, "a": 0.134, "psi_0": -0.0131},
 }  # fmt: skip
 SIGMA_X = {
     "temperature_lab": (0.5, 0.5, 0.03, 0.03, 1e-6),
     "cascaded_tanks": (0.05, 0.04),
     "heat_exchanger": (0.02, exchanger.state_noise["cold"]),
+    "coupled_drives": (0.008, *drives.state_noise.values()),
     "race_car": (1e-3, 1e-3, 1e-3, 1e-2, 1e-2),
 }
 """Process noise a period, of the size of the models' one-period errors on the recordings."""
-SCENARIOS = {s.name: s for s in (lab, tanks, exchanger, car)}
+SCENARIOS = {s.name: s for s in (lab, tanks, exchanger, car, drives)}
 
 
 def rates(plant, z, u, w=()):
@@ -128,6 +133,29 @@ def test_the_reservoir_is_a_saw_tooth():
     assert w == pytest.approx([75.5, 78.2, 76.85, 75.5, 76.85])
 
 
+def test_the_belt_holds_the_drives_back_and_stiffens():
+    plant = CoupledDrivesPlant()
+    z = plant.start(np.array([0.4, 0.4, 0.0, 1.0]))
+    jump = rates(plant, z, (2.0,)) - rates(plant, z, (1.0,))
+    assert np.flatnonzero(jump).tolist() == [4]  # the amplifier lags
+    pulled = z.copy()
+    pulled[2] = plant.stiff
+    change = rates(plant, pulled, (1.0,)) - rates(plant, z, (1.0,))
+    assert change[0] == pytest.approx(-plant.share * plant.stiff)  # the prior's drives do not feel the belt
+    z[1] = pulled[1] = 0.3
+    assert rates(plant, pulled, (1.0,))[2] == pytest.approx(2 * rates(plant, z, (1.0,))[2])
+
+
+def test_the_simulated_counter_does_not_see_the_sign_and_has_steps():
+    plant = CoupledDrivesPlant()
+    forth, back = (rates(plant, plant.start(np.array([s, s, 0.0, 0.0])), (0.0,))[3] for s in (0.4, -0.4))
+    assert forth == back == pytest.approx(plant.scale * 0.4**plant.power / plant.window)
+    y = plant.measure(plant.reset(np.array([0.3, 0.3, 0.0, 0.7123]), 0), np.random.default_rng(0))
+    assert y / 0.005 == pytest.approx(np.round(y / 0.005), abs=1e-9)
+    x = np.array([0.3, 0.2, 1.0, 0.5])
+    np.testing.assert_allclose(plant.shown(plant.start(x)), x)
+
+
 @pytest.mark.parametrize("speed", [0.3, 1.5])
 def test_the_car_rolls_when_slow_and_slips_when_fast(speed):
     """Slip of the rear axle in a steady turn: sideways acceleration over stiffness and gravity, 0.1 and 2.5 degrees."""
@@ -163,6 +191,7 @@ HELD = [
     ("temperature_lab", "weak_heater", 200),
     ("cascaded_tanks", "weak_pump", 400),
     ("heat_exchanger", "weak_valve", 375),
+    ("coupled_drives", "weak_drive", 500),
 ]
 
 
@@ -227,7 +256,7 @@ def test_the_benchmarks_linear_model_is_the_tangent_of_a_delayed_one(monkeypatch
     """At the operating point both step alike, delayed input and all; beside it they part by the curvature alone."""
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
     model = fitted_model("heat_exchanger")
-    linear = import_module("simulated_machines").linear_model(model)
+    linear = import_module("simulated_machines").linear_model(model, exchanger.control)
     assert (linear.n_h, linear.delay_states) == (1, 1)
 
     def apart(size):

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,8 @@ def xdot(prior, x, u, w=()):
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_scenarios_pass_the_pre_flight(scenario):
-    check_scenario(scenario)
+    here = scenario is not double_pendulum or find_spec("mujoco") is not None
+    check_scenario(scenario if here else replace(scenario, plant=None))
     # every sub-step costs a training its time
     assert required_substeps(scenario.prior(), scenario.data.dt) <= 6
 

@@ -367,8 +367,8 @@ def _analysis(context: Context) -> Any:
     friction = ", where the slope of dry friction dominates" if prior.kinematics else ""
     titles = {"rest": f"at rest{friction}", "moving": "at working speed"}
     for point in ("rest", "moving"):
-        if point not in found.models["prior"].points:
-            continue
+        if any(point not in found.models[n].points for n in poles):
+            continue  # a network that corrects every rate leaves no speed that is one
         for (i, output), (j, into) in product(enumerate(prior.outputs), enumerate(prior.inputs)):
             responses = {
                 n: (

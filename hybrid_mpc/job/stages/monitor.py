@@ -44,8 +44,8 @@ LOAD_SHARE = 0.2
 MARGIN = 1.5
 """Where nominal data are too short for a rate: threshold over the highest nominal level."""
 NO_ENERGY = (
-    "the energy of {scenario} cannot be watched: its model is not mechanical, with its positions measured; its "
-    "residuals are watched instead (stage residuals)"
+    "the energy of {scenario} cannot be watched: its model is not mechanical, or other outputs than its positions are "
+    "measured; its residuals are watched instead (stage residuals)"
 )
 
 
