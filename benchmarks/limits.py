@@ -53,6 +53,7 @@ class Case:
         x0: State in which the machine rests at first.
         duration: [s].
         drawn: Set-points over time, ``(generator, t) -> (n, n_x or n_y)``.
+        task: Task of the scenario whose control problem and weights it has. Default: the common problem.
     """
 
     machine: str
@@ -63,6 +64,7 @@ class Case:
     x0: tuple[float, ...]
     duration: float
     drawn: Callable[[np.random.Generator, np.ndarray], np.ndarray]
+    task: str = ""
 
 
 def levels(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
@@ -85,19 +87,27 @@ def swings(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
     return np.column_stack([fade * angle, slope * angle + fade * size * rate * np.cos(rate * t)])
 
 
+def upright(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
+    """At rest at the top, turned one way or the other: a swing-up."""
+    return np.tile([rng.choice([-1.0, 1.0]) * math.pi, 0.0, 0.0, 0.0], (len(t), 1))
+
+
 INF = math.inf
 CASES = {
     "cascaded_tanks": Case("cascaded_tanks", "x", (-INF, -INF), (8.0, INF), (8.0, 1.0), (4.0, 4.0), 1200.0, levels),
     "temperature_lab": Case("temperature_lab", "y", (-INF, -INF), (60.0, INF), (36.0, 1.0),
                             (43.5, 36.0, 43.5, 36.0, 24.0), 1000.0, temperatures),
     "golf_robot": Case("golf_robot", "x", (-0.5, -INF), (0.5, INF), (0.5, 1.0), (0.0, 0.0), 6.0, swings),
+    "double_pendulum": Case("double_pendulum", "x", (-INF, -INF, -8.0, -INF), (INF, INF, 8.0, INF),
+                            (1.0, 1.0, 8.0, 1.0), (0.0,) * 4, 3.0, upright, "pendubot_swing_up"),
 }  # fmt: skip
-"""The tanks' upper level below 8 V, the first temperature at most 60 degC, the golf robot within 0.5 rad."""
+"""The tanks' upper level below 8 V, the first temperature at most 60 degC, the golf robot within 0.5 rad, the first
+joint of a pendubot that swings up below 8 rad/s, with 5 N m at most."""
 
 
 def problem_of(kit: hm.Kit, case: Case, kind: str) -> hm.OCP:
     """The scenario's control problem with the case's limit alone, hard or soft."""
-    free = kit.problem()
+    free = kit.problem(case.task)
     n_x, n_y = free.n_x, len(kit.sensor_sigma)
     bare = free.changed(x_min=[-INF] * n_x, x_max=[INF] * n_x, slack_linear=None, slack_quadratic=None)
     if bare.y_min.size:
@@ -116,7 +126,7 @@ def parts(runs: Path, machine: str, kind: str):
     model, prior = kit.models[kit.recommended], kit.models["prior"]
     ocp = problem_of(kit, case, kind)
     made = hm.make_controller(model, prior, ocp, safe_input=kit.safe_input)
-    return scenario, model, kit.observer(), made, ocp
+    return scenario, model, kit.observer(task=case.task), made, ocp
 
 
 def excess(case: Case, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -138,6 +148,7 @@ def loop(runs: Path, machine: str, kind: str, seed: int, also: Callable[[Step], 
     t = model.dt * np.arange(round(case.duration / model.dt) + ocp.horizon + 1)
     goals = case.drawn(np.random.default_rng(seed), t)
     planned = [0.0]
+    weight = next((task.weight for task in scenario.tasks if task.name == case.task), None)
 
     def watch(step: Step) -> None:
         if also is not None:
@@ -154,7 +165,7 @@ def loop(runs: Path, machine: str, kind: str, seed: int, also: Callable[[Step], 
 
     result = hm.simulate(
         plant, observer, controller, _held(goals, model.dt),
-        dt=model.dt, duration=case.duration, x0=case.x0, seed=seed, stage_cost=ocp, on_step=watch,
+        dt=model.dt, duration=case.duration, x0=case.x0, seed=seed, stage_cost=ocp, on_step=watch, weight=weight,
     )  # fmt: skip
     beyond = excess(case, result.x, outputs_of(plant, result.x, result.u))
     over = np.maximum(result.u - ocp.u_max, ocp.u_min - result.u).max()
