@@ -158,8 +158,10 @@ def linearize_secant(
 
     The columns of A by the velocities are chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or
     the mean over a sinusoid of that amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb
-    friction). All other columns are the tangents. The point stays a point of rest, so poles, loops and margins of it
-    mean something.
+    friction). All other columns are the tangents of the step at rest. The point stays a point of rest, so poles, loops
+    and margins of it mean something. Where friction at rest brakes within less than a period (:func:`friction_slopes`:
+    tangent times dt above 1) these other columns are braked with it, and stiffness comes out too small: take
+    :func:`linearize_at_speed` there.
 
     Args:
         model: The model, state ``[q, v]``.
