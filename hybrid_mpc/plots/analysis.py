@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.plots.style import (
+    COLOURS,
     FAINT,
     INK,
     MUTED,
@@ -156,8 +157,8 @@ def bode(
     """Frequency responses of the linearized models from one input to one output: magnitude and phase.
 
     Args:
-        responses: By model: angular frequencies ``(n,)`` [rad/s], magnitude ``(n,)`` [output unit / input
-            unit], phase ``(n,)`` [rad].
+        responses: By model, or by names of your own: angular frequencies ``(n,)`` [rad/s], magnitude ``(n,)`` [output
+            unit / input unit], phase ``(n,)`` [rad].
         input_signal: The input.
         output_signal: The output.
         nyquist: Highest meaningful frequency ``pi / dt`` [rad/s]; drawn as a line. Default: none.
@@ -177,9 +178,12 @@ def bode(
     figure, axes = new_figure(2, 1, sharex=True, size=(9, 5.4))
     magnitude_ax, phase_ax = axes[:, 0]
     lowest, phases = np.inf, []
+    unknown = [name for name in responses if name.partition(",")[0] not in COLOURS]
     for model, (omega, magnitude, phase) in responses.items():
         omega = np.asarray(omega, dtype=float)
         line = line_style(model) | {"linewidth": 1.7}
+        if model in unknown and len(unknown) > 1:
+            line["color"] = _COLOURS[unknown.index(model) % len(_COLOURS)]
         size = checked(f"magnitude of {model}", magnitude, len(omega))
         angle = np.degrees(checked(f"phase of {model}", phase, len(omega)))
         # at the Nyquist frequency itself a sampled response is real: its size may vanish, its phase jump

@@ -254,6 +254,13 @@ def test_a_bode_plot_is_not_squeezed_by_the_nyquist_frequency():
     assert np.all(np.diff(figure.axes[1].get_yticks()) == 90)
 
 
+def test_responses_of_names_of_your_own_can_be_told_apart():
+    response = np.array([1.0, 2.0]), np.ones(2), np.zeros(2)
+    figure = analysis.bode({"power1": response, "power2": response}, input_signal=U, output_signal=Y)
+    one, other = drawn(figure.axes[0]).values()
+    assert one.get_color() != other.get_color()
+
+
 def test_loops_that_differ_in_their_filter_share_a_colour():
     one = {"omega": np.array([1.0, 2.0]), "S": np.ones(2, complex), "T": np.zeros(2, complex)}
     names = [f"{loop}, {mode}" for loop in ("a on a", "b on a") for mode in ("quiet", "jump")]
