@@ -158,10 +158,9 @@ def linearize_secant(
 
     The columns of A by the velocities are chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or
     the mean over a sinusoid of that amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb
-    friction). All other columns are the tangents of the step at rest. The point stays a point of rest, so poles, loops
-    and margins of it mean something. Where friction at rest brakes within less than a period (:func:`friction_slopes`:
-    tangent times dt above 1) these other columns are braked with it, and stiffness comes out too small: take
-    :func:`linearize_at_speed` there.
+    friction). All other columns are means of the tangents over the same motion, of all axes in phase: friction at rest
+    that brakes within less than a period would brake what positions and inputs do, too. The point stays a point of
+    rest, so poles, loops and margins of it mean something.
 
     Args:
         model: The model, state ``[q, v]``.
@@ -182,7 +181,10 @@ def linearize_secant(
     if kind not in ("secant", "harmonic"):
         raise InputError(f"secant: kind must be 'secant' or 'harmonic', got {kind!r}")
     x0, u0, h0 = operating_point(model, x, u, h)
-    a, *others = (m.full() for m in jacobians(model)(x0, h0, u0))
+    in_phase = np.concatenate([np.zeros(n_q), size])
+    around = [x0 + share * in_phase for share in _shares(kind)]
+    points = [jacobians(model)(x, h0, u0) for x in (*around, *(2 * x0 - x for x in around))]
+    a, *others = (np.mean([m.full() for m in column], axis=0) for column in zip(*points, strict=True))
     for j, v in enumerate(size):
         e = np.eye(model.n_x)[n_q + j]
 
@@ -263,11 +265,17 @@ def _positive(speed: ArrayLike, n: int) -> Array:
     return size
 
 
+def _shares(kind: Kind) -> Array:
+    """Shares of the largest speed at which a motion is looked at, of half a period; the other mirrors it."""
+    if kind == "secant":
+        return np.ones(1)
+    return np.asarray(np.cos((np.arange(ANGLES // 2) + 0.5) * (2 * np.pi / ANGLES)))
+
+
 def _chord(f: Any, v: float, kind: Kind) -> Any:
     if kind == "secant":
         return (f(v) - f(-v)) / (2 * v)
-    theta = (np.arange(ANGLES // 2) + 0.5) * (2 * np.pi / ANGLES)  # half the period; the other mirrors it
-    points = v * np.cos(theta)
+    points = v * _shares(kind)
     return sum(f(p) * p for p in points) / float(np.sum(points**2))
 
 

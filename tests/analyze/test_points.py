@@ -190,6 +190,16 @@ def test_secant_frees_the_pendulum_of_the_friction_at_rest():
     assert 0.2 < damped[1] < 0.4
 
 
+@pytest.mark.parametrize("kind", ["secant", "harmonic"])
+def test_friction_that_stops_within_a_period_brakes_neither_stiffness_nor_inputs(kind):
+    """At rest it brakes within a quarter of a period; in motion it is a constant force."""
+    free = linearize(pendulum_model(friction=0.0), [0.0, 0.0], [0.0])
+    stiff = linearize_secant(pendulum_model(slope=500.0), [0.0, 0.0], [0.0], [1.0], kind=kind)
+    # the sinusoid is slower than 2 / slope for 0.3 % of its time, and there the step's tangent may be anything
+    for given, wanted in ((stiff.B, free.B), (stiff.A[:, :1], free.A[:, :1])):
+        np.testing.assert_allclose(given, wanted, rtol=0.02, atol=1e-4)
+
+
 def test_schedule_is_python_control_s_lqr_at_each_point():
     model, q, r = pendulum_model(3), [10.0, 1.0], [0.5]
     points = [(np.array([a, 0.0]), holding_input(model, [a])) for a in (-0.6, 0.0, 0.9)]
