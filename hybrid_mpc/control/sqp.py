@@ -436,7 +436,8 @@ class SQPController(Controller):
         u = self._admissible(previous.following, case)
         run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
         active, lifted = self._cost.inner.qp.later(previous.active), 0
-        if not np.isfinite(previous.cost) and case.target.ok:  # a first plan, far from any that is good
+        # a first plan, far from any that is good; who asks for few iterations improves the guess that was given
+        if not np.isfinite(previous.cost) and case.target.ok and self._iterations > LIFTED:
             given = estimate, reference, weight, limits, w
             run, active, lifted = self._lifted(previous, run, case, given)
         at = self._cost.at(run, case)
@@ -460,7 +461,7 @@ class SQPController(Controller):
         inner, (estimate, reference, weight, limits, w) = self._cost.inner, given
         best, active, count = run, None, 0
         prepared = inner.prepare(previous, weight)
-        while count < min(LIFTED, self._iterations - 1):
+        while count < LIFTED:
             count += 1
             plan = inner.feedback(prepared, estimate, reference, limits, w)
             if not plan.status.ok:
