@@ -106,7 +106,7 @@ class SafeController:
                 f"first: (n_x, n_h, n_u, N) = {sizes[0]}, the controller has {sizes[1]}; "
                 "give both the same model and problem"
             )
-        self._fallback = None
+        self._rest_input = None
         if fallback is not None:
             if (fallback.n_x, fallback.n_u) != (ocp.n_x, ocp.n_u):
                 raise InputError(
@@ -116,8 +116,8 @@ class SafeController:
             gain = dare(*ocp.linear_quadratic(fallback))[1]
             self._gain = gain[:, : ocp.n_x]
             self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
-            self._fallback = _equilibrium_input(fallback, ocp.q)
-            self._fallback(fallback.x0, fallback.w)  # a CasADi function's first call is slow
+            self._rest_input = _equilibrium_input(fallback, ocp.q)
+            self._rest_input(fallback.x0, fallback.w)  # a CasADi function's first call is slow
 
     def initial(
         self,
@@ -206,7 +206,7 @@ class SafeController:
     ) -> tuple[Array, Source]:
         if age <= self.max_age and np.all(np.isfinite(failed.u[0])):
             return failed.u[0], Source.PLAN
-        if self._fallback is not None and estimate.finite:
+        if self._rest_input is not None and estimate.finite:
             goal, best = self._goal(estimate, reference, failed)
             u = best - self._gain @ (estimate.x - goal)
             if self._late.size:  # what is under way to the machine already
@@ -220,13 +220,13 @@ class SafeController:
     def _goal(self, estimate: Estimate, reference: Array, failed: Solution) -> tuple[Array, Array]:
         """State and input ``(n_x,)``, ``(n_u,)`` that the fallback holds: the reference's, else the operating point."""
         problem, m = self.controller.problem, self.controller.model
-        assert self._fallback is not None
+        assert self._rest_input is not None
         target = problem.target(np.asarray(reference, dtype=float)[:1], None, estimate, None, failed.steady)
         goal = target.x[0]
         if problem.targets is not None and np.all(np.isfinite(goal)):
             return goal, target.u[0]
         goal = goal if np.all(np.isfinite(goal)) else m.x0
-        best = self._fallback(goal, target.w[0]).full().ravel()
+        best = self._rest_input(goal, target.w[0]).full().ravel()
         return goal, best - m.disturbed[0] @ estimate.d
 
 
