@@ -55,11 +55,8 @@ def refused_monitor(monitor: object, model: HybridModel) -> list[str]:
     found = []
     if not _alike(monitor.model, model):
         found.append(f"a monitor of another model ({monitor.model.name}) than the one that plans")
-    if isinstance(monitor, EnergyMonitor):
-        if monitor.layout.history:
-            found.append("a monitor that keeps a history for a diagnosis (diagnose=True)")
-        if monitor.detector is not None and monitor.layout.length and not monitor.detector.energy:
-            found.append("a detector without the energy of free runs in a monitor that has them")
+    if isinstance(monitor, EnergyMonitor) and monitor.layout.history:
+        found.append("a monitor that keeps a history for a diagnosis (diagnose=True)")
     return found
 
 

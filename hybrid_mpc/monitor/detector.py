@@ -111,11 +111,13 @@ class Detector:
         return SHORTEST_S * self.time_unit
 
     def check(self, n_q: int, free_runs: bool, dt: float, time_unit: float) -> None:
-        """Refuse a monitor of other forces, without free runs, or of another period or unit of time."""
+        """Refuse a monitor of other forces, with free runs where none were learned or without, of another period."""
         if len(self.force) != n_q:
             raise InputError(f"detector: learned for {len(self.force)} forces, the model has {n_q}")
         if self.energy and not free_runs:
             raise InputError("detector: it reads free runs, the monitor has none; give free_run=0.8 [s], say")
+        if free_runs and not self.energy:
+            raise InputError("detector: it was learned without free runs, the monitor has some; leave free_run out")
         if abs(dt - self.dt) > 1e-9 * self.dt:
             raise InputError(
                 f"detector: learned at a period of {self.dt} s, the model's is {dt} s; learn it anew"

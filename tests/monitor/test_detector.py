@@ -139,6 +139,8 @@ def test_bad_input_is_refused(learned):
         EnergyMonitor(pendulum(), **WINDOW, detector=replace(detector, dt=0.01))
     with pytest.raises(InputError, match=r"free_run=0\.8"):
         EnergyMonitor(pendulum(), window=11, average=5, detector=detector)
+    with pytest.raises(InputError, match="leave free_run out"):
+        EnergyMonitor(pendulum(), **WINDOW, detector=replace(detector, energy=(), energy_threshold=np.inf))
     with pytest.raises(InputError, match="scales need 4"):
         Detector(0.02, ((1.0, 0.0),), (), 0.5, 4.0)
     with pytest.raises(InputError, match=r"no field 'drfit'; did you mean 'drift'"):
