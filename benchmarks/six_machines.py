@@ -5,6 +5,9 @@
 ``DATA`` is the folder of the recordings, one folder a machine. The last quarter of a recording, or the named whole
 recordings, enter neither fit nor choice. Runs follow each other without overlap; each starts from the scenario's
 warm-up alone. Root mean squares over all runs, one number an output, and the median over the runs.
+
+``fitted to these`` is the prior fitted to the very recordings that it is judged by: about the floor of its equation
+there. What lies above it is in the parameters, what is left in the equation, the unmeasured and the noise.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -92,13 +96,14 @@ def judge(name: str, data: Path, folder: Path) -> None:
         files = [first for first, _ in parts]
         tests = {f"last quarter of {last.stem.removesuffix('_last')}": [last] for _, last in parts} | tests
     known = read_training(scenario, files)
-    fit = fit_prior(
-        scenario.prior, known.train, known.valid, dt=dt,
-        length=spec.length or spec.piece, largest_delay=scenario.data.largest_delay,
+    fitted = partial(
+        fit_prior, scenario.prior, dt=dt, length=spec.length or spec.piece,
+        largest_delay=scenario.data.largest_delay,
     )  # fmt: skip
+    fit = fitted(known.train, known.valid)
     print(f"\n{name}\n{fit.table(scenario.prior().parameters)[['nominal', 'fitted', 'standard_error']]}")
     print(f"delay {fit.delay:.3g} s; {'; '.join(fit.identifiability) or 'all told apart'}")
-    prior, warm_up = scenario.prior(fit.values), scenario.data.warm_up
+    warm_up = scenario.data.warm_up
     warm = max(4, round(warm_up / dt))
     linear = {}
     for key, method in (("ARX", fit_arx), ("N4SID", fit_subspace)):
@@ -109,11 +114,16 @@ def judge(name: str, data: Path, folder: Path) -> None:
     judged = {"validation": list(known.valid)}
     judged |= {key: [t for path in paths for t in read_test(scenario, path)] for key, paths in tests.items()}
     for key, trajectories in judged.items():
+        fits = {"prior": fit}
+        if key in tests:
+            fits["fitted to these"] = fitted(trajectories, trajectories)
         for length in split.lengths:
             n = warm + round((fit.delay + (length or 0.0)) / dt) + 2
             pieces = trajectories if length is None else in_runs(trajectories, n)
-            runs = run_freely(prior, fit, {}, pieces, warm_up=warm_up, length=length)
-            rows = {"prior": [run.y_hat["phy"] - run.y for run in runs]}
+            rows = {}
+            for label, own in fits.items():
+                runs = run_freely(scenario.prior(own.values), own, {}, pieces, warm_up=warm_up, length=length)
+                rows[label] = [run.y_hat["phy"] - run.y for run in runs]
             for label, model in linear.items():
                 ahead = model.free_runs(pieces, warm)
                 rows[label] = [y - p.y[warm:] for y, p in zip(ahead, pieces, strict=True)]

@@ -38,6 +38,10 @@ STILL = 1e-6
 """Largest lack of a steady state, in the states' scales, that is rounding."""
 NEAR = 1e-5
 """Largest step, in scales of the unknowns, that rounding may keep from helping."""
+FLAT = 0.01
+"""Share of the outputs' slopes at the operating point below which they do not answer to the inputs as they do there: a
+speed whose size alone is measured, at a standstill and beyond; the top of a curve. A descent does not leave such a
+point."""
 LEAST_SHARE = 1e-3
 """Smallest share of a step that is tried."""
 
@@ -95,8 +99,9 @@ class Targets:
     left out.
 
     It is Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. It begins
-    where it is told to, then at the operating point, then beside it. No method changes the object's answers; not for
-    several threads at once.
+    where it is told to, then at the operating point, then beside it; at the operating point, too, where it misses a
+    set-point because outputs do not answer to the inputs where it was told to begin (``FLAT``). No method changes the
+    object's answers; not for several threads at once.
 
     Args:
         model: The model, with its disturbance model.
@@ -174,7 +179,10 @@ class Targets:
         for bounded in (True, False):
             beside = None if wide and bounded else int(wide or given is None)
             for first in self._firsts(given, beside):
-                found = self._descend(first, goal, d, w, bounded)
+                found, off, slopes = self._descend(first, goal, d, w, bounded)
+                if found.steady and not found.reached and np.vdot(slopes, self.slopes) < self.flat:
+                    other, nearer, _ = self._descend(self.beside[0], goal, d, w, bounded)
+                    found = other if other.steady and nearer < off else found
                 if found.steady:
                     return found
                 best = best or found
@@ -189,6 +197,18 @@ class Targets:
             yield from self.beside[:most]
 
     @cached_property
+    def slopes(self) -> Array:
+        """How the weighed outputs answer to the inputs ``(n, n_u)`` along steady states, at the operating point."""
+        m = self.model
+        at = self._point(self.beside[0], np.zeros(m.n_y), np.zeros(m.n_d), m.w)
+        return self._newton(at, at.y, False)[1]
+
+    @cached_property
+    def flat(self) -> float:
+        """Product with :attr:`slopes` of slopes that count as none."""
+        return FLAT * float(np.vdot(self.slopes, self.slopes))
+
+    @cached_property
     def beside(self) -> list[Array]:
         """The operating point, and points with one input more or less; hidden states, which may take a thousand steps
         to settle, at rest there.
@@ -200,13 +220,19 @@ class Targets:
         return [np.concatenate([m.x0, hidden_fixed_point(m, m.x0, u), u]) for u in inputs]
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
-    def _descend(self, v: Array, goal: Array, d: Array, w: Array, bounded: bool) -> Steady:
-        """Gauss-Newton from ``v = (x, h, u)``; ``bounded``: within the bounds of states and outputs."""
+    def _descend(
+        self, v: Array, goal: Array, d: Array, w: Array, bounded: bool
+    ) -> tuple[Steady, float, Array]:
+        """Gauss-Newton from ``v = (x, h, u)``; ``bounded``: within the bounds of states and outputs.
+
+        Returns:
+            The answer, its largest deviation, and :attr:`slopes` there.
+        """
         n_x, n_z = self.model.n_x, self._n_z
         at, done = self._point(v, goal, d, w), False
         lacks = [at.lacks]
         for _ in range(ITERATIONS):
-            step = self._newton(at, goal, bounded)
+            step, slopes = self._newton(at, goal, bounded)
             if step is None or not np.all(np.isfinite(step)):
                 break
             size = float(np.max(np.abs(step / self.scale)))
@@ -225,17 +251,17 @@ class Targets:
             lacks.append(at.lacks)
             if len(lacks) > WITHIN and at.lacks > max(STALLED * lacks[-1 - WITHIN], STILL):
                 break
-        off = np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0)
+        off = float(np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0))
         u = np.clip(at.v[n_z:], self._ocp.u_min, self._ocp.u_max)
-        return Steady(at.v[:n_x], at.v[n_x:n_z], u, at.y, bool(done and off <= REACHED), done)
+        return Steady(at.v[:n_x], at.v[n_x:n_z], u, at.y, done and off <= REACHED, done), off, slopes
 
-    def _newton(self, at: _Point, goal: Array, bounded: bool) -> Array | None:
-        """The step that the linearization asks for; None where its QP has no answer."""
+    def _newton(self, at: _Point, goal: Array, bounded: bool) -> tuple[Array | None, Array]:
+        """The step that the linearization asks for, None where its QP has no answer; and :attr:`slopes` there."""
         m, scale, v, y, rest = self.model, self.scale, at.v, at.y, at.rest
         n_z, n_x = self._n_z, m.n_x
         e, j = at.rest_by_v * scale, at.y_by_v * scale
         if not (np.all(np.isfinite(e)) and np.all(np.isfinite(j)) and np.all(np.isfinite(rest))):
-            return None
+            return None, np.full((self._tracked.size, m.n_u), np.nan)
         left, sizes, right = np.linalg.svd(e)
         rank = int(np.sum(sizes > RANK * sizes[0]))
         onto = right[:rank].T @ ((left[:, :rank].T @ -rest) / sizes[:rank])  # to the steady states
@@ -266,7 +292,7 @@ class Targets:
             lower.append((low - now)[k] / scale[places[k]] - onto[places[k]])
             upper.append((high - now)[k] / scale[places[k]] - onto[places[k]])
         eta = bounded_least_squares(h, g, np.vstack(rows), np.concatenate(lower), np.concatenate(upper))
-        return None if eta is None else (onto + along @ eta) * scale
+        return None if eta is None else (onto + along @ eta) * scale, sees @ along[n_z:].T
 
     def _settled(self, v: Array, goal: Array, d: Array, w: Array) -> _Point:
         """The point with the hidden state at rest under its state and input, by Newton's method; as it is where that

@@ -416,6 +416,7 @@ def _tables(
         reals |= {
             "target_scale": own.scale, "target_root": np.sqrt(ocp.q_y), "target_starts": np.array(own.beside),
             "target_x_range": np.array(own.x_range).T, "target_y_range": np.array(own.y_range).T,
+            "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
         }  # fmt: skip
     if estimator is not None:
         modes = _modes(estimator)

@@ -117,7 +117,9 @@ class Detector:
         if self.energy and not free_runs:
             raise InputError("detector: it reads free runs, the monitor has none; give free_run=0.8 [s], say")
         if free_runs and not self.energy:
-            raise InputError("detector: it was learned without free runs, the monitor has some; leave free_run out")
+            raise InputError(
+                "detector: it was learned without free runs, the monitor has some; leave free_run out"
+            )
         if abs(dt - self.dt) > 1e-9 * self.dt:
             raise InputError(
                 f"detector: learned at a period of {self.dt} s, the model's is {dt} s; learn it anew"

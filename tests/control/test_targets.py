@@ -303,6 +303,24 @@ def test_newton_begins_beside_the_operating_point_where_it_stops_there():
     assert found.u**3 - 0.0075 * found.u == pytest.approx(-7.2e-4)
 
 
+def test_a_set_point_leaves_a_standstill_where_the_sensor_shows_no_slope():
+    """The size alone shows of what pump and leak make together: with the leak, more of the pump seems to be less."""
+    x, u, shown = ca.SX.sym("x"), ca.SX.sym("u"), (Signal("shown", "m"),)
+    rate = ca.sqrt(u**2 + 0.0025) - 0.05 - x
+    model = HybridModel.of(
+        "counting", 1.0, shown, (Signal("u", "-"),), shown, x=x, u=u, x_next=x + 0.1 * rate, xdot=rate, y=x,
+        nominal_x=[1.0], nominal_u=[1.05], disturbance_model=(Disturbance("input", "u", 2.0),),
+    )  # fmt: skip
+    targets = Targets(model, OCP(5, [0.0], [1.0], [0.1], [0.0], [3.0], q_y=[1.0]))
+    standing = targets.at([0.0], start=targets.at([1.0]))
+    assert standing.reached
+    going = targets.at([1.0], d=[-0.3], start=standing)
+    assert going.reached
+    assert going.u == pytest.approx([np.sqrt(1.05**2 - 0.0025) + 0.3], abs=1e-6)
+    far = targets.at([4.0], start=standing)  # beyond the input's limit
+    assert (far.u.round(6), far.reached) == (3.0, False)
+
+
 def test_a_search_for_what_does_not_exist_ends_soon():
     targets, points = pumped(lambda u: (u - 0.3) ** 2 + 0.01), []
     evaluated = targets._point

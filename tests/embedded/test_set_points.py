@@ -147,3 +147,23 @@ def test_steady_states_are_those_of_python(name):
         plan = wanted
     assert (ends["steady"] == 0) == (name == "restless")
     assert (ends["reached"] > 0) == (name not in ("restless", "motor"))
+
+
+def test_a_standstill_is_left_as_in_python():
+    """The size alone shows of what pump and leak make together: with the leak, more of the pump seems to be less."""
+    rate = lambda x, u: ca.sqrt(u**2 + 0.0025) - 0.05 - x  # noqa: E731
+    model = written(
+        "counting", ["shown"], ["u"], lambda x, u: x + 0.1 * rate(x, u), rate, nominal_x=[1.0], nominal_u=[1.05],
+        disturbance_model=(Disturbance("input", "u", 2.0),),
+    )  # fmt: skip
+    ocp = OCP(5, [0.0], [1.0], [0.1], [0.0], [3.0], q_y=[1.0])
+    python, native = CondensedController(model, ocp), NativeController(model, ocp, flags=parts.QUICK)
+    estimate = TrueState(model).start(model.x0)
+    plan = python.initial(estimate)
+    for goal, leak in ((1.0, 0.0), (0.0, 0.0), (1.0, -0.3), (0.0, 0.0), (0.3, -0.3), (2.0, -0.3)):
+        e = replace(estimate, d=np.array([leak]))
+        plan, found = (c.solve(plan, e, np.array([[goal]])) for c in (python, native))
+        assert plan.steady.reached
+        assert found.steady.reached
+        # both have converged to a step of 1e-9 of the scales
+        np.testing.assert_allclose(found.steady.u, plan.steady.u, atol=1e-8)

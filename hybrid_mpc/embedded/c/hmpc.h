@@ -133,7 +133,7 @@ typedef struct {
   hmpc_point at, after, settled;
   hmpc_real a[HMPC_NZ][HMPC_NT], half[HMPC_NZ], diagonal[HMPC_NZ], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];
   hmpc_real h[HMPC_NT][HMPC_NT], gram[HMPC_NT][HMPC_NT];
-  hmpc_real bound[HMPC_TARGET_ROWS][HMPC_NT], end[HMPC_TARGET_ROWS], seen[HMPC_TARGET_ROWS][HMPC_NT];
+  hmpc_real bound[HMPC_TARGET_ROWS][HMPC_NT], end[HMPC_TARGET_ROWS], seen[HMPC_TARGET_ROWS][HMPC_NT], answer;
 } hmpc_search;
 #endif
 

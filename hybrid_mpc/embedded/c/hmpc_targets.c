@@ -341,6 +341,10 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   memcpy(work->turned, sees, sizeof sees);
   orthogonal(work->turned, tracked, m);
   for (int i = 0; i < tracked; ++i) size = hmpc_max(size, hmpc_sqrt(hmpc_dot(work->turned[i], work->turned[i], m)));
+  work->answer = R(0.0); /* do outputs answer to inputs as they do at the operating point? */
+  for (int i = 0; i < tracked; ++i)
+    for (int k = 0; k < m; ++k)
+      work->answer += sees[i][k] * hmpc_dot(target_slopes[i], work->along[k] + HMPC_NZ, HMPC_NU);
   memset(work->h, 0, sizeof work->h);
   memset(g, 0, sizeof g);
   for (int i = 0; i < tracked; ++i) {
@@ -392,8 +396,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   return hmpc_all_finite(step, NT);
 }
 
-/* Gauss-Newton from v; bounded: within the bounds of states and outputs. */
-static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_steady *found) {
+/* Gauss-Newton from v; bounded: within the bounds of states and outputs. Returns how far outputs are off. */
+static real descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_steady *found) {
   hmpc_search *const work = &s->search;
   hmpc_point *const at = &work->at, *const after = &work->after;
   real step[NT], there[NT], lacks[HMPC_TARGET_ITERATIONS + 1], off = R(0.0);
@@ -430,14 +434,16 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
   memcpy(found->y, at->y, sizeof found->y);
   found->steady = done;
   found->reached = done && off <= HMPC_TARGET_REACHED;
+  return off;
 }
 
 /* The steady state for outputs y, all finite where they are weighed: from a steady start, then, where wide or there is
-   no such start, at the operating point and beside it. Where none keeps the bounds of states and outputs, these are
+   no such start, at the operating point and beside it; at the operating point, too, where it misses the set-point
+   because outputs do not answer to inputs where it began. Where none keeps the bounds of states and outputs, these are
    left out. */
 void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
                        hmpc_steady *found) {
-  hmpc_steady trial;
+  hmpc_steady trial, other;
   real given[NT];
   const int known = start && start->steady;
   if (known) {
@@ -448,7 +454,11 @@ void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, co
   for (int bounded = 1; bounded >= 0; --bounded) {
     const int beside = wide && bounded ? STARTS : (wide || !known);
     for (int k = known ? -1 : 0; k < beside; ++k) {
-      descend(s, k < 0 ? given : target_starts[k], y, w, bounded, &trial);
+      const real off = descend(s, k < 0 ? given : target_starts[k], y, w, bounded, &trial);
+      if (trial.steady && !trial.reached && s->search.answer < target_flat[0]) {
+        const real nearer = descend(s, target_starts[0], y, w, bounded, &other);
+        if (other.steady && nearer < off) trial = other;
+      }
       if (trial.steady || (bounded && k == (known ? -1 : 0))) *found = trial; /* the first answer if none is steady */
       if (trial.steady) return;
     }
