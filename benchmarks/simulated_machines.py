@@ -20,7 +20,9 @@ Reads the runs and closes loops on the plants, every controller with the same se
   A car's steering holds y and its speed x, on top of wheels that roll along the path; each torque of a double
   pendulum holds its joint.
 - ``blind``, in tasks with measured disturbances: ``prior`` without their measurement;
-- ``slippery``, of the double pendulum: ``prior`` without its dry friction, whose slope at rest is a strong damper's.
+- ``slippery``, of the double pendulum: ``prior`` without its dry friction, whose slope at rest is a strong damper's;
+- ``twice``, of a double pendulum that stands: ``prior`` with two linearizations a period;
+- ``punctual``, likewise: ``prior`` without the fitted delay of its inputs.
 
 The cost counts what all pay for alike: weighed outputs without noise, weighed speeds, changes of the input. A ratio is
 the geometric mean over seeds with its 95 % interval (paired, by Student's t of the logarithms). With a constant load,
@@ -330,9 +332,31 @@ def parts(name: str, runs: Path, controller: str, place: int):
         model = replace(prior, parameters=tuple(values))
         made = hm.make_estimator(model, scenario, noise, control), hm.make_controller(model, model, control)
         return scenario, model, controlled, made
-    planned = "prior" if controller == "blind" else controller
-    made = kit.observer(planned, task=task.name), kit.controller(planned, task=task.name)
+    if controller == "punctual":
+        control, noise = task.control or scenario.control, kit.noise("prior_observer")
+        model = punctual(prior)
+        made = hm.make_estimator(model, scenario, noise, control), hm.make_controller(model, model, control)
+        return scenario, model, controlled, made
+    planned = "prior" if controller in ("blind", "twice") else controller
+    iterations = 2 if controller == "twice" else None
+    made = (
+        kit.observer(planned, task=task.name),
+        kit.controller(planned, task=task.name, iterations=iterations),
+    )
     return scenario, kit.models[planned], controlled, made
+
+
+def punctual(model: hm.HybridModel) -> hm.HybridModel:
+    """The model whose inputs act at once: its delay states take the input of now."""
+    x, h, u, w, p = (
+        ca.MX.sym(k, n) for k, n in zip("xhuwp", (model.n_x, 0, model.n_u, model.n_w, model.n_p), strict=True)
+    )
+    late = ca.repmat(u, model.delay_states // model.n_u, 1)
+    point, none = [x, h, u, w, p], ca.MX(0, 1)
+    x_next = model.step(x, late, u, w, p)[0]
+    step = ca.Function("step", point, [x_next, none])
+    xdot = ca.Function("xdot", point, [model.xdot(x, late, u, w, p)])
+    return replace(model, step=step, xdot=xdot, with_jacobian=None, side_by_side=None, delay_states=0)
 
 
 @dataclass(frozen=True)
@@ -355,7 +379,9 @@ def controllers_of(name: str, task: hm.Task) -> tuple[str, ...]:
     """Those of all tasks, and without measurement where there is one; no PI(D) where the way is free (a swing-up)."""
     found = CONTROLLERS[:-1] if task.weight is not None else CONTROLLERS
     found += () if task.w is None else ("blind",)
-    return (*found, "slippery") if name == "double_pendulum" else found
+    if name != "double_pendulum":
+        return found
+    return (*found, "slippery") if task.weight is not None else (*found, "slippery", "twice", "punctual")
 
 
 def loop(name: str, runs: Path, controller: str, place: int, seed: int) -> dict:
@@ -429,10 +455,12 @@ def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
         c: [r for r in cells if (r["machine"], r["task"], r["controller"]) == (name, task.name, c)]
         for c in controllers_of(name, task)
     }
+    own = {c: found for c, found in own.items() if found}
     costs = {c: np.log([r["cost"] for r in found]) for c, found in own.items()}
     row = {"machine": name, "task": task.name}
-    row |= {f"hybrid / {c}": interval(costs["hybrid"] - costs[c]) for c in CONTROLLERS[1:] if c in own}
-    row |= {f"prior / {c}": interval(costs["prior"] - costs[c]) for c in controllers_of(name, task)[2:]}
+    for first, others in (("hybrid", CONTROLLERS[1:]), ("prior", controllers_of(name, task)[2:])):
+        if first in own:
+            row |= {f"{first} / {c}": interval(costs[first] - costs[c]) for c in others if c in own}
     row["cost, prior"] = f"{np.exp(costs['prior'].mean()):.4g}"
     if any(math.isinf(fault.end) for fault in task.faults):
         bound = allowed(name, runs)
@@ -441,8 +469,10 @@ def row_of(name: str, runs: Path, task, cells: list[dict]) -> dict:
         rest = {
             c: np.log(np.linalg.norm([r["rest"] for r in own[c]] / bound, axis=1))
             for c in ("hybrid", "prior")
+            if c in own
         }
-        row["rest, hybrid / prior"] = interval(rest["hybrid"] - rest["prior"])
+        if "hybrid" in own:
+            row["rest, hybrid / prior"] = interval(rest["hybrid"] - rest["prior"])
     if np.isfinite(np.hstack(hm.load_scenario(name).control.state_range)).any():
         row |= {
             f"over a soft limit, {c}": f"{np.max([r['soft'] for r in found]):.3g}" for c, found in own.items()
@@ -458,8 +488,12 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=[*MACHINES], choices=MACHINES + REAL)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument(
+        "--first-seed", type=int, default=0, help="develop on others than those of the tables"
+    )
+    parser.add_argument(
         "--tasks", nargs="+", help="only these; those with a constant load: " + " ".join(LOADS)
     )
+    parser.add_argument("--controllers", nargs="+", help="only these, prior among them (default: all)")
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     tasks = [
@@ -473,7 +507,8 @@ def main() -> None:
             pool.submit(loop, name, given.runs, controller, place, seed)
             for name, place, task in tasks
             for controller in controllers_of(name, task)
-            for seed in range(given.seeds)
+            if not given.controllers or controller in given.controllers
+            for seed in range(given.first_seed, given.first_seed + given.seeds)
         ]
         cells = [job.result() for job in jobs]
     rows = [free_runs(name, given.runs) for name in given.machines]

@@ -22,6 +22,8 @@ ROW = 0.002
 """Distance of two rows [s] of the recordings for identification."""
 SLOW_ROW = 0.03
 """The same of the swing-ups [s]."""
+LARGEST_DELAY = 0.02
+"""Longest delay [s] of the torques behind their commands that the prior's fit may find: two periods."""
 MEASURED = ("q1_rad", "q2_rad", "dq1_rad_s", "dq2_rad_s")
 SLOW = tuple(f"{robot}_swingup_{k:02d}" for robot in ("acrobot", "pendubot") for k in (1, 2, 3))
 
@@ -47,6 +49,7 @@ scenario = Scenario(
         smoothing=0.06,
         warm_up=0.1,
         free_run=0.5,
+        largest_delay=LARGEST_DELAY,
         delays=dict.fromkeys(MEASURED, ROW),
         delays_of={stem: dict.fromkeys(MEASURED, SLOW_ROW) for stem in SLOW},
     ),
