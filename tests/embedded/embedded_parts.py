@@ -25,7 +25,7 @@ from hybrid_mpc.kit.assembly import disturbance_sizes
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 SOURCES = ("MPC", "PLAN", "FALLBACK", "SAFE", "HELD")
-QUICK = ("-std=c11", "-O1", "-ffp-contract=off")
+QUICK = ("-std=c11", "-O0", "-ffp-contract=off")  # compiling takes longer than the few solves
 
 
 def coupled():
