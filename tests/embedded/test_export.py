@@ -15,7 +15,7 @@ from embedded_parts import needs_compiler
 
 import hybrid_mpc as hm
 from hybrid_mpc import OCP, CondensedController, InputError
-from hybrid_mpc.embedded.export import OTHERS, TOLERANCE, write_controller
+from hybrid_mpc.embedded.export import OTHERS, TOLERANCE
 from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, make_sources
 from hybrid_mpc.embedded.scalar import c_function
 from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
@@ -79,7 +79,7 @@ int main(int count, char **words) {
 
 def written(folder, name, **options):
     model, ocp = MACHINES[name]()
-    write_controller(
+    parts.write_unmeasured(
         folder,
         model,
         ocp,
