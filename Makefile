@@ -23,7 +23,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 
 types: $(INSTALLED)
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 test: lint types
 	$(BIN)/python -m pytest -m 'not full' -n 2 --dist loadfile --no-loadscope-reorder -q --durations=8

@@ -1,5 +1,6 @@
 """Shared material of the tests."""
 
+import gc
 import os
 import shutil
 import sys
@@ -17,16 +18,23 @@ LONG = (
     "nn_export/test_random_modules.py",
     "job/study/test_study_runner.py",
     "job/study/test_loops.py",
+    "embedded/test_whole_loops.py",
+    "embedded/test_export.py",
+    "scenarios/test_simulated.py",
     "identify/test_linear.py",
     "job/test_control_command.py",
     "identify/test_prior_fit.py",
+    "identify/test_training.py",
+    "identify/test_simulation.py",
+    "identify/test_prediction.py",
+    "docs/test_examples.py",
+    "job/test_engine.py",
+    "job/test_guard.py",
+    "job/test_check_planted.py",
     "scenarios/paper/test_reproduce.py",
     "job/test_stages.py",
-    "scenarios/test_simulated.py",
     "job/test_preflight.py",
     "nn_export/test_budget.py",
-    "job/test_engine.py",
-    "control/test_stages.py",
     "loop/test_faulted_loops.py",
 )
 """Modules that take longest. Processes that share the tests by whole modules must not end with one of them."""
@@ -36,6 +44,12 @@ def pytest_collection_modifyitems(items):
     """The long modules first, the others as they were."""
     rank = {Path(__file__).parent / path: i for i, path in enumerate(LONG)}
     items.sort(key=lambda item: rank.get(item.path, len(LONG)))
+
+
+def pytest_collection_finish():
+    """What is imported and collected by now stays: the garbage collector need not look through it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

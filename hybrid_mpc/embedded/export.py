@@ -170,11 +170,11 @@ def footprint(folder: Path, names: Sequence[str] = SOURCES) -> Footprint | None:
         flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
         sources = [str((folder / name).resolve()) for name in names]
         made = subprocess.run([gcc, *flags, "-c", *sources], cwd=work, capture_output=True, check=False)
-        test = [str((folder / "hmpc_test.c").resolve()), *sources, "-lm", "-o", "test"]
+        objects = sorted(str(p) for p in Path(work).glob("*.o"))
+        test = [str((folder / "hmpc_test.c").resolve()), *objects, "-lm", "-o", "test"]
         linked = subprocess.run([gcc, *flags[:3], *test], cwd=work, capture_output=True, check=False)
         if made.returncode or linked.returncode:
             return None
-        objects = sorted(str(p) for p in Path(work).glob("*.o"))
         table_of = subprocess.run([size, *objects], capture_output=True, text=True, check=True).stdout
         flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
         frames = [

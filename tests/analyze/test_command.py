@@ -212,7 +212,9 @@ def test_the_delay_that_the_margins_allow_is_the_delay_that_the_rig_stands(golf_
         assert restless[2] > 1.5 * restless[1]
 
 
-@pytest.mark.parametrize("make", [two_tanks, dc_motor, pytest.param(thermal, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "make", [dc_motor, *(pytest.param(make, marks=pytest.mark.full) for make in (two_tanks, thermal))]
+)
 def test_machines_without_positions_are_analyzed_around_their_operating_point(make, tmp_path):
     """What has no speeds lacks friction and a working speed; all else is there, channel by channel."""
     model = make()

@@ -156,7 +156,7 @@ def test_fallback_stabilises_the_pendulum_at_a_reference_without_any_solve(parts
     safe = SafeController(Failing(CondensedController(prior, wide), range(500)), prior, max_age=0)
     x, goal = np.array([-0.3, 0.0]), np.array([[0.6, 0.0]])
     decision = safe.initial(estimate_of(x, n_h=0))
-    for _ in range(300):
+    for _ in range(150):  # 3 s
         decision = safe.decide(decision, estimate_of(x, n_h=0), goal)
         x = prior.step(x, [], decision.u, prior.w, prior.p)[0].full().ravel()
     assert decision.source is Source.FALLBACK

@@ -75,7 +75,7 @@ def test_on_the_real_machines_a_second_is_a_second(name):
         assert time_unit(part, scenario.data.dt) == 1.0
 
 
-@pytest.mark.parametrize("name", ["golf_robot", "pendulum"])
+@pytest.mark.parametrize("name", [pytest.param("golf_robot", marks=pytest.mark.full), "pendulum"])
 def test_on_the_simulated_machines_a_second_is_a_second(name, tmp_path):
     scenario = load_scenario(name)
     prior = scenario.prior()

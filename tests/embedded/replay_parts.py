@@ -30,7 +30,7 @@ from hybrid_mpc import (
 from hybrid_mpc.embedded.generate import sources_of
 from hybrid_mpc.loop.preview import Previews
 
-SHARED = ["-std=c11", "-O2", "-ffp-contract=off", "-fPIC", "-shared"]
+SHARED = [*parts.QUICK, "-fPIC", "-shared"]
 BRIDGE = """
 #include <stddef.h>
 #include <string.h>

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import embedded_parts as parts
@@ -70,6 +71,12 @@ def by_levels(periods=300):
     return golden("unbalanced_disk", "weak", periods, monitor=machine("unbalanced_disk").level_monitor())
 
 
+@cache
+def tanks():
+    """The tanks' case; its limits are learned once."""
+    return replays.tanks_case(400)
+
+
 CASES = {
     "golf robot, heavier": (lambda: golden("golf_robot", "heavy", 250), {"NORMAL", "BACKUP"}),
     "golf robot, frozen": (lambda: golden("golf_robot", "frozen"), {"NORMAL", "REST", "BACKUP"}),
@@ -77,7 +84,7 @@ CASES = {
     "disk, weak": (lambda: golden("unbalanced_disk", "weak"), {"NORMAL", "LIMITED", "REST"}),
     "disk, levels": (by_levels, {"NORMAL", "LIMITED"}),
     "arm": (lambda: replays.arm_case(400), {"NORMAL", "LIMITED", "REST"}),
-    "tanks": (lambda: replays.tanks_case(400), {"NORMAL", "FALLBACK", "REST"}),
+    "tanks": (tanks, {"NORMAL", "FALLBACK", "REST"}),
     "heaters": (lambda: replays.heaters_case(400), {"NORMAL", "LIMITED", "REST"}),
 }
 QUICK = ("arm", "tanks")
@@ -109,7 +116,7 @@ def guarded(name):
 
 def test_what_was_not_watched_is_watched_by_the_next_step(tmp_path):
     """Without hmpc_finish the next hmpc_step does its work."""
-    case = replays.tanks_case(120)
+    case = tanks()
     whole = Whole(tmp_path, case)
     goal = parts.goal(case.reference(np.zeros(1)))
     rng, found = np.random.default_rng(0), []
@@ -161,7 +168,7 @@ def survives(case, folder, periods):
     assert seen.bit_count() > 1
 
 
-WATCHED = {"arm": replays.arm_case, "tanks": replays.tanks_case}
+WATCHED = {"arm": lambda: replays.arm_case(60), "tanks": tanks}
 
 
 @pytest.mark.parametrize(
@@ -174,8 +181,11 @@ def test_vectors_with_readings_and_no_warning(name, single, tmp_path):
     """The test program of the folder compares readings too; a changed one is noticed."""
     from test_export import STRICT
 
-    found = parts.write(tmp_path, WATCHED[name](60), single=single)
-    words = ["cc", "-O2", *STRICT, *sources_of(found), "hmpc_test.c", "-lm", "-o", "test"]
+    found = parts.write(tmp_path, WATCHED[name](), single=single)
+    strict, sources = ["cc", "-O2", *STRICT], sources_of(found)
+    subprocess.run([*strict, "-c", *sources], cwd=tmp_path, check=True)
+    objects = [str(Path(name).with_suffix(".o")) for name in sources]
+    words = [*strict, *objects, "hmpc_test.c", "-lm", "-o", "test"]
     subprocess.run(words, cwd=tmp_path, check=True)
     assert subprocess.run([tmp_path / "test"], capture_output=True, check=False).returncode == 0
     text = (tmp_path / "hmpc_vectors.h").read_text()
@@ -192,7 +202,7 @@ def test_vectors_with_readings_and_no_warning(name, single, tmp_path):
 @pytest.mark.parametrize("name", [*WATCHED, "golf robot"])
 def test_cppcheck_finds_nothing(name, tmp_path):
     """In the monitor, the loop and, of the golf robot, the backup's own files."""
-    case = WATCHED[name](60) if name in WATCHED else golden("golf_robot", "heavy", 10)
+    case = WATCHED[name]() if name in WATCHED else golden("golf_robot", "heavy", 10)
     found = parts.write(tmp_path, case)
     names = [n for n in sources_of(found) if n not in CORE and "qp" not in n]
     done = subprocess.run(

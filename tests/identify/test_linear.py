@@ -212,7 +212,7 @@ def test_units_and_offsets_change_nothing(fit):
 
 
 @both
-@pytest.mark.parametrize("dt", [1e-4, 3600.0])
+@pytest.mark.parametrize("dt", [3600.0, pytest.param(1e-4, marks=pytest.mark.full)])
 def test_the_period_is_a_name_of_the_unit_of_time(fit, dt):
     train, valid = recordings(system(), noise=0.3)
     one, other = fit(train, valid, 1.0, warm=10), fit(train, valid, dt, warm=10)

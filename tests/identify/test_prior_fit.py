@@ -168,7 +168,7 @@ def test_the_same_machine_in_casadi_and_in_torch_has_the_same_fit(one, other, ru
 # recordings as they are
 
 
-@pytest.mark.parametrize("share", [0.2, 0.6])
+@pytest.mark.parametrize("share", [pytest.param(0.2, marks=pytest.mark.full), 0.6])
 def test_missing_samples_are_no_hindrance(noisy_runs, fit, share):
     rng = np.random.default_rng(0)
     gappy = [
@@ -205,7 +205,9 @@ def test_a_few_gross_outliers_move_nothing(noisy_runs, fit, size):
         assert 0.5 < found.standard_errors[name] / fit.standard_errors[name] < 4.0, name
 
 
-@pytest.mark.parametrize("start", ["lower", "upper", "mixed"])
+@pytest.mark.parametrize(
+    "start", [*(pytest.param(s, marks=pytest.mark.full) for s in ("lower", "upper")), "mixed"]
+)
 def test_bad_starts_still_find_the_machine(noisy_runs, start):
     """Nominal values at the corners of the bounds: 5 times too small an inertia, 10 times too much damping."""
 

@@ -3,11 +3,14 @@
 import math
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from engine_jobs import jobs_in_this_process
+from PIL import Image
 
 README = Path(__file__).parents[2] / "README.md"
 TINY = """
@@ -77,17 +80,30 @@ def finished(arguments, shared) -> Path:
     return shared("finished", lambda folder: finish(folder, arguments)) / "run"
 
 
-def finish(folder: Path, arguments: list[str]) -> None:
-    """A run into ``run`` of a folder, and what it told, by the command itself but in this process."""
+def finish(folder: Path, arguments: list[str], *, drawn: bool = True) -> None:
+    """A run into ``run`` of a folder, and what it told, by the command itself but in this process.
+
+    Where nobody looks at its pictures, a point of ink is each of them (``drawn=False``).
+    """
     from typer.testing import CliRunner
 
     from hybrid_mpc.cli.main import app
+    from hybrid_mpc.job.stages import figures
 
-    with jobs_in_this_process():
+    with jobs_in_this_process(), pytest.MonkeyPatch.context() as patch:
+        if not drawn:
+            patch.setattr(figures, "_saved", point)
         done = CliRunner().invoke(app, [*arguments, "--out", str(folder / "run")])
     assert done.exit_code == 0, done.output
     assert "report.html" in done.stdout
     (folder / "told.txt").write_text(done.stdout)
+
+
+def point(figure: Any, path: Path) -> Path:
+    """The smallest picture."""
+    path.parent.mkdir(exist_ok=True)
+    Image.new("1", (1, 1)).save(path)
+    return path
 
 
 @pytest.fixture(scope="session")
@@ -126,11 +142,12 @@ def bare_tanks(shared) -> Path:
 def write_bare_tanks(folder: Path) -> None:
     from scenarios.simulated.two_tanks import EXPERIMENT
 
+    short = replace(EXPERIMENT, seconds=1200.0)
     (folder / "tanks.py").write_text(BARE)
     words = []
     for i, name in enumerate(("monday", "tuesday", "later")):
-        table = dict(zip(EXPERIMENT.columns, EXPERIMENT.table("train", i + 1, 0).T, strict=True))
+        table = dict(zip(short.columns, short.table("train", i + 1, 0).T, strict=True))
         path = write(folder / f"{name}.csv", table)
         words += ["--data", str(path)] if name != "later" else []
     skipped = [word for stage in ("estimation", "residuals", "analysis") for word in ("--skip", stage)]
-    finish(folder, ["run", str(folder / "tanks.py"), *words, *skipped])
+    finish(folder, ["run", str(folder / "tanks.py"), *words, *skipped], drawn=False)

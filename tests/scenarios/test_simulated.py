@@ -22,6 +22,11 @@ MACHINES = {m.scenario.name: m for m in (cart_pole, dc_motor, lever, two_heaters
 SHORT = {"two_tanks": 1500.0, "dc_motor": 6.0, "two_heaters": 3000.0}
 """Seconds of a short recording; 10 s of the others."""
 each = pytest.mark.parametrize("name", MACHINES)
+WHOLE = ("two_tanks", "lever", "two_heaters")
+"""Of those that go the whole way in the quick set: a process with a measured inflow, a mechanical one, two inputs."""
+each_whole = pytest.mark.parametrize(
+    "name", [name if name in WHOLE else pytest.param(name, marks=pytest.mark.full) for name in MACHINES]
+)
 
 
 @dataclass(frozen=True)
@@ -127,7 +132,7 @@ def shown(plant, result):
     return np.array([[float(v) for v in plant.outputs(list(x), list(u), list(w), plant)] for x, u, w in rows])
 
 
-@each
+@each_whole
 def test_networks_learn_and_are_exported(name, made):
     """Sixty updates of two small networks already follow training windows better than the prior that was fitted to
     them, and the graph computes what torch does.
@@ -143,7 +148,7 @@ MODELS = ("prior", "hybrid")
 
 
 @pytest.mark.parametrize("model", ["prior", pytest.param("hybrid", marks=pytest.mark.full)])
-@each
+@each_whole
 def test_a_constant_load_leaves_no_offset(name, model, made):
     """The mean error of the last fifth is below two steps of the sensor."""
     whole = made(name)
@@ -163,7 +168,7 @@ PERIODS = 30
 
 
 @pytest.mark.parametrize("loops", [2, pytest.param(34, marks=pytest.mark.full)])
-@each
+@each_whole
 def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, made):
     """Loops of the prior's controller and the hybrid's, by turns, each watched by its monitor of residuals."""
     whole = made(name)
