@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.blas import dtrmm, dtrsm
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 Array = NDArray[np.float64]
 Active = NDArray[np.int8]
@@ -70,8 +71,8 @@ class RowQP:
             out = pushed - inside
             beyond = np.maximum(np.abs(out) - self.linear, 0.0) * (self.give / (1.0 + self.give))
             wrong -= np.copysign(beyond, out)
-        outside = np.where(self.give == 0, self.excess(value), 0.0)
-        return float(np.abs(slope).max()), float(np.abs(wrong).max()), max(float(outside.max()), 0.0)
+        outside = self.excess(value)[self.give == 0].max(initial=0.0)
+        return float(np.abs(slope).max()), float(np.abs(wrong).max()), float(outside)
 
 
 class Found(NamedTuple):
@@ -293,12 +294,12 @@ class ActiveSet:
     @cached_property
     def _inverse(self) -> Array:
         """Inverse of the Hessian's Cholesky factor; not needed where no row acts."""
-        return np.asarray(dtrtri(self._factor, 1)[0])
+        return np.asarray(dtrsm(1.0, self._factor, np.eye(self._n), 0, 1, 0, 0, 1))
 
     @cached_property
     def _reduced(self) -> Array:
         """All rows in the dual ``(R, n)``; not needed where only bounds of the unknowns act."""
-        return np.vstack([self._inverse.T, self._qp.a @ self._inverse.T])
+        return np.vstack([self._inverse.T, dtrmm(1.0, self._inverse, self._qp.a.T, 0, 1).T])
 
     def _refined(self, found: Found) -> Found:
         """The answer without what rounding left on a long way; multipliers of rows that give way are large."""

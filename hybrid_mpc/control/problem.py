@@ -216,8 +216,11 @@ class SoftRows:
             rows.append((value, by_x, by_u))
         if len(rows) == 1:
             return rows[0]
-        values, by_x, by_u = zip(*rows, strict=True)
-        return np.concatenate(values), np.vstack(by_x), np.vstack(by_u)
+        return (
+            np.concatenate([r[0] for r in rows]),
+            np.vstack([r[1] for r in rows]),
+            np.vstack([r[2] for r in rows]),
+        )
 
     def condensed(
         self, x: Array, u: Array, from_u: Array, e: Array | None = None

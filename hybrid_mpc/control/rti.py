@@ -221,7 +221,7 @@ class CondensedController(SplitController):
         z = np.hstack([previous.x[1:], previous.h[1:]])
         w = (
             np.vstack([previous.w[1:], previous.w[-1:]])
-            if len(previous.w)
+            if previous.w.size
             else self.problem.forecast(None, None)
         )
         derivatives = self.stages.at(z, self.model.acting(u, d, w))
@@ -275,7 +275,6 @@ class CondensedController(SplitController):
             drift[:, :n_x] += self._on_x @ (estimate.d - prepared.d)
         free = propagate(prepared.a_t, drift, dz0)
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
-        u_bar = prepared.u.ravel()
         gradient = 2 * error.ravel() @ prepared.weighted + prepared.direct - self._of_targets(target.u)
         if economic is not None:
             slope, curvature = economic
@@ -292,8 +291,9 @@ class CondensedController(SplitController):
         step = answer.step
         if not answer.status.ok:
             return self._failed(prepared, answer.status, start, answer.kkt)
-        u = (u_bar + step).reshape(prepared.u.shape)
-        z = prepared.z + free + self._response(prepared, step)
+        inputs = step.reshape(prepared.u.shape)
+        u = prepared.u + inputs
+        z = prepared.z + propagate(prepared.a_t, drift + self._of_inputs(prepared.b, inputs), dz0)
         excess, largest, given_way = None, 0.0, {}
         if soft is not None:
             excess = self.problem.soft.excess(soft[0] + soft[1] @ step)
@@ -378,11 +378,6 @@ class CondensedController(SplitController):
         if b.shape[2] == 1:
             return np.asarray(b[:, :, 0] * u)
         return np.asarray(np.einsum("kij,j->ki" if u.ndim == 1 else "kij,kj->ki", b, u))
-
-    def _response(self, prepared: Prepared, step: Array) -> Array:
-        """By how much a step of the inputs changes states and hidden states ``(N + 1, n_z)``."""
-        inputs = step.reshape(len(prepared.b), -1)
-        return propagate(prepared.a_t, self._of_inputs(prepared.b, inputs), np.zeros(prepared.z.shape[1]))
 
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
         """Hessian and economic derivatives, those that wait for the parameters' values included."""
