@@ -127,11 +127,8 @@ class ActiveSet:
         self, qp: RowQP, later: NDArray[np.int64] | None = None, earlier: NDArray[np.int64] | None = None
     ) -> None:
         own = np.arange(qp.lower.size)
-        self._qp, self._later, self._earlier = (
-            qp,
-            own if later is None else later,
-            own if earlier is None else earlier,
-        )
+        self._later, self._earlier = own if later is None else later, own if earlier is None else earlier
+        self._qp = qp
         self._factor, bad = dpotrf(qp.h, 1)
         self._free = -dpotrs(self._factor, qp.g, 1)[0]
         self._finite = not bad and bool(np.isfinite(self._free).all())
@@ -170,7 +167,7 @@ class ActiveSet:
             after, excess = np.sign(out).astype(np.int8), np.abs(out)
             mine = np.where(on.push * on.side > 0, np.sign(on.side), after[on.rows])
             mine[np.abs(on.push) > qp.linear[on.rows]] *= 2
-            excess[on.rows] = 0.0
+            excess[on.rows] = 0.0  # of the others, those join that exceed more than their neighbours in time
             near = np.maximum(excess[self._later], excess[self._earlier])
             after *= excess >= np.maximum(near, PRIMAL_TOLERANCE)
             after[on.rows] = mine
