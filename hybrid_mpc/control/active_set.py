@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.blas import dtrmm, dtrsm
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 Array = NDArray[np.float64]
 Active = NDArray[np.int8]
@@ -70,8 +71,8 @@ class RowQP:
             out = pushed - inside
             beyond = np.maximum(np.abs(out) - self.linear, 0.0) * (self.give / (1.0 + self.give))
             wrong -= np.copysign(beyond, out)
-        outside = np.where(self.give == 0, self.excess(value), 0.0)
-        return float(np.abs(slope).max()), float(np.abs(wrong).max()), max(float(outside.max()), 0.0)
+        outside = self.excess(value)[self.give == 0].max(initial=0.0)
+        return float(np.abs(slope).max()), float(np.abs(wrong).max()), float(outside)
 
 
 class Found(NamedTuple):
@@ -125,10 +126,12 @@ class ActiveSet:
     def __init__(
         self, qp: RowQP, later: NDArray[np.int64] | None = None, earlier: NDArray[np.int64] | None = None
     ) -> None:
-        self._qp, self._later, self._earlier = qp, later, earlier
+        own = np.arange(qp.lower.size)
+        self._later, self._earlier = own if later is None else later, own if earlier is None else earlier
+        self._qp = qp
         self._factor, bad = dpotrf(qp.h, 1)
-        self._factored = not bad
         self._free = -dpotrs(self._factor, qp.g, 1)[0]
+        self._finite = not bad and bool(np.isfinite(self._free).all())
         self._at_free = qp.values(self._free)
         self._n = qp.g.size
         self._nearest: Active = np.zeros(qp.lower.size, dtype=np.int8)
@@ -137,14 +140,14 @@ class ActiveSet:
     def solve(self, active: Active | None = None) -> Found:
         """The answer, whose residuals are to be looked at; ``active`` are rows to begin with."""
         none = np.zeros(self._qp.lower.size, dtype=np.int8)
-        if not self._factored:
+        if not self._finite:
             return Found(np.full(self._n, np.nan), np.full(none.size, np.nan), none)
         start = none if active is None or active.size != none.size else active
-        if not np.any(start) and np.max(self._qp.excess(self._at_free)) <= PRIMAL_TOLERANCE:
+        if not start.any() and self._qp.excess(self._at_free).max() <= PRIMAL_TOLERANCE:
             return Found(self._free, np.zeros(none.size), none)
         return (
             self.all_at_once(start)
-            or (self.all_at_once(none) if np.any(start) else None)  # after a jump the last set is of no use
+            or (self.all_at_once(none) if start.any() else None)  # after a jump the last set is of no use
             or self.one_at_a_time(self._nearest)
             or self.one_at_a_time(none)
             or Found(self._free, np.zeros(none.size), none)
@@ -157,20 +160,20 @@ class ActiveSet:
             on = self._on(active)
             if on is None:
                 return None
-            found = self._answer(active, on)
-            pushed = qp.values(found.s)
+            s = self._unknowns(on)
+            pushed = qp.values(s)
             pushed[on.rows] += on.own * on.push
-            over, under = pushed - qp.upper, qp.lower - pushed
-            after = (over > PRIMAL_TOLERANCE).astype(np.int8) - (under > PRIMAL_TOLERANCE).astype(np.int8)
-            if self._later is not None and self._earlier is not None:
-                excess = np.where(active == 0, np.maximum(over, under), 0.0)
-                after[(active == 0) & ((excess < excess[self._later]) | (excess < excess[self._earlier]))] = 0
-            if on.rows.size:
-                after[on.rows] = np.where((on.push > 0) == (on.side > 0), np.sign(on.side), after[on.rows])
-                after[np.abs(found.multipliers) > qp.linear] *= 2
-            if np.array_equal(after, active):
-                return found
+            out = pushed - np.minimum(np.maximum(pushed, qp.lower), qp.upper)
+            after, excess = np.sign(out).astype(np.int8), np.abs(out)
+            mine = np.where(on.push * on.side > 0, np.sign(on.side), after[on.rows])
+            mine[np.abs(on.push) > qp.linear[on.rows]] *= 2
+            excess[on.rows] = 0.0  # of the others, those join that exceed more than their neighbours in time
+            near = np.maximum(excess[self._later], excess[self._earlier])
+            after *= excess >= np.maximum(near, PRIMAL_TOLERANCE)
+            after[on.rows] = mine
             wrong = int(np.count_nonzero(after != active))
+            if not wrong:
+                return self._answer(active, on, s)
             left = PATIENCE if wrong < least else left - 1
             least = min(least, wrong)
             if wrong < self._wrong:
@@ -187,7 +190,7 @@ class ActiveSet:
         start = self._dual_feasible(active)
         if start is None:
             return None
-        qp, size = self._qp, np.sqrt(np.maximum(np.sum(self._rows() ** 2, axis=1), 1e-300))
+        qp, size = self._qp, np.sqrt(np.maximum(np.sum(self._reduced**2, axis=1), 1e-300))
         multipliers, active = start.multipliers.copy(), start.active.copy()
         row, sign = -1, 0.0
         for _ in range(STEPS * qp.lower.size):
@@ -251,62 +254,49 @@ class ActiveSet:
             if on is None:
                 return None
             if not on.rows.size:
-                return self._answer(active, on)
+                return self._answer(active, on, self._unknowns(on))
             right = (on.push > 0) == (on.side > 0)
             beyond = np.where(np.abs(on.push) > self._qp.linear[on.rows], 2, 1)
             after = np.where(right, np.sign(on.side) * beyond, 0)
             if np.array_equal(after, on.side):
-                return self._answer(active, on)
+                return self._answer(active, on, self._unknowns(on))
             active = active.copy()
             active[on.rows] = after
         return None
 
     def _on(self, active: Active) -> _On | None:
         """Multipliers of acting rows if they are met and all others forgotten; None where they depend on each other."""
-        rows, qp = np.flatnonzero(active), self._qp
+        rows, qp = active.nonzero()[0], self._qp
         side = active[rows]
         if rows.size > self._n and np.count_nonzero(np.abs(side) == 1) > self._n:
             return None
         if not rows.size:
             none = np.zeros(0)
             return _On(rows, side, np.zeros((0, self._n)), np.zeros((0, 0)), none, none)
-        chosen = self._rows(rows)[rows]
+        chosen = (self._inverse.T if rows[-1] < self._n else self._reduced)[rows]
         dual = chosen @ chosen.T
         own = dual.diagonal().copy()
         off = self._at_free[rows] - np.where(side > 0, qp.upper[rows], qp.lower[rows])
-        beyond = np.flatnonzero(np.abs(side) > 1)
+        beyond = (np.abs(side) > 1).nonzero()[0]
         if beyond.size:
             place = rows[beyond]
             dual[beyond, beyond] += qp.give[place]
             off[beyond] += np.sign(side[beyond]) * qp.linear[place] * qp.give[place]
-        pivots, bad = dpotrf(dual, 1)
-        if bad or not (pivots.diagonal() ** 2 / dual.diagonal()).min() > DEPENDENT:
+        least = DEPENDENT * dual.diagonal()
+        pivots, bad = dpotrf(dual.T, 1, 0, 1)
+        if bad or not (pivots.diagonal() ** 2 > least).all():
             return None
         return _On(rows, side, chosen, pivots, own, dpotrs(pivots, off, 1)[0])
 
     @cached_property
     def _inverse(self) -> Array:
         """Inverse of the Hessian's Cholesky factor; not needed where no row acts."""
-        return np.asarray(dtrtri(self._factor, 1)[0])
+        return np.asarray(dtrsm(1.0, self._factor, np.eye(self._n), 0, 1, 0, 0, 1))
 
     @cached_property
     def _reduced(self) -> Array:
-        """Rows in the dual ``(R, n)``; which are :attr:`_known` are there."""
-        return np.empty((self._qp.lower.size, self._n))
-
-    @cached_property
-    def _known(self) -> NDArray[np.bool_]:
-        return np.zeros(self._qp.lower.size, dtype=bool)
-
-    def _rows(self, rows: NDArray[np.int64] | None = None) -> Array:
-        """Rows in the dual, of which those asked for are there. Default: all."""
-        new = np.flatnonzero(~self._known) if rows is None else rows[~self._known[rows]]
-        if new.size:
-            bound, row = new[new < self._n], new[new >= self._n]
-            self._reduced[bound] = self._inverse.T[bound]
-            self._reduced[row] = self._qp.a[row - self._n] @ self._inverse.T
-            self._known[new] = True
-        return self._reduced
+        """All rows in the dual ``(R, n)``; not needed where only bounds of the unknowns act."""
+        return np.vstack([self._inverse.T, dtrmm(1.0, self._inverse, self._qp.a.T, 0, 1).T])
 
     def _refined(self, found: Found) -> Found:
         """The answer without what rounding left on a long way; multipliers of rows that give way are large."""
@@ -325,8 +315,10 @@ class ActiveSet:
             s = s - (change @ on.chosen) @ self._inverse
         return Found(s, multipliers, found.active)
 
-    def _answer(self, active: Active, on: _On) -> Found:
+    def _unknowns(self, on: _On) -> Array:
+        return self._free - (on.push @ on.chosen) @ self._inverse if on.rows.size else self._free
+
+    def _answer(self, active: Active, on: _On, s: Array) -> Found:
         multipliers = np.zeros(active.size)
         multipliers[on.rows] = on.push
-        s = self._free - (on.push @ on.chosen) @ self._inverse if on.rows.size else self._free
         return Found(s, multipliers, active)

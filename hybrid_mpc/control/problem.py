@@ -174,6 +174,10 @@ class SoftRows:
         self.scale: Array = np.where(np.isfinite(half), half, other)
         kept = np.where(self.hard, KEPT * self.scale, 0.0)
         self._kept = lower - kept, upper + kept
+        own = np.tile(self.states, n)
+        self._rows = np.repeat(np.arange(1, n + 1), self.states.size) * ocp.n_x + own
+        self._of_states = fixed(np.eye(ocp.n_x)[own]), fixed(np.zeros((own.size, ocp.n_u)))
+        self._soft, self._firm = np.flatnonzero(~self.hard), np.flatnonzero(self.hard)
 
     def __len__(self) -> int:
         return int(self.stage.size)
@@ -200,8 +204,7 @@ class SoftRows:
     def linearize(self, x: Array, u: Array, e: Array | None = None) -> tuple[Array, Array, Array]:
         """Values ``(M,)`` and their derivatives by the row's state ``(M, n_x)`` and input ``(M, n_u)``."""
         n = self._horizon
-        by_x = np.tile(np.eye(self._n_x)[self.states], (n, 1))
-        rows = [(x[1:, self.states].ravel(), by_x, np.zeros((by_x.shape[0], self._n_u)))]
+        rows = [(x[1:, self.states].ravel(), *self._of_states)]
         for f in self._expressions:
             f.inputs[0][:], f.inputs[1][:] = x[:-1].ravel(), u.ravel()
             f.inputs[2][:] = 0.0 if e is None else e.ravel()
@@ -211,6 +214,8 @@ class SoftRows:
             by_x = by_x.reshape(n, self._n_x, each).transpose(0, 2, 1).reshape(value.size, self._n_x)
             by_u = by_u.reshape(n, self._n_u, each).transpose(0, 2, 1).reshape(value.size, self._n_u)
             rows.append((value, by_x, by_u))
+        if len(rows) == 1:
+            return rows[0]
         return (
             np.concatenate([r[0] for r in rows]),
             np.vstack([r[1] for r in rows]),
@@ -227,11 +232,14 @@ class SoftRows:
         if not len(self):
             return np.zeros(0), np.zeros((0, self._n_x)), np.zeros((0, u.size))
         value, by_x, by_u = self.linearize(x, u, e)
-        states = from_u.reshape(len(x), self._n_x, u.size)[self.stage]
-        slope = (by_x[:, None, :] @ states)[:, 0, :]
-        direct = np.flatnonzero(np.any(by_u != 0, axis=1))
-        for j in range(self._n_u):
-            slope[direct, self.stage[direct] * self._n_u + j] += by_u[direct, j]
+        own = self._rows.size
+        slope = from_u[self._rows]
+        if own < len(self):  # expressions
+            states = from_u.reshape(len(x), self._n_x, u.size)[self.stage[own:]]
+            slope = np.vstack([slope, (by_x[own:, None, :] @ states)[:, 0, :]])
+            direct = np.flatnonzero(np.any(by_u != 0, axis=1))
+            for j in range(self._n_u):
+                slope[direct, self.stage[direct] * self._n_u + j] += by_u[direct, j]
         return value, by_x, slope
 
     def excess(self, values: Array) -> Array:
@@ -241,13 +249,13 @@ class SoftRows:
     def given_way(self, excess: Array) -> dict[str, float]:
         """Largest violation of each hard bound that violations ``(M,)`` have, by name."""
         found: dict[str, float] = {}
-        for row in np.flatnonzero(self.hard & (excess > 0)):
+        for row in self._firm[excess[self._firm] > 0]:
             found[self.names[row]] = max(found.get(self.names[row], 0.0), float(excess[row]))
         return found
 
     def largest(self, excess: Array) -> float:
         """Largest violation of a soft bound among violations ``(M,)``."""
-        return float(np.max(excess[~self.hard], initial=0.0))
+        return float(excess[self._soft].max(initial=0.0))
 
     def penalty(self, excess: Array) -> float:
         """Cost per second of violations ``(M,)``, summed."""
@@ -668,9 +676,7 @@ class Problem:
         array = np.asarray(values, dtype=float)
         if array.ndim != 2 or len(array) < 1 or array.shape[1] != columns:
             raise InputError(f"{name}: shape {array.shape} given, (m, {columns}) with m > 0 needed")
-        if len(array) == self._rows.size:
-            return array.copy()
-        return np.asarray(array[np.minimum(self._rows, len(array) - 1)])
+        return array.take(self._rows, axis=0, mode="clip")
 
     def state_weights(self, weight: Array) -> tuple[Array, Array]:
         """Weights of the stages ``(N, n_x)`` and the terminal matrix for weight factors ``(N + 1, n_x)``."""
@@ -695,8 +701,9 @@ class Problem:
         du[0] -= u_prev
         error = x - target.x
         stages, terminal = self.state_weights(target.weight)
-        last, inputs = error[-1], np.sum(off**2 @ ocp.r) + np.sum(du**2 @ ocp.r_delta)
-        total = float(np.vdot(stages, error[:-1] ** 2) + self.model.dt * inputs + last @ terminal @ last)
+        last, inputs = error[-1], np.vdot(off * ocp.r, off) + np.vdot(du * ocp.r_delta, du)
+        states = error[:-1]
+        total = float(np.vdot(stages * states, states) + self.model.dt * inputs + last @ terminal @ last)
         total += self.economic.value(x, u, target.p)
         if len(self.soft):
             excess = self.soft.excess(self.soft.values(x, u, target.e)) if excess is None else excess

@@ -123,7 +123,7 @@ class InputQP:
         s, multipliers, active = ActiveSet(qp, self._after[:rows], self._before[:rows]).solve(active)
         status, kkt = self._check(qp, s, multipliers)
         ways = self._gives_way
-        if strict and ways.size and np.any(np.abs(active[ways]) == 2):
+        if strict and ways.size and (np.abs(active[ways]) == 2).any():
             never = qp.linear.copy(), qp.give.copy()
             never[0][ways], never[1][ways] = np.inf, 0.0
             kept = replace(qp, linear=never[0], give=never[1])
@@ -139,7 +139,7 @@ class InputQP:
     def _check(self, qp: RowQP, s: Array, multipliers: Array) -> tuple[Status, float]:
         """What an answer is worth, and its KKT residual, relative to the inputs' gradient."""
         slope, wrong, violation = qp.residuals(s, multipliers)
-        kkt = max(slope, wrong) / max(1.0, float(np.max(np.abs(qp.g))))
+        kkt = max(slope, wrong) / max(1.0, float(np.abs(qp.g).max()))
         if not all(map(isfinite, (slope, wrong, violation))):
             return Status.NOT_FINITE, float("nan")
         if violation > BOUND_TOLERANCE:

@@ -7,7 +7,7 @@ from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dgemv
+from scipy.linalg.blas import dgemm, dgemv
 
 from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits
@@ -69,19 +69,21 @@ class Condenser:
     """Derivatives ``(N + 1, n_z, N n_u)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
 
     def __init__(self, n: int, n_z: int, n_u: int, n_x: int) -> None:
-        self.by_inputs = np.zeros((n + 1, n_z, n * n_u))  # by later inputs they stay zero
-        self._newest = self.by_inputs[1:].reshape(n, n_z, n, n_u)
+        by_rows = np.zeros((n + 1, n * n_u, n_z))  # by later inputs they stay zero
+        self.by_inputs = by_rows.transpose(0, 2, 1)
+        self._newest = by_rows[1:].reshape(n, n, n_u, n_z)
         self._stages = np.arange(n)
-        self._before = [self.by_inputs[k, :, : k * n_u] for k in range(1, n)]
+        self._before = [self.by_inputs[k, :, : k * n_u] for k in range(1, n)]  # column by column in memory
         self._after = [self.by_inputs[k + 1, :, : k * n_u] for k in range(1, n)]
         self._states = self.by_inputs[:, :n_x]
         self._shape = (n + 1) * n_x, n * n_u
 
     def __call__(self, a_t: Array, b: Array) -> Array:
         """``((N + 1) n_x, N n_u)`` from transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
-        self._newest[self._stages, :, self._stages] = b
-        for a, before, after in zip(a_t[1:].transpose(0, 2, 1), self._before, self._after, strict=True):
-            np.matmul(a, before, after)
+        self._newest[self._stages, self._stages] = b.transpose(0, 2, 1)
+        matrices, transposed = _columns(a_t)
+        for matrix, before, after in zip(matrices[1:], self._before, self._after, strict=True):
+            dgemm(1.0, matrix, before, 0.0, after, transposed, 0, 1)  # in place, as in propagate
         return np.array(self._states, order="C").reshape(self._shape)  # outlives the next call
 
 
@@ -219,7 +221,7 @@ class CondensedController(SplitController):
         z = np.hstack([previous.x[1:], previous.h[1:]])
         w = (
             np.vstack([previous.w[1:], previous.w[-1:]])
-            if len(previous.w)
+            if previous.w.size
             else self.problem.forecast(None, None)
         )
         derivatives = self.stages.at(z, self.model.acting(u, d, w))
@@ -254,7 +256,7 @@ class CondensedController(SplitController):
         """
         start = perf_counter()
         target = self.problem.target(reference, prepared.weight, estimate, w, prepared.steady)
-        if not np.array_equal(target.w, prepared.w):
+        if target.w is not prepared.w and not np.array_equal(target.w, prepared.w):
             prepared = self.linearize(
                 prepared.u,
                 prepared.z,
@@ -273,7 +275,6 @@ class CondensedController(SplitController):
             drift[:, :n_x] += self._on_x @ (estimate.d - prepared.d)
         free = propagate(prepared.a_t, drift, dz0)
         error = prepared.z[:, :n_x] + free[:, :n_x] - target.x
-        u_bar = prepared.u.ravel()
         gradient = 2 * error.ravel() @ prepared.weighted + prepared.direct - self._of_targets(target.u)
         if economic is not None:
             slope, curvature = economic
@@ -282,7 +283,7 @@ class CondensedController(SplitController):
                 slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
             )
         soft = self._soft_rows(prepared, free, target)
-        if not (np.all(np.isfinite(gradient)) and (soft is None or np.all(np.isfinite(soft[0])))):
+        if not (np.isfinite(gradient).all() and (soft is None or np.isfinite(soft[0]).all())):
             return self._failed(prepared, Status.NOT_FINITE, start)
         answer = self.qp.solve(
             hessian, gradient, prepared.u, prepared.u_prev, soft, limits, prepared.active, strict=True
@@ -290,8 +291,9 @@ class CondensedController(SplitController):
         step = answer.step
         if not answer.status.ok:
             return self._failed(prepared, answer.status, start, answer.kkt)
-        u = (u_bar + step).reshape(prepared.u.shape)
-        z = prepared.z + free + self._response(prepared, step)
+        inputs = step.reshape(prepared.u.shape)
+        u = prepared.u + inputs
+        z = prepared.z + propagate(prepared.a_t, drift + self._of_inputs(prepared.b, inputs), dz0)
         excess, largest, given_way = None, 0.0, {}
         if soft is not None:
             excess = self.problem.soft.excess(soft[0] + soft[1] @ step)
@@ -377,11 +379,6 @@ class CondensedController(SplitController):
             return np.asarray(b[:, :, 0] * u)
         return np.asarray(np.einsum("kij,j->ki" if u.ndim == 1 else "kij,kj->ki", b, u))
 
-    def _response(self, prepared: Prepared, step: Array) -> Array:
-        """By how much a step of the inputs changes states and hidden states ``(N + 1, n_z)``."""
-        inputs = step.reshape(len(prepared.b), -1)
-        return propagate(prepared.a_t, self._of_inputs(prepared.b, inputs), np.zeros(prepared.z.shape[1]))
-
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
         """Hessian and economic derivatives, those that wait for the parameters' values included."""
         if not self.problem.economic.n_p:
@@ -399,7 +396,7 @@ class CondensedController(SplitController):
             value, by_x, slope = self.problem.soft.condensed(x, prepared.u, prepared.from_u, target.e)
         if not value.size:
             return None
-        moved = np.sum(by_x * free[self.problem.soft.stage, : self._n_x], axis=1)
+        moved = np.einsum("ij,ij->i", by_x, free[:, : self._n_x][self.problem.soft.stage])
         return value + moved, slope
 
     def _evaluate_once(self) -> None:
@@ -444,4 +441,4 @@ class CondensedController(SplitController):
 
 
 def _largest(defects: Array) -> float:
-    return float(np.max(np.abs(defects)))
+    return float(np.abs(defects).max())
