@@ -14,6 +14,7 @@ from hybrid_mpc.identify.evaluate import Scores, input_correlation
 from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loop_figures import curves_of, loop_figure
+from hybrid_mpc.job.monitor import thresholds_of
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
@@ -403,12 +404,9 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
         cause = f"; the diagnosis: {row.diagnosis}" if row.diagnosis else ""
         yield "guard", f"guard_{row.fault}", figure, f"{row.title.capitalize()}: {seen}{cause}."
     if found.faults is None and found.shown:
-        limits: dict[str, float] = {}
-        stored = context.find(MONITOR)
+        limits, stored = dict[str, float](), context.find(MONITOR)
         if found.detector is None and not isinstance(stored, Absent):
-            calibration = stored.calibration
-            known = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
-            limits = {name: limit for name, limit in known.items() if limit is not None}
+            limits = thresholds_of(stored.calibration)
         figure = monitor.overview(
             read_trace(arrays, "recorded"), arrays["recorded/y"], outputs=outputs, force_unit=unit,
             thresholds=limits, title=found.shown,
