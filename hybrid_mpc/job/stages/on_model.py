@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import DRAWN, MODEL, LoopRow, LoopSpec, arrays_of, stand_in, with_arrays
-from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage
+from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, task_content
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.tasks import ready, tasks_of
@@ -106,8 +106,7 @@ def what_on_model_reads(context: Context) -> dict[str, object]:
         return {**read, "tasks": str(none)}
     loop = loop_settings(whole)
     for task in tasks_of(whole, budget.tasks):
-        content = task_content(task, context.spec.dt, loop)
-        read[f"task {task.name}"] = UNKNOWN if any(v is UNKNOWN for v in content.values()) else content
+        read[f"task {task.name}"] = task_content(task, context.spec.dt, loop)
     return read
 
 
