@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Literal
 
 from hybrid_mpc import __version__
+from hybrid_mpc.job.engine import THREADS
 
 PACKAGE = "hybrid-mpc"
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 WAIT_S = 1.0
 """Longest time [s] that another program is asked."""
 State = Literal["ok", "absent", "wrong"]

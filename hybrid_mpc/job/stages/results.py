@@ -426,15 +426,8 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
         )
     for group in (
-        "identification",
-        "control",
-        "estimation",
-        "timing",
-        "residuals",
-        "monitor",
-        "guard",
-        "analysis",
-    ):
+        "identification", "control", "estimation", "timing", "residuals", "monitor", "guard", "analysis",
+    ):  # fmt: skip
         _check_values(values[group], group, where)
     return results
 
@@ -502,8 +495,8 @@ def identification(context: Context) -> Identification:
         },
         SmootherNoise(prior.fit.sigma, prior.fit.walk),
         {
-            "error": _ratio(error[chosen.hybrid], error["phy"]),
-            "e_sim": _ratio(e_sim[chosen.hybrid], e_sim["phy"]),
+            "error": ratio(error[chosen.hybrid], error["phy"]),
+            "e_sim": ratio(e_sim[chosen.hybrid], e_sim["phy"]),
         },
         ModelChoice(
             chosen.recommended,
@@ -545,7 +538,8 @@ def finite(value: float) -> float | None:
     return float(value) if math.isfinite(float(value)) else None
 
 
-def _ratio(value: float | None, baseline: float | None) -> float | None:
+def ratio(value: float | None, baseline: float | None) -> float | None:
+    """A value over the baseline's, or None where one of them is missing, or the baseline is zero."""
     return None if value is None or not baseline else value / baseline
 
 
