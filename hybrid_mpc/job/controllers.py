@@ -131,10 +131,7 @@ def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[
 
 
 def find_noise(
-    scenario: Scenario,
-    artifact: Kit,
-    controllers: Sequence[str],
-    seed: int,
+    scenario: Scenario, artifact: Kit, controllers: Sequence[str], seed: int
 ) -> tuple[Mapping[str, Array], str]:
     """Process noise of the filters of controllers, and in words where it came from.
 

@@ -20,12 +20,7 @@ from hybrid_mpc.files import digest, read_document, read_document_arrays, write_
 from hybrid_mpc.job.controllers import CONTROLLERS, build
 from hybrid_mpc.job.tasks import ready, repeated, tasks_of
 from hybrid_mpc.kit.artifact import WATCHES, Kit
-from hybrid_mpc.kit.assembly import (
-    SOLVERS,
-    make_adaptive_guard,
-    make_backup_guard,
-    make_resting_guard,
-)
+from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
 from hybrid_mpc.loop.faults import Fault, check_channels, fault_text, install
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.plant import ModelPlant, Plant
@@ -177,12 +172,7 @@ class LoopSpec:
 
 @dataclass(frozen=True)
 class Interval:
-    """A stretch of time.
-
-    Args:
-        start_s: First instant [s].
-        end_s: Last one [s].
-    """
+    """A stretch of time, from its first instant to its last [s]."""
 
     start_s: float
     end_s: float
@@ -190,14 +180,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class ModeChange:
-    """A change of the guard's mode.
-
-    Args:
-        t_s: When [s].
-        before: Name of the mode before.
-        after: Name of the mode from then on.
-        why: What led to it.
-    """
+    """A change of the guard's mode: when [s], names of the mode before and from then on, and what led to it."""
 
     t_s: float
     before: str

@@ -348,11 +348,7 @@ def gain_schedules(
 
 
 def measured_bode(
-    responses: Mapping[str, Mapping[str, Array]],
-    *,
-    input_signal: Signal,
-    output_signal: Signal,
-    source: str,
+    responses: Mapping[str, Mapping[str, Array]], *, input_signal: Signal, output_signal: Signal, source: str
 ) -> Figure:
     """Frequency responses estimated in the same way from a machine and from models.
 

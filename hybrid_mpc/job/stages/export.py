@@ -72,9 +72,8 @@ def export_stage(context: Context) -> ExportResult:
     parities = []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)
-        like = (
-            programs.get(member_names(1)[0]) if name in members else None
-        )  # they differ in their weights alone
+        # members differ in their weights alone
+        like = programs.get(member_names(1)[0]) if name in members else None
         programs[name] = trace_model(step, like)
         training, samples = context.smoothed("train"), FEW if like else 100
         parities.append(

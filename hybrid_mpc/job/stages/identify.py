@@ -228,9 +228,8 @@ def models_of(prior: Prior) -> tuple[str, ...]:
 
 def training_stage(context: Context) -> TrainingResult:
     """Train the networks of every kind, two kinds at once."""
-    name = digest(TRAINING.keys(context))[
-        :12
-    ]  # networks of other settings or data lie in a folder of their own
+    # networks of other settings or data lie in a folder of their own
+    name = digest(TRAINING.keys(context))[:12]
     folder = context.out / "checkpoints" / "training" / name
     trained = train_kinds(
         context.settings.scenario,
