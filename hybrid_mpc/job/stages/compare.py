@@ -52,13 +52,9 @@ TIMED = ("prior_observer", "hybrid_observer")
 
 @dataclass(frozen=True)
 class Part:
-    """Loops that run and are kept together: one task under one controller.
+    """Loops that run and are kept together: one task under one controller, by their numbers.
 
-    Args:
-        task: The task.
-        controller: The controller.
-        seeds: Numbers of the loops.
-        timed: Whether it runs alone on the machine, so that the durations of its steps count.
+    A ``timed`` part runs alone on the machine, so that the durations of its steps count.
     """
 
     task: Task
@@ -114,8 +110,8 @@ class ControlResult:
 
     @property
     def drawn(self) -> list[LoopRow]:
-        """The loops with their signals."""
-        return with_arrays(self.rows, self.arrays) if self.rows else []
+        """The loops whose signals were kept, with these."""
+        return [row for row in with_arrays(self.rows, self.arrays) if row.arrays] if self.rows else []
 
 
 def control_stage(context: Context) -> ControlResult | Absent:

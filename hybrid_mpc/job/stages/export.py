@@ -34,12 +34,8 @@ FEW = 10
 
 @dataclass(frozen=True)
 class ExportResult:
-    """The artifact, and how far its models lie from PyTorch.
-
-    Args:
-        parity_max_abs_error: Largest difference of values, relative to the outputs' scale.
-        jacobian_max_abs_error: Largest difference of Jacobians, alike.
-        programs_sha256: Hash of the exported programs.
+    """The artifact: the largest differences of its models' values and Jacobians from PyTorch's, relative to the
+    outputs' scale, and the hash of its programs.
     """
 
     parity_max_abs_error: float

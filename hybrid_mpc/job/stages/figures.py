@@ -215,7 +215,7 @@ def _loops(context: Context) -> Any:
     scenario, found = context.scenario, context.find(CONTROL)
     if isinstance(found, Absent) or scenario.control is None:
         return
-    prior, drawn = scenario.prior(), [row for row in found.drawn if row.arrays]
+    prior, drawn = scenario.prior(), found.drawn
     if not drawn:
         return
     for task in tasks_of(scenario, context.budget.tasks):
@@ -233,7 +233,7 @@ def _on_model(context: Context) -> Any:
         return
     scenario = ready(context.scenario)
     tasks = {task.name: task for task in scenario.tasks}
-    for name, rows in by_controller([row for row in found.drawn if row.arrays]).items():
+    for name, rows in by_controller(found.drawn).items():
         for row in rows:
             task = tasks[row.task]
             control = task.control or scenario.control

@@ -138,14 +138,7 @@ SHOWN = ("t", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
 
 @dataclass(frozen=True)
 class Case:
-    """What breaks in a loop.
-
-    Args:
-        name: Short name.
-        title: In words.
-        target: Of the fault.
-        value: Its size.
-    """
+    """What breaks in a loop: a short name, the same in words, the fault's target and its size."""
 
     name: str
     title: str
@@ -258,14 +251,8 @@ def read_trace(arrays: Mapping[str, Any], name: str) -> MonitorTrace:
 
 @dataclass(frozen=True)
 class NominalLoop:
-    """A loop that the detector was learned from.
-
-    Args:
-        task: Name of the task.
-        seed: Number of the loop.
-        friction: Share to which friction drifts.
-        seconds: Length [s].
-        cost: Its cost.
+    """A loop that the detector was learned from: its task and number, the share to which friction drifts, its length
+    [s] and its cost.
     """
 
     task: str

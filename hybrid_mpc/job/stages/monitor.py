@@ -85,13 +85,8 @@ class RecordedAlarm:
 
 @dataclass(frozen=True)
 class CleanAlarms:
-    """Alarms where nothing disturbs the machine.
-
-    Args:
-        seconds: Time known to be undisturbed [s].
-        alarms: Alarms that begin in it.
-        test_seconds: The part of it in test data [s].
-        test_alarms: Alarms that begin there.
+    """Alarms where nothing disturbs the machine: time known to be undisturbed [s] and the alarms that begin in it, then
+    those of test data alone.
     """
 
     seconds: float = 0.0
@@ -155,7 +150,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     if not energy_is_watched(model):
         return Absent(NO_ENERGY.format(scenario=context.scenario.name))
     try:
-        rest = nominal_rest(context, model)
+        rest = rest_speeds([t for t in context.dataset.trajectories if t.role in NOMINAL], model)
     except InputError as short:
         reason = f"the monitor could not be calibrated: {short}"
     power, residual, traces = [], [], []
@@ -224,11 +219,6 @@ def put_calibration(context: Context, found: MonitorResult) -> str:
     if held is None or replace(held, detector=None) != found.calibration:
         set_calibration(context.out / "model", found.calibration)
     return ""
-
-
-def nominal_rest(context: Context, model: HybridModel) -> tuple[float, ...]:
-    """Rest speeds of a run's machine, from its undisturbed training and validation recordings."""
-    return rest_speeds([t for t in context.dataset.trajectories if t.role in NOMINAL], model)
 
 
 def _load_loop(context: Context, kit: Kit) -> tuple[UnknownLoad, ClosedLoopResult]:

@@ -43,8 +43,8 @@ class OnModelResult:
 
     @property
     def drawn(self) -> list[LoopRow]:
-        """The loops with their signals."""
-        return with_arrays(self.rows, self.arrays)
+        """The loops whose signals were kept, with these."""
+        return [row for row in with_arrays(self.rows, self.arrays) if row.arrays]
 
 
 def on_model_stage(context: Context) -> OnModelResult | Absent:

@@ -187,11 +187,7 @@ def report_so_far(context: Context) -> None:
     }
     if "free_run" in figures:
         found = identification(context)
-        tables["free_run"] = [
-            *_score_tables(context, found),
-            _choice_table(found),
-            _band_table(context, found),
-        ]
+        tables["free_run"] = _free_run_tables(context, found)
     texts = words("run_words.html")
     shown = [key for key in TITLES if key in figures or key in tables]
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
@@ -249,7 +245,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
     tables: dict[str, Sequence[Table | None]] = {
         "data": [_data_table(results.data)],
         "models": [_prior_table(context)],
-        "free_run": [*_score_tables(context, found), _choice_table(found), _band_table(context, found)],
+        "free_run": _free_run_tables(context, found),
         "export": [_export_table(results.export)],
         "control": [
             _control_table(results.control),
@@ -460,8 +456,8 @@ def _prior_table(context: Context) -> Table:
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
 
-def _score_tables(context: Context, found: Identification) -> list[Table]:
-    """Errors of every model: by output; then of its rates and by balance."""
+def _free_run_tables(context: Context, found: Identification) -> list[Table]:
+    """Errors of every model: by output; then of its rates and by balance; the choice, and the bands."""
     prior = context.scenario.prior()
     models = models_of(prior)
     outputs = [s.label for s in prior.outputs]
@@ -493,7 +489,7 @@ def _score_tables(context: Context, found: Identification) -> list[Table]:
         *(f"violation of {label}" for label in balances),
     )
     caption = "Free runs on unseen data: rates of the states" + (" and balances." if balances else ".")
-    return [*tables, Table(columns, rows, caption)]
+    return [*tables, Table(columns, rows, caption), _choice_table(found), _band_table(context, found)]
 
 
 def _choice_table(found: Identification) -> Table:
@@ -592,7 +588,7 @@ def _response_table(context: Context) -> Table | None:
     scenario, found = context.scenario, context.find(CONTROL)
     if isinstance(found, Absent) or scenario.control is None:
         return None
-    drawn, prior = [row for row in found.drawn if row.arrays], scenario.prior()
+    drawn, prior = found.drawn, scenario.prior()
     names = {controller: name for name, controller in REPORTED.items()}
     rows = [
         (
