@@ -68,7 +68,7 @@ from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import SwitchingFilter
-from hybrid_mpc.job.controllers import find_noise
+from hybrid_mpc.job.controllers import OBSERVERS, find_noise
 from hybrid_mpc.kit.artifact import FILE, Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import MODES, make_ocp
 from hybrid_mpc.loop.plant import Plant
@@ -290,7 +290,7 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     notes = [f"scenario {scenario.name}" if scenario else "no scenario: no response of a machine"]
     ocp: OCP | None = None
     filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
-    noise_known = scenario is not None or {"prior_observer", "hybrid_observer"} <= set(kit.loop.process_noise)
+    noise_known = scenario is not None or set(OBSERVERS) <= set(kit.loop.process_noise)
     if control is not None and not noise_known:
         notes.append("no loops: the model holds no process noise for its filters; run the scenario again")
     if control is not None and noise_known and {"prior", "hybrid"} <= set(kit.models):
@@ -362,7 +362,7 @@ def _filters(
     """The observers of the closed loops: quiet, and in the periods after a load came or went."""
     source = "the model's own"
     if scenario is not None:
-        noise, source = find_noise(scenario, kit, ("prior_observer", "hybrid_observer"), settings.seed)
+        noise, source = find_noise(scenario, kit, OBSERVERS, settings.seed)
         kit = kit.with_noise(noise)
     filters = {}
     for mode in ("quiet", "jump"):

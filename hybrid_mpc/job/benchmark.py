@@ -43,6 +43,7 @@ from hybrid_mpc.job.benchmark_runs import (
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.folder import JobNote, write_note
+from hybrid_mpc.job.stages.choose import CANDIDATES
 from hybrid_mpc.job.stages.identify import PARTS, load_trained, save_trained, train_kinds
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import BenchmarkBudget
@@ -52,8 +53,6 @@ from hybrid_mpc.scenario import Scenario, load_scenario
 Array = NDArray[np.float64]
 SCHEMA = 3
 MODEL_NOTE = "benchmark_model.json"
-CANDIDATES = ("phy", "pgrnn", "mopgrnn")
-"""What may be recommended, where it is trained."""
 SHOWN = 20.0
 """Length of a run that is drawn sample by sample [the machine's seconds]."""
 IN_MOTION = 0.1
@@ -302,14 +301,9 @@ def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Pro
         held = read_document(note, "delete it, and the same command fits the prior anew")
         return record(PriorFit, held, str(note))
     fit = fit_prior(
-        scenario.prior,
-        data.train,
-        data.valid,
-        dt=scenario.data.dt,
-        length=spec.length or spec.piece,
-        largest_delay=scenario.data.largest_delay,
-        on_progress=partial(progress.update, "prior"),
-    )
+        scenario.prior, data.train, data.valid, dt=scenario.data.dt, length=spec.length or spec.piece,
+        largest_delay=scenario.data.largest_delay, on_progress=partial(progress.update, "prior"),
+    )  # fmt: skip
     write_document(note, plain(fit))
     return fit
 

@@ -393,6 +393,12 @@ class Bench:
             Its row, and its whole record.
         """
         plans: list[Array] = []
+
+        def note(step: Step) -> None:
+            plans.append(step.decision.solution.x)
+            if on_step is not None:
+                on_step(step)
+
         task = self.task(spec) if task is None else task
         estimator, controller = self.parts(spec)
         late = spec.late
@@ -400,7 +406,7 @@ class Bench:
             self.plant(spec), estimator, controller, task.reference, weight=task.weight, w=task.w,
             dt=self.kit(spec).models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
             seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
-            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=_noting(spec, plans, on_step),
+            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=note if "plans" in spec.keep else on_step,
             late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
         )  # fmt: skip
         row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
@@ -409,21 +415,6 @@ class Bench:
         derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
         arrays = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
         return replace(row, arrays=arrays), result
-
-
-def _noting(
-    spec: LoopSpec, plans: list[Array], on_step: Callable[[Step], None] | None
-) -> Callable[[Step], None] | None:
-    """What is called after every period: it notes the plan where the row is to hold plans."""
-    if "plans" not in spec.keep:
-        return on_step
-
-    def note(step: Step) -> None:
-        plans.append(step.decision.solution.x)
-        if on_step is not None:
-            on_step(step)
-
-    return note
 
 
 def run_loops(

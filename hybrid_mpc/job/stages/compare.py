@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.files import digest
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
+from hybrid_mpc.job.controllers import CONTROLLERS, OBSERVERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.loops import (
     DRAWN,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 TIMED_PERIODS = 1000
 """Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
-TIMED = ("prior_observer", "hybrid_observer")
+TIMED = OBSERVERS
 """Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
 
 

@@ -13,7 +13,7 @@ from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.consistency import consistency
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTROLLERS
+from hybrid_mpc.job.controllers import CONTROLLERS, OBSERVERS
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.stages.identify import DATA
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-OBSERVERS = ("prior_observer", "hybrid_observer")
 PERIODS = 1000
 RECORDINGS = 4
 """So many periods of so many test recordings are looked at: a few seconds of computing for both observers."""

@@ -358,12 +358,8 @@ def _analysis(context: Context) -> Any:
         return
     arrays = found.arrays
     poles = {n: np.array([complex(*z) for z in found.models[n].rest.poles]) for n in ("prior", "hybrid")}
-    yield (
-        "analysis",
-        "poles",
-        analysis.pole_map(poles, context.spec.dt),
-        "Poles of the one-step maps at rest.",
-    )
+    figure = analysis.pole_map(poles, context.spec.dt)
+    yield "analysis", "poles", figure, "Poles of the one-step maps at rest."
     prior = context.scenario.prior()
     friction = ", where the slope of dry friction dominates" if prior.kinematics else ""
     titles = {"rest": f"at rest{friction}", "moving": "at working speed"}
@@ -371,13 +367,10 @@ def _analysis(context: Context) -> Any:
         if any(point not in found.models[n].points for n in poles):
             continue  # a network that corrects every rate leaves no speed that is one
         for (i, output), (j, into) in product(enumerate(prior.outputs), enumerate(prior.inputs)):
-            responses = {
-                n: (
-                    arrays[f"{n}/{point}/omega"],
-                    *(arrays[f"{n}/{point}/{k}"][i, j] for k in ("magnitude", "phase")),
-                )
-                for n in poles
-            }
+            responses = {}
+            for n in poles:
+                omega, size, phase = (arrays[f"{n}/{point}/{k}"] for k in ("omega", "magnitude", "phase"))
+                responses[n] = omega, size[i, j], phase[i, j]
             figure = analysis.bode(
                 responses, input_signal=into, output_signal=output, nyquist=np.pi / context.spec.dt
             )

@@ -60,12 +60,18 @@ class DataResult:
 
 
 @dataclass(frozen=True)
-class CutPart:
-    """A part of a recording that is not used as it was recorded: its file, from and to [s], and why."""
+class CutInterval:
+    """A part of a recording that is not used as it was recorded: its file, from and to [s]."""
 
     file: str
     start_s: float
     end_s: float
+
+
+@dataclass(frozen=True)
+class CutPart(CutInterval):
+    """The same, and why."""
+
     why: str
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.controllers import OBSERVERS
 from hybrid_mpc.job.loops import DRAWN, MODEL, LoopRow, LoopSpec, arrays_of, stand_in, with_arrays
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, task_content
@@ -18,7 +19,6 @@ from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.kit.artifact import loop_settings
 
 Array = NDArray[np.float64]
-CONTROLLERS = ("prior_observer", "hybrid_observer")
 ON_MODEL = "on the model, not the machine"
 """What stands wherever such a loop is shown."""
 
@@ -61,7 +61,7 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
     settings = context.settings
     plants: dict[str, str] = {}
     left_out: dict[str, str] = {}
-    for name in CONTROLLERS:
+    for name in OBSERVERS:
         try:
             plants[name] = stand_in(context.kit, name).model.name
         except InputError as none:
@@ -112,7 +112,7 @@ def what_on_model_reads(context: Context) -> dict[str, object]:
 
 def by_controller(rows: Sequence[LoopRow]) -> dict[str, list[LoopRow]]:
     """The loops of each controller by itself: each met another plant, so nothing compares them."""
-    return {name: [row for row in rows if row.controller == name] for name in CONTROLLERS}
+    return {name: [row for row in rows if row.controller == name] for name in OBSERVERS}
 
 
 LOOPS_ON_MODEL = Stage(

@@ -186,19 +186,14 @@ def report_so_far(context: Context) -> None:
         "models": [_prior_table(context)],
     }
     if "free_run" in figures:
-        found = identification(context)
-        tables["free_run"] = _free_run_tables(context, found)
+        tables["free_run"] = _free_run_tables(context, identification(context))
     texts = words("run_words.html")
     shown = [key for key in TITLES if key in figures or key in tables]
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
     going = "This run goes on: the page is written anew after the first stages and at the end. Load it again."
-    title = f"hybrid-mpc: {context.scenario.name}"
-    write_report(
-        context.out / "report.html",
-        Report(
-            title, context.scenario.title, context.scenario.description, command(context), (), sections, going
-        ),
-    )
+    s, title = context.scenario, f"hybrid-mpc: {context.scenario.name}"
+    page = Report(title, s.title, s.description, command(context), (), sections, going)
+    write_report(context.out / "report.html", page)
 
 
 def report_is_there(context: Context, found: ReportResult) -> str:

@@ -27,7 +27,7 @@ from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecord
 from hybrid_mpc.job.stages.evaluate import EVALUATION, BandScores, BaselineScores
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
-from hybrid_mpc.job.stages.identify import DATA, MODELS
+from hybrid_mpc.job.stages.identify import DATA, MODELS, CutInterval
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
@@ -46,15 +46,6 @@ REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "o
 """Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
 Errors = Mapping[str, Mapping[str, float] | str | None]
 """Error by model, each by signal with unit; a model without one has null, and ``MODEL_reason``."""
-
-
-@dataclass(frozen=True)
-class CutInterval:
-    """A part of a recording that is not used as it was recorded: its file, from and to [s]."""
-
-    file: str
-    start_s: float
-    end_s: float
 
 
 @dataclass(frozen=True)
