@@ -98,11 +98,8 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
             tasks = f"none declared, so default ones: {'; '.join(task.title for task in found.default_tasks)}"
         if scenario.plant is None:
             tasks += "; loops run on a trained model, for there is no plant"
-        _line(
-            console,
-            "control",
-            f"{control.horizon} periods, {control.horizon * spec.dt:.4g} s; tasks: {tasks}",
-        )
+        length = f"{control.horizon} periods, {control.horizon * spec.dt:.4g} s"
+        _line(console, "control", f"{length}; tasks: {tasks}")
     if found.dataset is not None:
         console.print(_recordings(found))
 
@@ -185,10 +182,8 @@ def _times(modes: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> str:
     rates = np.sort(-modes.real[modes.real < -1e-9 * size])
     told = [f"{1 / rates[0]:.3g} s"] if len(rates) else []
     told += [f"down to {1 / rates[-1]:.3g} s"] if len(rates) > 1 and rates[-1] > 1.001 * rates[0] else []
-    integrators, unstable = (
-        int((np.abs(modes.real) <= 1e-9 * size).sum()),
-        int((modes.real > 1e-9 * size).sum()),
-    )
+    integrators = int((np.abs(modes.real) <= 1e-9 * size).sum())
+    unstable = int((modes.real > 1e-9 * size).sum())
     told += [f"{integrators} undamped or integrating"] if integrators else []
     told += [f"{unstable} unstable"] if unstable else []
     return ", ".join(told) if told else "none"
@@ -198,12 +193,9 @@ def _recordings(found: Preflight) -> Table:
     assert found.dataset is not None
     data = found.dataset
     table = _table("recordings", "file", "length", "sampled every", "training", "validation", "test")
-    seconds = {
-        (t.file, t.role): sum(
-            p.dt * len(p.t) for p in data.trajectories if (p.file, p.role) == (t.file, t.role)
-        )
-        for t in data.trajectories
-    }
+    seconds: dict[tuple[str, str], float] = {}
+    for t in data.trajectories:
+        seconds[t.file, t.role] = seconds.get((t.file, t.role), 0.0) + t.dt * len(t.t)
     for name, dt in zip(data.files, data.sampling, strict=True):
         stem = Path(name).stem
         length = sum(t.dt * len(t.t) for t in data.whole if t.file == stem)

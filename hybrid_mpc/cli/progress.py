@@ -69,8 +69,7 @@ class Lines(Progress):
     """Plain lines for logs and pipes."""
 
     def __init__(self) -> None:
-        self._begin = self._stage = self._last = time.monotonic()
-        self._title = ""
+        self._stage = self._last = time.monotonic()
 
     def __enter__(self) -> Self:
         return self
@@ -80,7 +79,7 @@ class Lines(Progress):
 
     def start(self, title: str) -> None:
         """Note the stage."""
-        self._title, self._stage = title, time.monotonic()
+        self._stage = time.monotonic()
         print(f"{title} ...", flush=True)
 
     def update(self, key: str, done: int, total: int, text: str) -> None:

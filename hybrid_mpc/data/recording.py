@@ -52,6 +52,8 @@ SPAN = 1.05
 """Turns that a wrapped angle spans at most: one, and some noise. An angle that counts on and turns fast spans more."""
 MIN_SCORED = 10
 """Fewest samples after the warm-up that make a piece worth a free run."""
+COARSE = 1.5
+"""Model periods from one sample to the next beyond which what lies between would be made up."""
 ROUNDING = 1e-9
 """Share of the end of a sensor's range within which a sample is at that end: ten digits in a file, and units."""
 ABSURD = 1e100

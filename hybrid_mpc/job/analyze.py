@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -67,7 +68,7 @@ from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import SwitchingFilter
-from hybrid_mpc.job.controllers import find_noise
+from hybrid_mpc.job.controllers import OBSERVERS, find_noise
 from hybrid_mpc.kit.artifact import FILE, Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import MODES, make_ocp
 from hybrid_mpc.loop.plant import Plant
@@ -79,6 +80,7 @@ from nn_export import Program, load_programs
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+R = TypeVar("R")
 Point = tuple[Array, Array]
 """A state ``(n_x,)`` and a hidden state ``(n_h,)``."""
 
@@ -288,7 +290,7 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     notes = [f"scenario {scenario.name}" if scenario else "no scenario: no response of a machine"]
     ocp: OCP | None = None
     filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
-    noise_known = scenario is not None or {"prior_observer", "hybrid_observer"} <= set(kit.loop.process_noise)
+    noise_known = scenario is not None or set(OBSERVERS) <= set(kit.loop.process_noise)
     if control is not None and not noise_known:
         notes.append("no loops: the model holds no process noise for its filters; run the scenario again")
     if control is not None and noise_known and {"prior", "hybrid"} <= set(kit.models):
@@ -360,7 +362,7 @@ def _filters(
     """The observers of the closed loops: quiet, and in the periods after a load came or went."""
     source = "the model's own"
     if scenario is not None:
-        noise, source = find_noise(scenario, kit, ("prior_observer", "hybrid_observer"), settings.seed)
+        noise, source = find_noise(scenario, kit, OBSERVERS, settings.seed)
         kit = kit.with_noise(noise)
     filters = {}
     for mode in ("quiet", "jump"):
@@ -405,11 +407,16 @@ def analyze_models(given: AnalysisInput, report: Report = lambda *text: None) ->
     found: dict[str, Any] = {}
     for number, (name, compute) in enumerate(parts.items()):
         report("parts", number, len(parts), name)
-        try:
-            found[name] = compute()
-        except InputError as error:
-            found[name] = Missing(str(error))
+        found[name] = _tried(compute)
     return AnalysisResult(**found)
+
+
+def _tried(compute: Callable[[], R]) -> R | Missing:
+    """What is computed, or why it cannot be."""
+    try:
+        return compute()
+    except InputError as error:
+        return Missing(str(error))
 
 
 def resting_point(given: AnalysisInput, model: HybridModel) -> Point:
@@ -495,8 +502,8 @@ def _linearization(given: AnalysisInput, model: HybridModel, point: Point, syste
         frequency_response(system, omega),
         t,
         np.reshape(step, (model.n_y, model.n_u, -1)),
-        _reduced(given, model, point, system, omega) if model.n_h else None,
-        _gain(system),
+        _tried(lambda: _reduced(given, model, point, system, omega)) if model.n_h else None,
+        _tried(lambda: steady_gain(system)),
     )
 
 
@@ -513,28 +520,16 @@ def _scaled(given: AnalysisInput, model: HybridModel, system: Any) -> Any:
     )
 
 
-def _gain(system: Any) -> SteadyGain | Missing:
-    try:
-        return steady_gain(system)
-    except InputError as error:
-        return Missing(str(error))
-
-
 def _zeros(system: Any) -> Complex:
     """Zeros of a square system without those that only rounding keeps from infinity."""
     found = np.asarray(system.zeros(), dtype=np.complex128)
     return found[np.abs(found) < LARGEST_ZERO]
 
 
-def _reduced(
-    given: AnalysisInput, model: HybridModel, point: Point, system: Any, omega: Array
-) -> Reduction | Missing:
+def _reduced(given: AnalysisInput, model: HybridModel, point: Point, system: Any, omega: Array) -> Reduction:
     half_x, half_u = (0.5 * (box[:, 1] - box[:, 0]) for box in (given.x_range, given.u_range))
     (x, h), u = point, model.u0
-    try:
-        small = physical_states(model, x, u, h, x_scale=half_x, u_scale=half_u, system=system)
-    except InputError as error:
-        return Missing(str(error))
+    small = physical_states(model, x, u, h, x_scale=half_x, u_scale=half_u, system=system)
     response = frequency_response(small.system, omega)
     return Reduction(
         np.asarray(small.system.A), np.asarray(small.system.B), small.bound, small.hankel, response
@@ -692,15 +687,13 @@ def memory_of(given: AnalysisInput) -> dict[str, MemoryAnalysis]:
             found[name] = MemoryAnalysis(whole, None, None)
             continue
         hidden = lyapunov_exponent(model, model.x0, u, part="hidden")
-        found[name] = MemoryAnalysis(whole, hidden, _certificate(given, given.programs[f"{name}/step"]))
+        certificate = _tried(partial(_certificate, given, given.programs[f"{name}/step"]))
+        found[name] = MemoryAnalysis(whole, hidden, certificate)
     return found
 
 
-def _certificate(given: AnalysisInput, program: Program) -> Contraction | Missing:
-    try:
-        return contraction(gru_weights(program), *feature_box(program, given.x_range, given.u_range))
-    except InputError as error:
-        return Missing(str(error))
+def _certificate(given: AnalysisInput, program: Program) -> Contraction:
+    return contraction(gru_weights(program), *feature_box(program, given.x_range, given.u_range))
 
 
 def sensitivities_of(given: AnalysisInput) -> dict[str, SensitivityAnalysis]:

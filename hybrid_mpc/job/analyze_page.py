@@ -303,11 +303,8 @@ def _draw_linear(given: AnalysisInput, part: Mapping[str, Mapping[str, Lineariza
                 curves, input_signal=some.inputs[j], output_signal=some.outputs[i], nyquist=np.pi / some.dt
             )
             named, channel = _channel(some, i, j)
-            yield (
-                f"bode_{point}{named}",
-                figure,
-                f"Bode plot of the linearizations {TITLES[point]}{channel}.{note}",
-            )
+            caption = f"Bode plot of the linearizations {TITLES[point]}{channel}.{note}"
+            yield f"bode_{point}{named}", figure, caption
     for i, j in every:
         steps = {point: {n: (part[n][point].t, part[n][point].step[i, j]) for n in names} for point in here}
         figure = plots.step_responses(steps, input_signal=some.inputs[j], output_signal=some.outputs[i])

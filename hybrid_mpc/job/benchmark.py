@@ -43,6 +43,7 @@ from hybrid_mpc.job.benchmark_runs import (
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.folder import JobNote, write_note
+from hybrid_mpc.job.stages.choose import CANDIDATES
 from hybrid_mpc.job.stages.identify import PARTS, load_trained, save_trained, train_kinds
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import BenchmarkBudget
@@ -52,8 +53,6 @@ from hybrid_mpc.scenario import Scenario, load_scenario
 Array = NDArray[np.float64]
 SCHEMA = 3
 MODEL_NOTE = "benchmark_model.json"
-CANDIDATES = ("phy", "pgrnn", "mopgrnn")
-"""What may be recommended, where it is trained."""
 SHOWN = 20.0
 """Length of a run that is drawn sample by sample [the machine's seconds]."""
 IN_MOTION = 0.1
@@ -271,9 +270,8 @@ def _make(
 def _baselines(scenario: Scenario, data: Recordings) -> tuple[dict[str, LinearModel], dict[str, str]]:
     """Linear models by name, chosen on the same validation pieces, and why there is none of a name."""
     dt, found, missing = scenario.data.dt, {}, {}
-    warm = (
-        warm_samples(max(scenario.data.warm_up, IN_MOTION), 0.0, dt) + 1
-    )  # others start knowing this sample
+    # the others start knowing this sample
+    warm = warm_samples(max(scenario.data.warm_up, IN_MOTION), 0.0, dt) + 1
     for name, fitted in BASELINES.items():
         try:
             found[name] = fitted(data.train, data.valid, dt, warm=warm)
@@ -303,14 +301,9 @@ def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Pro
         held = read_document(note, "delete it, and the same command fits the prior anew")
         return record(PriorFit, held, str(note))
     fit = fit_prior(
-        scenario.prior,
-        data.train,
-        data.valid,
-        dt=scenario.data.dt,
-        length=spec.length or spec.piece,
-        largest_delay=scenario.data.largest_delay,
-        on_progress=partial(progress.update, "prior"),
-    )
+        scenario.prior, data.train, data.valid, dt=scenario.data.dt, length=spec.length or spec.piece,
+        largest_delay=scenario.data.largest_delay, on_progress=partial(progress.update, "prior"),
+    )  # fmt: skip
     write_document(note, plain(fit))
     return fit
 
@@ -396,7 +389,7 @@ def save_model(folder: Path, model: BenchmarkModel) -> None:
     for trained in model.networks.values():
         save_trained(folder, trained)
     description = {f.name: getattr(model, f.name) for f in fields(_Description)}
-    write_document(folder / MODEL_NOTE, {"schema": SCHEMA, **plain(description)})
+    write_document(folder / MODEL_NOTE, {"schema": SCHEMA, **description})
 
 
 def load_model(folder: Path, scenario: str) -> BenchmarkModel:
@@ -442,12 +435,8 @@ def _evaluate(
 def _runs(
     scenario: Scenario, model: BenchmarkModel, fit: PriorFit, trajectories: Sequence[Trajectory]
 ) -> list[BenchmarkRun]:
-    prior, spec, warm_up, dt = (
-        scenario.prior(fit.values),
-        benchmark_of(scenario),
-        scenario.data.warm_up,
-        model.dt,
-    )
+    prior, spec = scenario.prior(fit.values), benchmark_of(scenario)
+    warm_up, dt = scenario.data.warm_up, model.dt
     if spec.repeated and spec.length is not None:
         # behind what is given and what is scored the last input, and the sample that it leads to
         trajectories = in_runs(trajectories, round(warm_up / dt) + round(spec.length / dt) + 2)
@@ -511,11 +500,7 @@ def _document(
             "validated_on": [piece.name for piece in data.valid],
         }
     test = {
-        name: {
-            **plain(row.errors),
-            **({} if row.refit is None else {"refit": plain(row.refit)}),
-            "scored_s": row.scored_s,
-        }
+        name: {**row.errors, **({} if row.refit is None else {"refit": row.refit}), "scored_s": row.scored_s}
         for name, row in results.test.items()
     }
     return {
@@ -532,22 +517,22 @@ def _document(
 
 
 def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
-    """A model in plain data: parameters, delay, smoother, errors by candidate and network."""
+    """A model: parameters, delay, smoother, errors by candidate and network."""
     fit = model.fit
     return {
         "prior": fit.rows(scenario.prior().parameters),
-        "identifiability": list(fit.identifiability),
-        "fits": list(fit.stages),
+        "identifiability": fit.identifiability,
+        "fits": fit.stages,
         "delay_s": fit.delay,
         "smoother": {"sigma": fit.sigma, "walk": fit.walk},
         "hybrid": model.hybrid,
-        "choice": plain(model.choice),
-        "validation": plain(model.validation),
-        "long": plain(model.long),
+        "choice": model.choice,
+        "validation": model.validation,
+        "long": model.long,
         "baselines": {name: {"chosen": own.chosen.text} for name, own in model.linear.items()}
         | {name: {"reason": why} for name, why in model.no_linear.items()},
         "networks": {kind: trained.validation for kind, trained in model.networks.items()},
-        "faults": {kind: [asdict(f) for f in trained.failures] for kind, trained in model.networks.items()},
+        "faults": {kind: trained.failures for kind, trained in model.networks.items()},
     }
 
 

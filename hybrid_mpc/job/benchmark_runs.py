@@ -165,12 +165,7 @@ def read_test(
     """
     prior = scenario.prior()
     spec = replace(scenario.data, windows={})
-    dataset = load_trajectories(
-        [path],
-        prior,
-        spec,
-        needed=(),
-    )
+    dataset = load_trajectories([path], prior, spec, needed=())
     if not dataset.whole:
         raise InputError(
             f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given"

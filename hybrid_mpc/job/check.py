@@ -14,7 +14,7 @@ from scipy.optimize import root
 from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.data.excitation import check_excitation, short_runs
-from hybrid_mpc.data.recording import check_unit
+from hybrid_mpc.data.recording import COARSE, check_unit
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of
@@ -41,8 +41,6 @@ FEW = 6
 """Equilibria that are told one by one; more are a continuum as a rule."""
 REACHED = 0.01
 """Share of its size by which a state may miss a set-point that counts as one that can be held."""
-COARSE = 1.5
-"""Model periods from one sample to the next beyond which the samples are too few."""
 ANSWER = 10
 """Periods within which the plant is asked for its answer to a step of an input."""
 AGAINST = -0.3
@@ -389,9 +387,8 @@ def _check_problem(
             report.add(f"{what}: {name} needs {size} numbers, got {len(values)}: {values}")
     if model is None or rest is None or len(report.problems) > before:
         return
-    control = control.changed(
-        starts=()
-    )  # each is sought from for seconds, and their shapes are known to be right
+    # each start is sought from for seconds, and their shapes are known to be right
+    control = control.changed(starts=())
     with report.part(f"{what}: estimator"):
         estimator = make_estimator(model, scenario, np.ones(model.n_x), control)
     with report.part(f"{what}: controller"):

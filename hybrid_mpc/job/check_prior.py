@@ -88,9 +88,8 @@ class Report:
         except ExportError as error:  # of several lines, each with an operator
             self.add(f"{what}: {error}")
         except Exception as error:  # the user's own code may raise anything, and this is where it is reported
-            self.add(
-                f"{what} raised {type(error).__name__}: {_first_line(error)}{_place(error)}{_hint(error)}"
-            )
+            said = (str(error).strip() or "no message").splitlines()[0]
+            self.add(f"{what} raised {type(error).__name__}: {said}{_place(error)}{_hint(error)}")
 
     @contextmanager
     def sound(self, what: str) -> Iterator[list[bool]]:
@@ -305,7 +304,7 @@ def _check_point(prior: Prior) -> None:
 
 def _written(report: Report, prior: Prior) -> bool:
     """Whether all methods take what they are given and give what they must."""
-    before, kind = len(report.problems), type(prior).__name__
+    before, kind, whole = len(report.problems), type(prior).__name__, list[str]()
     wrong = [
         name for name, arguments in prior.methods.items() if _check_arguments(report, prior, name, arguments)
     ]
@@ -315,15 +314,13 @@ def _written(report: Report, prior: Prior) -> bool:
             prior.equations  # noqa: B018
         if not quiet.problems:
             return True
-        report_whole = quiet.problems
-    else:
-        report_whole = []
+        whole = quiet.problems
     for name, arguments in prior.methods.items():
         if name not in wrong:
             with report.part("prior"):
                 _ask(prior, name, arguments, f"{kind}.{name}({', '.join(arguments)})")
     if len(report.problems) == before:
-        for text in report_whole:
+        for text in whole:
             report.add(text)
     return False
 
@@ -590,10 +587,6 @@ def _check_balance(prior: Prior, balance: BalanceEquations, points: Points, rate
             f"{name}: the loss is {loss[k]:.3g} at {points.named(k)}; it must not be negative. Put what may have "
             "either sign into the supply"
         )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or "no message").splitlines()[0]
 
 
 def _hint(error: BaseException) -> str:

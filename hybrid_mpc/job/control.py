@@ -17,6 +17,7 @@ from hybrid_mpc.job.folder import JobNote, check_out, open_folder
 from hybrid_mpc.job.loops import DRAWN, Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
 from hybrid_mpc.job.stages.on_model import ON_MODEL
 from hybrid_mpc.job.study import Study
+from hybrid_mpc.job.study_log import NoiseNote
 from hybrid_mpc.job.study_run import StudyModel, load_models
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.job.tasks import tasks_of
@@ -52,14 +53,6 @@ class Origin:
 
 
 @dataclass(frozen=True)
-class FilterNoise:
-    """Process noise of the filters by controller, and where it is from."""
-
-    source: str
-    sigma_x: Mapping[str, tuple[float, ...]]
-
-
-@dataclass(frozen=True)
 class ControlResults:
     """What ``results.json`` of ``hybrid-mpc control`` holds (docs/control.md): what was run, every loop, and means.
 
@@ -83,7 +76,7 @@ class ControlResults:
     residuals: ResidualLimits | None
     reaction: str
     model: Origin
-    noise: FilterNoise
+    noise: NoiseNote
     versions: Mapping[str, str]
     period_ms: float
     step_ms: Mapping[str, Mapping[str, float]]
@@ -164,7 +157,7 @@ def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[Loop
         residuals=kit.residuals.get("hybrid") if study.guard else None,
         reaction=study.guard,
         model=Origin(kit.provenance),
-        noise=FilterNoise(model.noise_source, {name: tuple(kit.noise(name).tolist()) for name in filters}),
+        noise=NoiseNote(model.noise_source, {name: tuple(kit.noise(name).tolist()) for name in filters}),
         versions=versions(),
         period_ms=1e3 * kit.models["prior"].dt,
         step_ms={name: percentiles(values) for name, values in _times(rows).items()},

@@ -55,6 +55,7 @@ CONTROLLERS: Mapping[str, NamedController] = {
 """Baselines: the fitted prior without and with disturbance observer; the hybrid likewise; two oracles on the
 plant's own equations, one with the same measurements through the same kind of estimator, one with the truth."""
 ORACLES = ("oracle", "oracle_state")
+OBSERVERS = ("prior_observer", "hybrid_observer")
 LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
 """Whose process noise is the least that a controller has, where tasks go beyond the recordings."""
 
@@ -98,16 +99,11 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     errors["oracle"] = errors["hybrid"]
     found = {
         name: tuned_noise(
-            models[c.model],
-            scenario,
-            errors[c.model],
-            recordings,
-            observer=c.observer,
-            known=scenario.state_noise,
+            models[c.model], scenario, errors[c.model], recordings, observer=c.observer, known=scenario.state_noise
         )
         for name, c in CONTROLLERS.items()
         if c.model in models and not c.truth
-    }
+    }  # fmt: skip
     return no_surer_than_prior(scenario, found)
 
 
@@ -131,10 +127,7 @@ def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[
 
 
 def find_noise(
-    scenario: Scenario,
-    artifact: Kit,
-    controllers: Sequence[str],
-    seed: int,
+    scenario: Scenario, artifact: Kit, controllers: Sequence[str], seed: int
 ) -> tuple[Mapping[str, Array], str]:
     """Process noise of the filters of controllers, and in words where it came from.
 

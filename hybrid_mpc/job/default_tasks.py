@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -52,11 +53,19 @@ class _Rest:
         """Weights of what references are of."""
         return self.control.q_y if self.control.n_y else self.control.q
 
+    @cached_property
+    def linearized(self) -> ca.Function:
+        """Rates, their slopes by ``(x, u)``, what references are of, and the slopes of that; of ``x`` and ``u``."""
+        x, u = ca.SX.sym("x", len(self.x)), ca.SX.sym("u", len(self.u))
+        equations, rest = self.prior.equations, (self.w, self.prior.p)
+        tracked = equations.output(x, u, *rest) if self.control.n_y else x
+        values = equations.xdot(x, u, *rest), tracked
+        pairs = [(v, ca.densify(ca.jacobian(v, ca.vertcat(x, u)))) for v in values]
+        return ca.Function("linearized", [x, u], [*pairs[0], *pairs[1]])
+
     def tracked(self, x: Array, u: Array) -> Array:
         """What references are of, at a point."""
-        if not self.control.n_y:
-            return x
-        return np.asarray(self.prior.equations.output(x, u, self.w, self.prior.p).full().ravel())
+        return np.asarray(self.linearized(x, u)[2].full().ravel())
 
     def sizes(self) -> Array:
         """Sizes of ``(x, u)``: ranges, else what the weights tolerate, else 1."""
@@ -66,12 +75,9 @@ class _Rest:
 
     def slopes(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Rates ``(n_x,)`` in sizes of the states a horizon, and their slopes by ``(x, u)`` in sizes."""
-        n_x, sizes = len(self.x), self.sizes()
-        xs, us = ca.SX.sym("x", n_x), ca.SX.sym("u", len(self.u))
-        rates = self.prior.equations.xdot(xs, us, self.w, self.prior.p)
-        slope = ca.Function("slope", [xs, us], [rates, ca.densify(ca.jacobian(rates, ca.vertcat(xs, us)))])
-        value, matrix = (m.full() for m in slope(x, u))
-        scale = self.horizon / sizes[:n_x]
+        sizes = self.sizes()
+        value, matrix = (m.full() for m in self.linearized(x, u)[:2])
+        scale = self.horizon / sizes[: len(x)]
         return value.ravel() * scale, matrix * scale[:, None] * sizes
 
     def moved(self, j: int, by: float) -> tuple[Array, Array] | None:
@@ -80,25 +86,19 @@ class _Rest:
         z, goal = np.concatenate([self.x, self.u]), self.tracked(self.x, self.u)[j] + by
         for _ in range(TURNS):
             rates, matrix = self.slopes(z[:n_x], z[n_x:])
-            row, off = self._row(j, z[:n_x], z[n_x:])
+            tracked, slopes = (m.full() for m in self.linearized(z[:n_x], z[n_x:])[2:])
             unit = max(abs(by), 1e-300)
-            missed = np.append(rates, (off - goal) / unit)
+            missed = np.append(rates, (tracked[j] - goal) / unit)
             if not np.all(np.isfinite(matrix)):
                 return None
             if np.abs(missed).max() < STILL:
                 return z[:n_x], z[n_x:]
-            z = z - sizes * np.linalg.lstsq(np.vstack([matrix, row * sizes / unit]), missed, rcond=1e-9)[0]
+            z = (
+                z
+                - sizes
+                * np.linalg.lstsq(np.vstack([matrix, slopes[j] * sizes / unit]), missed, rcond=1e-9)[0]
+            )
         return None
-
-    def _row(self, j: int, x: Array, u: Array) -> tuple[Array, float]:
-        """Slope of tracked signal ``j`` by ``(x, u)``, and its value."""
-        if not self.control.n_y:
-            return np.eye(len(x) + len(u))[j], float(x[j])
-        xs, us = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
-        y = self.prior.equations.output(xs, us, self.w, self.prior.p)[j]
-        row = ca.Function("row", [xs, us], [ca.densify(ca.jacobian(y, ca.vertcat(xs, us))), y])
-        slope, value = row(x, u)
-        return slope.full().ravel(), float(value)
 
     def within(self, x: Array, u: Array) -> bool:
         """Whether a point takes no more than its share of the room to any limit."""

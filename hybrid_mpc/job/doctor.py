@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Literal
 
 from hybrid_mpc import __version__
+from hybrid_mpc.job.engine import THREADS
 
 PACKAGE = "hybrid-mpc"
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 WAIT_S = 1.0
 """Longest time [s] that another program is asked."""
 State = Literal["ok", "absent", "wrong"]
@@ -89,16 +89,11 @@ def _compiler() -> Finding:
         words = shlex.split(command)
         if words and shutil.which(words[0]):
             lines = _told([*words, "--version"]).splitlines()
-            return Finding(
-                "C compiler", f"{command}: {lines[0]}" if lines else f"{command}, which tells no version"
-            )
+            told = f"{command}: {lines[0]}" if lines else f"{command}, which tells no version"
+            return Finding("C compiler", told)
     what = f"CC = {named}, which is no command" if named else "none (cc, gcc, clang)"
-    return Finding(
-        "C compiler",
-        what,
-        "absent",
-        "install one to compile models; without it they run in CasADi's machine, slower",
-    )
+    remedy = "install one to compile models; without it they run in CasADi's machine, slower"
+    return Finding("C compiler", what, "absent", remedy)
 
 
 def _threads() -> Finding:
@@ -120,12 +115,8 @@ def _gpu() -> Finding:
         return Finding("GPU", "none found (nvidia-smi); networks are trained on the CPU")
     told = ", ".join(name.strip() for name in names)
     if torch.endswith("+cpu"):
-        return Finding(
-            "GPU",
-            f"{told}, which torch {torch} cannot use",
-            "absent",
-            "install a torch with CUDA, then --device cuda",
-        )
+        remedy = "install a torch with CUDA, then --device cuda"
+        return Finding("GPU", f"{told}, which torch {torch} cannot use", "absent", remedy)
     return Finding("GPU", f"{told}; give --device cuda to train on it" if torch else told)
 
 
@@ -148,12 +139,8 @@ def _folders() -> Iterator[Finding]:
         if _can_be_written(folder):
             yield Finding(name, f"{folder}, can be written")
         else:
-            yield Finding(
-                name,
-                f"{folder}, cannot be written",
-                "wrong",
-                f"point {variable} at a folder that can be written",
-            )
+            remedy = f"point {variable} at a folder that can be written"
+            yield Finding(name, f"{folder}, cannot be written", "wrong", remedy)
 
 
 def _can_be_written(folder: Path) -> bool:

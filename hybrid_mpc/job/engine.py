@@ -394,12 +394,6 @@ def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, Exceptio
 
 
 def _began(parent: int, begin: Callable[[], None] | None) -> None:
-    follow(parent)
-    if begin is not None:
-        begin()
-
-
-def follow(parent: int) -> None:
     """Tie a worker to the process of its parent: it leaves Ctrl-C to it, and ends with it, even if it was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -409,6 +403,8 @@ def follow(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+    if begin is not None:
+        begin()
 
 
 def _check(workers: int) -> None:

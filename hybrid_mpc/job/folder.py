@@ -9,15 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import (
-    LOCK,
-    check_writable,
-    digest,
-    is_empty,
-    locked,
-    read_document,
-    write_document,
-)
+from hybrid_mpc.files import LOCK, check_writable, digest, is_empty, locked, read_document, write_document
 from hybrid_mpc.records import plain
 
 DAMAGED = "choose another --out"

@@ -20,12 +20,7 @@ from hybrid_mpc.files import digest, read_document, read_document_arrays, write_
 from hybrid_mpc.job.controllers import CONTROLLERS, build
 from hybrid_mpc.job.tasks import ready, repeated, tasks_of
 from hybrid_mpc.kit.artifact import WATCHES, Kit
-from hybrid_mpc.kit.assembly import (
-    SOLVERS,
-    make_adaptive_guard,
-    make_backup_guard,
-    make_resting_guard,
-)
+from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
 from hybrid_mpc.loop.faults import Fault, check_channels, fault_text, install
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.plant import ModelPlant, Plant
@@ -177,12 +172,7 @@ class LoopSpec:
 
 @dataclass(frozen=True)
 class Interval:
-    """A stretch of time.
-
-    Args:
-        start_s: First instant [s].
-        end_s: Last one [s].
-    """
+    """A stretch of time, from its first instant to its last [s]."""
 
     start_s: float
     end_s: float
@@ -190,14 +180,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class ModeChange:
-    """A change of the guard's mode.
-
-    Args:
-        t_s: When [s].
-        before: Name of the mode before.
-        after: Name of the mode from then on.
-        why: What led to it.
-    """
+    """A change of the guard's mode: when [s], names of the mode before and from then on, and what led to it."""
 
     t_s: float
     before: str
@@ -410,6 +393,12 @@ class Bench:
             Its row, and its whole record.
         """
         plans: list[Array] = []
+
+        def note(step: Step) -> None:
+            plans.append(step.decision.solution.x)
+            if on_step is not None:
+                on_step(step)
+
         task = self.task(spec) if task is None else task
         estimator, controller = self.parts(spec)
         late = spec.late
@@ -417,7 +406,7 @@ class Bench:
             self.plant(spec), estimator, controller, task.reference, weight=task.weight, w=task.w,
             dt=self.kit(spec).models["prior"].dt, duration=task.duration, x0=np.array(task.x0),
             seed=spec.noise_seed, monitor=monitor or self.monitor(spec), guard=self.guard(spec),
-            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=_noting(spec, plans, on_step),
+            faults=(*task.faults, *spec.faults, *spec.drawn_faults), on_step=note if "plans" in spec.keep else on_step,
             late=(lambda t: any(a - 1e-9 <= t < b - 1e-9 for a, b in late)) if late else None,
         )  # fmt: skip
         row = row_of(spec, task, self.problem(spec), self.kit(spec).models["prior"], result)
@@ -426,21 +415,6 @@ class Bench:
         derived = {"step_ms": result.timing_ms["total"], "plans": np.array(plans)}
         arrays = {name: derived[name] if name in derived else getattr(result, name) for name in spec.keep}
         return replace(row, arrays=arrays), result
-
-
-def _noting(
-    spec: LoopSpec, plans: list[Array], on_step: Callable[[Step], None] | None
-) -> Callable[[Step], None] | None:
-    """What is called after every period: it notes the plan where the row is to hold plans."""
-    if "plans" not in spec.keep:
-        return on_step
-
-    def note(step: Step) -> None:
-        plans.append(step.decision.solution.x)
-        if on_step is not None:
-            on_step(step)
-
-    return note
 
 
 def run_loops(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from hybrid_mpc.kit.artifact import Kit, artifact_folder, load
 from hybrid_mpc.kit.assembly import energy_is_watched, make_monitor, sensor_steps
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.diagnose import Diagnoser
 from hybrid_mpc.monitor.energy import EnergyMonitor, Validity
@@ -34,8 +36,11 @@ from hybrid_mpc.monitor.residuals import (
     learn_residuals,
     replay_residuals,
 )
-from hybrid_mpc.records import plain, record
+from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FROZEN = "the sensor repeats itself while motion is predicted"
 BLIND = {
@@ -116,17 +121,17 @@ class MonitorJob:
         """That model."""
         return self.kit.models[self.name]
 
-    @property
+    @cached_property
     def estimator(self) -> EstimatorLike:
         """The estimator of the closed loops."""
         return self.kit.observer(self.name)
 
-    @property
+    @cached_property
     def residuals(self) -> ResidualMonitor:
         """The monitor of the residuals."""
         return ResidualMonitor(self.model, limits=self.limits, resolution=self.resolution)
 
-    @property
+    @cached_property
     def monitor(self) -> EnergyMonitor:
         """The guard's monitor where there is a detector, else that of the main job with the artifact's thresholds."""
         model = self.model
@@ -172,12 +177,7 @@ def prepared(
         )
     # all of a recording is watched: nothing warms up, and no part of it has a role
     spec = replace(scenario.data, windows={}, warm_up=scenario.data.dt, fractions=(1.0, 0.0, 0.0))
-    data = load_trajectories(
-        recordings,
-        hybrid,
-        spec,
-        needed=(),
-    )
+    data = load_trajectories(recordings, hybrid, spec, needed=())
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
         raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
@@ -227,24 +227,38 @@ def learn(
             on_progress=lambda done, total: say.update("recordings", done, total, "samples"),
         )  # fmt: skip
         say.finish("")
-        write_json(out / "calibration.json", {"residuals": plain(limits)})
+        write_json(out / "calibration.json", {"residuals": limits})
         return limits
     detector = learn_from(
         model, job.estimator, job.data.whole, false_alarms_per_hour=rate, rest_speed=job.kit.rest_speed,
         data_hash=job.data.hash, report=say.update,
     )  # fmt: skip
     say.finish("")
-    write_json(out / "calibration.json", {"detector": plain(detector)})
+    write_json(out / "calibration.json", {"detector": detector})
     return detector
 
 
 def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> MonitorResult:
     """Replay the monitor over each recording: ``NAME.csv`` and ``NAME.png``, and last ``monitor.json``."""
-    progress = progress or Progress()
-    rows, how = (_watch_energy if job.energy else _watch_residuals)(job, out, progress)
+    from hybrid_mpc.plots.style import save
+
+    progress, rows = progress or Progress(), []
+    look: Callable[..., tuple[MonitorTrace | ResidualTrace, tuple[Alarm, ...], str, Figure]]
+    look = _by_energy if job.energy else _by_residuals
+    progress.start("replaying the recordings")
+    for recording, report in along(job.data.whole, progress.update):
+        name, seconds = recording.name.replace("#", "_"), len(recording.t) * recording.dt
+        trace, alarms, csv, figure = look(job, recording, name, report)
+        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
+        write_text(out / f"{name}.csv", csv)
+        save(figure, out / f"{name}.png")
+    progress.finish("")
     gaps, short = ([cut for cut in job.data.cuts if ("gap" in cut.why) is gap] for gap in (True, False))
+    how: dict[str, object] = {"residuals": job.limits}
+    if job.energy:
+        how = {"detector": job.detector, "thresholds": job.monitor.calibration}
     result = {
-        "recordings": plain(rows),
+        "recordings": rows,
         "warnings": [str(finding) for finding in job.data.findings],
         "gaps": [cut._asdict() for cut in gaps],
         "not_watched": [cut._asdict() for cut in short],
@@ -255,59 +269,45 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
     return MonitorResult(tuple(rows), tuple(gaps), tuple(short))
 
 
-def _watch_residuals(
-    job: MonitorJob, out: Path, progress: Progress
-) -> tuple[list[RecordingResult], dict[str, Any]]:
-    """What the residuals say of each recording, and what they alarm by."""
+def _by_residuals(
+    job: MonitorJob, recording: Trajectory, title: str, report: Callable[[int, int], None]
+) -> tuple[ResidualTrace, tuple[Alarm, ...], str, Figure]:
+    """What the residuals say of a recording, and that as table and picture."""
     from hybrid_mpc.plots.monitor import channels
-    from hybrid_mpc.plots.style import save
 
-    rows, monitor, limits = [], job.residuals, job.limits
-    progress.start("replaying the recordings")
-    for recording, report in along(job.data.whole, progress.update):
-        trace, alarms = explained_residuals(
-            monitor, job.estimator, recording, job.kit.models.get("prior"), job.kit.causes, report
-        )
-        seconds = len(trace.t) * recording.dt
-        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
-        name = recording.name.replace("#", "_")
-        write_text(out / f"{name}.csv", residual_table(trace, recording, monitor))
-        figure = channels(
-            trace, monitor.units, None if limits is None else limits.threshold,
-            notes=[(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis], title=name,
-        )  # fmt: skip
-        save(figure, out / f"{name}.png")
-    progress.finish("")
-    return rows, {"residuals": plain(limits)}
+    monitor, limits = job.residuals, job.limits
+    trace, alarms = explained_residuals(
+        monitor, job.estimator, recording, job.kit.models.get("prior"), job.kit.causes, report
+    )
+    thresholds = None if limits is None else limits.threshold
+    figure = channels(trace, monitor.units, thresholds, notes=_notes(alarms), title=title)
+    return trace, alarms, residual_table(trace, recording, monitor), figure
 
 
-def _watch_energy(
-    job: MonitorJob, out: Path, progress: Progress
-) -> tuple[list[RecordingResult], dict[str, Any]]:
-    """What the energy says of each recording, and what it alarms by."""
+def _by_energy(
+    job: MonitorJob, recording: Trajectory, title: str, report: Callable[[int, int], None]
+) -> tuple[MonitorTrace, tuple[Alarm, ...], str, Figure]:
+    """What the energy says of a recording, and that as table and picture."""
     from hybrid_mpc.plots.monitor import overview
-    from hybrid_mpc.plots.style import save
 
-    rows, model = [], job.model
-    calibration = job.monitor.calibration
-    limits = {}
-    if calibration is not None:
-        known = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
-        limits = {name: limit for name, limit in known.items() if limit is not None}
-    progress.start("replaying the recordings")
-    for recording, report in along(job.data.whole, progress.update):
-        trace, alarms = watched(job, recording, report)
-        seconds = len(trace.t) * recording.dt
-        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
-        name = recording.name.replace("#", "_")
-        write_text(out / f"{name}.csv", table(trace, recording, model.outputs))
-        figure = overview(
-            trace, recording.y, outputs=model.outputs, force_unit=force_unit(model), thresholds=limits,
-            notes=[(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis], title=name,
-        )  # fmt: skip
-        save(figure, out / f"{name}.png")
-    progress.finish("")
-    return rows, {"detector": plain(job.detector), "thresholds": plain(calibration)}
+    trace, alarms = watched(job, recording, report)
+    figure = overview(
+        trace, recording.y, outputs=job.model.outputs, force_unit=force_unit(job.model),
+        thresholds=thresholds_of(job.monitor.calibration), notes=_notes(alarms), title=title,
+    )  # fmt: skip
+    return trace, alarms, table(trace, recording, job.model.outputs), figure
+
+
+def _notes(alarms: Sequence[Alarm]) -> list[tuple[float, str]]:
+    return [(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis]
+
+
+def thresholds_of(calibration: Calibration | None) -> dict[str, float]:
+    """Thresholds that there are, as :func:`~hybrid_mpc.plots.monitor.overview` takes them."""
+    if calibration is None:
+        return {}
+    found = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
+    return {name: limit for name, limit in found.items() if limit is not None}
 
 
 def watched(

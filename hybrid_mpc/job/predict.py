@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hybrid_mpc.data.files import write_csv
-from hybrid_mpc.data.recording import MIN_SCORED
+from hybrid_mpc.data.recording import COARSE, MIN_SCORED
 from hybrid_mpc.data.trajectories import Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_json
@@ -15,10 +15,7 @@ from hybrid_mpc.identify.delay import lost_samples
 from hybrid_mpc.identify.predict import Predicted, Prediction, predict
 from hybrid_mpc.job.context import Progress
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.records import known, plain
-
-COARSE = 1.5
-"""Model periods from one sample to the next beyond which what lies between would be made up."""
+from hybrid_mpc.records import known
 
 
 @dataclass(frozen=True)
@@ -114,10 +111,8 @@ def predict_recordings(
         )
         save(figure, out / f"{name}.png")
         found.append(one)
-    write_json(
-        out / "predict.json",
-        {"model": found[0].model, "recordings": plain([figures_of(one) for one in found])},
-    )
+    figures = {"model": found[0].model, "recordings": [figures_of(one) for one in found]}
+    write_json(out / "predict.json", figures)
     say.finish("")
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,13 @@ class RunSettings:
     def network(self) -> dict[str, Any]:
         """Settings of the networks that replace the budget's: what the file holds, checked."""
         return {} if self.network_file is None else read_network(self.network_file)
+
+    def options(self, name: Callable[[Path], str]) -> list[str]:
+        """Words of a command line that give the recordings, each file by its ``name``, and their columns."""
+        words = [word for path in self.data for word in ("--data", name(path))]
+        for option, columns in (("--input-column", self.inputs), ("--output-column", self.outputs)):
+            words += [word for column in columns for word in (option, column)]
+        return words + (["--time-column", self.time] if self.time else [])
 
     def identity(self) -> dict[str, Any]:
         """Settings as plain data, with the content hash of every file in place of where it lies."""

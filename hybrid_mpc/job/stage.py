@@ -272,7 +272,10 @@ def _imported(tree: ast.Module) -> Iterator[str]:
 
 def _code(tree: ast.Module) -> str:
     """The code without docstrings, comments and the scenario's own statement."""
-    body = [n for n in tree.body if not (isinstance(n, ast.Assign) and _names(n) == ["scenario"])]
+    own = ["scenario"]
+    body = [
+        n for n in tree.body if not (isinstance(n, ast.Assign) and list(map(ast.unparse, n.targets)) == own)
+    ]
     bare = ast.Module(body, [])
     for node in ast.walk(bare):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
@@ -281,7 +284,3 @@ def _code(tree: ast.Module) -> str:
             ]
             node.body = kept or [ast.Pass()]
     return ast.dump(bare)
-
-
-def _names(node: ast.Assign) -> list[str]:
-    return [target.id for target in node.targets if isinstance(target, ast.Name)]

@@ -17,7 +17,7 @@ import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_bytes
-from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
+from hybrid_mpc.job.controllers import CONTROLLERS, OBSERVERS, ORACLES
 from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec
 from hybrid_mpc.job.tasks import ready, selected_tasks
 from hybrid_mpc.kit.assembly import SOLVERS
@@ -27,7 +27,7 @@ from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
 
 LATE = "late"
 """A target beside those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
-DEFAULT_CONTROLLERS = ("prior_observer", "hybrid_observer")
+DEFAULT_CONTROLLERS = OBSERVERS
 MOST_DRAWS = 1_000_000
 """Most seeds, and most draws, of a study: all of them are in memory."""
 MOST_HORIZON = 10_000
@@ -469,12 +469,8 @@ def _loader() -> Any:
         def compose_node(self, parent: Any, index: Any) -> Any:
             event = self.peek_event()
             if getattr(event, "anchor", None) is not None:
-                raise yaml.composer.ComposerError(
-                    None,
-                    None,
-                    "anchors (&) and aliases (*) are not read; write the value out",
-                    event.start_mark,
-                )
+                why = "anchors (&) and aliases (*) are not read; write the value out"
+                raise yaml.composer.ComposerError(None, None, why, event.start_mark)
             return super().compose_node(parent, index)
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:

@@ -232,10 +232,7 @@ def _groups(table: pd.DataFrame, by: Sequence[str]) -> Any:
 def _interval(values: Any) -> tuple[float, float]:
     """Mean and half width of its 95 % interval; NaN where there is none."""
     found = interval(np.asarray(values, dtype=float).tolist())
-    return (
-        math.nan if found.mean is None else found.mean,
-        math.nan if found.ci95 is None else found.ci95,
-    )
+    return (math.nan if found.mean is None else found.mean, math.nan if found.ci95 is None else found.ci95)
 
 
 def _difference(first: pd.DataFrame, second: pd.DataFrame, value: str) -> tuple[float, ...]:

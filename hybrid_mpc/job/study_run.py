@@ -279,9 +279,8 @@ def run_study(
                 compact(out / RUNS, out / RESULTS, plain(made))
     finally:
         engine.close()
-    from hybrid_mpc.job.study_results import (
-        StudyResults,  # plots and pandas: what is refused, is refused before
-    )
+    # plots and pandas: what is refused, is refused before
+    from hybrid_mpc.job.study_results import StudyResults
 
     return StudyResults.load(out)
 
@@ -292,9 +291,7 @@ def make_note(
     """What a study of these settings (with its scenario) and models is made of."""
     scenario, path = load_scenario(study["scenario"]), Path(study["scenario"])
     content = sha256(path) if path.suffix == ".py" and path.is_file() else None
-    return StudyNote(
-        study, scenario.title, scenario.description, models, runs, versions(), kind, content
-    )  # fmt: skip
+    return StudyNote(study, scenario.title, scenario.description, models, runs, versions(), kind, content)
 
 
 def job_note(note: StudyNote) -> JobNote:

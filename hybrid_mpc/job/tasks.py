@@ -97,9 +97,8 @@ def repeated(
     n = min(len(task.x0), len(first))  # further columns are no reference of states
     positions, rates = list(pairs), list(pairs.values())
     fastest = np.abs(rows[:, rates]).max(axis=0)
-    far = np.abs(last - first)[positions] / np.maximum(
-        fastest, 1e-9
-    )  # a quintic's top speed is 15/8 of its mean
+    # a quintic's top speed is 15/8 of its mean
+    far = np.abs(last - first)[positions] / np.maximum(fastest, 1e-9)
     back = max(RETURN_S * time_unit, 2.0 * float(far.max(initial=0.0)) if np.all(fastest > 0) else 0.0)
     period = (length + math.ceil(back / dt - 1e-9)) * dt
     start = first.copy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,12 +93,9 @@ def run_tuning(
 
 def usage(settings: RunSettings, out: Path) -> str:
     """The command line of a run with the settings found."""
-    words = ["hybrid-mpc", "run", settings.scenario, *(w for f in settings.data for w in ("--data", str(f)))]
-    for option, values in (("--input-column", settings.inputs), ("--output-column", settings.outputs)):
-        words += [w for v in values for w in (option, v)]
-    words += ["--time-column", settings.time] if settings.time else []
-    words += ["--seed", str(settings.seed), "--budget", settings.budget]
-    return shlex.join([*words, "--settings", str(out / "settings.json"), "--out", f"{out}-run"])
+    effort = "--seed", str(settings.seed), "--budget", settings.budget
+    found = "--settings", str(out / "settings.json"), "--out", f"{out}-run"
+    return shlex.join(["hybrid-mpc", "run", settings.scenario, *settings.options(str), *effort, *found])
 
 
 def best_settings(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
@@ -119,14 +116,14 @@ def _write(context: Context, settings: TuneSettings, found: SearchResult) -> Non
         "budget": settings.budget,
         "kind": settings.kind,
         "space": {name: settings.space.bounds(name) for name in names},
-        "base_settings": asdict(training_settings(context, settings.kind)),
+        "base_settings": training_settings(context, settings.kind),
         "versions": versions(),
         "data": {"hash": data.hash, "warnings": data.warnings},
         "base_value": found.base,
-        "best": asdict(found.best),
+        "best": found.best,
         "settings": best,
-        "importance": dict(found.importance),
-        "trials": [asdict(row) for row in found.trials],
+        "importance": found.importance,
+        "trials": found.trials,
     }
     rows: list[tuple[Cell, ...]] = [
         (t.number, t.state, t.value, t.mean, t.steps, t.duration, *(t.values[n] for n in names))

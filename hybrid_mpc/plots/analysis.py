@@ -130,15 +130,9 @@ def _z_grid(ax: Axes, dt: float, spacing: float, reach: float) -> None:
             ax.plot(side.real, side.imag, color="#c9c9c9", linewidth=0.7, zorder=1)
         at = int(np.argmin(np.abs(np.abs(z - 1.0) - reach)))
         ax.annotate(
-            f"{damping:g}",
-            (z[at].real, z[at].imag),
-            fontsize=7,
-            color=MUTED,
-            ha="center",
-            va="center",
-            clip_on=True,
-            annotation_clip=True,
-        )
+            f"{damping:g}", (z[at].real, z[at].imag), fontsize=7, color=MUTED, ha="center", va="center",
+            clip_on=True, annotation_clip=True,
+        )  # fmt: skip
     turns = np.arange(spacing * dt, np.pi * 1.001, spacing * dt)
     for turn in turns[:40]:
         damping_angle = np.linspace(np.pi / 2, np.pi, 120)
@@ -348,11 +342,7 @@ def gain_schedules(
 
 
 def measured_bode(
-    responses: Mapping[str, Mapping[str, Array]],
-    *,
-    input_signal: Signal,
-    output_signal: Signal,
-    source: str,
+    responses: Mapping[str, Mapping[str, Array]], *, input_signal: Signal, output_signal: Signal, source: str
 ) -> Figure:
     """Frequency responses estimated in the same way from a machine and from models.
 

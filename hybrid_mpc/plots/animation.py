@@ -93,7 +93,13 @@ class Scene:
         self._applied: list[Line2D] = []
         for i, (ax, signal) in enumerate(zip(panels[n:], inputs, strict=True)):
             self._input_panel(ax, i, signal, None if limits is None else (limits[0][i], limits[1][i]))
-        self._bars = [self._alarm_bar(ax) for ax in panels] if loop.alarm is not None else []
+        self._bars = [  # along the top of each panel, whatever its values, for as long as the monitor alarms
+            self._line(
+                ax, color=ALARM, linewidth=6, solid_capstyle="butt", transform=ax.get_xaxis_transform(),
+                label="monitor alarms",
+            )
+            for ax in (panels if loop.alarm is not None else ())
+        ]  # fmt: skip
         for at, _ in loop.events:
             for ax in panels:
                 ax.axvline(at, color=ALARM, linestyle="--", linewidth=1.2)
@@ -102,14 +108,6 @@ class Scene:
             ax.tick_params(labelbottom=False)
         self._figure.align_ylabels(panels)
         shared_legend(self._figure)
-
-    def _alarm_bar(self, ax: Axes) -> Line2D:
-        """A bar along the top of a panel for as long as the monitor alarms."""
-        height = ax.get_xaxis_transform()  # the top of the panel, whatever its values
-        bar = self._line(
-            ax, color=ALARM, linewidth=6, solid_capstyle="butt", transform=height, label="monitor alarms"
-        )
-        return bar
 
     def _line(self, ax: Axes, **style: object) -> Line2D:
         """A line that each frame draws anew; over those before it."""

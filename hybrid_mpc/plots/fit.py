@@ -89,19 +89,32 @@ def free_run(
         >>> len(figure.axes)
         7
     """
-    t, n = np.asarray(t, dtype=float), len(signals)
+    t, n, ink = np.asarray(t, dtype=float), len(signals), colour(hybrid)
+    states = checked("measured", measured, len(t), n)
+    runs = {model: checked(f"free run of {model}", run, len(t), n) for model, run in predictions.items()}
     heights = [1.6, 0.8] * n + [0.9] * len(inputs) + [1.2, 0.9] * len(balances)
     figure, panels = new_column(heights, title=title)
-    shown, errors, below = panels[: 2 * n : 2], panels[1 : 2 * n : 2], panels[2 * n :]
-    _signals(shown, t, measured, predictions, signals)
-    _errors(errors, t, measured, {m: predictions[m] for m in ("phy", hybrid) if m in predictions}, signals)
-    ink = colour(hybrid)
-    for ax, signal in zip(shown, signals, strict=True):
+    below = panels[2 * n :]
+    for i, (ax, under, signal) in enumerate(
+        zip(panels[: 2 * n : 2], panels[1 : 2 * n : 2], signals, strict=True)
+    ):
+        ax.plot(t, states[:, i], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
+        under.axhline(0.0, color=FAINT, linewidth=0.8)
+        for model, run in runs.items():
+            ax.plot(t, run[:, i], **line_style(model))
+        for model in dict.fromkeys(("phy", hybrid)):
+            if model in runs:
+                under.plot(t, runs[model][:, i] - states[:, i], **(line_style(model) | {"linewidth": 1.0}))
+        low, high = np.nanmin(states[:, i]), np.nanmax(states[:, i])
+        room = 0.6 * max(high - low, 1e-9)  # a model that runs away must not flatten the others
+        bottom, top = ax.get_ylim()
+        limits = max(bottom, low - room), min(top, high + room)
         if band and signal.name in band:
-            low, high = (checked("band", end, len(t)) for end in band[signal.name])
-            limits = ax.get_ylim()
-            ax.fill_between(t, low, high, color=ink, alpha=0.2, linewidth=0, label="90 % band")
-            ax.set_ylim(limits)
+            least, most = (checked("band", end, len(t)) for end in band[signal.name])
+            ax.fill_between(t, least, most, color=ink, alpha=0.2, linewidth=0, label="90 % band")
+        ax.set_ylim(limits)
+        ax.set_ylabel(axis_label(signal))
+        under.set_ylabel(f"error\n[{signal.unit}]")
     plot_inputs(below[: len(inputs)], t, checked("u", u, len(t), len(inputs)), inputs)
     below = below[len(inputs) :]
     for balance, above, under in zip(balances, below[::2], below[1::2], strict=True):
@@ -148,42 +161,6 @@ def input_correlations(
     finish_column(figure, panels)
     panels[-1].set_xlabel("input before by [s]")
     return figure
-
-
-def _errors(
-    panels: Sequence[Axes],
-    t: Array,
-    measured: Array,
-    predictions: Mapping[str, Array],
-    signals: Sequence[Signal],
-) -> None:
-    """Predicted less measured, of the models that are compared."""
-    for i, (ax, signal) in enumerate(zip(panels, signals, strict=True)):
-        ax.axhline(0.0, color=FAINT, linewidth=0.8)
-        for model, run in predictions.items():
-            style = line_style(model) | {"linewidth": 1.0}
-            ax.plot(t, np.asarray(run)[:, i] - np.asarray(measured)[:, i], **style)
-        ax.set_ylabel(f"error\n[{signal.unit}]")
-
-
-def _signals(
-    panels: Sequence[Axes],
-    t: Array,
-    values: Array,
-    predictions: Mapping[str, Array],
-    signals: Sequence[Signal],
-) -> None:
-    measured = checked("measured", values, len(t), len(signals))
-    runs = {m: checked(f"free run of {m}", run, len(t), len(signals)) for m, run in predictions.items()}
-    for i, (ax, signal) in enumerate(zip(panels, signals, strict=False)):
-        ax.plot(t, measured[:, i], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
-        for model, run in runs.items():
-            ax.plot(t, run[:, i], **line_style(model))
-        low, high = np.nanmin(measured[:, i]), np.nanmax(measured[:, i])
-        room = 0.6 * max(high - low, 1e-9)  # a model that runs away must not flatten the others
-        bottom, top = ax.get_ylim()
-        ax.set_ylim(max(bottom, low - room), min(top, high + room))
-        ax.set_ylabel(axis_label(signal))
 
 
 def errors_bar(

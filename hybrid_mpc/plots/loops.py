@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -250,16 +249,14 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
 
 
 # Name, role whose colour it takes, marker, filled. With a disturbance observer: the same colour, hollow.
-CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = MappingProxyType(
-    {
-        "prior": (name_of("prior"), "prior", "o", True),
-        "prior_observer": ("prior with observer", "prior", "s", False),
-        "hybrid": (name_of("hybrid"), "hybrid", "o", True),
-        "hybrid_observer": (name_of("hybrid_observer"), "hybrid", "s", False),
-        "oracle": ("oracle, measuring", "oracle", "D", True),
-        "oracle_state": ("oracle, true state", "oracle", "D", False),
-    }
-)
+CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = {
+    "prior": (name_of("prior"), "prior", "o", True),
+    "prior_observer": (name_of("prior_observer"), "prior", "s", False),
+    "hybrid": (name_of("hybrid"), "hybrid", "o", True),
+    "hybrid_observer": (name_of("hybrid_observer"), "hybrid", "s", False),
+    "oracle": ("oracle, measuring", "oracle", "D", True),
+    "oracle_state": (name_of("oracle_state"), "oracle", "D", False),
+}
 
 Costs = Mapping[str, Mapping[str, tuple[float, float]]]
 

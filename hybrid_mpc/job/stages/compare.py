@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.files import digest
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
+from hybrid_mpc.job.controllers import CONTROLLERS, OBSERVERS, ORACLES
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.loops import (
     DRAWN,
@@ -33,7 +33,6 @@ from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
 from hybrid_mpc.loop.loop import Loop
-from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
 if TYPE_CHECKING:
@@ -47,19 +46,15 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 TIMED_PERIODS = 1000
 """Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
-TIMED = ("prior_observer", "hybrid_observer")
+TIMED = OBSERVERS
 """Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Loops that run and are kept together: one task under one controller.
+    """Loops that run and are kept together: one task under one controller, by their numbers.
 
-    Args:
-        task: The task.
-        controller: The controller.
-        seeds: Numbers of the loops.
-        timed: Whether it runs alone on the machine, so that the durations of its steps count.
+    A ``timed`` part runs alone on the machine, so that the durations of its steps count.
     """
 
     task: Task
@@ -115,8 +110,8 @@ class ControlResult:
 
     @property
     def drawn(self) -> list[LoopRow]:
-        """The loops with their signals."""
-        return with_arrays(self.rows, self.arrays) if self.rows else []
+        """The loops whose signals were kept, with these."""
+        return [row for row in with_arrays(self.rows, self.arrays) if row.arrays] if self.rows else []
 
 
 def control_stage(context: Context) -> ControlResult | Absent:
@@ -246,26 +241,22 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
     tasks = {task.name: task for task in scenario.tasks}
     loop = loop_settings(scenario, model.loop.process_noise)
     oracle = source_of(scenario.oracle) if any(spec.controller in ORACLES for spec in specs) else None
-    read = (
-        [task_content(tasks[spec.task], context.spec.dt, loop) for spec in specs],
-        source_of(scenario.plant),
-        oracle,
-    )
-    if any(value is UNKNOWN for value in (*read[1:], *(v for content in read[0] for v in content.values()))):
+    contents = [task_content(tasks[spec.task], context.spec.dt, loop) for spec in specs]
+    read = contents, source_of(scenario.plant), oracle
+    if any(value is UNKNOWN for value in (*contents, *read[1:])):
         return f"unknown {time.monotonic_ns()}"
-    return digest(
-        [
-            [(spec.id, spec.keep) for spec in specs],
-            model.programs_sha256,
-            plain(replace(loop, control={})),
-            of_monitor,
-            read,
-        ]
-    )
+    loops, estimators = [(spec.id, spec.keep) for spec in specs], replace(loop, control={})
+    return digest([loops, model.programs_sha256, estimators, of_monitor, read])
 
 
-def task_content(task: Task, dt: float, loop: LoopSettings) -> dict[str, object]:
-    """All of a task that decides how its loops go: its references sampled on the grid, its control problem."""
+def task_content(task: Task, dt: float, loop: LoopSettings) -> object:
+    """All of a task that decides how its loops go: its references sampled on the grid, its control problem.
+
+    ``UNKNOWN`` where nobody knows what its figures are made of.
+    """
+    figures = source_of(task.figures)
+    if figures is UNKNOWN:
+        return UNKNOWN
     problem = loop.control.get(task.name, loop.control.get(""))
     horizon = 0 if problem is None else problem.horizon
     t = np.arange(round(task.duration / dt) + horizon + 1, dtype=np.float64) * dt
@@ -278,7 +269,7 @@ def task_content(task: Task, dt: float, loop: LoopSettings) -> dict[str, object]
         "weight": None if task.weight is None else np.asarray(task.weight(t)),
         "measured disturbances": None if task.w is None else np.asarray(task.w(t)),
         "control problem": problem,
-        "figures": source_of(task.figures),
+        "figures": figures,
     }
 
 
@@ -295,17 +286,11 @@ def what_loops_read(context: Context) -> dict[str, object]:
         "safe input": scenario.safe_input,
     }
     for task in tasks_of(scenario, budget.tasks) if scenario.plant is not None else ():
-        content = task_content(task, context.spec.dt, loop)
-        read[f"task {task.name}"] = UNKNOWN if any(v is UNKNOWN for v in content.values()) else content
+        read[f"task {task.name}"] = task_content(task, context.spec.dt, loop)
     return read
 
 
 CONTROL = Stage(
-    "control",
-    "closing the loop",
-    ControlResult,
-    control_stage,
-    lambda context: {**what_loops_read(context), "what is drawn": DRAWN},
-    (EXPORT, NOISE),
-    optional=True,
-)
+    "control", "closing the loop", ControlResult, control_stage,
+    lambda context: {**what_loops_read(context), "what is drawn": DRAWN}, (EXPORT, NOISE), optional=True,
+)  # fmt: skip

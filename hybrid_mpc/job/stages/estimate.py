@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.consistency import Consistency, consistency
+from hybrid_mpc.estimate.consistency import consistency
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.controllers import CONTROLLERS
+from hybrid_mpc.job.controllers import CONTROLLERS, OBSERVERS
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.stages.identify import DATA
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-OBSERVERS = ("prior_observer", "hybrid_observer")
 PERIODS = 1000
 RECORDINGS = 4
 """So many periods of so many test recordings are looked at: a few seconds of computing for both observers."""
@@ -92,7 +91,10 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
         except InputError as too_short:
             found[name] = Absent(str(too_short))
             continue
-        found[name] = figures_of(tested)
+        found[name] = ObserverTest(
+            tested.mean_nis, *tested.nis_band, tested.nis_inside, tested.ljung_box, tested.ljung_box_limit,
+            tested.samples, tested.correlation_band,
+        )  # fmt: skip
         arrays[f"{name}/autocorrelation"] = tested.autocorrelation
         arrays |= {f"{name}/nis/{k}": run.nis for k, run in enumerate(tested.runs)}
     return EstimationResult(tuple(ObservedRecording(p.name, len(p.t)) for p in parts), found, arrays)
@@ -102,14 +104,6 @@ def parts_for_tests(recordings: Sequence[Trajectory]) -> list[Trajectory]:
     """The first samples of a few recordings, evenly chosen, that the tests can take the time for."""
     chosen = [recordings[i] for i in evenly(len(recordings), RECORDINGS)]
     return [r.part(slice(PERIODS // max(1, len(chosen)))) for r in chosen]
-
-
-def figures_of(found: Consistency) -> ObserverTest:
-    """The numbers of a test."""
-    return ObserverTest(
-        found.mean_nis, *found.nis_band, found.nis_inside, found.ljung_box, found.ljung_box_limit, found.samples,
-        found.correlation_band,
-    )  # fmt: skip
 
 
 ESTIMATION = Stage(

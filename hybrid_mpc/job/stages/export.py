@@ -34,12 +34,8 @@ FEW = 10
 
 @dataclass(frozen=True)
 class ExportResult:
-    """The artifact, and how far its models lie from PyTorch.
-
-    Args:
-        parity_max_abs_error: Largest difference of values, relative to the outputs' scale.
-        jacobian_max_abs_error: Largest difference of Jacobians, alike.
-        programs_sha256: Hash of the exported programs.
+    """The artifact: the largest differences of its models' values and Jacobians from PyTorch's, relative to the
+    outputs' scale, and the hash of its programs.
     """
 
     parity_max_abs_error: float
@@ -72,9 +68,8 @@ def export_stage(context: Context) -> ExportResult:
     parities = []
     for i, (name, step) in enumerate(steps.items()):
         context.progress.update("models", i, len(steps), name)
-        like = (
-            programs.get(member_names(1)[0]) if name in members else None
-        )  # they differ in their weights alone
+        # members differ in their weights alone
+        like = programs.get(member_names(1)[0]) if name in members else None
         programs[name] = trace_model(step, like)
         training, samples = context.smoothed("train"), FEW if like else 100
         parities.append(

@@ -14,6 +14,7 @@ from hybrid_mpc.identify.evaluate import Scores, input_correlation
 from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loop_figures import curves_of, loop_figure
+from hybrid_mpc.job.monitor import thresholds_of
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
@@ -214,7 +215,7 @@ def _loops(context: Context) -> Any:
     scenario, found = context.scenario, context.find(CONTROL)
     if isinstance(found, Absent) or scenario.control is None:
         return
-    prior, drawn = scenario.prior(), [row for row in found.drawn if row.arrays]
+    prior, drawn = scenario.prior(), found.drawn
     if not drawn:
         return
     for task in tasks_of(scenario, context.budget.tasks):
@@ -232,7 +233,7 @@ def _on_model(context: Context) -> Any:
         return
     scenario = ready(context.scenario)
     tasks = {task.name: task for task in scenario.tasks}
-    for name, rows in by_controller([row for row in found.drawn if row.arrays]).items():
+    for name, rows in by_controller(found.drawn).items():
         for row in rows:
             task = tasks[row.task]
             control = task.control or scenario.control
@@ -357,12 +358,8 @@ def _analysis(context: Context) -> Any:
         return
     arrays = found.arrays
     poles = {n: np.array([complex(*z) for z in found.models[n].rest.poles]) for n in ("prior", "hybrid")}
-    yield (
-        "analysis",
-        "poles",
-        analysis.pole_map(poles, context.spec.dt),
-        "Poles of the one-step maps at rest.",
-    )
+    figure = analysis.pole_map(poles, context.spec.dt)
+    yield "analysis", "poles", figure, "Poles of the one-step maps at rest."
     prior = context.scenario.prior()
     friction = ", where the slope of dry friction dominates" if prior.kinematics else ""
     titles = {"rest": f"at rest{friction}", "moving": "at working speed"}
@@ -370,13 +367,10 @@ def _analysis(context: Context) -> Any:
         if any(point not in found.models[n].points for n in poles):
             continue  # a network that corrects every rate leaves no speed that is one
         for (i, output), (j, into) in product(enumerate(prior.outputs), enumerate(prior.inputs)):
-            responses = {
-                n: (
-                    arrays[f"{n}/{point}/omega"],
-                    *(arrays[f"{n}/{point}/{k}"][i, j] for k in ("magnitude", "phase")),
-                )
-                for n in poles
-            }
+            responses = {}
+            for n in poles:
+                omega, size, phase = (arrays[f"{n}/{point}/{k}"] for k in ("omega", "magnitude", "phase"))
+                responses[n] = omega, size[i, j], phase[i, j]
             figure = analysis.bode(
                 responses, input_signal=into, output_signal=output, nyquist=np.pi / context.spec.dt
             )
@@ -403,12 +397,9 @@ def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
         cause = f"; the diagnosis: {row.diagnosis}" if row.diagnosis else ""
         yield "guard", f"guard_{row.fault}", figure, f"{row.title.capitalize()}: {seen}{cause}."
     if found.faults is None and found.shown:
-        limits: dict[str, float] = {}
-        stored = context.find(MONITOR)
+        limits, stored = dict[str, float](), context.find(MONITOR)
         if found.detector is None and not isinstance(stored, Absent):
-            calibration = stored.calibration
-            known = {"violation": calibration.threshold_w, "residual": calibration.residual_threshold}
-            limits = {name: limit for name, limit in known.items() if limit is not None}
+            limits = thresholds_of(stored.calibration)
         figure = monitor.overview(
             read_trace(arrays, "recorded"), arrays["recorded/y"], outputs=outputs, force_unit=unit,
             thresholds=limits, title=found.shown,

@@ -20,17 +20,22 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
-from hybrid_mpc.job.stages.monitor import FAULT_SEED, HELD, MONITOR, NO_ENERGY, RATES, clean_windows
+from hybrid_mpc.job.stages.monitor import (
+    FAULT_SEED,
+    HELD,
+    LEARNED_FROM,
+    MONITOR,
+    NO_ENERGY,
+    RATES,
+    WITH_TRAINING,
+    RecordedAlarm,
+    clean_windows,
+)
 from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
 from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.faults import Fault, install
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.monitor.calibrate import (
-    MAX_EXTRAPOLATION,
-    MIN_BLOCKS,
-    Calibration,
-    stretches,
-)
+from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, Calibration, stretches
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.learn import DRIFT, guard_monitor, learn_detector
@@ -133,14 +138,7 @@ SHOWN = ("t", "violation_w", "level_w", "residual_level", "energy_j", "energy_s"
 
 @dataclass(frozen=True)
 class Case:
-    """What breaks in a loop.
-
-    Args:
-        name: Short name.
-        title: In words.
-        target: Of the fault.
-        value: Its size.
-    """
+    """What breaks in a loop: a short name, the same in words, the fault's target and its size."""
 
     name: str
     title: str
@@ -253,14 +251,8 @@ def read_trace(arrays: Mapping[str, Any], name: str) -> MonitorTrace:
 
 @dataclass(frozen=True)
 class NominalLoop:
-    """A loop that the detector was learned from.
-
-    Args:
-        task: Name of the task.
-        seed: Number of the loop.
-        friction: Share to which friction drifts.
-        seconds: Length [s].
-        cost: Its cost.
+    """A loop that the detector was learned from: its task and number, the share to which friction drifts, its length
+    [s] and its cost.
     """
 
     task: str
@@ -288,12 +280,9 @@ class NominalData:
 
 
 @dataclass(frozen=True)
-class ExplainedAlarm:
-    """An alarm on a recording with test data: file, from and to [s], what the diagnosis takes it for."""
+class ExplainedAlarm(RecordedAlarm):
+    """An alarm on a recording with test data, and what the diagnosis takes it for."""
 
-    file: str
-    start_s: float
-    end_s: float
     diagnosis: str
 
 
@@ -456,14 +445,12 @@ def _nominal_data(context: Context, kit: Kit, rest: tuple[float, ...]) -> Nomina
             for start, end in clean_windows(context, recording, roles)
         ]
 
-    runs, block_s = inside(HELD), block_seconds(model.dt, model.time_unit)
-    source = "recordings that nothing was trained on"
+    roles, block_s = HELD, block_seconds(model.dt, model.time_unit)
+    runs = inside(roles)
     if _whole_blocks(runs, block_s, model.dt) < blocks_needed(RATES[-1]):
-        runs = inside((*HELD, "train"))
-        source = (
-            "undisturbed recordings, also those of the training, which the model fits better than new ones"
-        )
-    return NominalData(runs, source, context.dataset.hash)
+        roles = WITH_TRAINING
+        runs = inside(roles)
+    return NominalData(runs, LEARNED_FROM[roles], context.dataset.hash)
 
 
 def _settled(t: Array, start: float, end: float, model: HybridModel) -> NDArray[np.bool_]:
@@ -523,12 +510,8 @@ def _recorded(
     return GuardTest(watched, starts, tuple(found), most), shown, arrays
 
 
-def what_guard_reads(context: Context) -> dict[str, object]:
-    """The loops that it is learned from, and what may break."""
-    return {**what_loops_read(context), "causes": context.scenario.causes}
-
-
 GUARD = Stage(
-    "guard", "learning the energy guard", GuardResult, guard_stage, what_guard_reads,
-    (DATA, EXPORT, NOISE, MONITOR), optional=True, restore=put_detector,
+    "guard", "learning the energy guard", GuardResult, guard_stage,
+    lambda context: {**what_loops_read(context), "causes": context.scenario.causes}, (DATA, EXPORT, NOISE, MONITOR),
+    optional=True, restore=put_detector,
 )  # fmt: skip

@@ -60,12 +60,18 @@ class DataResult:
 
 
 @dataclass(frozen=True)
-class CutPart:
-    """A part of a recording that is not used as it was recorded: its file, from and to [s], and why."""
+class CutInterval:
+    """A part of a recording that is not used as it was recorded: its file, from and to [s]."""
 
     file: str
     start_s: float
     end_s: float
+
+
+@dataclass(frozen=True)
+class CutPart(CutInterval):
+    """The same, and why."""
+
     why: str
 
 
@@ -228,9 +234,8 @@ def models_of(prior: Prior) -> tuple[str, ...]:
 
 def training_stage(context: Context) -> TrainingResult:
     """Train the networks of every kind, two kinds at once."""
-    name = digest(TRAINING.keys(context))[
-        :12
-    ]  # networks of other settings or data lie in a folder of their own
+    # networks of other settings or data lie in a folder of their own
+    name = digest(TRAINING.keys(context))[:12]
     folder = context.out / "checkpoints" / "training" / name
     trained = train_kinds(
         context.settings.scenario,

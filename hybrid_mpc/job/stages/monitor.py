@@ -35,14 +35,22 @@ RATES = (1.0, 2.0, 5.0, 10.0)
 enough for."""
 NOMINAL = ("train", "valid", "nominal")
 """Roles of what the monitor is calibrated on."""
-HELD = ("valid", "nominal")
-"""Those that no parameter was fitted to. Test recordings are kept to try limits and detector on."""
+HELD: tuple[str, ...] = ("valid", "nominal")
+WITH_TRAINING = (*HELD, "train")
+"""Those that no parameter was fitted to, and with them the training's. Test recordings are kept to try limits and
+detector on."""
+LEARNED_FROM: Mapping[tuple[str, ...], str] = {
+    HELD: "recordings that nothing was trained on",
+    WITH_TRAINING: "undisturbed recordings, also those of the training, which the model fits better than new ones",
+}
+"""What limits or a detector are learned from, in words."""
 FAULT_SEED = 600
 """Number of the loops in which something breaks, away from those that a detector is learned from."""
 LOAD_SHARE = 0.2
 """Unknown load of the demonstration, as a share of half the input's range."""
 MARGIN = 1.5
 """Where nominal data are too short for a rate: threshold over the highest nominal level."""
+NO_PROBLEM = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
 NO_ENERGY = (
     "the energy of {scenario} cannot be watched: its model is not mechanical, or other outputs than its positions are "
     "measured; its residuals are watched instead (stage residuals)"
@@ -77,13 +85,8 @@ class RecordedAlarm:
 
 @dataclass(frozen=True)
 class CleanAlarms:
-    """Alarms where nothing disturbs the machine.
-
-    Args:
-        seconds: Time known to be undisturbed [s].
-        alarms: Alarms that begin in it.
-        test_seconds: The part of it in test data [s].
-        test_alarms: Alarms that begin there.
+    """Alarms where nothing disturbs the machine: time known to be undisturbed [s] and the alarms that begin in it, then
+    those of test data alone.
     """
 
     seconds: float = 0.0
@@ -140,16 +143,14 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     Where nothing can be calibrated the result holds the reason; the artifact then keeps the rest speeds alone.
     """
     if context.scenario.control is None:
-        return Absent(
-            "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
-        )
+        return Absent(NO_PROBLEM)
     context.read(NOISE)
     kit, whole = context.kit, context.dataset.whole
     model, reason, rest = kit.models["hybrid"], "", None
     if not energy_is_watched(model):
         return Absent(NO_ENERGY.format(scenario=context.scenario.name))
     try:
-        rest = nominal_rest(context, model)
+        rest = rest_speeds([t for t in context.dataset.trajectories if t.role in NOMINAL], model)
     except InputError as short:
         reason = f"the monitor could not be calibrated: {short}"
     power, residual, traces = [], [], []
@@ -218,11 +219,6 @@ def put_calibration(context: Context, found: MonitorResult) -> str:
     if held is None or replace(held, detector=None) != found.calibration:
         set_calibration(context.out / "model", found.calibration)
     return ""
-
-
-def nominal_rest(context: Context, model: HybridModel) -> tuple[float, ...]:
-    """Rest speeds of a run's machine, from its undisturbed training and validation recordings."""
-    return rest_speeds([t for t in context.dataset.trajectories if t.role in NOMINAL], model)
 
 
 def _load_loop(context: Context, kit: Kit) -> tuple[UnknownLoad, ClosedLoopResult]:

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.controllers import OBSERVERS
 from hybrid_mpc.job.loops import DRAWN, MODEL, LoopRow, LoopSpec, arrays_of, stand_in, with_arrays
-from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage
+from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, task_content
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.kit.artifact import loop_settings
 
 Array = NDArray[np.float64]
-CONTROLLERS = ("prior_observer", "hybrid_observer")
 ON_MODEL = "on the model, not the machine"
 """What stands wherever such a loop is shown."""
 
@@ -43,8 +43,8 @@ class OnModelResult:
 
     @property
     def drawn(self) -> list[LoopRow]:
-        """The loops with their signals."""
-        return with_arrays(self.rows, self.arrays)
+        """The loops whose signals were kept, with these."""
+        return [row for row in with_arrays(self.rows, self.arrays) if row.arrays]
 
 
 def on_model_stage(context: Context) -> OnModelResult | Absent:
@@ -61,7 +61,7 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
     settings = context.settings
     plants: dict[str, str] = {}
     left_out: dict[str, str] = {}
-    for name in CONTROLLERS:
+    for name in OBSERVERS:
         try:
             plants[name] = stand_in(context.kit, name).model.name
         except InputError as none:
@@ -106,14 +106,13 @@ def what_on_model_reads(context: Context) -> dict[str, object]:
         return {**read, "tasks": str(none)}
     loop = loop_settings(whole)
     for task in tasks_of(whole, budget.tasks):
-        content = task_content(task, context.spec.dt, loop)
-        read[f"task {task.name}"] = UNKNOWN if any(v is UNKNOWN for v in content.values()) else content
+        read[f"task {task.name}"] = task_content(task, context.spec.dt, loop)
     return read
 
 
 def by_controller(rows: Sequence[LoopRow]) -> dict[str, list[LoopRow]]:
     """The loops of each controller by itself: each met another plant, so nothing compares them."""
-    return {name: [row for row in rows if row.controller == name] for name in CONTROLLERS}
+    return {name: [row for row in rows if row.controller == name] for name in OBSERVERS}
 
 
 LOOPS_ON_MODEL = Stage(

@@ -24,14 +24,7 @@ from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop
-from hybrid_mpc.job.stages.identify import (
-    DATA,
-    MODELS,
-    PRIOR,
-    TRAINING,
-    models_of,
-    training_settings,
-)
+from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, TRAINING, models_of, training_settings
 from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL
 from hybrid_mpc.job.stages.residuals import RESIDUALS
@@ -51,6 +44,7 @@ from hybrid_mpc.job.stages.results import (
     collect,
     finite,
     identification,
+    ratio,
     recordings,
 )
 from hybrid_mpc.job.step_response import step_responses
@@ -192,23 +186,14 @@ def report_so_far(context: Context) -> None:
         "models": [_prior_table(context)],
     }
     if "free_run" in figures:
-        found = identification(context)
-        tables["free_run"] = [
-            *_score_tables(context, found),
-            _choice_table(found),
-            _band_table(context, found),
-        ]
+        tables["free_run"] = _free_run_tables(context, identification(context))
     texts = words("run_words.html")
     shown = [key for key in TITLES if key in figures or key in tables]
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
     going = "This run goes on: the page is written anew after the first stages and at the end. Load it again."
-    title = f"hybrid-mpc: {context.scenario.name}"
-    write_report(
-        context.out / "report.html",
-        Report(
-            title, context.scenario.title, context.scenario.description, command(context), (), sections, going
-        ),
-    )
+    s, title = context.scenario, f"hybrid-mpc: {context.scenario.name}"
+    page = Report(title, s.title, s.description, command(context), (), sections, going)
+    write_report(context.out / "report.html", page)
 
 
 def report_is_there(context: Context, found: ReportResult) -> str:
@@ -244,10 +229,7 @@ def page_sources() -> dict[str, str]:
 def command(context: Context, scenario: str = "") -> str:
     """The command line that makes this run; ``scenario`` stands for the scenario as it was given."""
     s = context.settings
-    words = ["hybrid-mpc", "run", scenario or s.scenario, *(w for f in s.data for w in ("--data", f.name))]
-    for option, values in (("--input-column", s.inputs), ("--output-column", s.outputs)):
-        words += [w for v in values for w in (option, v)]
-    words += ["--time-column", s.time] if s.time else []
+    words = ["hybrid-mpc", "run", scenario or s.scenario, *s.options(lambda path: path.name)]
     words += ["--settings", s.network_file.name] if s.network_file else []
     words += ["--deploy", s.deploy] if s.deploy else []
     return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
@@ -258,7 +240,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
     tables: dict[str, Sequence[Table | None]] = {
         "data": [_data_table(results.data)],
         "models": [_prior_table(context)],
-        "free_run": [*_score_tables(context, found), _choice_table(found), _band_table(context, found)],
+        "free_run": _free_run_tables(context, found),
         "export": [_export_table(results.export)],
         "control": [
             _control_table(results.control),
@@ -274,13 +256,8 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "analysis": [_pole_table(results.analysis)],
     }
     instead, after = _notes(context, results)
-    for key in (
-        "estimation",
-        "timing",
-        "residuals",
-        "monitor",
-        "guard",
-    ):  # words about pictures that are not there help nobody
+    for key in ("estimation", "timing", "residuals", "monitor", "guard"):
+        # words about pictures that are not there help nobody
         if key in after and not figures.get(key) and not any(t is not None and t.rows for t in tables[key]):
             instead[key] = after.pop(key)
     texts = words("run_words.html")
@@ -310,19 +287,19 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
 
 def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     found, timing, control = results.identification, results.timing, results.control
-    ratio, hybrid = found.details.hybrid_over_phy, found.details.choice.hybrid
+    over, hybrid = found.details.hybrid_over_phy, found.details.choice.hybrid
     for output in context.scenario.prior().outputs:
         rmse, base = (_by(found.rmse[m], output.label) for m in (hybrid, "phy"))
         fit = _by(found.fit_percent[hybrid], output.label)
         words = "" if fit is None else f"FIT {fit:.0f} %; "
         yield KeyFigure(
             f"Free-run error (RMSE) of {output.name}, hybrid on unseen data", rmse, output.unit,
-            f"{words}fitted prior: {_text(base)} {output.unit}", _verdict(_ratio(rmse, base)),
+            f"{words}fitted prior: {_text(base)} {output.unit}", _verdict(ratio(rmse, base)),
         )  # fmt: skip
     e_sim = {m: _number(found.e_sim[m]) for m in MODELS}
     yield KeyFigure(
         "Simulation error E_sim of the hybrid, over the rates' spread", e_sim[hybrid], "",
-        f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(ratio["e_sim"]),
+        f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(over["e_sim"]),
     )  # fmt: skip
     choice = found.details.choice
     own = choice.candidates[choice.hybrid]
@@ -349,8 +326,8 @@ def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
         yield KeyFigure("Alarms of the energy monitor", len(alarms), "", comment, verdict)
 
 
-def _verdict(ratio: float | None) -> Verdict:
-    return "plain" if ratio is None else "good" if ratio < 1.0 else "bad"
+def _verdict(over: float | None) -> Verdict:
+    return "plain" if over is None else "good" if over < 1.0 else "bad"
 
 
 def _text(value: float | None) -> str:
@@ -474,8 +451,8 @@ def _prior_table(context: Context) -> Table:
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
 
-def _score_tables(context: Context, found: Identification) -> list[Table]:
-    """Errors of every model: by output; then of its rates and by balance."""
+def _free_run_tables(context: Context, found: Identification) -> list[Table]:
+    """Errors of every model: by output; then of its rates and by balance; the choice, and the bands."""
     prior = context.scenario.prior()
     models = models_of(prior)
     outputs = [s.label for s in prior.outputs]
@@ -507,7 +484,7 @@ def _score_tables(context: Context, found: Identification) -> list[Table]:
         *(f"violation of {label}" for label in balances),
     )
     caption = "Free runs on unseen data: rates of the states" + (" and balances." if balances else ".")
-    return [*tables, Table(columns, rows, caption)]
+    return [*tables, Table(columns, rows, caption), _choice_table(found), _band_table(context, found)]
 
 
 def _choice_table(found: Identification) -> Table:
@@ -548,10 +525,6 @@ def _by(values: Any, label: str) -> float | None:
 
 def _number(value: Any) -> float | None:
     return value if isinstance(value, float) else None
-
-
-def _ratio(value: float | None, base: float | None) -> float | None:
-    return None if value is None or not base else value / base
 
 
 def _percent(value: float | None, base: float | None) -> str:
@@ -596,15 +569,8 @@ def _tracking_table(control: Control) -> Table | None:
         for name in CONTROLLERS
         if name in own
     ]
-    signals = list(dict.fromkeys(s for *_, cell in cells for s in cell.tracking_rmse))
-    rows = [
-        (
-            task,
-            name.replace("_", ", "),
-            *(cell.tracking_rmse[s].mean if s in cell.tracking_rmse else None for s in signals),
-        )
-        for task, name, cell in cells
-    ]
+    signals, errors = _tracking([cell for *_, cell in cells])
+    rows = [(task, name.replace("_", ", "), *own) for (task, name, _), own in zip(cells, errors, strict=True)]
     caption = (
         "Root mean square deviations from the reference, means over seeds: of true states, or of measured outputs "
         "where references are theirs."
@@ -617,7 +583,7 @@ def _response_table(context: Context) -> Table | None:
     scenario, found = context.scenario, context.find(CONTROL)
     if isinstance(found, Absent) or scenario.control is None:
         return None
-    drawn, prior = [row for row in found.drawn if row.arrays], scenario.prior()
+    drawn, prior = found.drawn, scenario.prior()
     names = {controller: name for name, controller in REPORTED.items()}
     rows = [
         (
@@ -642,17 +608,12 @@ def _on_model_tables(found: OnModel) -> list[Table | None]:
     """A table a controller: each met another plant, so no table holds two."""
     tables: list[Table | None] = []
     for name, cells in (found.details.controllers if found.details is not None else {}).items():
-        signals = list(dict.fromkeys(s for cell in cells.values() for s in cell.tracking_rmse))
+        signals, errors = _tracking(list(cells.values()))
         rows = [
-            (
-                task,
-                _cost(cell),
-                *(cell.tracking_rmse[s].mean if s in cell.tracking_rmse else None for s in signals),
-                f"{100 * max(cell.limits.values(), default=0.0):.0f} %",
-                f"{100 * cell.sources['MPC']:.1f} %",
-            )
-            for task, cell in cells.items()
-        ]
+            (task, _cost(cell), *own, f"{100 * max(cell.limits.values(), default=0.0):.0f} %",
+             f"{100 * cell.sources['MPC']:.1f} %")
+            for (task, cell), own in zip(cells.items(), errors, strict=True)
+        ]  # fmt: skip
         caption = (
             f"Controller {name.replace('_', ', ')} on the model {found.plants[name]} in place of the machine: "
             f"{ON_MODEL}. Cost J on the model's state, root mean square deviations from the reference, means over "
@@ -661,6 +622,13 @@ def _on_model_tables(found: OnModel) -> list[Table | None]:
         heads = ("task", "cost", *(f"RMSE of {s}" for s in signals), "largest share of a limit", "solved")
         tables.append(Table(heads, rows, caption))
     return tables
+
+
+def _tracking(cells: Sequence[Summary]) -> tuple[list[str], list[list[float | None]]]:
+    """Signals that any cell has an error of, and the means of each cell."""
+    signals = list(dict.fromkeys(s for cell in cells for s in cell.tracking_rmse))
+    errors = [{s: found.mean for s, found in cell.tracking_rmse.items()} for cell in cells]
+    return signals, [[own.get(s) for s in signals] for own in errors]
 
 
 def _cost(cell: Summary | None) -> str:

@@ -18,7 +18,18 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
-from hybrid_mpc.job.stages.monitor import FAULT_SEED, HELD, CleanAlarms, clean_alarms, inside, rates
+from hybrid_mpc.job.stages.monitor import (
+    FAULT_SEED,
+    HELD,
+    LEARNED_FROM,
+    NO_PROBLEM,
+    WITH_TRAINING,
+    CleanAlarms,
+    RecordedAlarm,
+    clean_alarms,
+    inside,
+    rates,
+)
 from hybrid_mpc.kit.artifact import Kit, read_description, set_residuals
 from hybrid_mpc.kit.assembly import energy_is_watched
 from hybrid_mpc.loop.faults import Fault
@@ -41,12 +52,9 @@ WEAKER = 0.8
 
 
 @dataclass(frozen=True)
-class ChannelAlarm:
-    """An alarm on a recording: its file, from and to [s], and the channels that alarmed in it, in their order."""
+class ChannelAlarm(RecordedAlarm):
+    """An alarm on a recording, and the channels that alarmed in it, in their order."""
 
-    file: str
-    start_s: float
-    end_s: float
     channels: tuple[str, ...]
 
 
@@ -102,9 +110,7 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
     """
     scenario = context.scenario
     if scenario.control is None:
-        return Absent(
-            "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
-        )
+        return Absent(NO_PROBLEM)
     context.read(NOISE)
     kit, limits = context.kit, {}
     for name in dict.fromkeys(("hybrid", kit.recommended)):
@@ -147,13 +153,12 @@ def _learned(
     try:
         found = learned(HELD)
         if found.rated:
-            return found, recordings, traces, "recordings that nothing was trained on"
+            return found, recordings, traces, LEARNED_FROM[HELD]
     except InputError:
         pass  # nothing of them is long enough; the others may be
     others = [r for r in context.dataset.whole if r not in held]
     recordings, traces = recordings + others, traces + _replayed(context, monitor, estimator, others)
-    source = "undisturbed recordings, also those of the training, which the model fits better than new ones"
-    return learned((*HELD, "train")), recordings, traces, source
+    return learned(WITH_TRAINING), recordings, traces, LEARNED_FROM[WITH_TRAINING]
 
 
 def _replayed(

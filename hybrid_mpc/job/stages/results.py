@@ -27,7 +27,7 @@ from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecord
 from hybrid_mpc.job.stages.evaluate import EVALUATION, BandScores, BaselineScores
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
-from hybrid_mpc.job.stages.identify import DATA, MODELS
+from hybrid_mpc.job.stages.identify import DATA, MODELS, CutInterval
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
@@ -46,15 +46,6 @@ REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "o
 """Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
 Errors = Mapping[str, Mapping[str, float] | str | None]
 """Error by model, each by signal with unit; a model without one has null, and ``MODEL_reason``."""
-
-
-@dataclass(frozen=True)
-class CutInterval:
-    """A part of a recording that is not used as it was recorded: its file, from and to [s]."""
-
-    file: str
-    start_s: float
-    end_s: float
 
 
 @dataclass(frozen=True)
@@ -426,15 +417,8 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
         )
     for group in (
-        "identification",
-        "control",
-        "estimation",
-        "timing",
-        "residuals",
-        "monitor",
-        "guard",
-        "analysis",
-    ):
+        "identification", "control", "estimation", "timing", "residuals", "monitor", "guard", "analysis",
+    ):  # fmt: skip
         _check_values(values[group], group, where)
     return results
 
@@ -502,8 +486,8 @@ def identification(context: Context) -> Identification:
         },
         SmootherNoise(prior.fit.sigma, prior.fit.walk),
         {
-            "error": _ratio(error[chosen.hybrid], error["phy"]),
-            "e_sim": _ratio(e_sim[chosen.hybrid], e_sim["phy"]),
+            "error": ratio(error[chosen.hybrid], error["phy"]),
+            "e_sim": ratio(e_sim[chosen.hybrid], e_sim["phy"]),
         },
         ModelChoice(
             chosen.recommended,
@@ -545,7 +529,8 @@ def finite(value: float) -> float | None:
     return float(value) if math.isfinite(float(value)) else None
 
 
-def _ratio(value: float | None, baseline: float | None) -> float | None:
+def ratio(value: float | None, baseline: float | None) -> float | None:
+    """A value over the baseline's, or None where one of them is missing, or the baseline is zero."""
     return None if value is None or not baseline else value / baseline
 
 
