@@ -288,11 +288,12 @@ class Descent:
         return self._answer(damped, self.at.gradient + 2 * bend @ prepared.weighted, value, slope)
 
     def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
+        """The QP's answer within the inputs' bounds: what rounding puts beyond them would promise what no run can keep."""
         soft = (value, slope) if value.size else None
-        case = self._case
-        return self._cost.inner.qp.solve(
-            hessian, gradient, self.at.run.u, case.u_prev, soft, case.limits, self.active
-        )
+        case, u, inner = self._case, self.at.run.u, self._cost.inner
+        found = inner.qp.solve(hessian, gradient, u, case.u_prev, soft, case.limits, self.active)
+        within = np.clip(u + found.step.reshape(u.shape), *inner.ocp.bounds(case.u_prev, case.limits))
+        return replace(found, step=(within - u).ravel())
 
     def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
         """By how much the convex model falls along a step."""
