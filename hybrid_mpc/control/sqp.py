@@ -288,7 +288,7 @@ class Descent:
         return self._answer(damped, self.at.gradient + 2 * bend @ prepared.weighted, value, slope)
 
     def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
-        """The QP's answer within the inputs' bounds: what rounding puts beyond them would promise what no run can keep."""
+        """The QP's answer within the inputs' bounds: what rounding puts beyond them promises what no run can keep."""
         soft = (value, slope) if value.size else None
         case, u, inner = self._case, self.at.run.u, self._cost.inner
         found = inner.qp.solve(hessian, gradient, u, case.u_prev, soft, case.limits, self.active)
