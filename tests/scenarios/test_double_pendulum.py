@@ -18,8 +18,8 @@ from scenarios.double_pendulum.prior import DoublePendulumPrior
 from scenarios.double_pendulum.tasks import UPRIGHT
 
 # fitted to the recordings, as the machine's page has them
-FITTED = {"I_1": 0.0279, "I_2": 0.0486, "mr_1": 0.080, "mr_2": 0.148, "b_1": 0.0, "b_2": 0.004, "F_1": 0.237,
-          "F_2": 0.157}  # fmt: skip
+FITTED = {"I_1": 0.0267, "I_2": 0.0481, "mr_1": 0.0747, "mr_2": 0.146, "b_1": 0.0, "b_2": 0.0064, "F_1": 0.246,
+          "F_2": 0.147}  # fmt: skip
 DELAY = 0.004
 """The inputs' delay [s] that is fitted to the recordings along with the prior."""
 SIGMA_X = (1e-4, 1e-4, 0.05, 0.08)
