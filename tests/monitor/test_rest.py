@@ -134,7 +134,14 @@ def test_dry_friction_raises_nothing_at_rest(strokes, pull, excess):
 
 def test_every_consumer_takes_the_stored_value():
     detector = Detector(
-        0.01, ((1.0, 0, 0, 0),), (1.0, 0, 0, 0), 1.0, 9.0, rest_speed=(0.003,), false_alarms_per_hour=1.0, time_unit=2.0
+        0.01,
+        ((1.0, 0, 0, 0),),
+        (1.0, 0, 0, 0),
+        1.0,
+        9.0,
+        rest_speed=(0.003,),
+        false_alarms_per_hour=1.0,
+        time_unit=2.0,
     )
     calibration = Calibration(1.0, 0.5, 1.0, 1, 1.0, "by hand", rest_speed=(0.004,))
     model = FIVE_CM.model()
