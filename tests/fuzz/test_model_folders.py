@@ -111,7 +111,9 @@ def test_fields_that_do_not_fit(folder, whole, tmp_path, seed):
 
 
 def detector_and_thresholds():
-    detector = Detector(0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (), 0.5, 4.0, rest_speed=(0.2,))
+    detector = Detector(
+        0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (1e-4, 1e-4, 0.0, 1e-4), 0.5, 4.0, 4.0, rest_speed=(0.2,)
+    )
     return Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, detector, (0.2,))
 
 
