@@ -6,8 +6,8 @@
 recordings, enter neither fit nor choice. Runs follow each other without overlap; each starts from the scenario's
 warm-up alone. Root mean squares over all runs, one number an output, and the median over the runs.
 
-``fitted to these`` is the prior fitted to the very recordings that it is judged by: about the floor of its equation
-there. What lies above it is in the parameters, what is left in the equation, the unmeasured and the noise.
+``fitted to these`` is the prior fitted to the very recordings that it is judged by. Where it is much better, parameters
+differ there. It is no floor: the fit minimizes another measure (all outputs over their noise, free first states).
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ ROW = 0.002
 SLOW_ROW = 0.03
 """The same of the swing-ups [s]."""
 LARGEST_DELAY = 2 * ROW
-"""Longest delay [s] of the torques behind their commands that the prior's fit may find: two rows, as the makers of the
-recordings say. The slow sines hardly tell it, and more of it would stand in for friction."""
+"""Longest delay [s] of the torques behind their commands that the prior's fit may find: the rows by which the measured
+torque lags its command. The slow sines hardly tell it, and more of it would stand in for friction."""
 MEASURED = ("q1_rad", "q2_rad", "dq1_rad_s", "dq2_rad_s")
 SLOW = tuple(f"{robot}_swingup_{k:02d}" for robot in ("acrobot", "pendubot") for k in (1, 2, 3))
 
