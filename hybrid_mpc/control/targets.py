@@ -180,7 +180,8 @@ class Targets:
             beside = None if wide and bounded else int(wide or given is None)
             for first in self._firsts(given, beside):
                 found, off, slopes = self._descend(first, goal, d, w, bounded)
-                if found.steady and not found.reached and np.vdot(slopes, self.slopes) < self.flat:
+                missed = found.steady and not found.reached and first is not self.beside[0]
+                if missed and np.vdot(slopes, self.slopes) < self.flat:
                     other, nearer, _ = self._descend(self.beside[0], goal, d, w, bounded)
                     found = other if other.steady and nearer < off else found
                 if found.steady:

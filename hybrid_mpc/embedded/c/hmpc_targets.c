@@ -455,7 +455,7 @@ void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, co
     const int beside = wide && bounded ? STARTS : (wide || !known);
     for (int k = known ? -1 : 0; k < beside; ++k) {
       const real off = descend(s, k < 0 ? given : target_starts[k], y, w, bounded, &trial);
-      if (trial.steady && !trial.reached && s->search.answer < target_flat[0]) {
+      if (k != 0 && trial.steady && !trial.reached && s->search.answer < target_flat[0]) {
         const real nearer = descend(s, target_starts[0], y, w, bounded, &other);
         if (other.steady && nearer < off) trial = other;
       }
