@@ -22,7 +22,7 @@ sys.path.extend(str(Path(__file__).parents[1] / "tests" / name) for name in ("em
 
 import replay_parts as replays
 from replay_parts import Case, Whole, replay
-from test_loop import golden, prior_takes_over
+from test_whole_loops import golden, prior_takes_over
 
 from hybrid_mpc import (
     OCP,

@@ -63,7 +63,8 @@ def test_costs_and_alarms_of_ten_seeds(m):
     for name, was in wanted.items():
         found = parts.paired(m, name, range(was["loops"]))
         change = np.mean(np.subtract(found["cost"], was["cost"]))
-        assert abs(change) <= was["ci95"], (name, change, was["mean"])
+        # of an unstable loop rounding draws every cost anew: a difference of two means, each with this interval
+        assert abs(change) <= np.sqrt(2) * was["ci95"], (name, change, was["mean"])
         for count in ("alarms", "detections", "switched"):
             low, high = binomial(was[count], was["loops"])
             assert low <= found[count] <= high, (name, count, found[count], was[count])
