@@ -174,7 +174,7 @@ def identified(
     known = read_training(scenario, paths)
     fit = fit_prior(
         scenario.prior, known.train, known.valid, dt=dt, length=spec.length or spec.piece,
-        largest_delay=scenario.data.largest_delay, warm_up=scenario.data.warm_up,
+        largest_delay=scenario.data.largest_delay,
     )  # fmt: skip
     prior = scenario.prior(fit.values)
     info = replace(model_info(prior, dt), input_delay=fit.delay, time_unit=time_unit(known.dataset.whole, dt))

@@ -145,7 +145,7 @@ def judge(name: str, data: Path, folder: Path) -> None:
     known = read_training(scenario, files)
     fit = fit_prior(
         scenario.prior, known.train, known.valid, dt=dt, length=spec.length or spec.piece,
-        largest_delay=scenario.data.largest_delay, warm_up=scenario.data.warm_up,
+        largest_delay=scenario.data.largest_delay,
     )  # fmt: skip
     print(f"\n{name}\n{fit.table(scenario.prior().parameters)[['nominal', 'fitted', 'standard_error']]}")
     print(f"delay {fit.delay:.3g} s; {'; '.join(fit.identifiability) or 'all told apart'}")

@@ -81,10 +81,6 @@ BEYOND = 0.05
 """Share of a state's own span by which it may leave its range: a smoother overshoots."""
 HARDLY = 0.98
 """Share of the nominal values' error from which on a fit counts as none."""
-SHARES = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
-"""Shares of the way back from what was fitted to the nominal values, one after the other while runs become better."""
-BACK = 0.95
-"""Share of the fitted parameters' error to which such a step must bring it to be taken."""
 LATE = 4.0
 """Longest delay of the inputs [model periods] that is looked for where none is fitted."""
 TELLING = 0.9
@@ -779,7 +775,6 @@ def fit_prior(
     dt: float,
     length: float | None = None,
     largest_delay: float = 0.0,
-    warm_up: float | None = None,
     start: Mapping[str, float] | None = None,
     time_unit: float | None = None,
     first_states: FirstStates = FREE,
@@ -796,11 +791,6 @@ def fit_prior(
     Recordings whose inputs answer to the outputs (:func:`feedback`) warn, and the errors of predictions are fitted too.
     Inputs that seem to act late warn where no delay is fitted.
 
-    A fit with free first states takes for a parameter what a first state can hide, and trusts recordings of one kind
-    too much. So the parameters go a part of the way back to their nominal values where free runs over all recordings
-    become clearly better by it that start as models do later: from a smoother's state behind a ``warm_up``. One number
-    is found so, and none of them by itself: that would fit the warm-ups' errors.
-
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         train: Training trajectories.
@@ -809,8 +799,6 @@ def fit_prior(
         length: Length [s] of the longest windows: that of the runs that the model will be evaluated by. Default: 5 of
             the machine's seconds, or 3 of the nominal prior's largest time constant where that is more.
         largest_delay: Longest delay [s] of the inputs. Default 0: they act at once.
-        warm_up: Length [s] of what a model is given before it runs freely, where it is evaluated. Default: parameters
-            stay as they were fitted.
         start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
             fixed parameters are left out. Default: none.
         time_unit: The machine's second [s]. Default: that of the training trajectories.
@@ -905,20 +893,6 @@ def fit_prior(
     warnings = _warnings(fit, chosen, answered, min(scores) / max(scores[0], 1e-300))
     if not largest_delay and first_states.kind not in ("known", "shared"):
         warnings += _late(fit, chosen.theta, guesses, lengths[-1], sizes)
-    if warm_up is not None and fit.free:
-        acting = shifted([*train, *valid], fit.delay(chosen.theta))
-        share, left = _way_back(fit, chosen.theta, acting, smoother, max(1, round(warm_up / dt)), lengths[-1])
-        if share:
-            n = len(fit.free)
-            nearer = chosen.theta.copy()
-            nearer[:n] += share * (fit.nominal[:n] - nearer[:n])
-            chosen = replace(chosen, theta=nearer)
-            fitted, substeps = make(fit.values(nearer)), fit.substeps(nearer)
-            smoother = fit_smoother(fitted, acting, dt, time_unit=unit, substeps=substeps)
-            warnings += (
-                f"parameters went {share:g} of the way back to their nominal values, where free runs from a smoother's "
-                f"states have {left:.2f} of the error: the recordings tell less of them than the standard errors say",
-            )
     on_progress(total, total, "done")
     return PriorFit(
         fit.values(chosen.theta), _errors(fit, chosen), warnings, stages,
@@ -1116,54 +1090,6 @@ def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0, gained: flo
         if min(value - low, high - value) < AT_BOUND * (high - low):
             warnings.append(f"{p.label} ends at a bound ({value * (abs(p.value) or p.upper - p.lower):.4g})")
     return tuple(warnings)
-
-
-def _way_back(
-    fit: OutputFit,
-    theta: Array,
-    trajectories: Sequence[Trajectory],
-    smoother: Smoother,
-    warm: int,
-    periods: int,
-) -> tuple[float, float]:
-    """Share of the way back to the nominal parameters at which free runs from the smoother's states are best, and what
-    is left of the error there; 0 and 1 where that is not clearly better.
-
-    ``trajectories`` have the inputs that act. Each run is ``warm`` samples that the smoother knows and ``periods``.
-    """
-    own, n = fit.with_delay(0.0), len(fit.free)
-    periods = min(periods, _longest(trajectories) - warm - 1)
-    if periods < 2:
-        return 0.0, 1.0
-    every = [
-        t.part(slice(k, k + warm + periods + 1))
-        for t in trajectories
-        for k in range(0, len(t.t) - warm - periods, warm + periods)
-    ]
-    pieces = [every[i] for i in evenly(len(every), WINDOWS)]
-    given = [piece.part(slice(0, warm + 1)) for piece in pieces]
-    windows = cut_outputs([piece.part(slice(warm, None)) for piece in pieces], periods, 0, WINDOWS)
-    problem = Shooting(own, windows, np.array(smoother.sizes.x))
-    spread = np.tile(problem.spread, periods + 1)
-
-    def error(share: float) -> float:
-        at = theta[:n] + share * (fit.nominal[:n] - theta[:n])
-        try:
-            around = replace(smoother, prior=fit.make(own.values(at)), substeps=own.substeps(at))
-        except InputError:  # too stiff there
-            return math.inf
-        x = np.stack([known.x[-1] for known in around.smooth(given)])
-        over = np.clip(problem.start(at, x, "x").error / spread, -FAR, FAR)
-        return float(np.sqrt(np.mean(np.square(over))))
-
-    first = least = error(0.0)
-    best = 0.0
-    for share in SHARES:
-        found = error(share)
-        if not found < least:
-            break
-        best, least = share, found
-    return (best, least / first) if least < BACK * first else (0.0, 1.0)
 
 
 def _late(

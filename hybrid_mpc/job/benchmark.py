@@ -302,8 +302,7 @@ def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Pro
         return record(PriorFit, held, str(note))
     fit = fit_prior(
         scenario.prior, data.train, data.valid, dt=scenario.data.dt, length=spec.length or spec.piece,
-        largest_delay=scenario.data.largest_delay, warm_up=scenario.data.warm_up,
-        on_progress=partial(progress.update, "prior"),
+        largest_delay=scenario.data.largest_delay, on_progress=partial(progress.update, "prior"),
     )  # fmt: skip
     write_document(note, plain(fit))
     return fit

@@ -201,8 +201,7 @@ def prior_stage(context: Context) -> PriorResult:
         ((len(t.t) - context.warm) * spec.dt for t in (*valid, *test)), default=None
     )
     fit = fit_prior(
-        make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay, warm_up=spec.warm_up,
-        time_unit=context.time_unit,
+        make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay, time_unit=context.time_unit,
         on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
     )  # fmt: skip
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
