@@ -179,7 +179,7 @@ def test_rubbish_for_long(folder, tmp_path):
     short = (
         "OUTPUT_COST 1" in (folder / "hmpc_config.h").read_text()
     )  # it searches from everywhere in bad times
-    rubbish(shutil.copytree(folder, tmp_path / "c"), 4_000 if short else 34_000)
+    rubbish(shutil.copytree(folder, tmp_path / "c"), 4_000 if short else 12_000)
 
 
 def refused(model, ocp, match, **options):

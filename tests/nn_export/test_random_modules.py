@@ -128,7 +128,7 @@ def test_random_stack(plan):
 
 
 @pytest.mark.full
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(stacks())
 def test_many_random_stacks(plan):
     check(*plan)
