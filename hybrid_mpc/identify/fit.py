@@ -891,7 +891,7 @@ def fit_prior(
             chosen, smoother = best()
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     warnings = _warnings(fit, chosen, answered, min(scores) / max(scores[0], 1e-300))
-    if not largest_delay and first_states.kind not in ("known", "shared"):
+    if fit.free and not largest_delay and first_states.kind not in ("known", "shared"):
         warnings += _late(fit, chosen.theta, guesses, lengths[-1], sizes)
     on_progress(total, total, "done")
     return PriorFit(

@@ -12,7 +12,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from typing import NamedTuple
 
 MOST_S, MOST_MB = 5.0, 500.0
-"""Processor time and memory that it may take to refuse a small file; on an idle core it is less than a second."""
+"""Processor time and memory that it may take to refuse a small file; most take less than a second."""
 HANGS_S = 120
 
 
