@@ -7,8 +7,9 @@ recordings, enter neither fit nor choice. Runs follow each other without overlap
 warm-up alone. Root mean squares over all runs, one number an output, and the median over the runs.
 
 ``least`` is the prior with the parameters that are best for the very runs that it is judged by, found by these from
-the fitted ones on: what no fit of this equation can beat there, up to a local optimum. The sum of the outputs' mean
-squares, each over the fitted prior's, is least. Its parameters are printed.
+the fitted ones on in a few steps: what fits of this equation could have there, and hardly less. The sum of the outputs'
+mean squares, each over the fitted prior's, is least; a single output may be better elsewhere. Delay and smoother stay
+those of the fit. Its parameters are printed.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ STEP = 0.02
 INSIDE = 1e-9
 """Share of its bounds by which each parameter begins within them."""
 DIVERGED = 1e3
-"""Error of a run that diverges, over the fitted prior's."""
+"""What each sample of a run that diverges counts."""
 
 
 @dataclass(frozen=True)

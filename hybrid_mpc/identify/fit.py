@@ -789,7 +789,7 @@ def fit_prior(
     stays as it is.
 
     Recordings whose inputs answer to the outputs (:func:`feedback`) warn, and the errors of predictions are fitted too.
-    Inputs that seem to act late warn where no delay is fitted.
+    Inputs that seem to act late warn where parameters are fitted and no delay is, and first states are not known ones.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
@@ -892,7 +892,7 @@ def fit_prior(
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     warnings = _warnings(fit, chosen, answered, min(scores) / max(scores[0], 1e-300))
     if fit.free and not largest_delay and first_states.kind not in ("known", "shared"):
-        warnings += _late(fit, chosen.theta, guesses, lengths[-1], sizes)
+        warnings += _late(fit, chosen.theta, guesses, lengths[-1], sizes, first_states)
     on_progress(total, total, "done")
     return PriorFit(
         fit.values(chosen.theta), _errors(fit, chosen), warnings, stages,
@@ -1093,26 +1093,37 @@ def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0, gained: flo
 
 
 def _late(
-    fit: OutputFit, theta: Array, parts: Sequence[Sequence[Trajectory]], periods: int, sizes: Array
+    fit: OutputFit,
+    theta: Array,
+    parts: Sequence[Sequence[Trajectory]],
+    periods: int,
+    sizes: Array,
+    first_states: FirstStates,
 ) -> tuple[str, ...]:
-    """A warning where inputs that act later than they are recorded explain each part of the recordings better; the
-    delay is found on the first one.
+    """A warning where inputs that act later than they are recorded explain the first of the parts, and each other one
+    that is long enough, better than parameters alone; both are fitted to the same windows of the first part.
     """
-    late, problems = fit.with_delay(LATE * fit.dt), []
+    late = fit.with_delay(LATE * fit.dt)
+    known = fit.prior.states, fit.prior.outputs, first_states
+    problems: list[Shooting] = []
     for part in parts:
-        if (longest := min(periods, _longest(part) - late.lead - 1)) < 2:
+        if (longest := min(periods, _longest(part) - late.lead - 1)) >= 2:
+            windows = cut_outputs(part, longest, late.lead, WINDOWS // 2, *known)
+            problems.append(Shooting(late, windows, sizes))
+        elif not problems:
             return ()
-        problems.append(Shooting(late, cut_outputs(part, longest, late.lead, WINDOWS // 2), sizes))
+    at_once = Shooting(fit, problems[0].windows, sizes).solve(theta, START_ITERATIONS)
     found = problems[0].solve(np.append(theta, 0.5), START_ITERATIONS)
-    both = np.array([problem.explained([np.append(theta, 0.0), found.theta]) for problem in problems])
-    delay, error = found.theta[-1] * fit.dt, math.sqrt(found.covariance[-1, -1]) * fit.dt
+    both = np.array([problem.explained([np.append(at_once.theta, 0.0), found.theta]) for problem in problems])
+    delay, error = found.theta[-1] * fit.dt, math.sqrt(max(found.covariance[-1, -1], 0.0)) * fit.dt
     if not ((both[:, 1] < TELLING * both[:, 0]).all() and delay > 2.0 * error):
         return ()
-    left = " and ".join(f"{then / at_once:.2f}" for at_once, then in both)
+    left = " and ".join(f"{then / before:.2f}" for before, then in both)
+    least = "at least " if found.theta[-1] > (1.0 - AT_BOUND) * LATE else ""
     return (
-        f"inputs seem to act {delay:.2g} s later than they are recorded (standard error {error:.1g} s): of the error "
-        f"over training and validation recordings this would leave {left}. Let the fit find the delay (largest_delay "
-        "of the data), or write the lag of the actuator into the prior",
+        f"inputs seem to act {least}{delay:.2g} s later than they are recorded (standard error {error:.1g} s): of the "
+        f"error over training and validation recordings this would leave {left}. Let the fit find the delay "
+        "(largest_delay of the data), or write the lag of the actuator into the prior",
     )
 
 

@@ -43,6 +43,20 @@ def test_a_prior_is_fitted_to_delayed_recordings():
     assert not any("later than" in w for w in right.warnings)
 
 
+def late_told(train, valid):
+    return any("later than" in w for w in fit_prior(Pendulum, train, valid, dt=DT).warnings)
+
+
+def test_late_inputs_are_told_where_all_recordings_show_them():
+    late, others = [late_recording(seed) for seed in range(3)], [record(seed, 3.0) for seed in range(3)]
+    noisy = [record(seed, seconds=3.0, noise=0.01) for seed in range(3)]
+    assert late_told(late[:2], late[2:])
+    assert late_told(late, [])
+    assert late_told(late[:2], [late[2].part(slice(0, 6))])  # too short to tell
+    assert not late_told(late[:2], others[2:])
+    assert not late_told(noisy[:2], noisy[2:])
+
+
 @pytest.mark.parametrize("largest", [2 * DT, 4 * DT])
 def test_the_delay_is_fitted_with_the_parameters(largest):
     commanded = [late_recording(seed) for seed in range(2)]

@@ -56,7 +56,7 @@ class Child:
     def _stands(self):
         try:
             state = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except FileNotFoundError:
+        except (FileNotFoundError, ProcessLookupError):
             return self.ended
         return state in "ST"
 
