@@ -17,6 +17,14 @@ equals. By case and kind of bound:
 - ``cost``: weighed errors and changes of the inputs on the plant, hard over soft: geometric mean over seeds, with its
   95 % interval (paired).
 - ``solve``: median and 99th percentile of a solve [ms].
+
+``--times`` measures instead what a bound adds to a solve. Along ``--seeds`` loops with the hard bound, three
+``CondensedController`` solve each period from their own last plans, in random order: without the limit, with a soft and
+with a hard one. By case and kind of bound, over the periods in which it acts in the plan:
+
+- ``acts``: how many of all periods these are, and ``rows``, how many rows of the QP act in their median.
+- ``without``, ``with``: medians of a solve [ms]; ``ratio``: of these medians.
+- ``p99 / median``: the slowest 1 % of all periods over their median, with the bound; ``without``: the same without.
 """
 
 from __future__ import annotations
@@ -27,6 +35,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 from parts import arguments, report
@@ -106,12 +115,14 @@ joint of a pendubot that swings up below 8 rad/s, with 5 N m at most."""
 
 
 def problem_of(kit: hm.Kit, case: Case, kind: str) -> hm.OCP:
-    """The scenario's control problem with the case's limit alone, hard or soft."""
+    """The scenario's control problem with the case's limit alone, hard or soft, or with none."""
     free = kit.problem(case.task)
     n_x, n_y = free.n_x, len(kit.sensor_sigma)
     bare = free.changed(x_min=[-INF] * n_x, x_max=[INF] * n_x, slack_linear=None, slack_quadratic=None)
     if bare.y_min.size:
         bare = bare.changed(y_min=[-INF] * n_y, y_max=[INF] * n_y)
+    if kind == "none":
+        return bare
     if kind == "hard":
         return bare.changed(hard=[hm.HardBound(case.what, case.lower, case.upper)])
     names = ("x_min", "x_max") if case.what == "x" else ("y_min", "y_max")
@@ -217,6 +228,47 @@ def row_of(machine: str, kind: str, cells: list[dict]) -> dict:
             "solve, median": f"{np.median(times):.2f}", "p99": f"{np.quantile(times, 0.99):.2f}"}  # fmt: skip
 
 
+def solve_times(runs: Path, machine: str, seed: int) -> list[dict]:
+    """Time of a solve with each kind of bound at every period of a loop, and how many rows of the bound act."""
+    case = CASES[machine]
+    scenario, model, *_ = parts(runs, machine, "hard")
+    kit = hm.load(runs / machine / "model").on(scenario)
+    problems = {kind: problem_of(kit, case, kind) for kind in ("none", *KINDS)}
+    solvers = {kind: hm.CondensedController(model, ocp) for kind, ocp in problems.items()}
+    ocp, plans, rows, rng = problems["none"], {}, [], np.random.default_rng(seed)
+    t = model.dt * np.arange(round(case.duration / model.dt) + ocp.horizon + 1)
+    goals = case.drawn(np.random.default_rng(seed), t)
+    weight = next((task.weight for task in scenario.tasks if task.name == case.task), None)
+    own = ocp.block_starts.size * ocp.n_u * (2 if ocp.du_max is not None else 1)
+
+    def watch(step: Step) -> None:
+        ahead = step.t + model.dt * np.arange(ocp.horizon + 1)
+        preview, factors = _held(goals, model.dt)(ahead), weight(ahead) if weight else None
+        row: dict[str, float] = {}
+        for kind in rng.permutation([*solvers]).tolist():
+            last = plans.get(kind) or solvers[kind].initial(step.estimate)
+            started = perf_counter()
+            plans[kind] = plan = solvers[kind].solve(last, step.estimate, preview, factors)
+            row[kind] = 1e3 * (perf_counter() - started)
+            row[f"{kind} acts"] = 0 if plan.active is None else int(np.count_nonzero(plan.active[own:]))
+        if step.k:
+            rows.append(row)
+
+    loop(runs, machine, "hard", seed, watch)
+    return rows
+
+
+def times_of(machine: str, kind: str, cells: list[dict]) -> dict:
+    """One line of the table of times."""
+    free, bound, rows = (np.array([c[key] for c in cells]) for key in ("none", kind, f"{kind} acts"))
+    at = rows > 0
+    without, own = float(np.median(free[at])), float(np.median(bound[at]))
+    return {"machine": machine, "bound": kind, "acts": f"{at.sum()} of {len(at)}", "rows": float(np.median(rows[at])),
+            "without": f"{without:.2f}", "with": f"{own:.2f}", "ratio": f"{own / without:.2f}",
+            "p99 / median": f"{np.quantile(bound, 0.99) / np.median(bound):.1f}",
+            "without, p99 / median": f"{np.quantile(free, 0.99) / np.median(free):.1f}"}  # fmt: skip
+
+
 def main() -> None:
     """Measure and print."""
     parser = arguments(__doc__)
@@ -224,7 +276,13 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=[*CASES], choices=[*CASES])
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--times", action="store_true", help="what a bound adds to a solve, in one process")
     given = parser.parse_args()
+    if given.times:
+        for machine in given.machines:
+            cells = [row for seed in range(given.seeds) for row in solve_times(given.runs, machine, seed)]
+            report([times_of(machine, kind, cells) for kind in KINDS], given.out)
+        return
     with ProcessPoolExecutor(given.workers) as pool:
         jobs = [
             pool.submit(loop, given.runs, machine, kind, seed)

@@ -1,13 +1,14 @@
-"""Do no harm: which of the candidates is recommended, by free runs over validation recordings.
+"""Do no harm: which of the candidates is recommended, by free runs over data that were left out.
 
-A hybrid is recommended only if it beats the fitted prior there by more than the uncertainty of the comparison.
+A hybrid is recommended only if it beats the fitted prior there by more than the uncertainty of the comparison. Where
+the whole correction does not, a share of it may.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,6 +29,10 @@ FEWEST = 3
 on the temperature lab two that agreed by chance made a hybrid recommended that was 1.3 to 1.4 times worse."""
 CONFIDENCE = 0.95
 """Probability, one-sided, with which a recommended hybrid is better than the prior."""
+SHARES = (0.75, 0.5, 0.25)
+"""Shares of a correction that are tried, the largest first, where the whole of it does not surely beat the prior. What
+a network learned of one recording and what another one lacks err alike only in part, so their mean errs less than
+either, and scatters less: half a correction is often sure where the whole is not."""
 CONFIDENT = 1.0
 """Ratio to the prior's error that the upper bound of the hybrid's has to stay below."""
 
@@ -40,11 +45,13 @@ class CandidateFigures:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
         ratio: That over the prior's [-]; of several recordings the geometric mean of each one's.
         upper: Upper bound of the ratio with a probability of ``CONFIDENCE`` [-].
+        share: Share of the networks' correction that it has. Default: the whole.
     """
 
     error: float
     ratio: float
     upper: float
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,10 @@ class Choice:
     blocks: int
     sure: tuple[str, ...] = ()
 
+    def share(self, name: str) -> float:
+        """Share of the networks' correction that a kind has in the model; of what is no candidate the whole."""
+        return self.candidates[name].share if name in self.candidates else 1.0
+
 
 def recommend(
     errors: Mapping[str, Sequence[Array]],
@@ -76,6 +87,7 @@ def recommend(
     samples: int = 1,
     recordings: Sequence[str] = (),
     evidence: str = "recordings",
+    shrunk: Callable[[str, float], Sequence[Array]] | None = None,
 ) -> Choice:
     """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
 
@@ -93,6 +105,9 @@ def recommend(
         samples: Samples of a block at least, within which errors hang together. Default: 1.
         recordings: Which recording each run is from, or which part of a single one. Default: all are from one.
         evidence: What these are called in the reason.
+        shrunk: ``(name, share) -> errors`` of a hybrid of which a share of its networks' correction counts. It is asked
+            where the whole does not surely beat the prior; the largest of ``SHARES`` that surely does is taken, else
+            the whole. Default: the whole alone.
 
     Raises:
         InputError: If ``deploy`` is no candidate, or there is no validation run.
@@ -110,33 +125,62 @@ def recommend(
         raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)}")
     if not errors.get(prior):
         raise InputError("there is no validation run to choose a model by; give longer recordings")
-    cuts = _cuts([len(run) for run in errors[prior]], samples)
-    sums = {name: _sums(runs, cuts) for name, runs in errors.items()}
-    sizes = np.array([b - a for run in cuts for a, b in run])
-    figures = {name: _by_blocks(own, sums[prior], sizes) for name, own in sums.items()}
-    whole = len(set(recordings)) >= RECORDINGS
-    if whole:
-        _, of = np.unique(
-            [name for name, run in zip(recordings, cuts, strict=True) for _ in run], return_inverse=True
-        )
-        sums = {name: np.bincount(of, own).astype(np.float64) for name, own in sums.items()}
-        figures = {n: _by_recordings(own, sums[prior], figures[n]) for n, own in sums.items()}
-        sizes = np.bincount(of)
+    compared = _Compared(errors[prior], samples, recordings)
+    figures = {name: compared.figures(runs) for name, runs in errors.items()}
+    for name in errors if shrunk is not None else ():
+        if name == prior or compared.sure(figures[name]):
+            continue
+        for share in SHARES:
+            less = compared.figures(shrunk(name, share), share)  # type: ignore[misc]
+            if compared.sure(less):
+                figures[name] = less
+                break
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)
-    safe = [
-        name
-        for name in hybrids
-        if figures[name].upper < CONFIDENT and figures[name].error < figures[prior].error
-    ]
+    safe = [name for name in hybrids if compared.sure(figures[name])]
     chosen = min(safe, key=lambda name: figures[name].error, default=prior)
-    of_what = f"{evidence}, their geometric mean" if whole else "block" if len(sizes) == 1 else "blocks"
-    reason = _reason(figures, best, chosen, prior, f"{len(sizes)} {of_what}")
+    pieces = compared.pieces
+    of_what = f"{evidence}, their geometric mean" if compared.whole else "block" if pieces == 1 else "blocks"
+    reason = _reason(figures, best, chosen, prior, f"{pieces} {of_what}")
     if deploy and deploy != chosen:
         reason = f"{deploy} is deployed as asked for. {reason}"
     return Choice(
-        deploy or chosen, best if deploy in ("", prior) else deploy, figures, reason, len(sizes), tuple(safe)
+        deploy or chosen, best if deploy in ("", prior) else deploy, figures, reason, pieces, tuple(safe)
     )
+
+
+class _Compared:
+    """Figures of candidates over the pieces of evidence that the prior's runs are cut into."""
+
+    def __init__(self, prior: Sequence[Array], samples: int, recordings: Sequence[str]) -> None:
+        self._cuts = _cuts([len(run) for run in prior], samples)
+        self._sizes = np.array([b - a for run in self._cuts for a, b in run])
+        self.whole = len(set(recordings)) >= RECORDINGS
+        self._of = np.zeros(0, dtype=np.int64)
+        if self.whole:
+            blocks = [name for name, run in zip(recordings, self._cuts, strict=True) for _ in run]
+            self._of = np.unique(blocks, return_inverse=True)[1]
+        self._prior = _sums(prior, self._cuts)
+
+    @property
+    def pieces(self) -> int:
+        """How many there are."""
+        return len(set(self._of.tolist())) if self.whole else len(self._sizes)
+
+    def figures(self, runs: Sequence[Array], share: float = 1.0) -> CandidateFigures:
+        """Of a candidate's squared errors by run."""
+        own = _sums(runs, self._cuts)
+        if np.array_equal(own, self._prior):
+            return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share)
+        found = _by_blocks(own, self._prior, self._sizes)
+        if self.whole:
+            of_own, of_prior = (np.bincount(self._of, v).astype(np.float64) for v in (own, self._prior))
+            found = _by_recordings(of_own, of_prior, found)
+        return replace(found, share=share)
+
+    def sure(self, figures: CandidateFigures) -> bool:
+        """Whether they are surely better than the prior's, and better over all runs together."""
+        return figures.upper < CONFIDENT and figures.error < _root_mean(self._prior, self._sizes)
 
 
 def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tuple[list[str], str]:
@@ -162,7 +206,8 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
     own = figures[best if chosen == prior else chosen]
     bound = f"at most {own.upper:.2f}" if math.isfinite(own.upper) else "without a bound: record more"
-    said = f"its error on data that were left out is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
+    of_it = "its error" if own.share == 1 else f"with {own.share:g} of its correction its error"
+    said = f"{of_it} on data that were left out is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
     if chosen == prior and own.upper < CONFIDENT:
         said += ", but over all of them together the prior's is no larger"
     if chosen == prior:
@@ -185,14 +230,17 @@ def _sums(runs: Sequence[Array], cuts: Sequence[Sequence[tuple[int, int]]]) -> A
     return np.array([float(np.sum(run[a:b])) for run, own in zip(runs, cuts, strict=True) for a, b in own])
 
 
+def _root_mean(sums: Array, sizes: Array) -> float:
+    """Root mean square of what the sums of squares of blocks are of; infinite where a run diverged."""
+    return math.sqrt(float(sums.sum()) / float(sizes.sum())) if np.isfinite(sums).all() else math.inf
+
+
 def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
     """Figures from the sums of squares of blocks; the scatter is the jackknife's."""
     n = len(sizes)
-    error = math.sqrt(float(own.sum()) / float(sizes.sum())) if np.isfinite(own).all() else math.inf
+    error = _root_mean(own, sizes)
     if not math.isfinite(error):
         return CandidateFigures(math.inf, math.inf, math.inf)
-    if own is prior:
-        return CandidateFigures(error, 1.0, 1.0)
     if not np.isfinite(prior).all():
         return CandidateFigures(error, 0.0, 0.0)
     ratio = float(np.sqrt(own.sum() / max(float(prior.sum()), 1e-300)))
@@ -206,7 +254,7 @@ def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
 
 def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures) -> CandidateFigures:
     """Figures from the sums of squares of recordings: the mean of the logarithms of their ratios."""
-    if own is prior or not np.isfinite(own).all() or not np.isfinite(prior).all():
+    if not np.isfinite(own).all() or not np.isfinite(prior).all():
         return blocks
     n, each = len(own), 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
     most = math.inf  # two may agree by chance

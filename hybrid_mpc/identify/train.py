@@ -122,6 +122,10 @@ class TrainingFailure:
     stopped: bool
 
 
+HEAD = ("w_out", "b_out")
+"""Weights that a network's output is proportional to."""
+
+
 @dataclass(frozen=True)
 class Trained:
     """Result of a training: plain arrays, so that it travels between processes and into files.
@@ -194,6 +198,21 @@ class Trained:
         """The step of all networks at once, tensors ``(networks, n, ...)``; the prior's parameters must be fixed."""
         own = {name: torch.tensor(w) for name, w in self.weights.items()}
         return self._step(prior, dt, own, lambda stack: stack, None)
+
+    def shrunk(self, prior: Prior, share: float) -> Trained:
+        """The same networks, whose corrections count by ``share`` only: 0 is the fitted ``prior``, 1 what was trained.
+
+        Parameters of the prior that were trained along go the same share of their way.
+        """
+        own = prior.values
+
+        def part(name: str, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+            if name.startswith(PREFIX):
+                start = own[name.removeprefix(PREFIX)]
+                return start + share * (weight - start)
+            return share * weight if name in HEAD else weight
+
+        return self if share == 1 else replace(self, weights={n: part(n, w) for n, w in self.weights.items()})
 
     def prior_values(self, i: int | None = None) -> dict[str, float]:
         """Values [SI] of the parameters trained along with network ``i``, or their mean; empty if none were."""

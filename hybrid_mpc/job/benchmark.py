@@ -244,7 +244,7 @@ def _make(
     warm = warm_samples(warm_up, fit.delay, dt)
     train, valid = (list(smoothed(scenario.prior, fit, part, dt)) for part in (data.train, data.valid))
     budget = spec.budgets[settings.budget]
-    networks = train_kinds(
+    whole = train_kinds(
         settings.scenario, fit.values, train, valid,
         {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in kinds_of(scenario.prior())},
         out / "checkpoints", workers=settings.workers, on_progress=progress.update,
@@ -253,10 +253,11 @@ def _make(
     progress.start("fitting the linear baselines")
     linear, no_linear = _baselines(scenario, data)
     progress.finish("")
+    choice, prior = _choice(scenario, fit, whole, train, valid), scenario.prior(fit.values)
+    networks = {kind: trained.shrunk(prior, choice.share(kind)) for kind, trained in whole.items()}
     errors = partial(candidate_errors, scenario, fit, networks, linear)
     validation = errors(data.valid, max(warm_up, IN_MOTION * time_unit(data.train, dt)))
     long = errors(data.long, warm_up) if data.long else {}
-    choice = _choice(scenario, fit, networks, train, valid)
     hybrid = recommended(
         *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=choice.sure
     )
@@ -355,13 +356,17 @@ def _choice(
 
     plain_prior = PriorStep(prior, dt, fit.substeps)
     found = {"phy": errors(lambda own: plain_prior)}
-    for kind, trained in networks.items():
-        if kind in CANDIDATES:
-            found[kind] = errors(lambda own, trained=trained: trained.step(prior, dt, own))  # type: ignore[misc]
+
+    def of_kind(kind: str, share: float = 1.0) -> list[Array]:
+        trained = networks[kind].shrunk(prior, share)
+        return errors(lambda own: trained.step(prior, dt, own))
+
+    found |= {kind: of_kind(kind) for kind in networks if kind in CANDIDATES}
     recordings, evidence = evidence_of(runs)
     return recommend(
-        found, samples=max(1, round(time_unit(training, dt) / dt)), recordings=recordings, evidence=evidence
-    )
+        found, samples=max(1, round(time_unit(training, dt) / dt)), recordings=recordings, evidence=evidence,
+        shrunk=of_kind,
+    )  # fmt: skip
 
 
 def recommended(

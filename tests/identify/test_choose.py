@@ -186,3 +186,67 @@ def test_two_recordings_give_no_bound():
     assert two.recommended == "phy"
     assert "without a bound: record more; 2 recordings" in two.reason
     assert recommend(errors, recordings=["a", "b", "c"]).recommended == "pgrnn"
+
+
+def blended(prior, hybrid):
+    """Squared errors of a share of the way from one run's errors to another's, by run."""
+    return lambda name, share: [
+        np.square((1 - share) * a + share * b) for a, b in zip(prior, hybrid[name], strict=True)
+    ]
+
+
+def test_a_share_of_a_correction_is_taken_where_the_whole_is_not_sure():
+    """What the hybrid adds helps in all recordings, and scatters so that the whole is no better."""
+    rng = np.random.default_rng(5)
+    prior = [1.0 + 0.1 * rng.standard_normal(200) for _ in range(6)]
+    hybrid = {"pgrnn": [0.3 + size * rng.standard_normal(200) for size in (0.6, 0.8, 1.0, 1.2, 0.7, 0.9)]}
+    of = [f"{i}" for i in range(6)]
+    given = {"phy": [r**2 for r in prior], "pgrnn": [r**2 for r in hybrid["pgrnn"]]}
+    alone = recommend(given, recordings=of)
+    assert (alone.recommended, alone.share("pgrnn")) == ("phy", 1.0)
+    tried = []
+
+    def shrunk(name, share):
+        tried.append((name, share))
+        return blended(prior, hybrid)(name, share)
+
+    found = recommend(given, recordings=of, shrunk=shrunk)
+    assert found.recommended == "pgrnn"
+    assert found.share("pgrnn") == tried[-1][1] < 1
+    assert [share for _, share in tried] == [s for s in (0.75, 0.5, 0.25) if s >= found.share("pgrnn")]
+    assert found.candidates["pgrnn"].upper < 1 <= alone.candidates["pgrnn"].upper
+    assert f"with {found.share('pgrnn'):g} of its correction" in found.reason
+    assert found.share("phy") == 1
+
+
+def test_no_share_of_what_does_not_help_is_taken():
+    """A correction that points the wrong way is worse by every share; its own figures are told, those of the whole."""
+    rng = np.random.default_rng(6)
+    prior = [1.0 + 0.1 * rng.standard_normal(200) for _ in range(6)]
+    hybrid = {"pgrnn": [1.2 + 0.1 * rng.standard_normal(200) for _ in range(6)]}
+    given = {"phy": [r**2 for r in prior], "pgrnn": [r**2 for r in hybrid["pgrnn"]]}
+    found = recommend(given, recordings=[f"{i}" for i in range(6)], shrunk=blended(prior, hybrid))
+    assert (found.recommended, found.share("pgrnn")) == ("phy", 1.0)
+    assert found.candidates["pgrnn"].ratio == pytest.approx(1.2, abs=0.02)
+
+
+def test_a_sure_hybrid_is_not_shrunk():
+    rng = np.random.default_rng(7)
+    prior = runs(rng)
+    whole = {"phy": prior, "pgrnn": [0.25 * r for r in prior]}
+    found = recommend(whole, shrunk=lambda name, share: pytest.fail("nothing is to be shrunk"))
+    assert found == recommend(whole)
+
+
+def test_shares_of_chance_are_hardly_ever_taken():
+    """A correction that is noise adds to the prior's error, by any share; at most a twentieth is taken by chance for
+    each of the four that are tried: 10 of 50."""
+    rng = np.random.default_rng(8)
+    taken = 0
+    for _ in range(50):
+        prior = [rng.standard_normal(200) for _ in range(6)]
+        hybrid = {"pgrnn": [r + 0.3 * rng.standard_normal(200) for r in prior]}
+        given = {"phy": [r**2 for r in prior], "pgrnn": [r**2 for r in hybrid["pgrnn"]]}
+        found = recommend(given, recordings=[f"{i}" for i in range(6)], shrunk=blended(prior, hybrid))
+        taken += found.recommended == "pgrnn"
+    assert taken <= 10

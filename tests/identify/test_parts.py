@@ -7,7 +7,7 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum
 
-from hybrid_mpc import InputError, TrainingSettings, train
+from hybrid_mpc import InputError, PriorStep, TrainingSettings, train
 from hybrid_mpc.identify.dataset import in_parts
 from hybrid_mpc.identify.evaluate import unseen_runs
 from hybrid_mpc.identify.smooth import Smoother, sizes_of
@@ -110,6 +110,21 @@ def test_the_model_is_the_mean_of_its_networks(data):
     np.testing.assert_allclose(mean, want, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(after, torch.cat([own for _, own in each], dim=1), rtol=1e-12, atol=1e-15)
     assert (each[0][0] - each[1][0]).abs().max() > 1e-6
+
+
+def test_a_shrunk_model_has_that_share_of_the_correction(data):
+    trained = train(PRIOR, *data, SETTINGS)
+    x, u, w = torch.rand(3, 2).double(), torch.rand(3, 1).double(), torch.zeros(3, 0).double()
+    h = torch.rand(3, 2 * SETTINGS.hidden).double()
+    whole, after = trained.step(PRIOR, DT).correction(x, h, u, w)
+    half, same = trained.shrunk(PRIOR, 0.5).step(PRIOR, DT).correction(x, h, u, w)
+    np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-14)
+    np.testing.assert_array_equal(same, after)
+    assert whole.abs().max() > 1e-6
+    none = trained.shrunk(PRIOR, 0.0).step(PRIOR, DT)(x, h, u, w)[0]
+    plain = PriorStep(PRIOR, DT, trained.scaling.substeps)
+    np.testing.assert_allclose(none, plain(x, plain.h0.expand(3, -1), u, w)[0], rtol=1e-13)
+    assert trained.shrunk(PRIOR, 1.0) is trained
 
 
 def test_a_network_without_finite_validation_is_left_out_of_the_mean(data):

@@ -96,6 +96,10 @@ def test_wrong_parameters_move_to_the_truth(data, trained):
     assert own[0] != own[1]
     np.testing.assert_allclose(list(trained.prior_values().values()), trained.shares @ own, rtol=1e-14)
     assert fixed.prior_values() == {}
+    whole, start = trained.prior_values(), Pendulum().values
+    half = trained.shrunk(Pendulum(), 0.5).prior_values()  # as far from where it began
+    for name, value in half.items():
+        assert value == pytest.approx(0.5 * (start[name] + whole[name]), rel=1e-12)
 
 
 def test_bounds_hold(data):

@@ -31,7 +31,7 @@ def changed(results: Results, **details: object) -> Results:
 def chosen(results: Results, upper: float | None, ratio: float | None) -> Results:
     """The fitted prior is recommended, of a hybrid with these figures."""
     choice = results.identification.details.choice
-    own = CandidateErrors(None if ratio is None else 0.1, ratio, upper)
+    own = CandidateErrors(None if ratio is None else 0.1, ratio, upper, 1.0)
     candidates = {**choice.candidates, choice.hybrid: own}
     return changed(results, choice=replace(choice, recommended="phy", candidates=candidates))
 

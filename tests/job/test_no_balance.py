@@ -2,13 +2,16 @@
 
 import json
 import re
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc import write_csv
+from hybrid_mpc import load, write_csv
 from hybrid_mpc.cli.main import app
+from hybrid_mpc.job.stages import choose
 from hybrid_mpc.job.stages.results import read_results
 
 MACHINE = """
@@ -38,6 +41,9 @@ scenario = Scenario(
 """
 
 
+SKIPPED = [word for stage in ("control", "estimation", "monitor", "guard") for word in ("--skip", stage)]
+
+
 def recording(path):
     """900 samples; a little of the heat goes by radiation, which no prior knows."""
     rng, n = np.random.default_rng(0), 900
@@ -60,8 +66,7 @@ def bodies(jobs_here, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bodies")
     (folder / "bodies.py").write_text(MACHINE)
     data, out = recording(folder / "run.csv"), folder / "run"
-    skipped = [word for stage in ("control", "estimation", "monitor", "guard") for word in ("--skip", stage)]
-    words = ("run", folder / "bodies.py", "--data", data, *skipped, "--out", out)
+    words = ("run", folder / "bodies.py", "--data", data, *SKIPPED, "--out", out)
     done = CliRunner().invoke(app, [*map(str, words)])
     assert done.exit_code == 0, done.output
     return out, done.stdout.partition("free runs on unseen data:")[2]
@@ -106,3 +111,34 @@ def test_a_model_that_is_not_there_cannot_be_deployed(call, bodies, tmp_path):
     assert code == 2
     assert "model to deploy" in told
     assert not (tmp_path / "no").exists()
+
+
+def test_a_share_of_the_correction_goes_into_all_that_follows(bodies, jobs_here, tmp_path, monkeypatch):
+    """Figures and artifact have half of what the networks say; the prior is linear, and so is the step's difference."""
+    whole, out, recommend = bodies[0], tmp_path / "half", choose.recommend
+    shutil.copytree(whole, out)
+
+    def half(errors, *, shrunk, **given):
+        found = recommend(errors, shrunk=shrunk, **given)
+        own = replace(found.candidates["pgrnn"], share=0.5)
+        return replace(found, candidates={**found.candidates, "pgrnn": own})
+
+    monkeypatch.setattr(choose, "recommend", half)
+    words = ("--data", whole.parent / "run.csv", *SKIPPED, "--out", out, "--resume", "--deploy", "pgrnn")
+    done = CliRunner().invoke(app, [*map(str, ("run", whole.parent / "bodies.py", *words))])
+    assert done.exit_code == 0, done.output
+    before, after = (json.loads((f / "results.json").read_text())["identification"] for f in (whole, out))
+    assert after["details"]["choice"]["candidates"]["pgrnn"]["share"] == 0.5
+    assert before["error"]["pgrnn"] != after["error"]["pgrnn"]
+    assert before["error"]["phy"] == after["error"]["phy"]
+    x, u, steps = np.array([70.0, 50.0]), np.array([20.0]), []
+    for folder in (whole, out):
+        models = load(folder / "model").models
+        h = np.zeros(models["hybrid"].n_h)
+        none = np.zeros(0)
+        hybrid = models["hybrid"].step(x, h, u, none, models["hybrid"].p)[0]
+        prior = models["prior"].step(x, none, u, none, models["prior"].p)[0]
+        steps.append((hybrid - prior).full().ravel())
+    assert np.abs(steps[0]).max() > 1e-6
+    np.testing.assert_allclose(steps[1], 0.5 * steps[0], rtol=1e-8, atol=1e-12)
+    assert re.search(r"<td>50\s%</td>", (out / "report.html").read_text())

@@ -63,22 +63,32 @@ def choice_stage(context: Context) -> ChoiceResult:
         validation = evaluation_trajectories(context.smoothed("valid"), smoother, warm, spec.free_run)
         calibrating.append((None, validation))
     n_left_out = sum(len(them) for _, them in runs)
-    errors: dict[str, list[Array]] = {}
-    bands: dict[str, Bands] = {}
-    for i, name in enumerate(candidates):
-        context.progress.update("candidates", i, len(candidates), name)
-        runs_scored = [
+
+    def scored(name: str, share: float = 1.0) -> list[tuple[FreeRun, ...]]:
+        """A candidate's runs; beside each those of its networks."""
+        return [
             run
             for own, them in calibrating
-            for run in zip(*runs_of(context, name, phy, them, own), strict=True)
+            for run in zip(*runs_of(context, name, phy, them, own, share), strict=True)
         ]
-        errors[name] = [run.squared_errors(smoother.sizes.y) for run, *_ in runs_scored[:n_left_out]]
-        bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*runs_scored, strict=True)), spec.dt))
+
+    def errors_of(every: Sequence[tuple[FreeRun, ...]]) -> list[Array]:
+        return [run.squared_errors(smoother.sizes.y) for run, *_ in every[:n_left_out]]
+
+    whole: dict[str, list[tuple[FreeRun, ...]]] = {}
+    for i, name in enumerate(candidates):
+        context.progress.update("candidates", i, len(candidates), name)
+        whole[name] = scored(name)
     samples = max(1, round(context.time_unit / spec.dt))
     recordings, evidence = evidence_of(runs)
     found = recommend(
-        errors, deploy=context.settings.deploy, samples=samples, recordings=recordings, evidence=evidence
-    )
+        {name: errors_of(every) for name, every in whole.items()}, deploy=context.settings.deploy, samples=samples,
+        recordings=recordings, evidence=evidence, shrunk=lambda name, share: errors_of(scored(name, share)),
+    )  # fmt: skip
+    bands: dict[str, Bands] = {}
+    for name in candidates:
+        every = whole[name] if found.share(name) == 1 else scored(name, found.share(name))
+        bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*every, strict=True)), spec.dt))
     longest = max((len(t.t) - warm - 2) * spec.dt for _, them in calibrating for t in them)
     return ChoiceResult(found, bands, longest)
 

@@ -108,8 +108,9 @@ def evaluation_stage(context: Context) -> EvaluationResult:
     models = models_of(phy)
     for i, name in enumerate(models):
         context.progress.update("models", i, len(models), name)
-        every = runs_of(context, name, phy, test)
-        drawn = every if spec.free_run is None else runs_of(context, name, phy, shown)
+        share = chosen.choice.share(name)
+        every = runs_of(context, name, phy, test, share=share)
+        drawn = every if spec.free_run is None else runs_of(context, name, phy, shown, share=share)
         model, *networks = (score(runs, phy, spread) for runs in every)
         scores[name] = ModelScores(model, tuple(networks))
         files[name] = {f: score(part, phy, spread) for f, part in _by_file(every[0]).items()}

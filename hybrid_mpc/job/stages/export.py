@@ -54,7 +54,7 @@ def export_stage(context: Context) -> ExportResult:
     """Write the hybrid, the fitted prior and each network of the hybrid's as one artifact; compare all with torch."""
     dt, settings, prior, chosen = context.spec.dt, context.settings, context.prior, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
-    trained = trained_models(context, chosen.deployed)
+    trained = trained_models(context, chosen.deployed).shrunk(phy, chosen.choice.share(chosen.deployed))
     alone = trained.steps(phy, dt)[:MOST_MEMBERS] if len(trained.validation) > 1 else []
     members = member_names(len(alone))
     steps: dict[str, RecurrentStep | PriorStep] = {

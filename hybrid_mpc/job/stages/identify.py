@@ -318,18 +318,20 @@ def trained_models(context: Context, kind: str) -> Trained:
 
 
 def runs_of(
-    context: Context, name: str, phy: Prior, trajectories: Sequence[Trajectory], own: int | None = None
-) -> list[list[FreeRun]]:
+    context: Context, name: str, phy: Prior, trajectories: Sequence[Trajectory], own: int | None = None,
+    share: float = 1.0,
+) -> list[list[FreeRun]]:  # fmt: skip
     """Free runs of one model: of the model itself, then of each of its networks, if it has several.
 
-    The model is the mean of its networks, or network ``own`` alone, where the others have seen what it runs over.
+    The model is the mean of its networks, or network ``own`` alone, where the others have seen what it runs over. Of
+    the networks' correction ``share`` counts.
     """
     dt, warm = context.spec.dt, context.warm
     if name in ("phy_nominal", "phy"):
         fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
         step = PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)
         return [free_runs(step, phy, trajectories, warm)]
-    trained = trained_models(context, name)
+    trained = trained_models(context, name).shrunk(phy, share)
     if len(trained.validation) == 1:
         return [free_runs(trained.step(phy, dt), phy, trajectories, warm)]
     every = stacked_free_runs(trained, phy, dt, phy, trajectories, warm)

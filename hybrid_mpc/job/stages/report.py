@@ -490,14 +490,16 @@ def _free_run_tables(context: Context, found: Identification) -> list[Table]:
 def _choice_table(found: Identification) -> Table:
     choice = found.details.choice
     rows = [
-        (name_of(name), c.error, c.ratio, None if name == "phy" else c.upper,
+        (name_of(name), None if name == "phy" else f"{100 * c.share:.0f} %", c.error, c.ratio,
+         None if name == "phy" else c.upper,
          "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]  # fmt: skip
-    columns = ("model", "error [spreads]", "over the prior's", "at most, by 95 %", "")
+    columns = ("model", "correction", "error [spreads]", "over the prior's", "at most, by 95 %", "")
     caption = (
         f"Parts of the training data that networks left out. {choice.reason} The error is that of all. Where there are "
-        "several, the ratio is the geometric mean of the ratios of each, and the bound is a bound of this mean."
+        "several, the ratio is the geometric mean of the ratios of each, and the bound is a bound of this mean. "
+        "Correction: how much of what its networks say a model has; less where the whole is not surely better."
     )
     return Table(columns, rows, caption)
 

@@ -38,7 +38,7 @@ from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 ENERGY = "energy [W]"
 """The balance that the monitor watches, with the unit of its rate."""
 BASELINES = ("prior", "prior_observer")
@@ -118,12 +118,13 @@ class ModelChoice:
 class CandidateErrors:
     """Error of a candidate on left-out parts of the training data [spreads of the outputs], its ratio to the prior's
     (of several recordings the geometric mean of each one's), and that one's upper bound; None where a run diverged or
-    the bound is not known.
+    the bound is not known. ``share`` is that of the networks' correction that the model has.
     """
 
     error: float | None
     ratio: float | None
     upper: float | None
+    share: float
 
 
 @dataclass(frozen=True)
@@ -494,7 +495,7 @@ def identification(context: Context) -> Identification:
             chosen.hybrid,
             chosen.reason,
             {
-                name: CandidateErrors(*(finite(v) for v in (c.error, c.ratio, c.upper)))
+                name: CandidateErrors(finite(c.error), finite(c.ratio), finite(c.upper), c.share)
                 for name, c in chosen.candidates.items()
             },
         ),
