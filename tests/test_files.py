@@ -43,6 +43,7 @@ main()
 """The command line on a disk that is full after 20 kB of any file."""
 
 
+@pytest.mark.full
 def test_two_writers_never_damage_what_a_reader_sees(tmp_path):
     """Every read gives what one of them wrote, whole; a name that both shared gave damaged reads and failed writes."""
     path, errors = tmp_path / "a.json", []
@@ -208,6 +209,7 @@ def test_a_folder_for_results_is_checked_and_not_made(tmp_path):
         check_writable(type(tmp_path)("/proc"))
 
 
+@pytest.mark.full
 def test_a_full_disk_ends_a_command_with_a_line_and_no_damage(tmp_path):
     """``data`` writes recordings of more than 20 kB: the first is refused, whole, and the command says so."""
     words = ["data", "golf_robot", "--out", str(tmp_path / "out"), "--budget", "quick"]

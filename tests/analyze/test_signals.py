@@ -40,6 +40,7 @@ def test_multisine_finds_the_response_of_a_linear_model():
     assert found.coherence.min() > 1 - 1e-9
 
 
+@pytest.mark.full
 def test_welch_finds_it_too_and_knows_how_well():
     rng = np.random.default_rng(0)
     u = rng.normal(size=20000)
@@ -61,6 +62,7 @@ def test_no_coherence_without_a_connection():
     assert np.median(found.coherence) < 3 / found.averages  # its mean is 1 / averages
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("length", [700.0, 50.0])  # 4 and 79 windows
 def test_unrelated_signals_are_trusted_as_rarely_as_it_is_said(length):
     """One line in a hundred, or fewer: 4 windows that overlap are a little more than 9/11 of 4 (here 0.25 %)."""

@@ -21,6 +21,7 @@ SECONDS = 5.0
 """Time of a processor that a refusal may take: the slowest (`fast.csv`) took 1.6 to 2.1 s beside the other tests."""
 
 
+@pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and counted as Linux does")
 def test_bombs_are_refused_in_little_memory_and_time(tmp_path):
     bombs.write(tmp_path)

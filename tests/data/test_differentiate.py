@@ -122,6 +122,7 @@ def test_straight_lines_pass_up_to_the_ends(method):
     np.testing.assert_allclose(d.second[known], 0.0, atol=1e-6)
 
 
+@pytest.mark.full
 def test_gcv_is_scipys_and_finds_a_useful_bandwidth():
     rng = np.random.default_rng(4)
     t = np.arange(1500) * DT

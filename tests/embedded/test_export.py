@@ -168,6 +168,7 @@ def rubbish(folder, periods):
     assert periods / 20 < solved < periods  # it saw good times and bad
 
 
+@pytest.mark.full
 @needs_compiler
 def test_rubbish(folder, tmp_path):
     rubbish(shutil.copytree(folder, tmp_path / "c"), 1500)

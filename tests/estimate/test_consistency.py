@@ -118,6 +118,7 @@ def test_the_statistics_by_hand():
     assert found.correlation_band == pytest.approx(1.959964 / np.sqrt(390), rel=1e-6)
 
 
+@pytest.mark.full
 def test_a_switching_filter_is_judged_by_its_mixture():
     model, a, b, c = system()
     chain, steps = np.array([[0.95, 0.05], [0.5, 0.5]]), (SIGMA_X, 10 * SIGMA_X)

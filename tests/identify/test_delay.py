@@ -47,6 +47,7 @@ def late_told(train, valid):
     return any("later than" in w for w in fit_prior(Pendulum, train, valid, dt=DT).warnings)
 
 
+@pytest.mark.full
 def test_late_inputs_are_told_where_all_recordings_show_them():
     late, others = [late_recording(seed) for seed in range(3)], [record(seed, 3.0) for seed in range(3)]
     noisy = [record(seed, seconds=3.0, noise=0.01) for seed in range(3)]

@@ -83,6 +83,7 @@ def test_estimates_are_those_of_least_squares_with_as_many_unknowns(runs, first)
     assert (np.abs(found.theta * problem.own.unit - of_theory(first.kind, runs)) < 0.1 * error).all()
 
 
+@pytest.mark.full
 def test_a_warm_up_alone_tells_the_first_states(runs):
     """Of each recording the warm-up gives the first state, for every set of parameters; what follows is fitted."""
     u, y = np.stack([r.u for r in runs]), np.stack([r.y[:, 0] for r in runs])

@@ -270,6 +270,7 @@ def test_measured_disturbances_join_the_inputs():
 # how a model is chosen
 
 
+@pytest.mark.full
 @both
 def test_an_unstable_candidate_is_passed_over(fit):
     """A level that integrates: some candidate's integrator grows, runs best, and is not taken."""

@@ -1,6 +1,7 @@
 """Recordings under feedback: they are told, and predictions are fitted where free runs are led astray."""
 
 import numpy as np
+import pytest
 
 from hybrid_mpc import Parameter, Prior, Signal, Trajectory
 from hybrid_mpc.identify.fit import OutputFit, feedback, fit_by_prediction
@@ -47,6 +48,7 @@ def test_feedback_is_told_from_open_loop():
     assert min(answered([record(seed, gain=2.0) for seed in (s, s + 100)]) for s in range(12)) > 1.5
 
 
+@pytest.mark.full
 def test_predictions_find_the_parameters_under_feedback():
     """Over ten recordings of a disturbed loop the mean estimate is the truth within three of its standard errors."""
     found = []

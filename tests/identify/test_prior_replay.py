@@ -78,6 +78,7 @@ def test_corrections_fade_there_and_still_explain_the_data(data, prior_replay):
     assert (faded.validation < 0.9 * faded.curve["validation"][0].min()).all()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("changed", [{"prior_parameters": "trained"}], ids=str)
 def test_it_goes_with_other_options(data, changed):
     one, two = (train(PRIOR, *data, replace(SMALL, prior_replay=w, **changed)) for w in (0.0, 10.0))
@@ -86,6 +87,7 @@ def test_it_goes_with_other_options(data, changed):
     assert any(not np.array_equal(one.weights[name], two.weights[name]) for name in one.weights)
 
 
+@pytest.mark.full
 def test_a_training_with_prior_replay_resumes_to_the_same_bits(data, tmp_path):
     whole, file = train(PRIOR, *data, SMALL), tmp_path / "training.safetensors"
     same_training(killed_and_resumed(30, file, PRIOR, *data, SMALL)[0], whole)

@@ -102,6 +102,7 @@ def test_wrong_parameters_move_to_the_truth(data, trained):
         assert value == pytest.approx(0.5 * (start[name] + whole[name]), rel=1e-12)
 
 
+@pytest.mark.full
 def test_bounds_hold(data):
     class Narrow(Pendulum):
         parameters = (

@@ -55,6 +55,7 @@ def whole(data, tmp_path_factory):
         return run(data, storage), storage
 
 
+@pytest.mark.full
 def test_it_finds_settings_that_train_to_the_value_it_names(data, tmp_path):
     space = SearchSpace(hidden=(2, 8), batch=(4, 16))
     result = run(data, tmp_path / "search.jsonl", 4, SMALL, space)

@@ -68,6 +68,7 @@ def rmse(fit, trajectory):
     return run_error(runs, "phy", prior.outputs, scenario.benchmark).rmse["phi [rad]"]
 
 
+@pytest.mark.full
 def test_three_seconds_make_the_prior_know_the_heavier_mass(machines):
     before, after, old = machines
     new, rest = refitted(scenario.prior, old, after, seconds=3.0, dt=0.02)

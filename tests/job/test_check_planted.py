@@ -498,6 +498,7 @@ def test_a_user_s_file_with_seven_errors_has_seven_lines(call, tmp_path):
         assert sum(word in line for line in told_to_user.splitlines()) == 1, word
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("block", [0, 1])
 def test_it_takes_seconds(tmp_path, block):
     """Processor time of the command with its interpreter on the README's machines: 1.5 s on one machine, 3.7 s on

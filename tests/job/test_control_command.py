@@ -83,6 +83,7 @@ def test_loops_of_two_controllers(call, run_folder, tmp_path):
     assert repeated["summary"]["stroke_1.4"]["prior"] == cell
 
 
+@pytest.mark.full
 def test_ctrl_c_loses_no_finished_loop(call, run_folder, tmp_path, monkeypatch):
     out, real, begun = tmp_path / "loops", Bench.run, []
 

@@ -326,6 +326,7 @@ def test_what_a_cluster_has_forgotten_is_lost(here_cluster):
     far.close()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("how", ["once", pytest.param("always", marks=pytest.mark.full)])
 def test_a_local_worker_that_dies(tmp_path, monkeypatch, how):
     trivial_runs.stand_in(monkeypatch, trivial_runs.deadly)

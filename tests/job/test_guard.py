@@ -209,6 +209,7 @@ def test_the_faulted_loops_are_reported(context, resumed):
     assert "alarm after" in drawn["guard_freeze"]
 
 
+@pytest.mark.full
 def test_without_a_detector_the_recording_is_shown_and_how_much_is_missing(context, resumed, tmp_path):
     out = shutil.copytree(context.out, tmp_path / "run")
     real = Context(context.settings, replace(context.scenario, plant=None), out)

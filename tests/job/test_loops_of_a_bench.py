@@ -110,6 +110,7 @@ def test_a_loop_of_another_scenario_is_refused(bench):
         bench.run(replace(SPEC, scenario="emps"))
 
 
+@pytest.mark.full
 def test_a_backup_plans_as_far_as_its_loop(kit):
     bench = Bench(
         GOLF, {"mine": kit.with_noise({n: [1e-4, 2e-2] for n in ("hybrid_observer", "prior_observer")})}

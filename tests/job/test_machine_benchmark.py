@@ -137,6 +137,7 @@ def test_networks_are_trained_with_what_the_budget_says():
     assert (settings.decay, settings.prior_replay, settings.seed, settings.warm) == (7.0, 3.0, 1, 4)
 
 
+@pytest.mark.full
 def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_on(machine, made, tmp_path):
     scenario, train, test = machine
     out, results = made

@@ -113,6 +113,7 @@ def test_a_model_that_is_not_there_cannot_be_deployed(call, bodies, tmp_path):
     assert not (tmp_path / "no").exists()
 
 
+@pytest.mark.full
 def test_a_share_of_the_correction_goes_into_all_that_follows(bodies, jobs_here, tmp_path, monkeypatch):
     """Figures and artifact have half of what the networks say; the prior is linear, and so is the step's difference."""
     whole, out, recommend = bodies[0], tmp_path / "half", choose.recommend

@@ -23,6 +23,7 @@ def kit(bare_tanks):
     return load(bare_tanks / "run")
 
 
+@pytest.mark.full
 def test_every_task_runs_on_another_model_than_the_controller_s(bare_tanks):
     found = json.loads((bare_tanks / "run" / "results.json").read_text())
     read_results(found)
@@ -54,6 +55,7 @@ def test_report_terminal_and_figures_say_that_it_is_no_machine(bare_tanks):
     assert "hybrid_observer on the model hybrid_1, not the machine" in told
 
 
+@pytest.mark.full
 def test_control_does_the_same_from_the_artifact(call, bare_tanks, tmp_path):
     words = ("--model", bare_tanks / "run", "--task", "hold", "--seeds", 1, "--out", tmp_path / "loops")
     code, told, error = call("control", bare_tanks / "tanks.py", *words)

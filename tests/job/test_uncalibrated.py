@@ -135,6 +135,7 @@ def slow(tmp_path_factory):
     return run
 
 
+@pytest.mark.full
 def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
     found = slow.read(MONITOR)
     assert found.reason == ""

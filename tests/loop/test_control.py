@@ -49,6 +49,7 @@ def viscous(**changes):
     return pendulum_model(**same), PendulumPlant(**{**same, "noise": 0.0, **changes})
 
 
+@pytest.mark.full
 def test_the_steady_error_is_the_one_that_the_weights_ask_for():
     model, plant = viscous(disturbance=0.3)
     safe = make_safe(model, r=0.5, horizon=100)

@@ -96,6 +96,7 @@ def swings(error, size):
     return count
 
 
+@pytest.mark.full
 def test_with_stiction_a_load_is_held_within_the_dead_zone(golf_artifact):
     model, angle, duration = load(golf_artifact).models["prior"], 0.3, 10.0
     result = simulate(

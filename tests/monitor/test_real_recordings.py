@@ -63,6 +63,7 @@ def found(real, model, data):
     return {f.name: f for f in real.judge(model, SIGMA_X, replace(data, whole=tuple(short)))}
 
 
+@pytest.mark.full
 @needs_data
 def test_no_alarm_in_clean_windows_of_a_recording_that_was_not_learned_from(found):
     assert sum(f.clean.sum() for f in found.values()) * 0.02 == pytest.approx(61.5, abs=0.3)

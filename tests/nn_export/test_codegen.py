@@ -229,6 +229,7 @@ def test_a_pipe_in_the_cache_is_not_waited_for(tmp_path):
     assert square(tmp_path)[0] == 9
 
 
+@pytest.mark.full
 @needs_compiler
 def test_without_a_home_libraries_last_as_long_as_the_process(cache, monkeypatch):
     cache.write_text("a file where the folder should be")

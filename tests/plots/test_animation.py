@@ -62,6 +62,7 @@ def test_three_seconds_are_small_and_play_in_real_time(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["a.gif"]
 
 
+@pytest.mark.full
 def test_an_odd_period_does_not_drift_from_real_time(tmp_path):
     t, x, plans, u = swing(n=60, dt=0.033)
     _, durations = frames(write(tmp_path / "a.gif", t, x, plans, u, dt=0.033))

@@ -105,6 +105,7 @@ def test_the_page_carries_all_it_needs(drawn, tmp_path):
     assert len(page) < len(plain) + 1.3e6  # of the 6 MB that a report may have
 
 
+@pytest.mark.full
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no Chromium")
 def test_a_browser_draws_it_without_an_error(drawn, tmp_path):
     path = save(drawn, tmp_path / "run.png")

@@ -74,6 +74,7 @@ def text(tmp_path_factory):
     return page(tmp_path_factory.mktemp("page"))
 
 
+@pytest.mark.full
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="there is no Chromium")
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_all_text_stands_out_from_what_is_behind_it(text, tmp_path, dark):

@@ -115,6 +115,7 @@ def test_the_priors_controller_stands(name, mujoco):
     assert set(result.source) == {"MPC"}
 
 
+@pytest.mark.full
 def test_a_delay_that_the_model_knows_is_not_taken_for_loads(mujoco):
     """Late commands look like loads to the observer, and a controller that answers these rocks the acrobot."""
     control = TASKS["acrobot_push"].control

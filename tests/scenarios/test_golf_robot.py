@@ -94,6 +94,7 @@ def test_oracle_s_jacobian_is_sane_through_stiction_and_backlash():
     assert largest < 3
 
 
+@pytest.mark.full
 def test_data_files_are_reproducible_and_have_their_roles(tmp_path, monkeypatch):
     monkeypatch.setattr("scenarios.golf_robot.data.SIZES", {"full": {"train": 2, "valid": 1, "test": 1}})
     paths = make_data(tmp_path / "a", 3, "full")
@@ -162,6 +163,7 @@ def test_recorded_angles_are_the_states_at_the_recorded_times():
     # a club at rest quantises to a constant error, hence the wide 30 %; a shift by one sample gives 10 times
 
 
+@pytest.mark.full
 def test_data_reach_what_they_promise_and_leave_something_to_learn():
     effects = measure_effects()
     assert 1.0 < effects.largest_angle <= 1.5

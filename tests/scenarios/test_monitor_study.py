@@ -123,6 +123,7 @@ def test_run_resume_report(stand_in, tmp_path, monkeypatch, capsys):
     assert "report.html" in capsys.readouterr().out
 
 
+@pytest.mark.full
 def test_another_size_is_another_study(stand_in, tmp_path):
     room.run_monitor_study(SMALL, tmp_path / "a")
     with pytest.raises(InputError, match="seeds"):

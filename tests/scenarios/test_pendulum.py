@@ -146,6 +146,7 @@ def test_bad_options_are_refused(options, words):
         DampedPendulum(**options)
 
 
+@pytest.mark.full
 def test_files_hold_what_was_measured_and_load_with_every_role(tmp_path):
     files = make_data(tmp_path, 3, "quick")
     assert [f.stem for f in files] == stems("quick")

@@ -22,8 +22,8 @@ MACHINES = {m.scenario.name: m for m in (cart_pole, dc_motor, lever, two_heaters
 SHORT = {"two_tanks": 1500.0, "dc_motor": 6.0, "two_heaters": 3000.0}
 """Seconds of a short recording; 10 s of the others."""
 each = pytest.mark.parametrize("name", MACHINES)
-WHOLE = ("two_tanks", "lever", "two_heaters")
-"""Of those that go the whole way in the quick set: a process with a measured inflow, a mechanical one, two inputs."""
+WHOLE = ("two_tanks", "two_heaters")
+"""Of those that go the whole way in the quick set: a process with a measured inflow, and one with two inputs."""
 each_whole = pytest.mark.parametrize(
     "name", [name if name in WHOLE else pytest.param(name, marks=pytest.mark.full) for name in MACHINES]
 )

@@ -134,8 +134,8 @@ def cut(name: str, first: int, rows: int, folder: Path) -> Path:
     [
         (tanks, "cascaded_tanks/estimation.csv", 0, 300, 400.0, 0.4),
         (lab, "temperature_lab/prbs.csv", 0, 1500, 300.0, 0.4),
-        (drives, "coupled_drives/uniform_low_first400.csv", 0, 300, 2.0, 0.6),
-        (double_pendulum, "double_pendulum/sines_143339.csv", 500, 600, 0.3, 0.5),
+        pytest.param(drives, "coupled_drives/uniform_low_first400.csv", 0, 300, 2.0, 0.6, marks=pytest.mark.full),
+        pytest.param(double_pendulum, "double_pendulum/sines_143339.csv", 500, 600, 0.3, 0.5, marks=pytest.mark.full),
         (exchanger, "heat_exchanger/random_steps_jun16.csv", 1700, 700, 300.0, 0.5),
         (car, "race_car/run_07.csv", 0, 120, 2.0, 0.2),
     ],

@@ -152,6 +152,7 @@ def test_plots_leave_out_what_is_not_finite():
             draw(nothing, "cost")
 
 
+@pytest.mark.full
 def test_a_damaged_table_is_made_of_the_log_again(monkeypatch, tmp_path):
     """Report, comparison and resumption go on from the log, which has every row."""
     stand_in(monkeypatch, trivial)

@@ -48,7 +48,11 @@ def exact():
 
 @needs_pysindy
 @pytest.mark.parametrize(
-    ("target", "tolerance"), [pytest.param("mean_rate", 1e-5, marks=pytest.mark.full), ("derivative", 1e-9)]
+    ("target", "tolerance"),
+    [
+        pytest.param("mean_rate", 1e-5, marks=pytest.mark.full),
+        pytest.param("derivative", 1e-9, marks=pytest.mark.full),
+    ],
 )
 def test_the_pendulums_equation_comes_out_of_exact_runs(exact, target, tolerance):
     plant, (training, validation, test) = DampedPendulum().parameters, exact
