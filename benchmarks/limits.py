@@ -262,6 +262,8 @@ def times_of(machine: str, kind: str, cells: list[dict]) -> dict:
     """One line of the table of times."""
     free, bound, rows = (np.array([c[key] for c in cells]) for key in ("none", kind, f"{kind} acts"))
     at = rows > 0
+    if not at.any():
+        raise SystemExit(f"{machine}: the {kind} bound never acts; take more seeds")
     without, own = float(np.median(free[at])), float(np.median(bound[at]))
     return {"machine": machine, "bound": kind, "acts": f"{at.sum()} of {len(at)}", "rows": float(np.median(rows[at])),
             "without": f"{without:.2f}", "with": f"{own:.2f}", "ratio": f"{own / without:.2f}",
@@ -276,7 +278,11 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=[*CASES], choices=[*CASES])
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--times", action="store_true", help="what a bound adds to a solve, in one process")
+    parser.add_argument(
+        "--times",
+        action="store_true",
+        help="what a bound adds to a solve; in one process, one after the other",
+    )
     given = parser.parse_args()
     if given.times:
         for machine in given.machines:

@@ -6,7 +6,8 @@ For every machine recordings are left out in at most ``--folds`` groups; a singl
 of which one is left out, a gap of a warm-up before and behind it. The prior is fitted, networks are trained, and one of
 them or the prior is recommended on what remains, of which the last quarter validates; then what was left out is
 predicted in free runs. A cell is one group and one seed. ``ratio`` is the recommended model's error over the prior's,
-``best`` the best hybrid's whether recommended or not, ``coverage`` that of the recommended model's 90 % band.
+``best`` the best hybrid's whether recommended or not (each with the share of its correction that the choice gives it),
+``coverage`` that of the recommended model's 90 % band.
 
 Cells are kept in ``--work`` and are not computed twice. Needs the recordings of the machines.
 """
@@ -16,7 +17,7 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,7 @@ class Cell:
     coverage: float
     score: float
     reason: str
+    share: float
 
 
 def folds(scenario: Scenario, files: list[Path], count: int) -> list[Scenario]:
@@ -110,8 +112,10 @@ def cell(name: str, scenario: Scenario, files: list[Path], fold: int, seed: int,
     """Identify and judge once; the fit of a fold is that of its first seed."""
     out, first = (work / name / f"fold{fold}" / f"seed{s}" for s in (seed, 0))
     note = out / "cell.json"
-    if note.is_file():
-        return Cell(**read_json(note))
+    if note.is_file() and set(held := read_json(note)) == {
+        f.name for f in fields(Cell)
+    }:  # else of another version
+        return Cell(**held)
     kept = out / "checkpoints"
     if seed and not kept.exists():
         kept.mkdir(parents=True)
@@ -130,6 +134,7 @@ def cell(name: str, scenario: Scenario, files: list[Path], fold: int, seed: int,
     made = Cell(
         name, fold, seed, choice.recommended, found.scores[choice.recommended].model.error / prior,
         min(hybrids.values(), default=math.nan) / prior, band.coverage, float(np.mean(share)), choice.reason,
+        choice.share(choice.recommended),
     )  # fmt: skip
     write_json(note, asdict(made))
     shutil.rmtree(kept / "training", ignore_errors=True)

@@ -84,8 +84,8 @@ HARDLY = 0.98
 LATE = 4.0
 """Longest delay of the inputs [model periods] that is looked for where none is fitted."""
 SHORTEST = 0.01
-"""Shortest delay that is told of [periods]. Exact data end at the integrator's error, of which a delay of 4e-5 periods
-explained four fifths."""
+"""Shortest delay that is told of [periods]. Exact data leave the integrator's error alone; a delay of 4e-5 periods
+explained four fifths of that."""
 TELLING = 0.9
 """Share of the error, of training and of validation, to which such a delay must bring it to be told; it must be twice
 its standard error, too."""

@@ -578,4 +578,8 @@ def table(results: BenchmarkResults) -> list[str]:
             cells = " ".join(f"{value:>{max(12, len(head))}.4g}" for head, value in by_output)
             lines.append(f"{file:28} {name:10} {found.error:>12.4g} {cells}")
     lines += [f"no {name}: {why}" for name, why in results.model.no_linear.items()]
-    return [*lines, f"hybrid: {results.model.hybrid}"]
+    model, shares = results.model, {kind: results.model.choice.share(kind) for kind in results.model.kinds}
+    lines += [
+        f"{kind}: {100 * share:.0f} % of its correction" for kind, share in shares.items() if share != 1
+    ]
+    return [*lines, f"hybrid: {model.hybrid}"]

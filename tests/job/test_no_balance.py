@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc import load, write_csv
+from hybrid_mpc import load, load_scenario, write_csv
 from hybrid_mpc.cli.main import app
+from hybrid_mpc.identify.evaluate import evaluation_trajectories, score
+from hybrid_mpc.job.context import Context
+from hybrid_mpc.job.settings import RunSettings
 from hybrid_mpc.job.stages import choose
+from hybrid_mpc.job.stages.identify import runs_of
 from hybrid_mpc.job.stages.results import read_results
 
 MACHINE = """
@@ -130,7 +134,19 @@ def test_a_share_of_the_correction_goes_into_all_that_follows(bodies, jobs_here,
     assert done.exit_code == 0, done.output
     before, after = (json.loads((f / "results.json").read_text())["identification"] for f in (whole, out))
     assert after["details"]["choice"]["candidates"]["pgrnn"]["share"] == 0.5
-    assert before["error"]["pgrnn"] != after["error"]["pgrnn"]
+    scenario = load_scenario(str(whole.parent / "bodies.py"))
+    context = Context(RunSettings(scenario.name, (whole.parent / "run.csv",), 0), scenario, out)
+    phy = scenario.prior(context.prior.fit.values)
+    smoother = context.prior.fit.smoother(phy, context.spec.dt)
+    test = evaluation_trajectories(context.smoothed("test"), smoother, context.warm, context.spec.free_run)
+    of_share = [
+        score(runs_of(context, "pgrnn", phy, test, share=share)[0], phy, smoother.sizes.y).error
+        for share in (1.0, 0.5)
+    ]
+    assert [before["error"]["pgrnn"], after["error"]["pgrnn"]] == pytest.approx(of_share, rel=1e-9)
+    assert of_share[0] != pytest.approx(of_share[1], rel=1e-3)
+    bands = [found["details"]["bands"]["pgrnn"]["width"]["cold [degC]"] for found in (before, after)]
+    assert bands[0] != pytest.approx(bands[1], rel=1e-3)
     assert before["error"]["phy"] == after["error"]["phy"]
     x, u, steps = np.array([70.0, 50.0]), np.array([20.0]), []
     for folder in (whole, out):

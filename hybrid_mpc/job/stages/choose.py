@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,31 +65,31 @@ def choice_stage(context: Context) -> ChoiceResult:
         calibrating.append((None, validation))
     n_left_out = sum(len(them) for _, them in runs)
 
+    @cache
     def scored(name: str, share: float = 1.0) -> list[tuple[FreeRun, ...]]:
         """A candidate's runs; beside each those of its networks."""
+        context.progress.update(
+            "candidates", candidates.index(name), len(candidates), f"{name}, {100 * share:.0f} %"
+        )
         return [
             run
             for own, them in calibrating
             for run in zip(*runs_of(context, name, phy, them, own, share), strict=True)
         ]
 
-    def errors_of(every: Sequence[tuple[FreeRun, ...]]) -> list[Array]:
-        return [run.squared_errors(smoother.sizes.y) for run, *_ in every[:n_left_out]]
+    def errors_of(name: str, share: float = 1.0) -> list[Array]:
+        return [run.squared_errors(smoother.sizes.y) for run, *_ in scored(name, share)[:n_left_out]]
 
-    whole: dict[str, list[tuple[FreeRun, ...]]] = {}
-    for i, name in enumerate(candidates):
-        context.progress.update("candidates", i, len(candidates), name)
-        whole[name] = scored(name)
     samples = max(1, round(context.time_unit / spec.dt))
     recordings, evidence = evidence_of(runs)
     found = recommend(
-        {name: errors_of(every) for name, every in whole.items()}, deploy=context.settings.deploy, samples=samples,
-        recordings=recordings, evidence=evidence, shrunk=lambda name, share: errors_of(scored(name, share)),
+        {name: errors_of(name) for name in candidates}, deploy=context.settings.deploy, samples=samples,
+        recordings=recordings, evidence=evidence, shrunk=errors_of,
     )  # fmt: skip
     bands: dict[str, Bands] = {}
     for name in candidates:
-        every = whole[name] if found.share(name) == 1 else scored(name, found.share(name))
-        bands[name] = fit_bands(run_parts(phy, prior.fit, list(zip(*every, strict=True)), spec.dt))
+        every = list(zip(*scored(name, found.share(name)), strict=True))
+        bands[name] = fit_bands(run_parts(phy, prior.fit, every, spec.dt))
     longest = max((len(t.t) - warm - 2) * spec.dt for _, them in calibrating for t in them)
     return ChoiceResult(found, bands, longest)
 
