@@ -1,6 +1,8 @@
 """``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
 
 import json
+import shutil
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,8 +13,10 @@ from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, Signal, fit_p
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.job import benchmark as job_benchmark
 from hybrid_mpc.job.benchmark import BenchmarkSettings, benchmark, load_model, training_settings
 from hybrid_mpc.job.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
+from hybrid_mpc.job.stages.identify import load_trained
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +133,34 @@ def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(
     assert set(model.choice.sure) == {
         n for n, own in model.choice.candidates.items() if n != "phy" and own.upper < 1
     }
+
+
+@pytest.mark.full
+def test_a_share_of_a_correction_is_kept_judged_and_told(machine, made, tmp_path, monkeypatch):
+    scenario, train, test = machine
+    out, recommend = tmp_path / "half", job_benchmark.recommend
+    shutil.copytree(made[0], out)
+    shutil.rmtree(out / "model")
+
+    def half(errors, **given):
+        found = recommend(errors, **given)
+        own = replace(found.candidates["mopgrnn"], share=0.5)
+        return replace(found, candidates={**found.candidates, "mopgrnn": own}, sure=("mopgrnn",))
+
+    monkeypatch.setattr(job_benchmark, "recommend", half)
+    results = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
+    whole, kept = (
+        load_trained(out / "checkpoints", "mopgrnn"),
+        load_model(out / "model", "cart").networks["mopgrnn"],
+    )
+    for name, weight in whole.weights.items():
+        np.testing.assert_array_equal(
+            kept.weights[name], (0.5 if name in ("w_out", "b_out") else 1.0) * weight
+        )
+    before, after = (r.test["test.csv"].errors for r in (made[1], results))
+    assert after["mopgrnn"].error != pytest.approx(before["mopgrnn"].error, rel=1e-4)
+    assert after["pgrnn"] == before["pgrnn"]
+    assert "mopgrnn: 50 % of its correction" in job_benchmark.table(results)
 
 
 def test_networks_are_trained_with_what_the_budget_says():
