@@ -73,6 +73,7 @@ def test_unrelated_signals_are_trusted_as_rarely_as_it_is_said(length):
     assert 0.001 < trusted.mean() < 0.02
 
 
+@pytest.mark.full
 def test_a_response_is_trusted_where_there_is_one():
     rng = np.random.default_rng(3)
     u = rng.normal(size=20000)

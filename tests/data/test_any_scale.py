@@ -102,6 +102,7 @@ def test_time_in_other_units(k, seed, kind, split, start):
         np.testing.assert_allclose(b.xdot * rates * k, a.xdot, atol=1e-6)
 
 
+@pytest.mark.full
 @settings(max_examples=40, deadline=None)
 @given(st.floats(1e-6, 1e6), st.floats(1e-6, 1e6), st.integers(0, 50), st.sampled_from(sorted(STATES)))
 def test_channels_in_other_units(k, u, seed, kind):

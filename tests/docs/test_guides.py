@@ -122,6 +122,7 @@ def test_every_prior_of_ones_own_machine_passes_the_preflight(own):
     )
 
 
+@pytest.mark.full
 def test_what_does_not_fit_is_refused_as_the_page_says(what_fits):
     """The cases of benchmarks/what_fits.py, whose words the page sums up."""
     for prior in what_fits.REFUSED.values():

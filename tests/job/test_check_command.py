@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 WITHOUT_TORCH = """
 import sys
 from hybrid_mpc.cli.main import app
@@ -52,6 +54,7 @@ def test_machine_and_recordings_are_told_in_one_pass(call, machine, tmp_path):
         assert words in told
 
 
+@pytest.mark.full
 def test_a_machine_in_casadi_is_checked_without_torch(machine):
     words = ["check", str(machine / "my_machine.py"), "--data", str(machine / "monday.csv")]
     done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True)

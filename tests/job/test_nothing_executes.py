@@ -61,7 +61,7 @@ def test_control_takes_the_scenario_from_the_command_line_alone(call, model, tra
     assert not trap[1].exists()
 
 
-@pytest.mark.parametrize("command", [["report"], ["compare"]])
+@pytest.mark.parametrize("command", [["report"], pytest.param(["compare"], marks=pytest.mark.full)])
 def test_a_study_folder_executes_nothing(call, monkeypatch, trap, tmp_path, command):
     stand_in(monkeypatch, trivial)
     folder = tmp_path / "study"

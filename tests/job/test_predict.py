@@ -143,6 +143,7 @@ def test_missing_samples_are_predicted_in_the_free_run(bare_tanks, model):
     assert found.free_run.rmse["lower [m]"] > 0
 
 
+@pytest.mark.full
 def test_it_needs_no_torch(bare_tanks, model, tmp_path):
     code = (
         "import sys\nclass Refuse:\n    def find_spec(self, name, *rest):\n"

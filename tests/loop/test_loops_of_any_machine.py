@@ -139,6 +139,7 @@ def drive(model, loop, seen):
     return total
 
 
+@pytest.mark.full
 def test_a_loop_by_hand_is_the_simulated_one_and_lost_samples_of_the_inflow_are_held():
     model = two_tanks(dt=10.0)
 

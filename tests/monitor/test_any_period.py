@@ -18,7 +18,7 @@ def axis(dt, swing, unit=1.0, speed=0.1, push=0.0, viscous=1.0):
 
 @pytest.mark.parametrize(
     ("dt", "swing"),
-    [(1e-4, 5e-3), pytest.param(1e-3, 0.05, marks=pytest.mark.full),
+    [pytest.param(1e-4, 5e-3, marks=pytest.mark.full), pytest.param(1e-3, 0.05, marks=pytest.mark.full),
      pytest.param(2.0, 120.0, marks=pytest.mark.full), pytest.param(3600.0, 2e5, marks=pytest.mark.full)],
     ids=lambda v: f"{v:g}",
 )  # fmt: skip

@@ -176,6 +176,7 @@ def test_the_command_fails_where_no_reading_is_valid(recordings, tmp_path):
     assert "no finite number" in found["alarms"][0]["diagnosis"]
 
 
+@pytest.mark.full
 def test_a_recording_of_a_second_is_watched_and_the_replay_shows_how_far_it_is(
     recordings, noisy_artifact, tmp_path
 ):

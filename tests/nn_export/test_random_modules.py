@@ -121,6 +121,7 @@ def check(n, plans, seed):
             assert np.abs(given_slope.full() - slope).max() < 1e-10 * max(1.0, np.abs(slope).max())
 
 
+@pytest.mark.full
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(stacks(widest=24))
 def test_random_stack(plan):

@@ -102,6 +102,7 @@ VALUES = st.recursive(
 )
 
 
+@pytest.mark.full
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(where=st.floats(0, 1, exclude_max=True), value=VALUES)
 def test_foreign_content_is_refused_by_name_or_builds(where, value):

@@ -102,7 +102,7 @@ def test_the_plant_stays_within_a_fifth_of_what_was_fitted():
 
 
 @pytest.mark.parametrize(
-    "name", ["pendubot_push", *(pytest.param(n, marks=pytest.mark.full) for n in TASKS if n != "pendubot_push")]
+    "name", [pytest.param(n, marks=pytest.mark.full) for n in TASKS]
 )  # fmt: skip
 def test_the_priors_controller_stands(name, mujoco):
     """Both joints are within what the weights tolerate at the end; the acrobot rocks by two thirds of it."""
