@@ -33,8 +33,8 @@ exactly as good as the prior, and all else is worse, 6 % of choices take it (``t
 SHARES = (0.75, 0.5)
 """Shares of a correction that are tried, the largest first, where the whole of it does not surely beat the prior. The
 errors of prior and hybrid are alike only in part: a model between them may err less than either, and scatters less, so
-half a correction may be sure where the whole is not. A quarter is not tried: it alone was
-sure in 3 of 45 cells on real machines, and had 0.99, 1.05, 1.01 of the prior's error there (docs/results/no_harm.md)."""
+half a correction may be sure where the whole is not. A quarter is not tried: it alone was sure in 3 of 45 cells
+on real machines, and had 0.99, 1.05, 1.01 of the prior's error there (docs/results/no_harm.md)."""
 CONFIDENT = 1.0
 """Ratio to the prior's error that the upper bound of the hybrid's has to stay below."""
 
