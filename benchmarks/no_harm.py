@@ -112,9 +112,8 @@ def cell(name: str, scenario: Scenario, files: list[Path], fold: int, seed: int,
     """Identify and judge once; the fit of a fold is that of its first seed."""
     out, first = (work / name / f"fold{fold}" / f"seed{s}" for s in (seed, 0))
     note = out / "cell.json"
-    if note.is_file() and set(held := read_json(note)) == {
-        f.name for f in fields(Cell)
-    }:  # else of another version
+    held = read_json(note) if note.is_file() else {}
+    if set(held) == {f.name for f in fields(Cell)}:  # else another version wrote it
         return Cell(**held)
     kept = out / "checkpoints"
     if seed and not kept.exists():

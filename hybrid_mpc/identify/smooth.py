@@ -363,9 +363,8 @@ def _innovations(
         counts = runs.inside & (np.arange(runs.y.shape[1]) >= skip[:, None])
         e, s, counted = (v.reshape(m, b, *v.shape[1:])[:, counts] for v in (found.e, found.s, found.counted))
         squares += np.sum(e * np.linalg.solve(s, e[..., None])[..., 0], axis=(1, 2))
-        with np.errstate(
-            invalid="ignore"
-        ):  # of a filter that diverged; its cost is not finite, and it is passed over
+        # a filter that diverged has no determinant; its cost is not finite, and it is passed over
+        with np.errstate(invalid="ignore"):
             logs += np.linalg.slogdet(s)[1].sum(axis=1)
         count += counted.sum(axis=(1, 2))
     return [(float(a), float(b), int(c)) for a, b, c in zip(squares, logs, count, strict=True)]
