@@ -41,7 +41,7 @@ CONFIDENT = 1.0
 
 @dataclass(frozen=True)
 class CandidateFigures:
-    """A candidate on the validation runs.
+    """A candidate on the runs that it is judged by: over data that were left out.
 
     Args:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
@@ -65,7 +65,7 @@ class Choice:
         hybrid: The hybrid that is exported: the recommended one, else that with the least error.
         candidates: Figures by candidate.
         reason: One sentence for the report.
-        blocks: Blocks of the validation runs that were compared.
+        blocks: Blocks of these runs that were compared.
         sure: The hybrids that surely beat the prior.
     """
 
