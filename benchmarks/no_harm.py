@@ -7,7 +7,8 @@ of which one is left out, a gap of a warm-up before and behind it. The prior is 
 them or the prior is recommended on what remains, of which the last quarter validates; then what was left out is
 predicted in free runs. A cell is one group and one seed. ``ratio`` is the recommended model's error over the prior's,
 ``best`` the best hybrid's whether recommended or not (each with the share of its correction that the choice gives it),
-``coverage`` that of the recommended model's 90 % band.
+``whole`` the ratio of what is recommended where corrections count whole or not at all, ``coverage`` that of the
+recommended model's 90 % band.
 
 Cells are kept in ``--work`` and are not computed twice. Needs the recordings of the machines.
 """
@@ -67,6 +68,8 @@ class Cell:
     score: float
     reason: str
     share: float
+    whole: float
+    whole_recommended: str
 
 
 def folds(scenario: Scenario, files: list[Path], count: int) -> list[Scenario]:
@@ -129,11 +132,13 @@ def cell(name: str, scenario: Scenario, files: list[Path], fold: int, seed: int,
     prior = found.scores["phy"].model.error
     hybrids = {n: found.scores[n].model.error for n in choice.candidates if n != "phy"}
     band = found.bands[choice.recommended]
-    share = [b / c for b, c in zip(band.score.values(), band.score_of_constant.values(), strict=True)]
+    entire = [n for n in choice.sure if choice.share(n) == 1.0]
+    whole = min(entire, key=lambda n: choice.candidates[n].error, default="phy")
+    score = [b / c for b, c in zip(band.score.values(), band.score_of_constant.values(), strict=True)]
     made = Cell(
         name, fold, seed, choice.recommended, found.scores[choice.recommended].model.error / prior,
-        min(hybrids.values(), default=math.nan) / prior, band.coverage, float(np.mean(share)), choice.reason,
-        choice.share(choice.recommended),
+        min(hybrids.values(), default=math.nan) / prior, band.coverage, float(np.mean(score)), choice.reason,
+        choice.share(choice.recommended), found.scores[whole].model.error / prior, whole,
     )  # fmt: skip
     write_json(note, asdict(made))
     shutil.rmtree(kept / "training", ignore_errors=True)
@@ -149,6 +154,8 @@ def summary(cells: list[Cell]) -> dict[str, object]:
         "hybrid recommended": float(np.mean([c.recommended != "phy" for c in cells])),
         "ratio, geometric mean": float(np.exp(np.log(ratios).mean())),
         "largest ratio": float(ratios.max()),
+        "whole alone, geometric mean": float(np.exp(np.mean([math.log(c.whole) for c in cells]))),
+        "whole alone, hybrid recommended": float(np.mean([c.whole_recommended != "phy" for c in cells])),
         "at most 1.02": float(np.mean(ratios <= 1.02)),
         "best hybrid, geometric mean": float(np.exp(np.mean([math.log(c.best) for c in cells]))),
         "coverage": float(np.mean([c.coverage for c in cells])),

@@ -96,7 +96,7 @@ class Budget:
             of ``networks * hidden`` hidden units z, on which the time of a control step depends.
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
-        seeds: Closed loops per task and controller.
+        seeds: Closed loops per task and controller, at most: fewer where they tell the controllers' costs apart.
         oracle_seeds: Closed loops per task of the oracles, which are slow.
         tasks: Names of the tasks to run. Default: all.
         decay: Weight decay times the number of training samples: the less data, the more is needed to keep a network

@@ -1,7 +1,9 @@
 """What the closed loops of a run are summed up to, and what they are made of."""
 
+import math
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +14,7 @@ from hybrid_mpc import InputError, RunSettings, Signal, load_scenario, set_proce
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
 from hybrid_mpc.job.loops import limits_used
+from hybrid_mpc.job.sequential import looks
 from hybrid_mpc.job.stages.compare import TIMED, _seeds, compare, parts_of
 from hybrid_mpc.job.stages.results import gap_closed
 from hybrid_mpc.job.summary import by_task, interval, summaries
@@ -132,13 +135,49 @@ def test_tasks_are_found_by_name():
 
 def test_parts_are_every_loop_once_and_the_timed_ones_come_first():
     budget = GOLF.budgets["full"]
-    parts = parts_of(GOLF, budget)
+    parts = parts_of(GOLF, GOLF.tasks, budget, range(budget.seeds))
     loops = [(p.task.name, p.controller, seed) for p in parts for seed in p.seeds]
     per_task = sum(_seeds(n, GOLF, budget.seeds, budget.oracle_seeds) for n in CONTROLLERS)
     assert len(loops) == len(set(loops)) == per_task * len(GOLF.tasks)
     assert len({p.stage for p in parts}) == len(parts)
     assert [p.timed for p in parts] == sorted((p.timed for p in parts), reverse=True)
     assert all(len(p.seeds) == 1 for p in parts if p.controller in ORACLES)  # a kill loses one slow loop
+
+
+def test_parts_of_all_looks_are_those_of_one():
+    budget = GOLF.budgets["full"]
+    bounds = [0, *looks(budget.seeds)]
+    parts = [part for a, b in pairwise(bounds) for part in parts_of(GOLF, GOLF.tasks, budget, range(a, b))]
+    loops = {(p.task.name, p.controller, seed) for p in parts for seed in p.seeds}
+    whole = parts_of(GOLF, GOLF.tasks, budget, range(budget.seeds))
+    assert loops == {(p.task.name, p.controller, seed) for p in whole for seed in p.seeds}
+    assert sum(len(p.seeds) for p in parts) == len(loops)
+    assert len({p.stage for p in parts}) == len(parts)
+
+
+def test_a_task_that_is_decided_runs_no_further(monkeypatch):
+    """Track_sine is decided at the first look of six seeds; the stroke's costs scatter, so it goes on to the last."""
+    tasks, asked = ("track_sine", "stroke_3"), []
+    budget = replace(GOLF.budgets["quick"], seeds=9, tasks=tasks)
+
+    def run(context, specs, *, alone):
+        asked.append({spec.task for own in specs.values() for spec in own})
+        rng = np.random.default_rng(0)
+        return {part: [loop_row(
+            task=s.task, controller=s.controller, seed=s.seed,
+            cost=(0.5 if (s.task, s.controller) == ("track_sine", "hybrid_observer") else 1.0)
+            * math.exp(rng.normal(0.0, 0.01 if s.task == "track_sine" else 1.0)),
+        ) for s in own] for part, own in specs.items()}  # fmt: skip
+
+    monkeypatch.setattr("hybrid_mpc.job.stages.compare.run_or_read", run)
+    context = SimpleNamespace(scenario=GOLF, budget=budget, settings=RunSettings("golf_robot"))
+    table = by_task(compare(context))
+    assert asked == [set(tasks), {"stroke_3"}]
+    assert list(table) == list(tasks)
+    for task, n in (("track_sine", 6), ("stroke_3", 9)):
+        assert [row.seed for row in table[task]["hybrid_observer"]] == list(range(n))
+        assert len(table[task]["prior"]) == n
+        assert len(table[task]["oracle"]) == budget.oracle_seeds
 
 
 def test_every_controller_runs_and_oracles_less_often():

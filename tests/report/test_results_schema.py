@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 8,
+    "schema_version": 9,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -190,7 +190,7 @@ def test_null_needs_a_reason():
 
 
 def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match="this version reads 8"):
+    with pytest.raises(InputError, match="this version reads 9"):
         read_results(put("schema_version", 4))
     with pytest.raises(InputError, match="no field 'programs'"):
         read_results(put("export.programs", 3))

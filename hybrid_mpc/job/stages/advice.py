@@ -120,6 +120,15 @@ def _loops(results: Results) -> Iterator[Hint]:
             "bad", f"A controller step takes {times.p99:.3g} ms in 99 of 100 periods, the period is {period:g} ms.",
             "Was the computer busy? Else the solver native (compiled C), a shorter horizon or a longer dt.",
         )  # fmt: skip
+    details = results.control.details
+    for task, own in (details.comparisons if details is not None else {}).items():
+        dearer = {base: found for base, found in own.items() if found.low is not None and found.low > 1.0}
+        if dearer:
+            ratios = ", ".join(f"{found.ratio:.3g} times that of {base}" for base, found in dearer.items())
+            yield Hint(
+                "bad", f"In {task} the hybrid's cost is {ratios}.",
+                "The prior's MPC is the better one there: hm.load(FOLDER).controller('prior').",
+            )  # fmt: skip
     if not results.on_model.reason:
         yield Hint(
             "plain", "There is no plant: loops ran on a model, which shows no more than that they run.",

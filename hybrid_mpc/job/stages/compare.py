@@ -1,4 +1,4 @@
-"""The closed loops of a run: every task under every controller, several seeds each."""
+"""The closed loops of a run: every task under every controller, seeds until costs are told apart."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ from hybrid_mpc.job.loops import (
     with_arrays,
     write_rows,
 )
+from hybrid_mpc.job.sequential import Comparison, comparison, looks
 from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
+from hybrid_mpc.job.summary import by_task
 from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
 from hybrid_mpc.loop.loop import Loop
@@ -44,6 +46,9 @@ if TYPE_CHECKING:
     from hybrid_mpc.monitor.residuals import ResidualMonitor
 
 Array = NDArray[np.float64]
+BASELINES = ("prior", "prior_observer")
+REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
+"""Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
 TIMED_PERIODS = 1000
 """Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
 TIMED = OBSERVERS
@@ -79,18 +84,18 @@ class Part:
         ]  # fmt: skip
 
 
-def parts_of(scenario: Scenario, budget: Budget) -> list[Part]:
-    """All loops of a budget, in the order in which they run: the timed ones, then the slow ones first."""
-    tasks, parts = tasks_of(scenario, budget.tasks), []
-    for task in tasks:
-        parts += [Part(task, name, (0,), timed=True) for name in TIMED]
+def parts_of(scenario: Scenario, tasks: Sequence[Task], budget: Budget, seeds: range) -> list[Part]:
+    """Loops of the tasks with some of a budget's seeds, in the order in which they run.
+
+    First come the timed ones, then the slow ones.
+    """
+    parts = [Part(task, name, (0,), timed=True) for task in tasks for name in TIMED if 0 in seeds]
     for name in reversed(list(CONTROLLERS)):
-        seeds = range(1 if name in TIMED else 0, _seeds(name, scenario, budget.seeds, budget.oracle_seeds))
-        together = 1 if name in ORACLES else max(1, len(seeds))
+        most = _seeds(name, scenario, budget.seeds, budget.oracle_seeds)
+        own = range(max(seeds.start, 1 if name in TIMED else 0), min(seeds.stop, most))
+        together = 1 if name in ORACLES else max(1, len(own))
         for task in tasks:
-            parts += [
-                Part(task, name, tuple(seeds[i : i + together])) for i in range(0, len(seeds), together)
-            ]
+            parts += [Part(task, name, tuple(own[i : i + together])) for i in range(0, len(own), together)]
     return parts
 
 
@@ -131,16 +136,38 @@ def control_stage(context: Context) -> ControlResult | Absent:
 
 
 def compare(context: Context) -> list[LoopRow]:
-    """Run all loops on the run's model; the timed ones alone, the others side by side in processes.
+    """Run the loops on the run's model; the timed ones alone, the others side by side in processes.
 
-    Every part is kept as it ends; what a run that was killed has kept is not run again.
+    A task gets no more seeds where the costs of its hybrid and of the better baseline are told apart
+    (:mod:`hybrid_mpc.job.sequential`). Every part is kept as it ends; what a run that was killed has kept is not run
+    again.
     """
-    parts, settings = parts_of(context.scenario, context.budget), context.settings
-    specs = {part.stage: part.specs(settings.scenario, settings.seed) for part in parts}
-    found = run_or_read(context, specs, alone=[part.stage for part in parts if part.timed])
-    rows = [row for part in parts for row in found[part.stage]]
-    order = [task.name for task in tasks_of(context.scenario, context.budget.tasks)]
+    scenario, budget, settings = context.scenario, context.budget, context.settings
+    every = tasks_of(scenario, budget.tasks)
+    tasks, rows, done = list(every), list[LoopRow](), 0
+    for seeds in looks(budget.seeds):
+        parts = parts_of(scenario, tasks, budget, range(done, seeds))
+        specs = {part.stage: part.specs(settings.scenario, settings.seed) for part in parts}
+        found = run_or_read(context, specs, alone=[part.stage for part in parts if part.timed])
+        rows += [row for part in parts for row in found[part.stage]]
+        own = by_task(rows)
+        tasks, done = [task for task in tasks if not decided(own[task.name], budget.seeds)], seeds
+    order = [task.name for task in every]
     return sorted(rows, key=lambda row: (order.index(row.task), row.controller, row.seed))
+
+
+def comparisons(cells: Mapping[str, Sequence[LoopRow]], most: int) -> dict[str, Comparison]:
+    """The cost of a task's hybrid with observer over that of each baseline, by baseline, at most ``most`` seeds."""
+    costs = {
+        name: [row.cost for row in sorted(rows, key=lambda row: row.seed)] for name, rows in cells.items()
+    }
+    return {name: comparison(costs[REPORTED["hybrid"]], costs[name], most) for name in BASELINES}
+
+
+def decided(cells: Mapping[str, Sequence[LoopRow]], most: int) -> bool:
+    """Whether more seeds of a task would tell nothing more: its hybrid and the better baseline are told apart."""
+    better = min(BASELINES, key=lambda name: float(np.mean([row.cost for row in cells[name]])))
+    return comparisons(cells, most)[better].decided
 
 
 def _only_timing(context: Context) -> ControlResult:

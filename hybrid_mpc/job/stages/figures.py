@@ -18,14 +18,14 @@ from hybrid_mpc.job.monitor import thresholds_of
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
-from hybrid_mpc.job.stages.compare import CONTROL
+from hybrid_mpc.job.stages.compare import CONTROL, REPORTED
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import PRIOR, TRAINING, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL, by_controller
-from hybrid_mpc.job.stages.results import REPORTED, finite, step_times
+from hybrid_mpc.job.stages.results import finite, step_times
 from hybrid_mpc.job.summary import summaries
 from hybrid_mpc.job.tasks import ready, tasks_of
 from hybrid_mpc.machine.prior import Prior

@@ -19,10 +19,11 @@ from hybrid_mpc.identify.evaluate import Scores
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loops import LoopRow
+from hybrid_mpc.job.sequential import Comparison
 from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.analyze import ANALYSIS, ModelAnalysis
 from hybrid_mpc.job.stages.choose import CHOICE
-from hybrid_mpc.job.stages.compare import CONTROL
+from hybrid_mpc.job.stages.compare import BASELINES, CONTROL, REPORTED, comparisons
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecording, ObserverTest
 from hybrid_mpc.job.stages.evaluate import EVALUATION, BandScores, BaselineScores
 from hybrid_mpc.job.stages.export import EXPORT
@@ -38,12 +39,9 @@ from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 ENERGY = "energy [W]"
 """The balance that the monitor watches, with the unit of its rate."""
-BASELINES = ("prior", "prior_observer")
-REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
-"""Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
 Errors = Mapping[str, Mapping[str, float] | str | None]
 """Error by model, each by signal with unit; a model without one has null, and ``MODEL_reason``."""
 
@@ -169,10 +167,15 @@ class Gap:
 
 @dataclass(frozen=True)
 class ControlDetails:
-    """Figures by task and controller, and the gap closed by task."""
+    """Figures by task and controller, the gap closed by task, and the hybrid's cost over that of each baseline by task.
+
+    ``most_seeds`` is the number of seeds at which a task's loops stop at the latest.
+    """
 
     tasks: Mapping[str, Mapping[str, Summary]]
     gap_closed_by_task: Mapping[str, Gap]
+    comparisons: Mapping[str, Mapping[str, Comparison]]
+    most_seeds: int
 
 
 @dataclass(frozen=True)
@@ -550,7 +553,12 @@ def _control(context: Context) -> Control:
         **costs,
         gap_closed=float(np.mean(defined)) if defined else None,
         gap_closed_reason="" if defined else "; ".join(dict.fromkeys(gap.reason for gap in gaps.values())),
-        details=ControlDetails(means, gaps),
+        details=ControlDetails(
+            means,
+            gaps,
+            {task: comparisons(cells, context.budget.seeds) for task, cells in table.items()},
+            context.budget.seeds,
+        ),
     )
 
 

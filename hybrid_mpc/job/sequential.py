@@ -1,0 +1,105 @@
+"""Costs of two controllers on the same seeds, compared by an interval that holds although loops may stop early."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+LOOKS = 3
+"""How often costs are looked at, at most; each look takes a part of the 5 %, so more looks widen the last interval."""
+FEWEST = 6
+"""Seeds before the first look. At the level of a first look of two, the interval of four seeds is 2.3 times as wide as
+that of six at 95 %: it would decide little, and still take its part of the 5 %."""
+LEVEL = 0.95
+"""Probability that no interval of any look misses the ratio."""
+SAME = 0.02
+"""Ratios within 2 % of 1 are taken for the same cost: more loops would not change what anybody does."""
+
+
+def looks(most: int) -> tuple[int, ...]:
+    """Numbers of seeds after which costs are looked at: thirds of ``most``, none below six; the last is ``most``.
+
+    Args:
+        most: Largest number of seeds, at least 1, fixed before the first loop runs.
+
+    Example:
+        >>> looks(30), looks(10), looks(6), looks(2)
+        ((10, 20, 30), (7, 10), (6,), (2,))
+    """
+    thirds = [math.ceil(most * k / LOOKS) for k in range(1, LOOKS + 1)]
+    return tuple(dict.fromkeys(n for n in thirds if n >= FEWEST or n == most))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How one controller's cost compares with another's on the same seeds.
+
+    Args:
+        ratio: Geometric mean of the ratios seed by seed; None where a cost is not finite or not positive.
+        low: Lower end of the interval of the ratio; None where there is none.
+        high: Its upper end.
+        n: Number of seeds.
+        reason: Why there is no ratio. Default: there is one.
+    """
+
+    ratio: float | None
+    low: float | None
+    high: float | None
+    n: int
+    reason: str = ""
+
+    @property
+    def decided(self) -> bool:
+        """Whether the interval tells the costs apart, or tells that they are the same within 2 %."""
+        if self.low is None or self.high is None:
+            return False
+        apart = self.high < 1.0 or self.low > 1.0
+        return apart or (self.low > 1.0 - SAME and self.high < 1.0 + SAME)
+
+
+def comparison(costs: Sequence[float], base: Sequence[float], most: int) -> Comparison:
+    """Compare costs with those of a base on the same seeds, at one of the looks.
+
+    The interval is Student's t of the logarithms of the ratios. Look ``k`` of ``K`` has the level
+    ``1 - 0.05 k / (1 + ... + K)``. So the probability that an interval of any look misses the ratio is at most 5 %
+    (the union bound), and loops may stop at the look that decides; the rules of stopping do not matter. It assumes that
+    the logarithms are normal and the seeds independent. Later looks get the larger part, so the last interval is little
+    wider than that of a fixed number of seeds.
+
+    Args:
+        costs: ``(n,)``, one a seed.
+        base: ``(n,)``, of the same seeds.
+        most: Largest number of seeds, fixed before; ``n`` is one of ``looks(most)``.
+
+    Raises:
+        ValueError: If the numbers of costs differ, or are of no look.
+
+    Source:
+        Group sequential tests with spent errors: Lan, DeMets, Discrete sequential boundaries for clinical trials,
+        Biometrika 70 (1983).
+
+    Example:
+        >>> found = comparison([1.0, 1.1, 0.9, 1.0, 1.2, 1.0], [2.0, 2.1, 1.9, 2.0, 2.2, 1.9], most=9)
+        >>> round(found.ratio, 2), found.high < 1.0, found.decided
+        (0.51, True, True)
+    """
+    from scipy.stats import t as student
+
+    x, y, n, every = np.asarray(costs, dtype=float), np.asarray(base, dtype=float), len(costs), looks(most)
+    if x.shape != y.shape or n not in every:
+        raise ValueError(f"{n} costs and {len(base)} of the base; needed as many of each, one of {every}")
+    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
+        return Comparison(None, None, None, n, "a loop diverged")
+    if not (np.all(x > 0.0) and np.all(y > 0.0)):
+        return Comparison(None, None, None, n, "a cost is not positive")
+    logs = np.log(x) - np.log(y)
+    ratio = float(np.exp(logs.mean()))
+    if n == 1:
+        return Comparison(ratio, None, None, n)
+    k = every.index(n) + 1
+    miss = (1.0 - LEVEL) * k / (len(every) * (len(every) + 1) / 2)
+    half = float(student.ppf(1.0 - miss / 2, n - 1) * logs.std(ddof=1) / math.sqrt(n))
+    return Comparison(ratio, ratio * math.exp(-half), ratio * math.exp(half), n)
