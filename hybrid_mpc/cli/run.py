@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +13,7 @@ from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordin
 from hybrid_mpc.records import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.stages.results import Guard, Identification, OnModel, Residuals, Results
+    from hybrid_mpc.job.stages.results import Control, Guard, Identification, OnModel, Residuals, Results
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -102,11 +103,21 @@ def summary(results: Results) -> list[str]:
             lines.append(
                 f"closed loop, {name:8} cost {loop.cost:.4g}, tracking {tracking(loop.tracking_rmse)}"
             )
+    lines += comparison_lines(results.control)
     lines += on_model_lines(results.on_model)
     lines += residual_lines(results.residuals)
     if results.monitor.alarms is None:
         lines.append(f"energy monitor: {results.monitor.reason}")
     return lines + guard_lines(results.guard)
+
+
+def comparison_lines(found: Control) -> list[str]:
+    """The hybrid's cost by task over that of the baseline that it does least well against, on the same seeds."""
+    lines = []
+    for task, own in (found.details.comparisons if found.details is not None else {}).items():
+        base, least = max(own.items(), key=lambda item: math.inf if item[1].ratio is None else item[1].ratio)
+        lines.append(f"{task}: hybrid_observer / {base} {least.words}, {least.n} seeds: {least.finding}")
+    return lines
 
 
 def on_model_lines(found: OnModel) -> list[str]:

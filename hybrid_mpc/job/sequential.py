@@ -52,12 +52,31 @@ class Comparison:
     reason: str = ""
 
     @property
-    def decided(self) -> bool:
-        """Whether the interval tells the costs apart, or tells that they are the same within 2 %."""
+    def finding(self) -> str:
+        """``"cheaper"``, ``"dearer"``, ``"the same"`` (surely within 2 %), or ``"undecided"``."""
         if self.low is None or self.high is None:
-            return False
-        apart = self.high < 1.0 or self.low > 1.0
-        return apart or (self.low > 1.0 - SAME and self.high < 1.0 + SAME)
+            return "undecided"
+        if self.low > 1.0 - SAME and self.high < 1.0 + SAME:
+            return "the same"
+        return "cheaper" if self.high < 1.0 else "dearer" if self.low > 1.0 else "undecided"
+
+    @property
+    def decided(self) -> bool:
+        """Whether the interval tells the costs apart, or tells that they are the same."""
+        return self.finding != "undecided"
+
+    @property
+    def words(self) -> str:
+        """The ratio with its interval, or why there is none.
+
+        Example:
+            >>> Comparison(0.5, 0.4, 0.625, 6).words
+            '0.5 (0.4 to 0.625)'
+        """
+        if self.ratio is None:
+            return f"– ({self.reason})"
+        of = "" if self.low is None or self.high is None else f" ({self.low:.3g} to {self.high:.3g})"
+        return f"{self.ratio:.3g}{of}"
 
 
 def comparison(costs: Sequence[float], base: Sequence[float], most: int) -> Comparison:

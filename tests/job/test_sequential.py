@@ -8,8 +8,10 @@ import pytest
 from closed_loop_parts import loop_row
 from scipy.stats import t as student
 
+from hybrid_mpc.cli.run import comparison_lines
 from hybrid_mpc.job.sequential import SAME, Comparison, comparison, looks
 from hybrid_mpc.job.stages.compare import comparisons, decided
+from hybrid_mpc.job.stages.results import Control, ControlDetails, ControllerCosts
 
 
 @pytest.mark.parametrize("most", range(1, 40))
@@ -67,11 +69,23 @@ def test_the_last_look_is_little_wider_than_a_fixed_number():
 
 
 def test_what_is_decided():
-    assert Comparison(0.5, 0.4, 0.6, 4).decided
-    assert Comparison(2.0, 1.1, 3.0, 4).decided
-    assert Comparison(1.0, 1 - SAME / 2, 1 + SAME / 2, 4).decided
-    assert not Comparison(0.9, 0.7, 1.1, 4).decided
-    assert not Comparison(0.5, None, None, 1).decided
+    assert Comparison(0.5, 0.4, 0.6, 6).finding == "cheaper"
+    assert Comparison(2.0, 1.1, 3.0, 6).finding == "dearer"
+    assert Comparison(1.0, 1 - SAME / 2, 1 + SAME / 2, 6).finding == "the same"
+    assert Comparison(0.99, 0.985, 0.995, 6).finding == "the same"  # apart, but nobody cares
+    assert Comparison(0.9, 0.7, 1.1, 6).finding == Comparison(0.5, None, None, 1).finding == "undecided"
+
+
+def test_the_terminal_names_the_baseline_that_the_hybrid_does_least_well_against():
+    none = ControllerCosts(1.0, {})
+    own = {"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": Comparison(0.8, 0.7, 0.9, 6)}
+    lost = {"prior": Comparison(None, None, None, 6, "a loop diverged"), "prior_observer": own["prior"]}
+    details = ControlDetails({}, {}, {"track": own, "stroke": lost}, most_seeds=6)
+    assert comparison_lines(Control(none, none, none, 0.5, details=details)) == [
+        "track: hybrid_observer / prior_observer 0.8 (0.7 to 0.9), 6 seeds: cheaper",
+        "stroke: hybrid_observer / prior – (a loop diverged), 6 seeds: undecided",
+    ]
+    assert comparison_lines(Control(none, none, none, 0.5)) == []
 
 
 def test_costs_without_a_ratio_are_told_and_decide_nothing():

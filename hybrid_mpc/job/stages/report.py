@@ -14,7 +14,7 @@ from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS
-from hybrid_mpc.job.sequential import SAME, Comparison
+from hybrid_mpc.job.sequential import SAME
 from hybrid_mpc.job.stage import Absent, Stage, source_of
 from hybrid_mpc.job.stages.advice import advice
 from hybrid_mpc.job.stages.analyze import ANALYSIS
@@ -569,7 +569,7 @@ def _comparison_table(control: Control) -> Table | None:
     if details is None:
         return None
     rows = [
-        (task, base.replace("_", ", "), _ratio(found), found.n, _finding(found))
+        (task, base.replace("_", ", "), found.words, found.n, found.finding)
         for task, own in details.comparisons.items()
         for base, found in own.items()
     ]
@@ -579,22 +579,6 @@ def _comparison_table(control: Control) -> Table | None:
         f"{details.most_seeds} seeds. Ratios within {SAME:.0%} of 1 are the same."
     )
     return Table(("task", "baseline", "ratio of costs", "seeds", "finding"), rows, caption)
-
-
-def _ratio(found: Comparison) -> str:
-    if found.ratio is None:
-        return f"– ({found.reason})"
-    if found.low is None or found.high is None:
-        return f"{found.ratio:.3g}"
-    return f"{found.ratio:.3g} ({found.low:.3g} to {found.high:.3g})"
-
-
-def _finding(found: Comparison) -> str:
-    if found.low is None or found.high is None or not found.decided:
-        return "undecided"
-    if found.low > 1.0 - SAME and found.high < 1.0 + SAME:
-        return "the same"
-    return "cheaper" if found.high < 1.0 else "dearer"
 
 
 def _tracking_table(control: Control) -> Table | None:
