@@ -7,8 +7,8 @@ of which one is left out, a gap of a warm-up before and behind it. The prior is 
 them or the prior is recommended on what remains, of which the last quarter validates; then what was left out is
 predicted in free runs. A cell is one group and one seed. ``ratio`` is the recommended model's error over the prior's,
 ``best`` the best hybrid's whether recommended or not (each with the share of its correction that the choice gives it),
-``whole`` the ratio of what is recommended where corrections count whole or not at all, ``coverage`` that of the
-recommended model's 90 % band.
+the better one in hindsight is that or the prior, ``whole`` the ratio of what is recommended where corrections count
+whole or not at all, ``coverage`` that of the recommended model's 90 % band.
 
 Cells are kept in ``--work`` and are not computed twice. Needs the recordings of the machines.
 """
@@ -158,6 +158,7 @@ def summary(cells: list[Cell]) -> dict[str, object]:
         "whole alone, hybrid recommended": float(np.mean([c.whole_recommended != "phy" for c in cells])),
         "at most 1.02": float(np.mean(ratios <= 1.02)),
         "best hybrid, geometric mean": float(np.exp(np.mean([math.log(c.best) for c in cells]))),
+        "the better one in hindsight": float(np.exp(np.mean([math.log(min(c.best, 1.0)) for c in cells]))),
         "coverage": float(np.mean([c.coverage for c in cells])),
         "score / constant band's": float(np.mean([c.score for c in cells])),
     }

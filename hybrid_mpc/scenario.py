@@ -97,7 +97,7 @@ class Budget:
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
         seeds: Closed loops per task and controller, at most: fewer where they tell the controllers' costs apart.
-        oracle_seeds: Closed loops per task of the oracles, which are slow.
+        oracle_seeds: Closed loops per task of the oracles, which are slow, at most; never more than of the others.
         tasks: Names of the tasks to run. Default: all.
         decay: Weight decay times the number of training samples: the less data, the more is needed to keep a network
             from learning their noise. Default: 300.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -113,9 +112,11 @@ def summary(results: Results) -> list[str]:
 
 def comparison_lines(found: Control) -> list[str]:
     """The hybrid's cost by task over that of the baseline that it does least well against, on the same seeds."""
+    from hybrid_mpc.job.sequential import hardest
+
     lines = []
     for task, own in (found.details.comparisons if found.details is not None else {}).items():
-        base, least = max(own.items(), key=lambda item: math.inf if item[1].ratio is None else item[1].ratio)
+        least = own[base := hardest(own)]
         lines.append(f"{task}: hybrid_observer / {base} {least.words}, {least.n} seeds: {least.finding}")
     return lines
 

@@ -16,7 +16,7 @@ from hybrid_mpc import __version__
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest
+from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.job.settings import RunSettings
 from hybrid_mpc.job.stage import Absent, Stage, Stored, read_stage, write_stage
 from hybrid_mpc.kit.artifact import Kit, load
@@ -58,6 +58,7 @@ class Context:
     progress: Progress = field(default_factory=Progress)
     pictures: dict[str, list[tuple[str, Path, str]]] = field(default_factory=dict, repr=False, compare=False)
     _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
+    _kits: dict[str, Kit] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def budget(self) -> Budget:
@@ -142,8 +143,16 @@ class Context:
 
     @property
     def kit(self) -> Kit:
-        """The run's artifact as it is now, with the control problems that the scenario now states."""
-        return load(self.out / "model").on(self.scenario)
+        """The run's artifact as it is now, with the control problems that the scenario now states.
+
+        It is read again only where its description has changed: that names the programs by their contents.
+        """
+        folder = self.out / "model"
+        content = sha256(folder / "model.json")
+        if content not in self._kits:
+            self._kits.clear()
+            self._kits[content] = load(folder).on(self.scenario)
+        return self._kits[content]
 
     @cached_property
     def versions(self) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,8 @@ FEWEST = 6
 that of six at 95 %: it would decide little, and still take its part of the 5 %."""
 LEVEL = 0.95
 """Probability that no interval of any look misses the ratio."""
+MOST_LOG = 100.0
+"""Half width of an interval of logarithms beyond which it says nothing, and its ends are no numbers any more."""
 SAME = 0.02
 """Ratios within 2 % of 1 are taken for the same cost: more loops would not change what anybody does."""
 
@@ -42,7 +44,7 @@ class Comparison:
         low: Lower end of the interval of the ratio; None where there is none.
         high: Its upper end.
         n: Number of seeds.
-        reason: Why there is no ratio. Default: there is one.
+        reason: Why there is no ratio, or no interval. Default: there are both.
     """
 
     ratio: float | None
@@ -73,10 +75,20 @@ class Comparison:
             >>> Comparison(0.5, 0.4, 0.625, 6).words
             '0.5 (0.4 to 0.625)'
         """
-        if self.ratio is None:
-            return f"– ({self.reason})"
-        of = "" if self.low is None or self.high is None else f" ({self.low:.3g} to {self.high:.3g})"
-        return f"{self.ratio:.3g}{of}"
+        ratio = "–" if self.ratio is None else f"{self.ratio:.3g}"
+        of = self.reason if self.low is None or self.high is None else f"{self.low:.3g} to {self.high:.3g}"
+        return f"{ratio} ({of})"
+
+
+def hardest(comparisons: Mapping[str, Comparison]) -> str:
+    """The baseline that a controller does least well against: of the largest ratio. Those without one come last.
+
+    Example:
+        >>> hardest({"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": Comparison(0.8, 0.7, 0.9, 6)})
+        'prior_observer'
+    """
+    ratios = {name: -math.inf if found.ratio is None else found.ratio for name, found in comparisons.items()}
+    return max(ratios, key=lambda name: ratios[name])
 
 
 def comparison(costs: Sequence[float], base: Sequence[float], most: int) -> Comparison:
@@ -85,7 +97,8 @@ def comparison(costs: Sequence[float], base: Sequence[float], most: int) -> Comp
     The interval is Student's t of the logarithms of the ratios. Look ``k`` of ``K`` has the level
     ``1 - 0.05 k / (1 + ... + K)``. So the probability that an interval of any look misses the ratio is at most 5 %
     (the union bound), and loops may stop at the look that decides; the rules of stopping do not matter. It assumes that
-    the logarithms are normal and the seeds independent. Later looks get the larger part, so the last interval is little
+    the logarithms are normal and the seeds independent. It is the level of one comparison: of twenty tasks that are
+    alike one may be told apart. Later looks get the larger part, so the last interval is little
     wider than that of a fixed number of seeds.
 
     Args:
@@ -110,15 +123,18 @@ def comparison(costs: Sequence[float], base: Sequence[float], most: int) -> Comp
     x, y, n, every = np.asarray(costs, dtype=float), np.asarray(base, dtype=float), len(costs), looks(most)
     if x.shape != y.shape or n not in every:
         raise ValueError(f"{n} costs and {len(base)} of the base; needed as many of each, one of {every}")
-    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
-        return Comparison(None, None, None, n, "a loop diverged")
+    for values, of in ((x, "its own"), (y, "the baseline's")):
+        if not np.all(np.isfinite(values)):
+            return Comparison(None, None, None, n, f"a loop diverged, {of}")
     if not (np.all(x > 0.0) and np.all(y > 0.0)):
         return Comparison(None, None, None, n, "a cost is not positive")
     logs = np.log(x) - np.log(y)
     ratio = float(np.exp(logs.mean()))
     if n == 1:
-        return Comparison(ratio, None, None, n)
+        return Comparison(ratio, None, None, n, "one seed has no interval")
     k = every.index(n) + 1
     miss = (1.0 - LEVEL) * k / (len(every) * (len(every) + 1) / 2)
     half = float(student.ppf(1.0 - miss / 2, n - 1) * logs.std(ddof=1) / math.sqrt(n))
+    if half > MOST_LOG:
+        return Comparison(ratio, None, None, n, "the ratios scatter too far for an interval")
     return Comparison(ratio, ratio * math.exp(-half), ratio * math.exp(half), n)

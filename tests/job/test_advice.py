@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 
 from hybrid_mpc.files import read_object
+from hybrid_mpc.job.sequential import Comparison
 from hybrid_mpc.job.stages.advice import advice
 from hybrid_mpc.job.stages.monitor import CleanAlarms
 from hybrid_mpc.job.stages.results import CandidateErrors, Results, StepTimes, read_results
+from hybrid_mpc.job.summary import Mean
 from hybrid_mpc.report.page import Hint, Report, render
 
 PATH = Path(__file__).parents[2] / "docs/results/golf_robot_quick.json"
@@ -67,7 +69,24 @@ def test_each_finding_is_told_with_what_to_do(results):
     bands = found.details.bands
     thin = changed(results, bands={**bands, "pgrnn": replace(bands["pgrnn"], coverage=0.6)})
     assert bad(thin) == ["The 90% band of PGRNN holds 60% of unseen measurements."]
-    assert all(hint.remedy for case in (slow, noisy, warned, poor, thin) for hint in advice(case)[:1])
+    control = results.control
+    assert control.details is not None
+    for ratio, said_of in ((Comparison(1.5, 1.2, 1.9, 6), ["costs 1.5 (1.2 to 1.9) times as much as prior_observer."]),
+                           (Comparison(1.01, 1.005, 1.015, 6), []), (Comparison(1.2, 0.9, 1.6, 6), [])):  # fmt: skip
+        own = {"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": ratio}
+        dear = replace(results, control=replace(
+            control, details=replace(control.details, comparisons={"track_sine": own})
+        ))  # fmt: skip
+        assert bad(dear) == [f"In track_sine hybrid_observer {said}" for said in said_of]
+    cells = control.details.tasks["track_sine"]
+    gone = {**cells, "hybrid_observer": replace(cells["hybrid_observer"], cost=Mean(None, None, 6))}
+    none = Comparison(None, None, None, 6, "a loop diverged, its own")
+    lost = replace(results, control=replace(control, details=replace(
+        control.details, comparisons={"track_sine": {"prior": none, "prior_observer": none}},
+        tasks={**control.details.tasks, "track_sine": gone},
+    )))  # fmt: skip
+    assert bad(lost) == ["In track_sine hybrid_observer diverges."]
+    assert all(hint.remedy for case in (slow, noisy, warned, poor, thin, lost) for hint in advice(case)[:1])
 
 
 def test_an_error_that_is_the_sensor_s_noise_is_told(results):

@@ -79,22 +79,30 @@ def test_what_is_decided():
 def test_the_terminal_names_the_baseline_that_the_hybrid_does_least_well_against():
     none = ControllerCosts(1.0, {})
     own = {"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": Comparison(0.8, 0.7, 0.9, 6)}
-    lost = {"prior": Comparison(None, None, None, 6, "a loop diverged"), "prior_observer": own["prior"]}
-    details = ControlDetails({}, {}, {"track": own, "stroke": lost}, most_seeds=6)
+    none_of_it = Comparison(None, None, None, 6, "a loop diverged, the baseline's")
+    lost = {"prior": none_of_it, "prior_observer": own["prior"]}
+    both = {"prior": none_of_it, "prior_observer": none_of_it}
+    details = ControlDetails({}, {}, {"track": own, "stroke": lost, "push": both}, most_seeds=6)
     assert comparison_lines(Control(none, none, none, 0.5, details=details)) == [
         "track: hybrid_observer / prior_observer 0.8 (0.7 to 0.9), 6 seeds: cheaper",
-        "stroke: hybrid_observer / prior – (a loop diverged), 6 seeds: undecided",
+        "stroke: hybrid_observer / prior_observer 0.5 (0.4 to 0.6), 6 seeds: cheaper",
+        "push: hybrid_observer / prior – (a loop diverged, the baseline's), 6 seeds: undecided",
     ]
     assert comparison_lines(Control(none, none, none, 0.5)) == []
 
 
 def test_costs_without_a_ratio_are_told_and_decide_nothing():
     lost = comparison([1.0, math.inf], [1.0, 1.0], most=2)
-    assert (lost.ratio, lost.reason, lost.decided) == (None, "a loop diverged", False)
+    assert (lost.ratio, lost.reason, lost.decided) == (None, "a loop diverged, its own", False)
+    assert comparison([1.0, 1.0], [math.inf, 1.0], most=2).reason == "a loop diverged, the baseline's"
+    far = comparison([1e-3, 1e60], [1.0, 1.0], most=2)  # e to the power of half the width is no number
+    assert (far.low, far.high, far.finding) == (None, None, "undecided")
+    assert far.words == "3.16e+28 (the ratios scatter too far for an interval)"
     gain = comparison([-1.0, 2.0], [1.0, 1.0], most=2)
     assert (gain.ratio, gain.reason, gain.decided) == (None, "a cost is not positive", False)
     single = comparison([1.0], [2.0], most=1)
     assert (single.ratio, single.low, single.decided) == (0.5, None, False)
+    assert single.words == "0.5 (one seed has no interval)"
 
 
 @pytest.mark.parametrize(("costs", "base"), [([1.0] * 8, [1.0] * 8), ([1.0] * 7, [1.0] * 10)])
@@ -110,21 +118,24 @@ def cells(**costs):
     }
 
 
-def test_a_task_is_decided_where_the_better_baseline_is():
+def test_a_task_is_decided_where_the_harder_baseline_is():
     noise = np.array([1.0, 1.1, 0.95, 1.02, 0.9, 1.05, 1.0])
     found = cells(hybrid_observer=0.5 * noise, prior_observer=1.0 * noise, prior=1.2 * noise[::-1])
     own = comparisons(found, most=10)
     assert own["prior_observer"].ratio == pytest.approx(0.5)  # pairs are by seed, in whatever order rows come
     assert own["prior"].ratio == pytest.approx(math.exp(fmean(np.log(0.5 * noise / (1.2 * noise[::-1])))))
     assert decided(found, most=10)
-    # the prior without observer is the better one now, and not told apart
+    # the prior without observer is the harder one now, and not told apart
     near = cells(
         hybrid_observer=0.5 * noise, prior_observer=1.0 * noise, prior=0.5 * noise[[1, 0, 2, 4, 3, 6, 5]]
     )
     assert not decided(near, most=10)
-    # it is the worse one, and its scatter does not matter
+    # it is the easier one, and its scatter does not matter
     wide = cells(
         hybrid_observer=0.5 * noise, prior_observer=1.0 * noise, prior=[0.4, 9.0, 1.0, 0.1, 2.0, 5.0, 99.0]
     )
     assert not comparisons(wide, most=10)["prior"].decided
     assert decided(wide, most=10)
+    # nor does a baseline that diverges
+    assert decided(cells(hybrid_observer=0.5 * noise, prior_observer=noise, prior=[math.inf] * 7), most=10)
+    assert not decided(cells(hybrid_observer=[math.inf] * 7, prior_observer=noise, prior=noise), most=10)

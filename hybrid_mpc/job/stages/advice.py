@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from hybrid_mpc.job.sequential import hardest
+from hybrid_mpc.job.stages.compare import REPORTED
 from hybrid_mpc.job.stages.results import Identification, Results
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
@@ -122,12 +124,15 @@ def _loops(results: Results) -> Iterator[Hint]:
         )  # fmt: skip
     details = results.control.details
     for task, own in (details.comparisons if details is not None else {}).items():
-        dearer = {base: found for base, found in own.items() if found.low is not None and found.low > 1.0}
-        if dearer:
-            ratios = ", ".join(f"{found.ratio:.3g} times that of {base}" for base, found in dearer.items())
+        found = own[base := hardest(own)]
+        means = {name: details.tasks[task][name].cost.mean for name in (REPORTED["hybrid"], *own)}  # type: ignore[union-attr]
+        lost = means.pop(REPORTED["hybrid"]) is None and any(cost is not None for cost in means.values())
+        if found.finding == "dearer" or lost:
+            worse = "diverges" if lost else f"costs {found.words} times as much as {base}"
             yield Hint(
-                "bad", f"In {task} the hybrid's cost is {ratios}.",
-                "The prior's MPC is the better one there: hm.load(FOLDER).controller('prior').",
+                "bad", f"In {task} hybrid_observer {worse}.",
+                f"Control such tasks with {base}: hybrid-mpc control --controller {base}, and from Python the kit's "
+                "observer('prior') and controller('prior').",
             )  # fmt: skip
     if not results.on_model.reason:
         yield Hint(

@@ -28,7 +28,7 @@ from hybrid_mpc.job.loops import (
     with_arrays,
     write_rows,
 )
-from hybrid_mpc.job.sequential import Comparison, comparison, looks
+from hybrid_mpc.job.sequential import Comparison, comparison, hardest, looks
 from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.summary import by_task
@@ -138,7 +138,7 @@ def control_stage(context: Context) -> ControlResult | Absent:
 def compare(context: Context) -> list[LoopRow]:
     """Run the loops on the run's model; the timed ones alone, the others side by side in processes.
 
-    A task gets no more seeds where the costs of its hybrid and of the better baseline are told apart
+    A task gets no more seeds where the costs of its hybrid and of the harder baseline are told apart
     (:mod:`hybrid_mpc.job.sequential`). Every part is kept as it ends; what a run that was killed has kept is not run
     again.
     """
@@ -165,9 +165,9 @@ def comparisons(cells: Mapping[str, Sequence[LoopRow]], most: int) -> dict[str, 
 
 
 def decided(cells: Mapping[str, Sequence[LoopRow]], most: int) -> bool:
-    """Whether more seeds of a task would tell nothing more: its hybrid and the better baseline are told apart."""
-    better = min(BASELINES, key=lambda name: float(np.mean([row.cost for row in cells[name]])))
-    return comparisons(cells, most)[better].decided
+    """Whether more seeds of a task would tell nothing more: its hybrid is told apart from the harder baseline."""
+    found = comparisons(cells, most)
+    return found[hardest(found)].decided
 
 
 def _only_timing(context: Context) -> ControlResult:
@@ -309,7 +309,7 @@ def what_loops_read(context: Context) -> dict[str, object]:
         "control problem": scenario.control,
         "plant": source_of(scenario.plant),
         "seed": context.settings.seed,
-        "number of loops": (budget.seeds, budget.oracle_seeds, budget.tasks),
+        "number of loops": (looks(budget.seeds), budget.oracle_seeds, budget.tasks),
         "safe input": scenario.safe_input,
     }
     for task in tasks_of(scenario, budget.tasks) if scenario.plant is not None else ():

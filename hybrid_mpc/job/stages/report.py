@@ -14,7 +14,7 @@ from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS
-from hybrid_mpc.job.sequential import SAME
+from hybrid_mpc.job.sequential import SAME, hardest
 from hybrid_mpc.job.stage import Absent, Stage, source_of
 from hybrid_mpc.job.stages.advice import advice
 from hybrid_mpc.job.stages.analyze import ANALYSIS
@@ -77,7 +77,7 @@ DRAWN_IN = ("plots", "report")
 """Rooms whose files decide what the report looks like, its templates among them."""
 DRAWN_BY = (
     *(f"job/stages/{name}.py" for name in ("advice", "figures", "report", "results")),
-    *(f"job/{name}.py" for name in ("loop_figures", "step_response", "summary")),
+    *(f"job/{name}.py" for name in ("loop_figures", "sequential", "step_response", "summary")),
 )
 """Modules that do, too."""
 
@@ -569,14 +569,15 @@ def _comparison_table(control: Control) -> Table | None:
     if details is None:
         return None
     rows = [
-        (task, base.replace("_", ", "), found.words, found.n, found.finding)
+        (task, base.replace("_", ", ") + " *" * (base == hardest(own)), found.words, found.n, found.finding)
         for task, own in details.comparisons.items()
         for base, found in own.items()
     ]
     caption = (
         f"Cost of the hybrid with observer over a baseline's on the same seeds: geometric mean, and a 95 % interval "
-        f"that holds although a task's loops stop where the ratio to its better baseline is decided, at most after "
-        f"{details.most_seeds} seeds. Ratios within {SAME:.0%} of 1 are the same."
+        f"that holds although a task's loops stop where the larger ratio (*) is decided, at most after "
+        f"{details.most_seeds} seeds. Ratios within {SAME:.0%} of 1 are the same. The 95 % are those of one row: of "
+        "twenty rows one may be wrong."
     )
     return Table(("task", "baseline", "ratio of costs", "seeds", "finding"), rows, caption)
 

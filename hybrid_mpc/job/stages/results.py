@@ -570,11 +570,12 @@ def _costs(
     if not own:
         return ControllerCosts(None, None, reason="the scenario has no oracle")
     signals = dict.fromkeys(signal for row in loops for signal in row.tracking_rmse)
+    squares = {signal: dict[str, list[float]]() for signal in signals}  # by task: these may have other seeds
+    for row in loops:
+        for signal, rmse in row.tracking_rmse.items():
+            squares[signal].setdefault(row.task, []).append(rmse**2)
     tracking = {
-        signal: float(
-            np.sqrt(np.mean([row.tracking_rmse[signal] ** 2 for row in loops if signal in row.tracking_rmse]))
-        )
-        for signal in signals
+        signal: math.sqrt(np.mean([np.mean(own) for own in by.values()])) for signal, by in squares.items()
     }
     known = [cost for cost in own if cost is not None]
     diverged = len(known) < len(own)
@@ -595,7 +596,7 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     baseline = min((costs[n] for n in BASELINES if n in costs), key=lambda c: float(c.mean()))
     hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
     if min(len(baseline), len(oracle)) < 2:
-        return None, "one seed has no standard error: more oracle_seeds are needed (budget full)"
+        return None, "one seed has no standard error: more seeds and oracle_seeds are needed (budget full)"
     if not all(np.all(np.isfinite(c)) for c in (baseline, hybrid, oracle)):
         return None, "a loop diverged"
     gap = float(baseline.mean() - oracle.mean())
