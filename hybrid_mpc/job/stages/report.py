@@ -576,8 +576,8 @@ def _comparison_table(control: Control) -> Table | None:
     caption = (
         f"Cost of the hybrid with observer over a baseline's on the same seeds: geometric mean, and a 95 % interval "
         f"that holds although a task's loops stop where the larger ratio (*) is decided, at most after "
-        f"{details.most_seeds} seeds. Ratios within {100 * SAME:.0f} % of 1 are the same. The 95 % are those of one row: of "
-        "twenty rows one may be wrong."
+        f"{details.most_seeds} seeds. Ratios within {100 * SAME:.0f} % of 1 are the same. The 95 % are those of one "
+        "row: of twenty rows one may be wrong."
     )
     return Table(("task", "baseline", "ratio of costs", "seeds", "finding"), rows, caption)
 
