@@ -12,14 +12,17 @@ from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import Simulation
 
 
-def late_recording(seed):
+def late_recording(seed, delay=1.3):
     """A recording with the commanded torque, which acts 1.3 periods later; at 1.5 its two shares would be equal."""
-    run = record(seed, seconds=3.0)
+    run, younger = record(seed, seconds=3.0), int(delay)
     prior, x = Pendulum(TRUTH), [run.x[0]]
-    parts = [Simulation(prior.equations.xdot, share * DT) for share in (0.3, 0.7)]
+    shares = (delay - younger, 1.0 + younger - delay)
+    parts = [Simulation(prior.equations.xdot, share * DT) for share in shares]
     for k in range(len(run.u) - 1):
         now = x[-1][None]
-        for simulation, m in zip(parts, (2, 1), strict=True):  # the older input, then the younger
+        for simulation, m in zip(
+            parts, (younger + 1, younger), strict=True
+        ):  # the older input, then the younger
             held = run.u[None, [max(k - m, 0)] * 2]
             now = simulation.values(now, held, np.zeros((1, 2, 0)), prior.p, 2)[:, -1]
         x.append(now[0])
@@ -56,6 +59,14 @@ def test_late_inputs_are_told_where_all_recordings_show_them():
     assert late_told(late[:2], [late[2].part(slice(0, 6))])  # too short to tell
     assert not late_told(late[:2], others[2:])
     assert not late_told(noisy[:2], noisy[2:])
+
+
+def test_a_delay_that_nobody_would_act_on_is_not_told(monkeypatch):
+    """Half of a hundredth of a period explains all that is left of exact recordings, and matters to nobody."""
+    runs = [late_recording(seed, 0.005) for seed in range(3)]
+    assert not late_told(runs[:2], runs[2:])
+    monkeypatch.setattr("hybrid_mpc.identify.fit.SHORTEST", 0.0)
+    assert late_told(runs[:2], runs[2:])
 
 
 @pytest.mark.parametrize("largest", [2 * DT, 4 * DT])
