@@ -96,6 +96,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.job.controllers import find_noise as find_noise
     from hybrid_mpc.job.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
     from hybrid_mpc.job.run import run as run
+    from hybrid_mpc.job.sequential import Comparison as Comparison, compare_costs as compare_costs
     from hybrid_mpc.job.settings import RunSettings as RunSettings
     from hybrid_mpc.job.study import FaultKind as FaultKind, RandomFaults as RandomFaults, Study as Study
     from hybrid_mpc.job.study_results import (
@@ -219,6 +220,7 @@ _ROOMS = {
     "job.controllers": ("find_noise",),
     "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
     "job.run": ("run",),
+    "job.sequential": ("Comparison", "compare_costs"),
     "job.settings": ("RunSettings",),
     "job.study": ("FaultKind", "RandomFaults", "Study"),
     "job.study_results": ("StudyResults", "write_study_report"),

@@ -194,22 +194,40 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
 
 def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
     """An operating point is an equilibrium."""
-    point = prior.operating_point
-    if point is None:
-        return
+    if moving := moves_at_rest(prior, second):
+        x, u, w = rest_of(prior)
+        report.add(
+            f"prior: operating_point is no equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}; give the input "
+            f"that holds it there, or the states where this input does{_nearest(prior, x, u, w)}"
+        )
+
+
+def moves_at_rest(prior: Prior, second: float) -> str:
+    """What moves at the operating point, in words; empty where nothing does, or no point is given.
+
+    ``second`` is the time [s] within which a state at rest may move by a hundredth of its size.
+    """
+    if prior.operating_point is None:
+        return ""
     x, u, w = rest_of(prior)
     rates = prior.equations.xdot(x, u, w, prior.p).full().ravel()
-    sizes = _sizes(prior.states, x)
-    moving = [
+    return ", ".join(
         f"{s.name} changes by {r:.3g} {s.unit} a second"
-        for s, r, size in zip(prior.states, rates, sizes, strict=True)
+        for s, r, size in zip(prior.states, rates, _sizes(prior.states, x), strict=True)
         if abs(r) * second > DRIFT * size
-    ]
-    if moving:
-        report.add(
-            f"prior: operating_point is no equilibrium: at x = {x.tolist()}, u = {u.tolist()} {', '.join(moving)}; "
-            f"give the input that holds it there, or the states where this input does{_nearest(prior, x, u, w)}"
-        )
+    )
+
+
+def rests_no_more(prior: Prior, second: float) -> tuple[str, ...]:
+    """A warning where a fitted prior does not rest at its operating point, and where it does; as ``moves_at_rest``."""
+    moving = moves_at_rest(prior, second)
+    if not moving:
+        return ()
+    return (
+        f"with the fitted parameters the machine does not rest at operating_point ({moving}), where observers begin. "
+        "Write the fitted values into the prior's parameters, and where they rest into operating_point"
+        f"{_nearest(prior, *rest_of(prior))}",
+    )
 
 
 def _nearest(prior: Prior, x: Array, u: Array, w: Array) -> str:

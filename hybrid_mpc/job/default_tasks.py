@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -28,8 +28,10 @@ HOLD, LEAD, LASTS = 3, 0.5, 6
 """Horizons that a set-point is held, that the machine rests before the first change, and that holding lasts."""
 TURNS = 20
 """Newton steps to a point of rest at most."""
+RESTS = 0.1
+"""Largest rate, in sizes of the states a horizon, at an operating point that is given."""
 STILL = 1e-6
-"""Largest rate, in sizes of the states a horizon, that counts as rest."""
+"""Largest rate, in sizes of the states a horizon, that counts as rest where one is looked for."""
 
 
 @dataclass(frozen=True)
@@ -80,25 +82,40 @@ class _Rest:
         scale = self.horizon / sizes[: len(x)]
         return value.ravel() * scale, matrix * scale[:, None] * sizes
 
-    def moved(self, j: int, by: float) -> tuple[Array, Array] | None:
-        """The point of rest at which tracked signal ``j`` is off by ``by``, the inputs changed least; None: none is."""
-        sizes, n_x = self.sizes(), len(self.x)
-        z, goal = np.concatenate([self.x, self.u]), self.tracked(self.x, self.u)[j] + by
+    def moved(self, j: Sequence[int], by: float, unit: Array) -> tuple[Array, Array] | None:
+        """The point of rest at which tracked signals ``j`` are off by ``by``, the inputs changed least; None: none is.
+
+        They are met to a millionth of ``unit`` ``(len(j),)``.
+        """
+        sizes, n_x, own = self.sizes(), len(self.x), list(j)
+        z, goal = np.concatenate([self.x, self.u]), self.tracked(self.x, self.u)[own] + by
         for _ in range(TURNS):
             rates, matrix = self.slopes(z[:n_x], z[n_x:])
             tracked, slopes = (m.full() for m in self.linearized(z[:n_x], z[n_x:])[2:])
-            unit = max(abs(by), 1e-300)
-            missed = np.append(rates, (tracked[j] - goal) / unit)
+            missed = np.append(rates, (tracked.ravel()[own] - goal) / unit)
             if not np.all(np.isfinite(matrix)):
                 return None
             if np.abs(missed).max() < STILL:
                 return z[:n_x], z[n_x:]
-            z = (
-                z
-                - sizes
-                * np.linalg.lstsq(np.vstack([matrix, slopes[j] * sizes / unit]), missed, rcond=1e-9)[0]
-            )
+            rows = np.vstack([matrix, slopes[own] * sizes / unit[:, None]])
+            z = z - sizes * np.linalg.lstsq(rows, missed, rcond=1e-9)[0]
         return None
+
+    def settled(self) -> _Rest:
+        """The point of rest with what is weighed as it is, as many signals as there are inputs; itself if none is.
+
+        A fit moves parameters, and with them where the machine rests.
+        """
+        own = np.flatnonzero(self.weights > 0)[: len(self.u)]
+        found = self.moved(own.tolist(), 0.0, 1.0 / np.sqrt(self.weights[own]))
+        inside = found is not None and all(
+            np.all((v >= low) & (v <= high))
+            for v, low, high in (
+                (found[0], *_ranges(self.prior.states)),
+                (found[1], self.control.u_min, self.control.u_max),
+            )
+        )
+        return replace(self, x=found[0], u=found[1]) if found is not None and inside else self
 
     def within(self, x: Array, u: Array) -> bool:
         """Whether a point takes no more than its share of the room to any limit."""
@@ -123,13 +140,18 @@ def _ranges(signals: Sequence[Signal]) -> tuple[Array, Array]:
     return low, high
 
 
-def default_tasks(scenario: Scenario) -> tuple[Task, ...]:
+def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None) -> tuple[Task, ...]:
     """Two tasks around the operating point of a scenario with a control problem.
 
     ``step``: each signal that the problem weighs, as many as there are inputs, is stepped, one after the other, and the
     last set-point is the operating point's. Set-points are points of rest within half of the room to every limit, and
     ten times what the weights tolerate away at most. ``hold``: the operating point is held while a constant
     disturbance, a fifth of the room to a limit, acts at the first input.
+
+    Args:
+        scenario: The scenario.
+        values: Fitted parameters of the prior. Where it does not rest at the operating point with these, the point of
+            rest with the same values of what is weighed takes its place. Default: the prior's own.
 
     Raises:
         InputError: If the prior does not rest at its operating point, or nothing that is weighed can be moved to
@@ -142,14 +164,17 @@ def default_tasks(scenario: Scenario) -> tuple[Task, ...]:
         >>> [task.title for task in default_tasks(replace(golf, tasks=()))]
         ['A step of phi by 0.1 rad (default task)', 'Hold against -0.1 N m at u (default task)']
     """
-    prior, control, dt = scenario.prior(), scenario.control, scenario.data.dt
+    prior, control, dt = scenario.prior(values), scenario.control, scenario.data.dt
     assert control is not None
     length = control.horizon * dt
     rest = _Rest(prior, control, length, *rest_of(prior))
     why = f"scenario {scenario.name} declares no tasks, and default ones cannot be made: "
     rates = rest.slopes(rest.x, rest.u)[0]
-    if not np.all(np.abs(rates) < 0.1):
-        moving = ", ".join(s.name for s, r in zip(prior.states, rates, strict=True) if not abs(r) < 0.1)
+    if values is not None and not np.all(np.abs(rates) < RESTS):
+        rest = rest.settled()
+        rates = rest.slopes(rest.x, rest.u)[0]
+    if not np.all(np.abs(rates) < RESTS):
+        moving = ", ".join(s.name for s, r in zip(prior.states, rates, strict=True) if not abs(r) < RESTS)
         raise InputError(
             f"{why}{moving} of the prior would not rest at the operating point; give operating_point = "
             "OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),)"
@@ -170,7 +195,7 @@ def _steps(rest: _Rest) -> list[tuple[int, float, Array]]:
         size = TOLERATED / math.sqrt(rest.weights[j])
         candidates = ((sign, size / 2**k) for k in range(12) for sign in (1.0, -1.0))
         for sign, own in candidates:
-            point = rest.moved(j, sign * own)
+            point = rest.moved([j], sign * own, np.array([own]))
             if point is not None and rest.within(*point):
                 found.append((j, sign * own, rest.tracked(*point)))
                 break

@@ -284,8 +284,6 @@ class Bench:
     def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
         if not isinstance(scenario, Scenario):
             raise InputError(f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME)")
-        scenario = ready(scenario)
-        check_complete(scenario)
         if not isinstance(kits, Mapping):
             raise InputError(
                 f'Bench: kits by label are needed, got a {type(kits).__name__}; give {{"model": hm.load(FOLDER)}}'
@@ -294,6 +292,9 @@ class Bench:
             if not isinstance(kit, Kit):
                 raise InputError(f"Bench: kit {label!r} is a {type(kit).__name__}; load it: hm.load(FOLDER)")
             check_kit(scenario, kit, f"model {label}")
+        first = next(iter(kits.values()), None)  # all kits run the same tasks
+        scenario = ready(scenario, None if first is None else first.fitted)
+        check_complete(scenario)
         self.scenario = scenario
         self.kits = {label: kit.on(scenario) for label, kit in kits.items()}
         self._built: OrderedDict[tuple[object, ...], tuple[Estimator, SafeController]] = OrderedDict()

@@ -91,7 +91,7 @@ def hardest(comparisons: Mapping[str, Comparison]) -> str:
     return max(ratios, key=lambda name: ratios[name])
 
 
-def comparison(costs: Sequence[float], base: Sequence[float], most: int) -> Comparison:
+def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> Comparison:
     """Compare costs with those of a base on the same seeds, at one of the looks.
 
     The interval is Student's t of the logarithms of the ratios. Look ``k`` of ``K`` has the level
@@ -114,7 +114,7 @@ def comparison(costs: Sequence[float], base: Sequence[float], most: int) -> Comp
         Biometrika 70 (1983).
 
     Example:
-        >>> found = comparison([1.0, 1.1, 0.9, 1.0, 1.2, 1.0], [2.0, 2.1, 1.9, 2.0, 2.2, 1.9], most=9)
+        >>> found = compare_costs([1.0, 1.1, 0.9, 1.0, 1.2, 1.0], [2.0, 2.1, 1.9, 2.0, 2.2, 1.9], most=9)
         >>> round(found.ratio, 2), found.high < 1.0, found.decided
         (0.51, True, True)
     """

@@ -16,15 +16,17 @@ from hybrid_mpc.scenario import Scenario, Task
 Array = NDArray[np.float64]
 
 
-def ready(scenario: Scenario) -> Scenario:
+def ready(scenario: Scenario, values: Mapping[str, float] | None = None) -> Scenario:
     """The scenario; one with a control problem and neither plant nor tasks gets default tasks, which run on a model.
+
+    ``values`` are the fitted parameters of its prior, which say where it rests. Default: the prior's own.
 
     Raises:
         InputError: If default tasks cannot be made.
     """
     if scenario.plant is not None or scenario.control is None or scenario.tasks:
         return scenario
-    return replace(scenario, tasks=default_tasks(scenario))
+    return replace(scenario, tasks=default_tasks(scenario, values))
 
 
 def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:

@@ -508,6 +508,11 @@ class Kit:
         return self.provenance.scenario
 
     @property
+    def fitted(self) -> dict[str, float]:
+        """Fitted parameters of the prior by name."""
+        return {p.name: p.value for p in self.models["prior"].parameters}
+
+    @property
     def sensor_sigma(self) -> tuple[float, ...]:
         """Standard deviations of the sensors ``(n_y,)`` [output units]."""
         return self.loop.sensor_sigma

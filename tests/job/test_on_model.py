@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from hybrid_mpc import Bench, InputError, LoopSpec, OperatingPoint, load, load_scenario
 from hybrid_mpc.job.default_tasks import default_tasks
@@ -162,6 +163,30 @@ def test_default_tasks_are_points_of_rest_within_the_limits(machine):
     for signal, column in zip(prior.outputs, rows.T, strict=True):
         assert signal.lower <= column.min()
         assert column.max() <= signal.upper
+
+
+def test_default_tasks_start_where_the_fitted_prior_rests():
+    """The upper level that holds the lower one depends on what was fitted; the measured level is the user's."""
+    scenario = replace(two_tanks.scenario, plant=None, tasks=())
+    nominal = scenario.prior()
+    fitted = {
+        name: 1.15 * value if name.startswith("pipe_upper") else value
+        for name, value in nominal.values.items()
+    }
+    prior = scenario.prior(fitted)
+    point = prior.operating_point
+    moving = prior.equations.xdot(point.x, point.u, point.w, prior.p).full().ravel()
+    assert np.abs(moving * scenario.control.horizon * scenario.data.dt).max() > 0.01
+    for task, own in zip(default_tasks(scenario, fitted), default_tasks(scenario), strict=True):
+        assert np.array_equal(own.x0, point.x)
+        first = task.reference(np.zeros(1))[0]
+        np.testing.assert_allclose(first, own.reference(np.zeros(1))[0], rtol=1e-6)  # the same set-point
+        # some input rests there: the rates that no input moves are zero
+        u = minimize_scalar(
+            lambda u, x=task.x0: np.sum(prior.equations.xdot(x, [u], point.w, prior.p).full() ** 2),
+            bounds=(0.0, 10 * point.u[0]), options={"xatol": 1e-16},
+        )  # fmt: skip
+        assert np.sqrt(u.fun) < 1e-3 * np.abs(moving).max()
 
 
 def test_a_prior_that_does_not_rest_gets_no_default_tasks():

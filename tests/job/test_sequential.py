@@ -9,7 +9,7 @@ from closed_loop_parts import loop_row
 from scipy.stats import t as student
 
 from hybrid_mpc.cli.run import comparison_lines
-from hybrid_mpc.job.sequential import SAME, Comparison, comparison, looks
+from hybrid_mpc.job.sequential import SAME, Comparison, compare_costs, looks
 from hybrid_mpc.job.stages.compare import comparisons, decided
 from hybrid_mpc.job.stages.results import Control, ControlDetails, ControllerCosts
 
@@ -31,7 +31,7 @@ def test_intervals_of_all_looks_hold_the_ratio_together(most, true):
     logs = math.log(true) + 0.3 * rng.standard_normal((repetitions, most))
     missed = 0
     for row in logs:
-        every = [comparison(np.exp(row[:n]), np.ones(n), most) for n in looks(most)]
+        every = [compare_costs(np.exp(row[:n]), np.ones(n), most) for n in looks(most)]
         missed += any(not found.low <= true <= found.high for found in every)
     # three standard deviations of a share of 5 %
     assert missed / repetitions <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / repetitions)
@@ -51,7 +51,7 @@ def test_fixed_intervals_at_every_look_would_not_hold():
 
 def test_one_look_is_student_s_interval():
     logs = np.array([0.1, -0.3, 0.2])
-    found = comparison(np.exp(logs), np.ones(3), most=3)
+    found = compare_costs(np.exp(logs), np.ones(3), most=3)
     half = student.ppf(0.975, 2) * logs.std(ddof=1) / math.sqrt(3)
     assert (found.low, found.high) == pytest.approx(
         (math.exp(-half), math.exp(half))
@@ -63,7 +63,7 @@ def test_the_last_look_is_little_wider_than_a_fixed_number():
     """By the quantiles of Student's t: 11 % with 10 seeds (two looks), 16 % with 30 (three)."""
     for most, wider in ((10, 1.11), (30, 1.16)):
         logs = np.random.default_rng(0).standard_normal(most)
-        found = comparison(np.exp(logs), np.ones(most), most)
+        found = compare_costs(np.exp(logs), np.ones(most), most)
         fixed = 2 * student.ppf(0.975, most - 1) * logs.std(ddof=1) / math.sqrt(most)
         assert math.log(found.high / found.low) / fixed == pytest.approx(wider, abs=0.005)
 
@@ -92,15 +92,15 @@ def test_the_terminal_names_the_baseline_that_the_hybrid_does_least_well_against
 
 
 def test_costs_without_a_ratio_are_told_and_decide_nothing():
-    lost = comparison([1.0, math.inf], [1.0, 1.0], most=2)
+    lost = compare_costs([1.0, math.inf], [1.0, 1.0], most=2)
     assert (lost.ratio, lost.reason, lost.decided) == (None, "a loop diverged, its own", False)
-    assert comparison([1.0, 1.0], [math.inf, 1.0], most=2).reason == "a loop diverged, the baseline's"
-    far = comparison([1e-3, 1e60], [1.0, 1.0], most=2)  # e to the power of half the width is no number
+    assert compare_costs([1.0, 1.0], [math.inf, 1.0], most=2).reason == "a loop diverged, the baseline's"
+    far = compare_costs([1e-3, 1e60], [1.0, 1.0], most=2)  # e to the power of half the width is no number
     assert (far.low, far.high, far.finding) == (None, None, "undecided")
     assert far.words == "3.16e+28 (the ratios scatter too far for an interval)"
-    gain = comparison([-1.0, 2.0], [1.0, 1.0], most=2)
+    gain = compare_costs([-1.0, 2.0], [1.0, 1.0], most=2)
     assert (gain.ratio, gain.reason, gain.decided) == (None, "a cost is not positive", False)
-    single = comparison([1.0], [2.0], most=1)
+    single = compare_costs([1.0], [2.0], most=1)
     assert (single.ratio, single.low, single.decided) == (0.5, None, False)
     assert single.words == "0.5 (one seed has no interval)"
 
@@ -108,7 +108,7 @@ def test_costs_without_a_ratio_are_told_and_decide_nothing():
 @pytest.mark.parametrize(("costs", "base"), [([1.0] * 8, [1.0] * 8), ([1.0] * 7, [1.0] * 10)])
 def test_costs_of_no_look_are_refused(costs, base):
     with pytest.raises(ValueError, match=r"needed as many of each, one of \(7, 10\)"):
-        comparison(costs, base, most=10)
+        compare_costs(costs, base, most=10)
 
 
 def cells(**costs):

@@ -28,7 +28,7 @@ from hybrid_mpc.job.loops import (
     with_arrays,
     write_rows,
 )
-from hybrid_mpc.job.sequential import Comparison, comparison, hardest, looks
+from hybrid_mpc.job.sequential import Comparison, compare_costs, hardest, looks
 from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.summary import by_task
@@ -161,7 +161,7 @@ def comparisons(cells: Mapping[str, Sequence[LoopRow]], most: int) -> dict[str, 
     costs = {
         name: [row.cost for row in sorted(rows, key=lambda row: row.seed)] for name, rows in cells.items()
     }
-    return {name: comparison(costs[REPORTED["hybrid"]], costs[name], most) for name in BASELINES}
+    return {name: compare_costs(costs[REPORTED["hybrid"]], costs[name], most) for name in BASELINES}
 
 
 def decided(cells: Mapping[str, Sequence[LoopRow]], most: int) -> bool:
@@ -264,7 +264,7 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
     model = read_description(context.out / "model")
     rest = None if model.calibration is None else model.calibration.rest_speed
     of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
-    scenario = ready(context.scenario)
+    scenario = ready(context.scenario, context.prior.fit.values)
     tasks = {task.name: task for task in scenario.tasks}
     loop = loop_settings(scenario, model.loop.process_noise)
     oracle = source_of(scenario.oracle) if any(spec.controller in ORACLES for spec in specs) else None

@@ -231,7 +231,7 @@ def _on_model(context: Context) -> Any:
     found = context.find(LOOPS_ON_MODEL)
     if isinstance(found, Absent):
         return
-    scenario = ready(context.scenario)
+    scenario = ready(context.scenario, context.prior.fit.values)
     tasks = {task.name: task for task in scenario.tasks}
     for name, rows in by_controller(found.drawn).items():
         for row in rows:

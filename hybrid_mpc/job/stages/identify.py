@@ -20,6 +20,7 @@ from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
 from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
+from hybrid_mpc.job.check import rests_no_more
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.engine import WORKERS, run_jobs
 from hybrid_mpc.job.stage import Stage, source_of
@@ -205,7 +206,9 @@ def prior_stage(context: Context) -> PriorResult:
         on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
     )  # fmt: skip
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
-    fit = replace(fit, warnings=(*fit.warnings, *beyond_ranges(make(fit.values), every)))
+    fitted = make(fit.values)
+    told = *beyond_ranges(fitted, every), *rests_no_more(fitted, max(10 * spec.dt, spec.warm_up))
+    fit = replace(fit, warnings=(*fit.warnings, *told))
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     return PriorResult(

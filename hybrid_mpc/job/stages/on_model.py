@@ -55,7 +55,7 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
         return Absent("the scenario has a plant: its loops are those of the section before")
     context.read(NOISE)
     try:
-        tasks = tasks_of(ready(context.scenario), context.budget.tasks)
+        tasks = tasks_of(ready(context.scenario, context.prior.fit.values), context.budget.tasks)
     except InputError as none:
         return Absent(str(none))
     settings = context.settings
@@ -101,7 +101,7 @@ def what_on_model_reads(context: Context) -> dict[str, object]:
     if scenario.plant is not None or scenario.control is None:
         return read
     try:
-        whole = ready(scenario)
+        whole = ready(scenario, context.prior.fit.values)
     except InputError as none:  # the stage says so
         return {**read, "tasks": str(none)}
     loop = loop_settings(whole)
