@@ -47,6 +47,8 @@ CHUNK = 2**20
 """Bytes of a file that are checked at a time [byte]."""
 LONGEST_ROW = 2**20
 """Longest row of a CSV file [byte]: ten thousand columns of a hundred characters."""
+ALIKE = 0.7
+"""How alike a column's name must be to be proposed: ``inflow_degC`` is by 0.6 like ``tank_degC``, by its unit alone."""
 LISTED = 30
 """Most names that a message lists."""
 COMPARED = 1000
@@ -137,7 +139,9 @@ class Source:
                 f"{self.path}: column {name!r} may be {' or '.join(map(shown, fields[:LISTED]))}. "
                 "Name it whole in the scenario's DataSpec."
             )
-        near = difflib.get_close_matches(name, [c for c in self.header[:COMPARED] if len(c) < LONGEST], n=1)
+        near = difflib.get_close_matches(
+            name, [c for c in self.header[:COMPARED] if len(c) < LONGEST], n=1, cutoff=ALIKE
+        )
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise MissingColumn(
             f"{self.path}: no column {name!r}; it has {there}.{hint} "

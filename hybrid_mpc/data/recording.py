@@ -40,6 +40,8 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "W": {"mW": 1e-3, "kW": 1e3},
 }
 """For each unit of a signal the units a recording may have, as multiples of it."""
+TEMPERATURES = frozenset({"K", "degC", "°C", "degF", "°F"})
+"""Units of temperature, which have zeros of their own."""
 FILLED = 0.01
 """Share of a signal's range that a column would have to fill in another unit for that unit to be proposed."""
 SHARE = 0.05
@@ -499,9 +501,13 @@ def _factor(column: str, unit: str | float, signal: Signal) -> float:
         known = {signal.unit: 1.0, **UNITS.get(signal.unit, {})}
         if size := known.get(unit) or factor(unit, signal.unit):
             return size
+        remedy = f"there are: {', '.join(known)}. Or give the factor to {signal.unit} as a number."
+        if {unit, signal.unit} <= TEMPERATURES:
+            remedy = (
+                f"they differ by an offset, and no factor brings that: write the column in {signal.unit}."
+            )
         raise InputError(
-            f"data specification: unit {unit!r} of column {column!r} is none for {signal.label}; there are: "
-            f"{', '.join(known)}. Or give the factor to {signal.unit} as a number."
+            f"data specification: unit {unit!r} of column {column!r} is none for {signal.label}; {remedy}"
         )
     if not math.isfinite(unit) or unit == 0:
         raise InputError(

@@ -566,7 +566,10 @@ def _fewest(spec: DataSpec) -> int:
 
 
 def _too_short(need: float, spec: DataSpec) -> str:
-    return f"shorter than the {need:.4g} s that warm-up ({spec.warm_up:g} s) and smoothing need"
+    return (
+        f"shorter than the {need:.4g} s that warm-up ({spec.warm_up:g} s), smoothing and {MIN_SCORED} periods of dt "
+        f"({spec.dt:g} s) need"
+    )
 
 
 def _numbered(stem: str, number: int) -> str:

@@ -18,6 +18,7 @@ from hybrid_mpc.files import write_text
 
 Array = NDArray[np.float64]
 MARK = "TODO"
+ACTING = "what only acts: new ... --disturbance-column NAME"
 """What stands before everything that is left to decide."""
 HELD = 0.5
 """Share of samples equal to the one before from which on a column looks commanded."""
@@ -289,15 +290,18 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         else:
             rates.append((f"x.{name}_rate", f"exact: the rate of {name}"))
         lower, upper = _wide(column)
+        rest = float(lower), float(upper)
+        if draft.disturbances:  # what they leave of the output may lie far from all that it was
+            rest = min(rest[0], lag.offset - np.ptp(rest)), max(rest[1], lag.offset + np.ptp(rest))
         parameters.append(
             (f"T_{name}", lag.seconds, "s", lag.seconds / 20, lag.seconds * 20, "time constant")
         )
         if lag.states == 2:
             parameters.append((f"D_{name}", min(max(lag.damping, 0.01), 5.0), "-", 0.0, 10.0, "damping"))
-        middle = min(max(lag.offset, float(lower)), float(upper))
+        middle = min(max(lag.offset, rest[0]), rest[1])
         offsets.append(float(_rounded(middle)))
         gains.append([float(_rounded(gain)) for gain in lag.gains])
-        parameters.append((f"rest_{name}", middle, unit, float(lower), float(upper), "value without inputs"))
+        parameters.append((f"rest_{name}", middle, unit, *rest, "value without inputs"))
         for (_, u), source, gain in zip(drives, draft.drives, lag.gains, strict=True):
             reach = max(10 * abs(gain), 10 * np.ptp(column.span) / np.ptp(source.span))
             per = f"{unit}/({source.unit})" if source.unit and source.unit != "-" else unit
@@ -332,7 +336,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
     lines = [
         f'"""{path.stem}: written from {data.name} by hybrid-mpc new. Lines marked {MARK} are yours to decide."""',
         "",
-        "from hybrid_mpc import DataSpec, Parameter, Prior, Scenario, Signal",
+        "from hybrid_mpc import OCP, DataSpec, OperatingPoint, Parameter, Prior, Scenario, Signal",
         "",
         "",
         f"class {kind}(Prior):",
@@ -362,7 +366,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         ),
         "    )",
         f"    corrects = ({', '.join(f'{n!r}' for n in corrected)},)".replace("'", '"'),
-        f"    # {MARK}: where the machine works (import OperatingPoint); your own equations rest elsewhere: see check",
+        f"    # {MARK}: where the machine works; your own equations rest elsewhere: see check",
         f"    # operating_point = OperatingPoint({point})",
         f"    # {MARK}: balances(self, x, u, w, p), if something is stored: energy, mass, heat",
         "",
@@ -381,7 +385,7 @@ def scenario_text(path: Path, data: Path, draft: Draft) -> str:
         "    data=DataSpec(",
         f"        {time}," + (f"  # {MARK}: {time_note}" if time_note else ""),
         f"        {_tuple(c.full for c in draft.inputs)},  # {MARK}: are these commanded?",
-        f"        {_tuple(c.full for c in draft.outputs)},  # {MARK}: are these measured?",
+        f"        {_tuple(c.full for c in draft.outputs)},  # {MARK}: does the machine move these? {ACTING}",
         *([f"        # {MARK}: not used: {', '.join(draft.left_out)}"] if draft.left_out else []),
         f"        dt={_rounded(dt)},  # s, as it was sampled; a tenth of the fastest motion is enough",
         f"        max_gap={_rounded(5 * draft.period)},",
@@ -420,7 +424,7 @@ def _first_control(draft: Draft, n_x: int, horizon: int) -> list[str]:
     low, high = (_numbers(c.span[i] for c in draft.inputs) for i in (0, 1))
     free = f"q={_numbers([0.0] * n_x)}, r={_numbers([0.0] * len(draft.inputs))}"
     return [
-        f"    # {MARK}: what a controller is to do. For a first loop import OCP, and take away the # before:",
+        f"    # {MARK}: what a controller is to do. For a first loop take away the # before:",
         f"    # control=OCP({horizon}, {free}, u_min={low}, u_max={high},",
         "    #             # weights: one over the square of a deviation that you tolerate",
         f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from hybrid_mpc.monitor.residuals import ResidualTrace
 
 LEVEL, POWER = COLOURS["hybrid"], COLOURS["prior"]
+NOTES, WIDTH = 6, 130
+"""Most notes that stand below a title, and characters of one line."""
 
 
 def trace(
@@ -132,11 +135,7 @@ def overview(
         for (time, _), style in zip(marks, cycle(("-", ":", "-.")), strict=False):
             ax.axvline(time, color=INK, linestyle=style, linewidth=1.2)
     _marks(panels[-1], marks, 0.5 * float(t[0] + t[-1]))
-    for time, text in notes:
-        place = {"xycoords": ("data", "axes fraction"), "va": "top", "fontsize": 8}
-        panels[0].annotate(plain(text), (time, 1.0), color=INK, **place)  # type: ignore[arg-type]
-    if title:
-        title_axes(panels[0], plain(title))
+    _headed(panels[0], title, notes)
     finish_column(figure, panels)
     return figure
 
@@ -180,13 +179,26 @@ def channels(
         _shade(ax, intervals(t, trace.on[:, i]), "alarm of the channel", color=ALARM, alpha=0.3)
         frozen = trace.frozen[:, i] if i < len(trace.outputs) else np.zeros(len(t), dtype=bool)
         _shade(ax, intervals(t, frozen), "sensor frozen", color=INK, ymax=0.05)
-    for i, (time, text) in enumerate(notes):
-        place: Any = {"xycoords": ("data", "axes fraction"), "va": "top", "fontsize": 8, "color": INK}
-        panels[0].annotate(plain(text), (time, 1.0 - 0.14 * (i % 6)), **place)
-    if title:
-        title_axes(panels[0], plain(title))
+    _headed(panels[0], title, notes)
     finish_column(figure, panels)
     return figure
+
+
+def _headed(ax: Axes, title: str, notes: Sequence[tuple[float, str]]) -> None:
+    """Title, and below it the notes, each with the number that marks its time: their texts are longer than a panel."""
+    for number, (time, _) in enumerate(notes, 1):
+        place: Any = {
+            "xycoords": ("data", "axes fraction"),
+            "ha": "center",
+            "va": "top",
+            "annotation_clip": True,
+        }
+        ax.annotate(str(number), (time, 1.0), fontsize=9, fontweight="bold", color=INK, **place)
+    lines = [f"{number}: {text}" for number, (_, text) in enumerate(notes[:NOTES], 1)]
+    lines += [f"and {len(notes) - NOTES} more"] * (len(notes) > NOTES)
+    wrapped = [part for line in lines for part in textwrap.wrap(line, WIDTH, subsequent_indent="    ")]
+    if title or wrapped:
+        title_axes(ax, plain("\n".join([title] * bool(title) + wrapped)))
 
 
 def intervals(t: Array, active: Any) -> list[tuple[float, float]]:

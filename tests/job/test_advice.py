@@ -69,6 +69,10 @@ def test_each_finding_is_told_with_what_to_do(results):
     bands = found.details.bands
     thin = changed(results, bands={**bands, "pgrnn": replace(bands["pgrnn"], coverage=0.6)})
     assert bad(thin) == ["The 90% band of PGRNN holds 60% of unseen measurements."]
+    arx = found.details.baselines["ARX"]
+    assert arx.errors is not None
+    linear = changed(results, baselines={"ARX": replace(arx, errors=replace(arx.errors, error=0.02))})
+    assert bad(linear) == ["On unseen data the linear model ARX has an error of 0.02, PGRNN 0.0231."]
     control = results.control
     assert control.details is not None
     for ratio, said_of in ((Comparison(1.5, 1.2, 1.9, 6), ["costs 1.5 (1.2 to 1.9) times as much as prior_observer."]),
@@ -86,7 +90,9 @@ def test_each_finding_is_told_with_what_to_do(results):
         tasks={**control.details.tasks, "track_sine": gone},
     )))  # fmt: skip
     assert bad(lost) == ["In track_sine hybrid_observer diverges."]
-    assert all(hint.remedy for case in (slow, noisy, warned, poor, thin, lost) for hint in advice(case)[:1])
+    assert all(
+        hint.remedy for case in (slow, noisy, warned, poor, thin, linear, lost) for hint in advice(case)[:1]
+    )
 
 
 def test_an_error_that_is_the_sensor_s_noise_is_told(results):

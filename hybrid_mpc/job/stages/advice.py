@@ -27,9 +27,10 @@ def advice(results: Results) -> list[Hint]:
     Example:
         ``[hint.finding for hint in advice(read_results(read_object(path), str(path))) if hint.verdict == "bad"]``
     """
+    own = results.identification
     found = [
-        *_recordings(results), *_prior(results.identification), *_choice(results.identification),
-        *_floor(results.identification), *_bands(results.identification), *_loops(results), *_watching(results),
+        *_recordings(results), *_prior(own), *_choice(own), *_linear(own), *_floor(own), *_bands(own), *_loops(results),
+        *_watching(results),
     ]  # fmt: skip
     if not any(hint.verdict == "bad" for hint in found):
         found.append(
@@ -80,6 +81,21 @@ def _choice(found: Identification) -> Iterator[Hint]:
             "plain", why,
             "What the prior lacks differs from recording to recording, or is noise: look at the residuals of the free "
             "runs for a term of the prior or a curve of the sensor.",
+        )  # fmt: skip
+
+
+def _linear(found: Identification) -> Iterator[Hint]:
+    """A linear model of inputs and outputs that has less error on unseen data than the recommended one."""
+    chosen = found.details.choice.recommended
+    own = found.error.get(chosen)
+    errors = {name: b.errors.error for name, b in found.details.baselines.items() if b.errors is not None}
+    name = min(errors, key=lambda n: errors[n], default="")
+    if name and isinstance(own, float) and errors[name] < own:
+        yield Hint(
+            "bad", f"On unseen data the linear model {name} has an error of {errors[name]:.3g}, {name_of(chosen)} "
+            f"{own:.3g}.",
+            "The prior lacks something that is linear: a state (a lag, a wall, a filter), a delay, or an input that "
+            "the recordings have. Look at the residuals of its free runs.",
         )  # fmt: skip
 
 
