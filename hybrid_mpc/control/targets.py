@@ -42,6 +42,12 @@ FLAT = 0.01
 """Share of the outputs' slopes at the operating point below which they do not answer to the inputs as they do there: a
 speed whose size alone is measured, at a standstill and beyond; the top of a curve. A descent does not leave such a
 point."""
+RUN = 5000
+"""Periods of the model's own run from the operating point at most."""
+NEARER = 1e-3
+"""Largest lack of a steady state, in the states' scales, at which a run has nearly come to rest."""
+PARTS = (2, 4, 8)
+"""Parts of the way to a set-point to which no start leads at once."""
 LEAST_SHARE = 1e-3
 """Smallest share of a step that is tried."""
 
@@ -99,9 +105,10 @@ class Targets:
     left out.
 
     It is Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. It begins
-    where it is told to, then at the operating point, then beside it; at the operating point, too, where it misses a
-    set-point because outputs do not answer to the inputs where it was told to begin (``FLAT``). No method changes the
-    object's answers; not for several threads at once.
+    where it is told to, then at the operating point, beside it, and where the model's own run from there ends; at the
+    operating point, too, where it misses a set-point because outputs do not answer to the inputs where it was told to
+    begin (``FLAT``). Where all of that leads to no steady state, set-points on the way are met first. No method changes
+    the object's answers; not for several threads at once.
 
     Args:
         model: The model, with its disturbance model.
@@ -187,15 +194,40 @@ class Targets:
                 if found.steady:
                     return found
                 best = best or found
+            if wide and bounded and (approached := self._approached(given, goal, d, w)) is not None:
+                return approached
         assert best is not None
         return best
 
     def _firsts(self, given: Steady | None, most: int | None) -> Iterator[Array]:
-        """Points at which a descent begins: the given one and ``most`` of :attr:`beside`, which is asked if needed."""
+        """Points at which a descent begins: the given one and ``most`` of :attr:`beside`; with None all of these, and
+        :attr:`run_out` last. What is not needed is not computed.
+        """
         if given is not None:
             yield np.concatenate([given.x, given.h, given.u])
         if most != 0:
             yield from self.beside[:most]
+        if most is None:
+            yield from self.run_out
+
+    def _approached(self, given: Steady | None, goal: Array, d: Array, w: Array) -> Steady | None:
+        """The steady state to which descents lead along set-points between the outputs at a point near rest and the
+        goal, a few, then more of them; None where they lead to none.
+        """
+        first = next(self._firsts(given, 0), None)
+        first = [*self.run_out, self.beside[0]][0] if first is None else first
+        begun = self._outputs(first, d, w)[0]
+        for parts in PARTS:
+            v, found = first, None
+            for k in range(1, parts + 1):
+                towards = begun + k / parts * (goal - begun)
+                found = self._descend(v, towards, d, w, True)[0]
+                if not found.steady:
+                    break
+                v = np.concatenate([found.x, found.h, found.u])
+            if found is not None and found.steady:
+                return found
+        return None
 
     @cached_property
     def slopes(self) -> Array:
@@ -219,6 +251,27 @@ class Targets:
         moves = np.diag(ASIDE * ocp.input_scale)
         inputs = [u0, *(np.clip(u0 + move, ocp.u_min, ocp.u_max) for row in moves for move in (row, -row))]
         return [np.concatenate([m.x0, hidden_fixed_point(m, m.x0, u), u]) for u in inputs]
+
+    @cached_property
+    def run_out(self) -> list[Array]:
+        """Where the model's own run from the operating point ends under its input, if it is nearer to rest there; else
+        nothing. The operating point may be far from rest in a state that no sensor shows, and hidden states that a
+        descent moves there leave what a network ever reaches: their gates are shut, and they rest anywhere.
+        """
+        m, f, n_x = self.model, self._step, self.model.n_x
+        v = self.beside[0].copy()
+        f.inputs[2][:], f.inputs[3][:] = v[self._n_z :], m.w
+        for _ in range(RUN):
+            f.inputs[0][:], f.inputs[1][:] = v[:n_x], v[n_x : self._n_z]
+            f()
+            after = np.concatenate(f.outputs[:2])
+            moved, v[: self._n_z] = np.max(np.abs((after - v[: self._n_z]) / self.scale[: self._n_z])), after
+            if not moved > STEADY:
+                break
+        first, last = (
+            self._point(at, np.zeros(m.n_y), np.zeros(m.n_d), m.w).lacks for at in (self.beside[0], v)
+        )
+        return [v] if last < min(first, NEARER) else []
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def _descend(

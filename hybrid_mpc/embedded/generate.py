@@ -114,7 +114,7 @@ def make_sources(
     soft = SoftRows(ocp, model)
     expressions = sum(int(f.numel_out(0)) for f in soft.functions)
     modes = () if estimator is None else _modes(estimator)
-    starts = ocp.block_starts
+    starts, aims = ocp.block_starts, target_starts(problem.targets)
     sizes = {
         "NX": model.n_x, "NH": model.n_h, "NU": model.n_u, "NY": model.n_y, "NW": model.n_w, "ND": model.n_d,
         "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": soft.states.size, "SOFT_E": expressions, "MODES": len(modes),
@@ -123,6 +123,8 @@ def make_sources(
         "NP": ocp.n_p, "HARD": int(np.any(soft.hard)), "OUTPUT_COST": int(ocp.n_y > 0), "TARGET_KNOTS": KNOTS,
         "SOFT_D": int(any(np.any(np.array(f.jac_sparsity(0, 2).get_triplet()[1]) < model.n_d) for f in soft.functions)),
         "TARGET_ITERATIONS": targets.ITERATIONS, "TARGET_SETTLING": targets.SETTLING, "TARGET_WITHIN": targets.WITHIN,
+        "TARGET_PARTS_LEAST": targets.PARTS[0], "TARGET_PARTS_MOST": targets.PARTS[-1], "TARGET_STARTS": len(aims),
+        "TARGET_NEAREST": len(aims) - 1 if problem.targets is not None and problem.targets.run_out else 0,
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
         model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0, watched.code
@@ -382,6 +384,11 @@ def _scalar(what: str, f: ca.Function) -> ca.Function:
         raise InputError(f"no C for this controller: {what} is no scalar code: {last_line(error)}") from error
 
 
+def target_starts(own: targets.Targets | None) -> Array:
+    """Where descents of the target calculator begin, a row each: the operating point first, the run's end last."""
+    return np.zeros((0, 0)) if own is None else np.array([*own.beside, *own.run_out])
+
+
 def _tables(
     model: HybridModel, ocp: OCP, problem: Problem, soft: SoftRows, fallback: HybridModel | None,
     safe_input: Array | None, estimator: Filter | None, watched: str,
@@ -414,7 +421,7 @@ def _tables(
     if problem.targets is not None:
         own = problem.targets
         reals |= {
-            "target_scale": own.scale, "target_root": np.sqrt(ocp.q_y), "target_starts": np.array(own.beside),
+            "target_scale": own.scale, "target_root": np.sqrt(ocp.q_y), "target_starts": target_starts(own),
             "target_x_range": np.array(own.x_range).T, "target_y_range": np.array(own.y_range).T,
             "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
         }  # fmt: skip

@@ -15,8 +15,7 @@ enum {
   NT = HMPC_NT,
   HALVINGS = 10, /* of a step that does not help */
   SWEEPS = 30,   /* of Jacobi's rotations */
-  ROUNDS = 10 * HMPC_TARGET_ROWS,
-  STARTS = 1 + 2 * HMPC_NU
+  ROUNDS = 10 * HMPC_TARGET_ROWS
 };
 
 /* What a descent needs to know of v. */
@@ -396,6 +395,13 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   return hmpc_all_finite(step, NT);
 }
 
+/* The unknowns v of a steady state. */
+static void place(const hmpc_steady *from, real *v) {
+  memcpy(v, from->x, sizeof from->x);
+  if (HMPC_NH > 0) memcpy(v + HMPC_NX, from->h, sizeof(real) * HMPC_NH);
+  memcpy(v + HMPC_NZ, from->u, sizeof from->u);
+}
+
 /* Gauss-Newton from v; bounded: within the bounds of states and outputs. Returns how far outputs are off. */
 static real descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_steady *found) {
   hmpc_search *const work = &s->search;
@@ -437,22 +443,37 @@ static real descend(hmpc_state *s, const real *v, const real *goal, const real *
   return off;
 }
 
+/* Descents along set-points between the outputs at first, a point near rest, and y: a few, then more of them. Returns
+   whether they lead to a steady state. */
+static int approach(hmpc_state *s, const real *first, const real *y, const real *w, hmpc_steady *found) {
+  real begun[HMPC_NY], towards[HMPC_NY], v[NT];
+  look(s, first, y, w, &s->search.at);
+  memcpy(begun, s->search.at.y, sizeof begun);
+  for (int parts = HMPC_TARGET_PARTS_LEAST; parts <= HMPC_TARGET_PARTS_MOST; parts *= 2) {
+    memcpy(v, first, sizeof v);
+    found->steady = 1;
+    for (int k = 1; k <= parts && found->steady; ++k) {
+      for (int i = 0; i < HMPC_NY; ++i) towards[i] = begun[i] + (real)k / (real)parts * (y[i] - begun[i]);
+      descend(s, v, towards, w, 1, found);
+      place(found, v);
+    }
+    if (found->steady) return 1;
+  }
+  return 0;
+}
+
 /* The steady state for outputs y, all finite where they are weighed: from a steady start, then, where wide or there is
-   no such start, at the operating point and beside it; at the operating point, too, where it misses the set-point
-   because outputs do not answer to inputs where it began. Where none keeps the bounds of states and outputs, these are
-   left out. */
+   no such start, at the operating point, beside it, and where the model's own run from there ends; at the operating
+   point, too, where it misses the set-point because outputs do not answer to inputs where it began. Where none leads to
+   one, set-points on the way are met first. Where none keeps the bounds of states and outputs, these are left out. */
 void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
                        hmpc_steady *found) {
   hmpc_steady trial, other;
   real given[NT];
   const int known = start && start->steady;
-  if (known) {
-    memcpy(given, start->x, sizeof start->x);
-    if (HMPC_NH > 0) memcpy(given + HMPC_NX, start->h, sizeof(real) * HMPC_NH);
-    memcpy(given + HMPC_NZ, start->u, sizeof start->u);
-  }
+  if (known) place(start, given);
   for (int bounded = 1; bounded >= 0; --bounded) {
-    const int beside = wide && bounded ? STARTS : (wide || !known);
+    const int beside = wide && bounded ? HMPC_TARGET_STARTS : (wide || !known);
     for (int k = known ? -1 : 0; k < beside; ++k) {
       const real off = descend(s, k < 0 ? given : target_starts[k], y, w, bounded, &trial);
       if (k != 0 && trial.steady && !trial.reached && s->search.answer < target_flat[0]) {
@@ -461,6 +482,10 @@ void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, co
       }
       if (trial.steady || (bounded && k == (known ? -1 : 0))) *found = trial; /* the first answer if none is steady */
       if (trial.steady) return;
+    }
+    if (wide && bounded && approach(s, known ? given : target_starts[HMPC_TARGET_NEAREST], y, w, &trial)) {
+      *found = trial;
+      return;
     }
   }
 }
