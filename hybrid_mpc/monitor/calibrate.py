@@ -121,7 +121,7 @@ def calibrate(
         raise InputError(
             f"calibration: {maxima.size * block_s / 60:.1f} min of nominal data "
             f"in whole blocks of {block_s:g} s; "
-            f"{false_alarms_per_hour:g} false alarms an hour need {needed * block_s / 60:.1f} min. "
+            f"{false_alarms_per_hour:.3g} false alarms an hour need {needed * block_s / 60:.1f} min. "
             "Record more, or ask for a higher rate."
         )
     location, scale = gumbel(maxima)
