@@ -32,7 +32,7 @@ from hybrid_mpc.job.sequential import Comparison, compare_costs, hardest, looks
 from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.summary import by_task
-from hybrid_mpc.job.tasks import ready, tasks_of
+from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
@@ -264,7 +264,7 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
     model = read_description(context.out / "model")
     rest = None if model.calibration is None else model.calibration.rest_speed
     of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
-    scenario = ready(context.scenario, context.prior.fit.values)
+    scenario = context.ready
     tasks = {task.name: task for task in scenario.tasks}
     loop = loop_settings(scenario, model.loop.process_noise)
     oracle = source_of(scenario.oracle) if any(spec.controller in ORACLES for spec in specs) else None

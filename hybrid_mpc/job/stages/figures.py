@@ -27,7 +27,7 @@ from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL, by_controller
 from hybrid_mpc.job.stages.results import finite, step_times
 from hybrid_mpc.job.summary import summaries
-from hybrid_mpc.job.tasks import ready, tasks_of
+from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
@@ -231,7 +231,7 @@ def _on_model(context: Context) -> Any:
     found = context.find(LOOPS_ON_MODEL)
     if isinstance(found, Absent):
         return
-    scenario = ready(context.scenario, context.prior.fit.values)
+    scenario = context.ready
     tasks = {task.name: task for task in scenario.tasks}
     for name, rows in by_controller(found.drawn).items():
         for row in rows:

@@ -15,7 +15,7 @@ from hybrid_mpc.job.loops import DRAWN, MODEL, LoopRow, LoopSpec, arrays_of, sta
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, task_content
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
-from hybrid_mpc.job.tasks import ready, tasks_of
+from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import loop_settings
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
         return Absent("the scenario has a plant: its loops are those of the section before")
     context.read(NOISE)
     try:
-        tasks = tasks_of(ready(context.scenario, context.prior.fit.values), context.budget.tasks)
+        tasks = tasks_of(context.ready, context.budget.tasks)
     except InputError as none:
         return Absent(str(none))
     settings = context.settings
@@ -101,7 +101,7 @@ def what_on_model_reads(context: Context) -> dict[str, object]:
     if scenario.plant is not None or scenario.control is None:
         return read
     try:
-        whole = ready(scenario, context.prior.fit.values)
+        whole = context.ready
     except InputError as none:  # the stage says so
         return {**read, "tasks": str(none)}
     loop = loop_settings(whole)
