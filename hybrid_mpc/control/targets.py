@@ -72,6 +72,11 @@ class Steady:
     reached: bool
     steady: bool
 
+    @property
+    def unknowns(self) -> Array:
+        """``(x, h, u)`` in one vector."""
+        return np.concatenate([self.x, self.h, self.u])
+
 
 class _Point(NamedTuple):
     """A point ``v = (x, h, u)``.
@@ -182,6 +187,8 @@ class Targets:
         d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
         w = m.w if w is None else vector(w, m.n_w, "w")
         given = start if start is not None and start.steady else None
+        if given is None:
+            _ = self.run_out  # thousands of periods: at the first plan, not in some later period
         best: Steady | None = None
         for bounded in (True, False):
             beside = None if wide and bounded else int(wide or given is None)
@@ -204,7 +211,7 @@ class Targets:
         :attr:`run_out` last. What is not needed is not computed.
         """
         if given is not None:
-            yield np.concatenate([given.x, given.h, given.u])
+            yield given.unknowns
         if most != 0:
             yield from self.beside[:most]
         if most is None:
@@ -214,18 +221,16 @@ class Targets:
         """The steady state to which descents lead along set-points between the outputs at a point near rest and the
         goal, a few, then more of them; None where they lead to none.
         """
-        first = next(self._firsts(given, 0), None)
-        first = [*self.run_out, self.beside[0]][0] if first is None else first
+        first = (self.run_out or self.beside)[0] if given is None else given.unknowns
         begun = self._outputs(first, d, w)[0]
         for parts in PARTS:
-            v, found = first, None
+            v = first
             for k in range(1, parts + 1):
-                towards = begun + k / parts * (goal - begun)
-                found = self._descend(v, towards, d, w, True)[0]
+                found = self._descend(v, begun + k / parts * (goal - begun), d, w, True)[0]
                 if not found.steady:
                     break
-                v = np.concatenate([found.x, found.h, found.u])
-            if found is not None and found.steady:
+                v = found.unknowns
+            else:
                 return found
         return None
 
@@ -253,25 +258,30 @@ class Targets:
         return [np.concatenate([m.x0, hidden_fixed_point(m, m.x0, u), u]) for u in inputs]
 
     @cached_property
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is no rest
     def run_out(self) -> list[Array]:
-        """Where the model's own run from the operating point ends under its input, if it is nearer to rest there; else
-        nothing. The operating point may be far from rest in a state that no sensor shows, and hidden states that a
-        descent moves there leave what a network ever reaches: their gates are shut, and they rest anywhere.
+        """Where the model's own run from the operating point comes nearly to rest under its input; nothing where it
+        does not, or nearly rests there from the first.
+
+        The operating point may be far from rest in a state that no sensor shows. Hidden states that a descent moves
+        there leave what a network ever reaches: their gates are shut, and they rest anywhere.
         """
-        m, f, n_x = self.model, self._step, self.model.n_x
+        m, f, n_x, n_z = self.model, self._step, self.model.n_x, self._n_z
         v = self.beside[0].copy()
-        f.inputs[2][:], f.inputs[3][:] = v[self._n_z :], m.w
+
+        def lacks() -> float:
+            return self._point(v, np.zeros(m.n_y), np.zeros(m.n_d), m.w).lacks
+
+        if lacks() < NEARER:
+            return []
         for _ in range(RUN):
-            f.inputs[0][:], f.inputs[1][:] = v[:n_x], v[n_x : self._n_z]
+            f.inputs[0][:], f.inputs[1][:], f.inputs[2][:], f.inputs[3][:] = v[:n_x], v[n_x:n_z], v[n_z:], m.w
             f()
             after = np.concatenate(f.outputs[:2])
-            moved, v[: self._n_z] = np.max(np.abs((after - v[: self._n_z]) / self.scale[: self._n_z])), after
+            moved, v[:n_z] = np.max(np.abs((after - v[:n_z]) / self.scale[:n_z])), after
             if not moved > STEADY:
                 break
-        first, last = (
-            self._point(at, np.zeros(m.n_y), np.zeros(m.n_d), m.w).lacks for at in (self.beside[0], v)
-        )
-        return [v] if last < min(first, NEARER) else []
+        return [v] if lacks() < NEARER else []
 
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def _descend(

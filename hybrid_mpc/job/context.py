@@ -19,7 +19,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.job.settings import RunSettings
 from hybrid_mpc.job.stage import Absent, Stage, Stored, read_stage, write_stage
-from hybrid_mpc.job.tasks import lacks_tasks, ready
+from hybrid_mpc.job.tasks import ready
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.machine.specification import DataSpec, Role
 from hybrid_mpc.scenario import Budget, Scenario
@@ -141,7 +141,7 @@ class Context:
     @property
     def ready(self) -> Scenario:
         """The scenario; where it gets default tasks, with those from where the fitted prior rests."""
-        return ready(self.scenario, self.prior.fit.values) if lacks_tasks(self.scenario) else self.scenario
+        return ready(self.scenario, self.kit.fitted)
 
     def _with_states(self, trajectories: list[Trajectory]) -> list[Trajectory]:
         arrays = self.prior.arrays

@@ -18,8 +18,9 @@ from hybrid_mpc.files import write_text
 
 Array = NDArray[np.float64]
 MARK = "TODO"
-ACTING = "what only acts: new ... --disturbance-column NAME"
 """What stands before everything that is left to decide."""
+ACTING = "what only acts: new ... --disturbance-column NAME"
+"""What to do about a column that is no output although it is measured."""
 HELD = 0.5
 """Share of samples equal to the one before from which on a column looks commanded."""
 EVEN = 0.2

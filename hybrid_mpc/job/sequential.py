@@ -98,8 +98,8 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
     ``1 - 0.05 k / (1 + ... + K)``. So the probability that an interval of any look misses the ratio is at most 5 %
     (the union bound), and loops may stop at the look that decides; the rules of stopping do not matter. It assumes that
     the logarithms are normal and the seeds independent. It is the level of one comparison: of twenty tasks that are
-    alike one may be told apart. Later looks get the larger part, so the last interval is little
-    wider than that of a fixed number of seeds.
+    alike one may be told apart. Later looks get the larger part, so the last interval is little wider than that of a
+    fixed number of seeds.
 
     Args:
         costs: ``(n,)``, one a seed.

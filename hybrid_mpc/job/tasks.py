@@ -24,12 +24,9 @@ def ready(scenario: Scenario, values: Mapping[str, float] | None = None) -> Scen
     Raises:
         InputError: If default tasks cannot be made.
     """
-    return replace(scenario, tasks=default_tasks(scenario, values)) if lacks_tasks(scenario) else scenario
-
-
-def lacks_tasks(scenario: Scenario) -> bool:
-    """Whether a scenario has a control problem and neither plant nor tasks, so that it gets default ones."""
-    return scenario.plant is None and scenario.control is not None and not scenario.tasks
+    if scenario.plant is not None or scenario.control is None or scenario.tasks:
+        return scenario
+    return replace(scenario, tasks=default_tasks(scenario, values))
 
 
 def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:

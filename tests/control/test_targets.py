@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from control_parts import plan_of
+from gated import gated
 from machines import AMBIENT, HEAT, PUMP, dc_motor, rest_levels, thermal, two_tanks
 
 from hybrid_mpc import (
@@ -372,29 +373,6 @@ def test_a_network_s_memory_is_brought_to_rest_on_the_way(seed):
         moved = model.step(steady.x, steady.h, steady.u, model.w, model.p)
         np.testing.assert_allclose(moved[0].full().ravel(), steady.x, atol=1e-8)
         np.testing.assert_allclose(moved[1].full().ravel(), steady.h, atol=1e-6)
-
-
-def gated(seed, units=16):
-    """A tank heated through a wall, corrected by a GRU; the operating point has the right level and a wall far too hot.
-
-    Where Newton's method moves the memory far beyond one its gates shut, and it rests wherever it is.
-    """
-    rng = np.random.default_rng(seed)
-    x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", units), ca.MX.sym("u", 1)
-
-    def layer():
-        own, given = (rng.normal(size=(units, n)) * 2.0 for n in (units, 3))
-        return own / np.sqrt(units) @ h + given @ ca.vertcat(x, u) + rng.normal(size=units)
-
-    keeps = 1 / (1 + ca.exp(-layer() - 3.0))
-    h_next = keeps * h + (1 - keeps) * ca.tanh(layer())
-    flows = 0.1 * ca.vertcat(x[1] - 2 * x[0], u - (x[1] - x[0]))
-    rate = flows + 0.05 * (0.1 * rng.normal(size=(2, units)) / np.sqrt(units) @ h_next)
-    tank, wall = Signal("tank", "K", -5, 5), Signal("wall", "K", -5, 10)
-    return HybridModel.of(
-        "gated", 1.0, (tank, wall), (Signal("power", "W"),), (tank,), x=x, h=h, u=u, x_next=x + rate, h_next=h_next,
-        xdot=rate, y=x[0], nominal_x=(0.5, 4.0), nominal_u=(0.5,),
-    )  # fmt: skip
 
 
 def found_one_by_one(targets, goals):

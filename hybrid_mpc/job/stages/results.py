@@ -569,11 +569,10 @@ def _costs(
     loops = [row for row in rows if row.controller == controller]
     if not own:
         return ControllerCosts(None, None, reason="the scenario has no oracle")
-    signals = dict.fromkeys(signal for row in loops for signal in row.tracking_rmse)
-    squares = {signal: dict[str, list[float]]() for signal in signals}  # by task: these may have other seeds
+    squares: dict[str, dict[str, list[float]]] = {}  # by task: each may have another number of seeds
     for row in loops:
         for signal, rmse in row.tracking_rmse.items():
-            squares[signal].setdefault(row.task, []).append(rmse**2)
+            squares.setdefault(signal, {}).setdefault(row.task, []).append(rmse**2)
     tracking = {
         signal: math.sqrt(np.mean([np.mean(own) for own in by.values()])) for signal, by in squares.items()
     }
