@@ -267,11 +267,14 @@ __all__ = sorted((*_HOME, "plots", "__version__"))
 
 
 def __getattr__(name: str) -> Any:
-    if name == "plots":
-        return importlib.import_module("hybrid_mpc.plots")
-    if name not in _HOME:
+    if name != "plots" and name not in _HOME:
         raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"hybrid_mpc.{_HOME[name]}"), name)
+    from hybrid_mpc.errors import named_extra
+
+    with named_extra(f"hybrid_mpc.{name}"):
+        if name == "plots":
+            return importlib.import_module("hybrid_mpc.plots")
+        return getattr(importlib.import_module(f"hybrid_mpc.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:

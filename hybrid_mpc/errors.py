@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class InputError(ValueError):
@@ -23,6 +29,86 @@ class InputError(ValueError):
     def problems(self) -> tuple[str, ...]:
         """What is wrong, one by one."""
         return self._problems or (str(self),)
+
+
+class MissingPackage(InputError, ImportError):
+    """A package of an extra is not installed; the message says which extra to install."""
+
+
+EXTRAS = {
+    **dict.fromkeys(("torch", "optuna", "filelock"), "train"),
+    **dict.fromkeys(("typer", "rich"), "cli"),
+    **dict.fromkeys(("matplotlib", "PIL", "bokeh", "jinja2", "markupsafe", "pandas"), "report"),
+    "control": "analysis",
+    **dict.fromkeys(("dask", "distributed", "pyarrow", "yaml"), "studies"),
+    "pysindy": "sindy",
+    "mujoco": "mujoco",
+}
+"""Extra of the installation by the module that it brings."""
+
+
+@contextmanager
+def named_extra(what: str = "") -> Iterator[None]:
+    """Within it, an import of a package that is not installed is an error that names the extra.
+
+    Also a decorator of functions that import such packages, or modules that do.
+
+    Args:
+        what: What needs the package, for the message. Default: nothing is said.
+
+    Raises:
+        MissingPackage: If a package of :data:`EXTRAS` is not installed.
+
+    Example:
+        >>> with named_extra("a table"):
+        ...     raise ModuleNotFoundError("No module named 'pandas'", name="pandas")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.MissingPackage: a table needs pandas, ... pip install 'hybrid-mpc[report]'
+    """
+    try:
+        yield
+    except ModuleNotFoundError as missing:
+        package = (missing.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        raise MissingPackage(
+            f"{what or 'this'} needs {package}, which is not installed: pip install 'hybrid-mpc[{EXTRAS[package]}]'"
+        ) from missing
+
+
+@contextmanager
+def no_exit(what: str = "") -> Iterator[None]:
+    """Within it, code that ends Python (``sys.exit``, ``SystemExit``) is an error with the code's file and line.
+
+    A scenario's file or one of its functions would end a job without a word, with exit code 0. Also a decorator of
+    functions that call such code.
+
+    Args:
+        what: What runs there, for the message. Default: nothing is said.
+
+    Raises:
+        InputError: If the code within raises ``SystemExit``.
+
+    Example:
+        >>> with no_exit("my_machine.py"):
+        ...     raise SystemExit(0)
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: my_machine.py: SystemExit(0) ...
+    """
+    try:
+        yield
+    except SystemExit as stop:
+        # without this block itself, and what Python is started with, where exit() stands
+        passed = [frame for frame in traceback.extract_tb(stop.__traceback__) if frame.filename != __file__]
+        frames = [frame for frame in passed if not frame.filename.startswith("<frozen")]
+        place = f"{frames[-1].filename}:{frames[-1].lineno}: " if frames else ""
+        of = f"{what}: " if what and not place.startswith(what) else ""
+        raise InputError(
+            f"{of}{place}SystemExit({stop.code!r}) would end Python; take sys.exit or exit out, or put what a script "
+            'does under if __name__ == "__main__":'
+        ) from stop
 
 
 SHOWN = 20
@@ -53,6 +139,42 @@ def refuse(problems: Sequence[str]) -> None:
     error = InputError("\n  ".join([f"{len(distinct)} problems:", *distinct[:SHOWN], *more]))
     error._problems = distinct
     raise error
+
+
+class Collected:
+    """Problems of several checks, told together: each is made though another has failed.
+
+    Example:
+        >>> def positive(value: float, name: str) -> float:
+        ...     refuse([] if value > 0 else [f"{name}: {value} is not positive"])
+        ...     return value
+        >>> own = Collected()
+        >>> found = own(positive, 1.0, "a"), own(positive, -1.0, "b")
+        >>> found
+        (1.0, None)
+        >>> own.refuse()
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: b: -1.0 is not positive
+    """
+
+    def __init__(self) -> None:
+        self._problems: list[str] = []
+
+    def __call__(self, check: Callable[P, T], *args: P.args, **options: P.kwargs) -> T | None:
+        """What a check returns; None where it raises InputError."""
+        try:
+            return check(*args, **options)
+        except InputError as error:
+            self._problems += error.problems
+            return None
+
+    def add(self, problem: str) -> None:
+        """One more problem, a message of its own."""
+        self._problems.append(problem)
+
+    def refuse(self) -> None:
+        """Raise InputError with all problems, if there are any."""
+        refuse(self._problems)
 
 
 class StorageError(InputError):

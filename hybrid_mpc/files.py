@@ -12,6 +12,7 @@ import io
 import json
 import math
 import os
+import shutil
 import tempfile
 import zipfile
 import zlib
@@ -24,7 +25,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 import nn_export.files
-from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc.errors import InputError, StorageError, named_extra
 from hybrid_mpc.records import plain, shown
 
 MOST_JSON = 16 * 2**20
@@ -39,7 +40,7 @@ HEADER = 10_100
 """First bytes of an array, which hold its header: numpy reads none of more than 10 000 characters [byte]."""
 HASH, ARRAYS_HASH = "sha256", "arrays_sha256"
 """Fields of a document that hold hashes: of its content, of the arrays beside it."""
-LOCK = ".lock"
+LOCK, PART = ".lock", ".part"
 
 
 @contextlib.contextmanager
@@ -54,6 +55,59 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
             yield file
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+@contextlib.contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """A new folder to write in, whose content becomes that of ``folder`` when the block ends well.
+
+    A full disk or an exception within the block leave ``folder`` as it was. One that is not there appears as a whole,
+    whatever is killed when; into one that is there the finished files are moved. Files of other names stay in it.
+
+    Raises:
+        StorageError: If something cannot be written; with how to go on.
+    """
+    there = folder.is_dir()
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        place = folder if there else folder.parent
+        work = Path(tempfile.mkdtemp(prefix=f".{folder.name[:50]}.", suffix=PART, dir=place))
+        try:
+            new = work / "new"
+            new.mkdir()
+            yield new
+            if there:
+                _move_into(folder, new, work / "before")
+            else:
+                new.rename(folder)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except (StorageError, OSError) as error:
+        cause = error.__cause__ if isinstance(error, StorageError) and error.__cause__ else error
+        kept = "it is as it was before" if there else "nothing half-written is left"
+        raise StorageError(
+            f"cannot write {folder}: {reason(cause)}; {kept}. Make room there, or choose another folder, "
+            "and give the same command again"
+        ) from error
+
+
+def _move_into(folder: Path, new: Path, before: Path) -> None:
+    """Move finished files into a folder; all of them, or none. Those of the same names go to ``before``."""
+    before.mkdir()
+    moved: list[Path] = []
+    try:
+        for path in sorted(new.iterdir()):
+            target = folder / path.name
+            if target.exists():
+                target.rename(before / path.name)
+            path.rename(target)
+            moved.append(target)
+    except BaseException:
+        for target in moved:
+            target.rename(new / target.name)
+        for path in before.iterdir():
+            path.rename(folder / path.name)
+        raise
 
 
 def write_text(path: Path, text: str) -> None:
@@ -208,7 +262,7 @@ def read_bytes(path: Path, limit: int) -> bytes:
         raise InputError(f"cannot read {path}: {reason(error)}") from error
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """Why the file system refused something, in words."""
     if isinstance(error, FileExistsError) and error.filename:
         return f"{error.filename} is a file where a folder is needed"
@@ -247,7 +301,7 @@ def is_empty(folder: Path) -> bool:
 
 
 def _leftover(path: Path) -> bool:
-    return path.name == LOCK or (path.name.startswith(".") and path.name.endswith(".part"))
+    return path.name == LOCK or (path.name.startswith(".") and path.name.endswith(PART))
 
 
 def check_folder(folder: Path) -> None:
@@ -279,7 +333,8 @@ def locked(folder: Path) -> Iterator[None]:
 
     The system lets go of it when the process ends, however it ends. InputError if another job holds it.
     """
-    from filelock import FileLock, Timeout
+    with named_extra("a job's folder"):
+        from filelock import FileLock, Timeout
 
     lock = FileLock(folder / LOCK, timeout=0)
     try:

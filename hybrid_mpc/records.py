@@ -8,15 +8,18 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import sys
 import types
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.rules import printable
 
 T = TypeVar("T")
 NUMBERS = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
@@ -27,6 +30,8 @@ MOST_SEED = 2**31 - 1
 """Largest seed: a thousand times it, as loops number theirs, still fits 64 bits."""
 LONGEST = 40
 """Characters of a text that a message shows."""
+LONGEST_WHAT = 100
+"""Characters of what a message calls a record."""
 MOST_NAMED = 20
 """Most problems of one file that are named; a damaged one may have thousands."""
 
@@ -78,7 +83,8 @@ def record(kind: type[T], data: object, where: str) -> T:
     """The dataclass ``kind`` from plain data, as :func:`plain` makes it or a user writes it.
 
     Every field is checked against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, arrays,
-    mappings with text keys, CasADi functions, unions and dataclasses of these, ``Any``. A whole number fits a float.
+    mappings with text keys, CasADi functions, unions and dataclasses of these, callables, ``Any``, and what
+    ``Annotated`` adds: a rule of :mod:`hybrid_mpc.rules`. A whole number fits a float, a flag fits no number.
     Fields with a default may be left out; ``where`` stands in messages.
 
     Raises:
@@ -144,7 +150,7 @@ def _dataclass(kind: type[Any], data: object, where: str, problems: list[str]) -
         problems.append(f"{head}an object (fields and values) is needed, got {_short(data)}")
         return None
     taken = {f.name: f for f in dataclasses.fields(kind) if f.init}
-    hints = get_type_hints(kind)
+    hints = _hints(kind)  # type: ignore[arg-type]
     before = len(problems)
     problems += [head + _unknown(key, list(taken), "field") for key in data if key not in taken]
     problems += [
@@ -161,9 +167,75 @@ def _dataclass(kind: type[Any], data: object, where: str, problems: list[str]) -
         return None
     try:
         return kind(**values)
-    except (InputError, OverflowError) as error:  # what the dataclass itself checks
+    except InputError as error:  # what the dataclass itself checks
+        problems += [f"{head}{problem}" for problem in error.problems]
+    except OverflowError as error:
         problems.append(f"{head}{error}")
-        return None
+    return None
+
+
+class Fields:
+    """The fields of a dataclass while it is made: each against its annotation, and then what the class itself asks for.
+
+    In ``__post_init__``: every field takes its annotation's form (a list becomes a tuple, a whole number a float), and
+    all problems of the record are told together.
+
+    Args:
+        made: The record.
+        what: What it is, for messages, e.g. ``"signal 'phi'"``.
+
+    Example: of a class with ``start: Bound`` and ``end: Bound``::
+
+        def __post_init__(self):
+            own = Fields(self, "window")
+            own.need("start end", lambda: self.start < self.end, "its end must come after its start")
+            own.refuse()
+    """
+
+    def __init__(self, made: Any, what: str) -> None:
+        self._what = printable(what).replace("\n", " ")[:LONGEST_WHAT]
+        self._problems, self._wrong = list[str](), set[str]()
+        hints = _hints(type(made))  # type: ignore[arg-type]
+        for name in (f.name for f in dataclasses.fields(made)):
+            own: list[str] = []
+            value = _value(hints[name], getattr(made, name), name, own)
+            if own:
+                self._wrong.add(name)
+                self._problems += own
+            else:
+                object.__setattr__(made, name, value)
+
+    def need(self, names: str, holds: Callable[[], object], otherwise: str) -> None:
+        """One more condition on some fields, asked only where each of them fits by itself."""
+        if self._wrong.isdisjoint(names.split()) and not holds():
+            self._problems.append(otherwise)
+
+    def distinct(self, names: str, values: Callable[[], Iterable[object]], what: str) -> None:
+        """Nothing stands twice among some values."""
+        given = list(values()) if self._wrong.isdisjoint(names.split()) else []
+        if twice := [value for i, value in enumerate(given) if value in given[:i]]:
+            self._problems.append(f"{what} {_short(twice[0])} stands twice")
+
+    def add(self, problems: Iterable[str]) -> None:
+        """Problems that were found elsewhere."""
+        self._problems += problems
+
+    def refuse(self) -> None:
+        """Raise InputError with all problems, if there are any."""
+        refuse([f"{self._what}: {problem}" for problem in self._problems])
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    """Annotations of a dataclass. Names that it imports for type checkers alone mean anything."""
+    unknown: dict[str, Any] = {}
+    while True:
+        try:
+            return get_type_hints(kind, localns=unknown or None, include_extras=True)
+        except NameError as error:
+            if error.name is None or error.name in unknown:
+                raise
+            unknown[error.name] = Any
 
 
 def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
@@ -171,10 +243,12 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
     origin, arms = get_origin(kind), get_args(kind)
     if kind is Any or kind is object:
         return value
+    if origin is Annotated:
+        return _ruled(arms[0], arms[1:], value, where, problems)
     if origin in (Union, types.UnionType):
         return _union(arms, value, where, problems)
     if origin is Literal:
-        if any(value == arm and type(value) is type(arm) for arm in arms):
+        if any(type(value) is type(arm) and value == arm for arm in arms):
             return value
         needed = f"one of {', '.join(repr(arm) for arm in arms)}"
     elif kind in _SIMPLE:
@@ -189,12 +263,19 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
         return _built(value, where, problems)
     elif dataclasses.is_dataclass(kind):
         return _dataclass(kind, value, where, problems)  # type: ignore[arg-type]
+    elif origin is Callable:
+        if callable(value):
+            return value
+        needed = "something that can be called"
     elif origin in (tuple, list, Sequence) or kind in (tuple, list, Sequence):
         return _sequence(kind, value, where, problems)
     elif origin in (dict, Mapping) or kind in (dict, Mapping):
         if isinstance(value, Mapping):
-            inner = arms[1] if arms else Any
-            return {str(k): _value(inner, v, f"{where}.{k}"[:200], problems) for k, v in value.items()}
+            key, inner = arms or (str, Any)
+            return {
+                _key(key, k, where, problems): _value(inner, v, f"{where}.{k}"[:200], problems)
+                for k, v in value.items()
+            }
         needed = "an object (names and values) is"
     else:
         raise TypeError(f"{where}: records know no {kind}")
@@ -204,21 +285,39 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
     return None
 
 
+def _ruled(kind: Any, rules: Sequence[Any], value: object, where: str, problems: list[str]) -> Any:
+    """``value`` as ``kind``, which keeps some rules, too: each says what is wrong, or nothing."""
+    before = len(problems)
+    found = _value(kind, value, where, problems)
+    if len(problems) == before:
+        problems += [f"{where}: {wrong}" for rule in rules if (wrong := rule(found))]
+    return found
+
+
+def _key(kind: Any, key: object, where: str, problems: list[str]) -> Any:
+    """A name in a mapping; a number, as YAML reads one, becomes its text."""
+    text = str(key) if isinstance(key, int | float) and not isinstance(key, bool) else key
+    return _value(kind, text, f"{where}: a name in it", problems)
+
+
 def _union(arms: tuple[Any, ...], value: object, where: str, problems: list[str]) -> Any:
     tried: list[list[str]] = []
-    for arm in sorted(arms, key=lambda arm: arm is float):  # a whole number stays one where both fit
+    # a whole number stays one where both fit
+    for arm in sorted(arms, key=lambda arm: arm is float or get_args(arm)[:1] == (float,)):
         own: list[str] = []
         found = _value(arm, value, where, own)
         if not own:
             return found
         tried.append(own)
-    likely = max(tried, key=lambda own: own[0].count("."))  # the arm that went deepest says most
-    problems += (
-        likely
-        if len(arms) > 1 and likely[0].count(".") > where.count(".")
-        else [_either(tried, where, value)]
-    )
+
+    deeper = [own for own in tried if not own[0].startswith(f"{where}: ") or " is missing" in own[0]]
+    problems += sorted(deeper, key=_depth)[-1] if deeper else [_either(tried, where, value)]
     return None
+
+
+def _depth(own: Sequence[str]) -> int:
+    """How deep in a value its first problem lies: the arm of a union that went deepest says most."""
+    return len(re.findall(r"[.\[]", own[0].split(": ")[0]))
 
 
 def _either(tried: Sequence[Sequence[str]], where: str, value: object) -> str:
@@ -228,6 +327,8 @@ def _either(tried: Sequence[Sequence[str]], where: str, value: object) -> str:
 
 def _sequence(kind: Any, value: object, where: str, problems: list[str]) -> Any:
     arms, make = get_args(kind), tuple if (get_origin(kind) or kind) is not list else list
+    if isinstance(value, np.ndarray) and value.ndim:
+        value = value.tolist()
     if not isinstance(value, list | tuple):
         problems.append(f"{where}: a list is needed, got {_short(value)}")
         return None

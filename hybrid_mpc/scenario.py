@@ -15,19 +15,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, no_exit
+from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.signals import Parameter, Signal
-from hybrid_mpc.machine.specification import BenchmarkSpec, DataSpec, check_prior_replay
+from hybrid_mpc.machine.specification import BenchmarkSpec, Count, CountOrNone, DataSpec
+from hybrid_mpc.model.disturbance import Disturbance
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import Line, Name, NotNegative, Number, Seconds, Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from hybrid_mpc.control.ocp import OCP
-    from hybrid_mpc.loop.faults import Fault
     from hybrid_mpc.loop.plant import Plant
     from hybrid_mpc.loop.simulate import ClosedLoopResult
     from hybrid_mpc.machine.prior import Prior
-    from hybrid_mpc.model.disturbance import Disturbance
     from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -46,12 +48,21 @@ SWITCHED = (
 """How an input of whole numbers may be declared, which no signal can be."""
 
 
+def _is_problem(control: object) -> bool:
+    """Whether it is a control problem, or none; casadi is loaded only for one that is."""
+    if control is None:
+        return True
+    from hybrid_mpc.control.ocp import OCP
+
+    return isinstance(control, OCP)
+
+
 @dataclass(frozen=True)
 class Task:
     """A closed-loop task.
 
     Args:
-        name: Short name, e.g. ``"track_sine"``.
+        name: Short name, e.g. ``"track_sine"``, made as a signal's; files are called after it.
         title: One line for plots and the report.
         duration: Length [s].
         x0: Initial state ``(n_x,)`` [SI], at rest.
@@ -66,6 +77,9 @@ class Task:
         w: ``t (n,) [s] -> (n, n_w)``, measured disturbances of the machine in this task: they act on the plant and are
             measured, and known ahead where the control problem previews them. Default: those of the operating point.
 
+    Raises:
+        InputError: If a field is of another kind; all of it together.
+
     Example:
         >>> def meet(t):  # at t = 1 s only, and from then on ordinarily
         ...     return np.where(np.abs(t - 1.0) < 0.01, 1e3, 1.0 * (t > 1.0))[:, None] * np.ones(2)
@@ -74,16 +88,25 @@ class Task:
         [0.0, 1000.0, 1.0]
     """
 
-    name: str
-    title: str
-    duration: float
-    x0: tuple[float, ...]
+    name: Name
+    title: Line
+    duration: Seconds
+    x0: tuple[Number, ...]
     reference: Callable[[Array], Array]
     weight: Callable[[Array], Array] | None = None
     control: OCP | None = None
     faults: tuple[Fault, ...] = ()
     figures: Callable[[ClosedLoopResult], dict[str, float]] | None = None
     w: Callable[[Array], Array] | None = None
+
+    def __post_init__(self) -> None:
+        own = Fields(self, f"task {self.name!r}")
+        own.need(
+            "control",
+            lambda: _is_problem(self.control),
+            f"control: OCP(...) is needed, got {self.control!r:.60}",
+        )
+        own.refuse()
 
 
 @dataclass(frozen=True)
@@ -105,18 +128,18 @@ class Budget:
             whose tasks go where its recordings do not. Default: zero, none.
     """
 
-    hidden: int
-    networks: int
-    teacher_steps: int
-    free_run_steps: int
-    seeds: int
-    decay: float = 300.0
-    oracle_seeds: int = 1
-    tasks: tuple[str, ...] | None = None
-    prior_replay: float = 0.0
+    hidden: Count
+    networks: Count
+    teacher_steps: CountOrNone
+    free_run_steps: CountOrNone
+    seeds: Count
+    decay: NotNegative = 300.0
+    oracle_seeds: CountOrNone = 1
+    tasks: tuple[Name, ...] | None = None
+    prior_replay: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        check_prior_replay(self.prior_replay)
+        Fields(self, "budget").refuse()
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {
@@ -167,33 +190,46 @@ class Scenario:
             as there are outputs leave no offset (:func:`~hybrid_mpc.estimate.offset_free.offset_free`). Default: one at
             each input.
 
+    Raises:
+        InputError: If a field is of another kind, or two tasks have one name; all of it together.
+
     Example:
         >>> spec = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
         >>> Scenario("mine", "My machine", "", prior=lambda values=None: None, data=spec).tasks
         ()
     """
 
-    name: str
-    title: str
-    description: str
+    name: Name
+    title: Line
+    description: Text
     prior: Callable[..., Prior]
     data: DataSpec
     make_data: Callable[[Path, int, str], list[Path]] | None = None
     plant: Callable[[], Plant] | None = None
     oracle: Callable[[float], HybridModel] | None = None
     control: OCP | None = None
-    sensor_sigma: tuple[float, ...] = ()
-    first_sigma: tuple[float, ...] | None = None
-    state_noise: Mapping[str, float] = field(default_factory=dict)
-    safe_input: tuple[float, ...] | None = None
+    sensor_sigma: tuple[NotNegative, ...] = ()
+    first_sigma: tuple[NotNegative, ...] | None = None
+    state_noise: Mapping[Name, NotNegative] = field(default_factory=dict)
+    safe_input: tuple[Number, ...] | None = None
     tasks: tuple[Task, ...] = ()
-    budgets: Mapping[str, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
+    budgets: Mapping[Name, Budget] = field(default_factory=lambda: DEFAULT_BUDGETS)
     draw: Callable[[Array], Sequence[Array]] | None = None
     figures: Callable[[Sequence[Any]], Mapping[str, tuple[Figure, str]]] | None = None
-    causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    causes: Mapping[Name, tuple[str, ...]] = field(default_factory=dict)
     benchmark: BenchmarkSpec | None = None
     beyond_recordings: bool = False
     disturbance_model: tuple[Disturbance, ...] | None = None
+
+    def __post_init__(self) -> None:
+        own = Fields(self, f"scenario {self.name!r}")
+        own.need(
+            "control",
+            lambda: _is_problem(self.control),
+            f"control: OCP(...) is needed, got {self.control!r:.60}",
+        )
+        own.distinct("tasks", lambda: [task.name for task in self.tasks], "tasks: the name")
+        own.refuse()
 
 
 def registered_scenarios() -> dict[str, str]:
@@ -247,7 +283,8 @@ def load_scenario(name_or_path: str) -> Scenario:
     """
     for entry in entry_points(group="hybrid_mpc.scenarios"):
         if entry.name == name_or_path:
-            return _checked(entry.load(), name_or_path)
+            with no_exit(name_or_path):
+                return _checked(entry.load(), name_or_path)
     path = Path(name_or_path)
     if path.suffix != ".py":
         names = ", ".join(registered_scenarios()) or "none is registered"
@@ -264,11 +301,12 @@ def load_scenario(name_or_path: str) -> Scenario:
     folder = str(path.resolve().parent)
     if folder not in sys.path:
         sys.path.append(folder)  # files beside it may be imported; installed modules come first
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        line = _line_in(error, path)
-        raise InputError(f"{path}{line}: {type(error).__name__}: {error}{_hint(error)}") from error
+    with no_exit(str(path)):
+        try:
+            spec.loader.exec_module(module)
+        except Exception as error:
+            line = _line_in(error, path)
+            raise InputError(f"{path}{line}: {type(error).__name__}: {error}{_hint(error)}") from error
     if not hasattr(module, "scenario"):
         raise InputError(f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)")
     return _checked(module.scenario, str(path))
@@ -278,8 +316,6 @@ def _checked(scenario: object, where: str) -> Scenario:
     if not isinstance(scenario, Scenario):
         kind = type(scenario).__name__
         raise InputError(f"{where}: 'scenario' is a {kind}, it must be a hybrid_mpc Scenario")
-    if not callable(scenario.prior):
-        raise InputError(f"{where}: scenario {scenario.name!r} has no prior; give prior=YourPriorClass")
     return scenario
 
 

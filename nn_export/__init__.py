@@ -68,4 +68,12 @@ _HOME = {name: module for module, names in _MODULES.items() for name in names}
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'nn_export' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"nn_export.{_HOME[name]}"), name)
+    try:
+        return getattr(importlib.import_module(f"nn_export.{_HOME[name]}"), name)
+    except ModuleNotFoundError as missing:
+        if (missing.name or "").partition(".")[0] != "torch":
+            raise
+        raise ModuleNotFoundError(
+            f"nn_export.{name} needs torch, which is not installed: pip install 'hybrid-mpc[train]'",
+            name="torch",
+        ) from missing

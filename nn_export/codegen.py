@@ -23,7 +23,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
+from nn_export.c_names import refused_name
 from nn_export.errors import CompileError, last_line
+from nn_export.files import replacing
 
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 _LINK = {"win32": ["-shared"], "darwin": ["-dynamiclib", "-fPIC"]}.get(
@@ -65,8 +67,9 @@ def compile_function(
         there is no compiler.
 
     Raises:
-        CompileError: If CasADi cannot write the function as C, the compiler fails or takes too long, or the
-            compiler named does not exist; if the folder named is another user's, a link, or others may write there.
+        CompileError: If CasADi cannot write the function as C, its name means something in C
+            (:mod:`nn_export.c_names`), the compiler fails or takes too long, or the compiler named does not exist; if
+            the folder named is another user's, a link, or others may write there.
 
     Example:
         >>> x = ca.MX.sym("x")
@@ -165,7 +168,9 @@ def generate_c(
         seed: Seed of the random samples.
 
     Raises:
-        CompileError: If CasADi cannot write the function as C.
+        CompileError: If CasADi cannot write the function as C, or its name means something in C: keywords, names of
+            the C library, reserved ones (:mod:`nn_export.c_names`).
+        OSError: If the files cannot be written; each is then the one from before, or none.
 
     Example:
         >>> x = ca.MX.sym("x")
@@ -175,18 +180,23 @@ def generate_c(
         square.c square.h square_test.c
     """
     name, path = function.name(), Path(folder)
-    path.mkdir(parents=True, exist_ok=True)
     _source([function])  # raises what there is to raise
     generator = ca.CodeGenerator(name, {"with_header": True})
     generator.add(function)
-    generator.generate(f"{path.resolve()}{os.sep}")
+    with tempfile.TemporaryDirectory() as work:
+        generator.generate(f"{Path(work).resolve()}{os.sep}")
+        texts = {end: (Path(work) / f"{name}{end}").read_bytes() for end in (".c", ".h")}
     if points is None:
         rng = np.random.default_rng(seed)
         points = [
             [rng.standard_normal(function.size_in(i)) for i in range(function.n_in())] for _ in range(3)
         ]
     files = CFiles(path / f"{name}.c", path / f"{name}.h", path / f"{name}_test.c")
-    files.test.write_text(main_program(function, points))
+    for file, content in (
+        (files.header, texts[".h"]), (files.test, main_program(function, points).encode()), (files.source, texts[".c"])
+    ):  # fmt: skip
+        with replacing(file) as open_file:
+            open_file.write(content)
     return files
 
 
@@ -202,6 +212,19 @@ def _compiler(given: str | None) -> list[str] | None:
 
 
 def _source(functions: list[ca.Function]) -> str:
+    name = functions[0].name()
+    if reason := refused_name(name, _OWN_NAMES):
+        raise CompileError(
+            f"a function named {name!r} cannot be written as C: the name {reason}; give it another, as in "
+            'ca.Function("f", ...)'
+        )
+    for f in (one for own in functions for one in (own, *own.find_functions())):
+        # CasADi writes the names of arguments into comments as they are
+        if strange := [n for n in (*f.name_in(), *f.name_out()) if not re.fullmatch(r"\w+", n, re.ASCII)]:
+            raise CompileError(
+                f"{name} cannot be written as C: an argument of {f.name()} is called {strange[0]!r:.80}; a name has "
+                "letters, digits and _"
+            )
     try:
         generator = ca.CodeGenerator("compiled")
         for f in functions:
@@ -369,6 +392,11 @@ int main(void) {{
   return wrong;
 }}
 """
+
+_OWN_NAMES = frozenset(
+    re.findall(r"[A-Za-z]\w*", re.sub(r'/\*.*?\*/|"[^"]*"|\{\w+\}\w*|#[^\n]*', " ", _TEST, flags=re.DOTALL))
+)
+"""Names that the test program takes: of its variables, which would hide the function, and of what it calls."""
 
 
 def main_program(f: ca.Function, points: Sequence[Sequence[np.ndarray | float]]) -> str:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MOST_INSTRUCTIONS = 20_000
-"""Longer scalar code is evaluated point by point: its graph of vectors would take seconds to build."""
+MOST_INSTRUCTIONS = 100_000
+"""Longer scalar code is evaluated point by point, some nine times slower: its graph of vectors would take seconds to
+build (half a second at this length)."""
 
 
 def vectorised(f: ca.Function, n: int) -> ca.Function:

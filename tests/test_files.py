@@ -10,6 +10,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from patience import HANGS
 
 import hybrid_mpc.files
 import hybrid_mpc.records
@@ -214,7 +215,7 @@ def test_a_full_disk_ends_a_command_with_a_line_and_no_damage(tmp_path):
     """``data`` writes recordings of more than 20 kB: the first is refused, whole, and the command says so."""
     words = ["data", "golf_robot", "--out", str(tmp_path / "out"), "--budget", "quick"]
     done = subprocess.run(
-        [sys.executable, "-c", LIMITED, *words], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", LIMITED, *words], capture_output=True, text=True, timeout=HANGS
     )
     assert done.returncode == 2
     assert "Traceback" not in done.stderr

@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from patience import HANGS
 
 import hybrid_mpc
 
@@ -15,25 +16,26 @@ OWN = ("nn_export", "hybrid_mpc", "scenarios")
 ROOMS = {
     "nn_export": "",
     "errors": "",
-    "records": "nn_export errors",
+    "rules": "",
+    "records": "nn_export errors rules",
     "files": "nn_export errors records",
-    "machine": "nn_export errors",
+    "machine": "nn_export errors rules records",
     "data": "nn_export errors records files machine",
-    "model": "nn_export errors machine",
+    "model": "nn_export errors rules records machine",
     "estimate": "errors model",
-    "control": "nn_export errors records model estimate",
-    "loop": "errors model estimate control",
-    "scenario": "errors machine model control loop",
-    "monitor": "errors data model",
-    "embedded": "nn_export errors model estimate control loop monitor",
+    "control": "nn_export errors rules records model estimate",
+    "loop": "errors rules records model estimate control",
+    "scenario": "errors rules records machine model control loop",
+    "monitor": "errors rules data model",
+    "embedded": "nn_export errors rules files model estimate control loop monitor",
     "analyze": "nn_export errors data model estimate control loop",
-    "kit": "nn_export errors records files machine data model estimate control embedded loop scenario monitor",
-    "identify": "nn_export errors files machine data model kit",
+    "kit": "nn_export errors rules records files machine data model estimate control embedded loop scenario monitor",
+    "identify": "nn_export errors rules records files machine data model kit",
     "plots": "errors files machine monitor",
-    "report": "errors files plots",
-    "job": "nn_export errors records files machine data model estimate control loop scenario monitor analyze kit "
+    "report": "errors rules files plots",
+    "job": "nn_export errors rules records files machine data model estimate control loop scenario monitor analyze kit "
     "identify plots report",
-    "cli": "errors records files machine data scenario kit identify job",
+    "cli": "errors rules records files machine data scenario kit identify job",
     "scenarios.paper": "errors records files machine data scenario identify plots job cli",
     "scenarios.golf_robot.monitor_study": "errors records files loop scenario monitor kit plots report job cli",
     "scenarios": "nn_export",
@@ -257,7 +259,7 @@ print(result.source.count("MPC"), float(np.abs(result.x[:, 0] - result.reference
 
 def test_closed_loop_runs_where_torch_cannot_be_imported(tmp_path, golf_artifact):
     done = subprocess.run(
-        [sys.executable, "-c", CLOSED_LOOP, str(golf_artifact)], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", CLOSED_LOOP, str(golf_artifact)], capture_output=True, text=True, timeout=HANGS
     )
     assert done.returncode == 0, done.stderr
     solved, error = done.stdout.split()

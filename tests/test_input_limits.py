@@ -12,6 +12,7 @@ from online_models import PendulumPlant, linear_model, pendulum_model
 from hybrid_mpc import (
     OCP,
     CondensedController,
+    DataSpec,
     Guard,
     InputError,
     Limits,
@@ -56,7 +57,8 @@ OPEN = {
 CONTROL = OCP(10, (30.0, 1.0), (0.05,), (0.05,), (-1.0,), (2.0,), (0.5,))
 TOLERATED = 2 / np.sqrt(0.1)
 """What stands for the input's range where it has none: both ways of what the weights tolerate."""
-MACHINE = Scenario("pendulum", "", "", prior=pendulum_model, data=None, control=CONTROL, sensor_sigma=(1e-3,))
+SPEC = DataSpec("t", ("u",), ("y",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.1)
+MACHINE = Scenario("pendulum", "", "", prior=pendulum_model, data=SPEC, control=CONTROL, sensor_sigma=(1e-3,))
 
 
 @pytest.mark.parametrize("limits", (FINITE | OPEN).values(), ids=(FINITE | OPEN).keys())

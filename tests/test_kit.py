@@ -89,6 +89,19 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     assert kit.controller(task=limited.name).controller.ocp.u_max == limited.control.u_max
 
 
+def test_a_monitor_that_cannot_alarm_is_refused(run):
+    kit = hm.load(run)
+    reason = hm.Calibration.without("too little data", (0.2,))
+    for learned in (None, reason):
+        blind = replace(kit, calibration=learned)
+        for kind in ("", "energy", "guard", "residuals"):
+            with pytest.raises(hm.InputError, match=r"kind=|detector"):
+                blind.monitor(kind=kind)
+        for kind in ("own", "readings"):
+            blind.monitor(kind=kind)
+    assert replace(kit, calibration=replace(CALIBRATION, detector=None)).monitor().calibration is not None
+
+
 def test_a_kit_is_printed_short(run):
     text = repr(hm.load(run))
     assert "name='hybrid'" in text
@@ -107,8 +120,12 @@ def test_the_safe_input_is_the_scenario_s(run):
     # the limit of the change lets it be reached in a few periods
     assert 0.1 in np.round(result.u[first : first + 10, 0], 9)
     assert hm.Loop(other.observer(), other.controller()).safe_input.tolist() == [0.1]
-    for wrong in ((9.0,), (0.0, 0.0), (np.nan,)):
-        with pytest.raises(hm.InputError, match="outside the limits"):
+    for wrong, words in (
+        ((9.0,), "outside the limits"),
+        ((0.0, 0.0), "outside the limits"),
+        ((np.nan,), "finite"),
+    ):
+        with pytest.raises(hm.InputError, match=words):
             kit.on(replace(GOLF, safe_input=wrong))
 
 
@@ -218,7 +235,7 @@ def test_what_is_missing_is_named(run, tmp_path, change, use, told):
 
 
 def test_impossible_settings_and_models_are_refused(run):
-    with pytest.raises(hm.InputError, match="not negative"):
+    with pytest.raises(hm.InputError, match="process_noise"):
         LoopSettings(process_noise={"prior": (-1.0,)})
     with pytest.raises(hm.InputError, match="does not exist"):
         hm.load("nowhere")

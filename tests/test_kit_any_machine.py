@@ -139,9 +139,10 @@ def test_limits_of_residuals_are_kept_and_make_the_monitor(kit, tmp_path):
     for kind in ("", "guard", "residuals"):
         assert learned.monitor(kind=kind).limits == LIMITS
     assert learned.monitor(kind="own").limits is None
-    assert kit.monitor().limits is None  # nothing was learned
-    with pytest.raises(hm.InputError, match="holds no limits of residuals"):
-        kit.monitor(kind="guard")
+    for kind in ("", "guard", "residuals"):  # nothing was learned
+        with pytest.raises(hm.InputError, match="holds no limits of residuals"):
+            kit.monitor(kind=kind)
+    assert kit.monitor(kind="own").limits is None
     with pytest.raises(hm.InputError, match="the outputs of model prior must be its positions"):
         learned.monitor(kind="energy")
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.analyze.equilibria import hidden_equilibrium
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.model.model import HybridModel, positions_of
 from hybrid_mpc.model.riccati import vector
 
@@ -22,12 +22,8 @@ ANGLES = 64
 
 def control_toolbox() -> Any:
     """The module ``control``; an InputError says how to install it where it is missing."""
-    try:
+    with named_extra("linear analysis"):
         import control
-    except ImportError as missing:
-        raise InputError(
-            f"linear analysis needs python-control ({missing}); install it with: pip install 'hybrid-mpc[analysis]'"
-        ) from None
     return control
 
 

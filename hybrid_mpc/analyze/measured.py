@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Run: TypeAlias = Callable[[Array], Array]
 """Inputs ``(n,)`` to outputs ``(n,)`` of one channel, measured before each input acts."""
+LARGEST = 1e60
+"""Sample beyond which a run has diverged: products of its powers would leave the range of numbers."""
 BY_CHANCE = 0.01
 """Share of the lines of unrelated signals that would pass for a response."""
 
@@ -62,8 +64,8 @@ def welch_response(
     unbiased by noise of the output. A window that is short against the machine's ringing smears its resonance.
 
     Raises:
-        InputError: If no piece is long enough, shapes differ, or fewer than four windows come together: coherence of
-            one window is 1 whatever the signals are.
+        InputError: If no piece is long enough, shapes differ, a signal diverges, or fewer than four windows come
+            together: coherence of one window is 1 whatever the signals are.
 
     Source: Welch, *The use of fast Fourier transform for the estimation of power spectra*, IEEE Trans. Audio
     Electroacoust. 15 (1967), also for the variance of overlapping windows; Bendat and Piersol, *Random Data*, 4th
@@ -79,6 +81,8 @@ def welch_response(
             )
         if n < 8 or u.size < n:
             continue
+        _check_power(u, "input")
+        _check_power(y, "output")
         windows = 1 + (u.size - n) // (n // 2)
         options = {"fs": 1.0 / dt, "nperseg": n, "noverlap": n - n // 2, "detrend": "linear"}
         total += windows * np.stack([welch(u, **options)[1], welch(y, **options)[1], csd(u, y, **options)[1]])
@@ -112,7 +116,8 @@ def multisine_response(
         odd: Odd lines only, so that what an even nonlinearity makes falls between them. Default: yes.
 
     Raises:
-        InputError: If fewer than two periods count, the period is no multiple of ``dt``, or the band holds no line.
+        InputError: If fewer than two periods count, the period is no multiple of ``dt``, the band holds no line, or the
+            run diverges.
 
     Source: Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, 2nd edition, chapter 4.
 
@@ -132,6 +137,7 @@ def multisine_response(
     y = np.asarray(run(u), dtype=float).ravel()
     if y.shape != u.shape:
         raise InputError(f"multisine: the run returned {y.size} outputs for {u.size} inputs")
+    _check_power(y, "output")
     lines = np.arange(np.ceil(band[0] * period - 1e-9), np.floor(band[1] * period + 1e-9) + 1).astype(int)
     lines = lines[lines % 2 == 1] if odd else lines
     spectra = [np.fft.rfft(v[settle * n :].reshape(periods, n), axis=1)[:, lines] for v in (u, y)]
@@ -192,6 +198,16 @@ def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *,
         return y
 
     return run
+
+
+def _check_power(signal: Array, what: str) -> None:
+    """Refuse a signal ``(n,)`` whose power is no number."""
+    wrong = np.flatnonzero(~(np.abs(signal) <= LARGEST))
+    if wrong.size:
+        raise InputError(
+            f"frequency response: the {what} diverges, sample {wrong[0]} is {signal[wrong[0]]:.3g}; take shorter "
+            "recordings, or leave this model out"
+        )
 
 
 def _response(omega: Array, uu: Array, yy: Array, uy: Complex, averages: float) -> MeasuredResponse:

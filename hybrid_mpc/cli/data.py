@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import inspect
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +15,7 @@ from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import check_folder, write_text
 from hybrid_mpc.records import MOST_SEED
+from hybrid_mpc.rules import markdown
 
 if TYPE_CHECKING:
     from hybrid_mpc.scenario import Scenario
@@ -57,9 +59,9 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
     check_folder(out)
     options = {"data_set": data_set} if data_set else {}
     files = make(out, seed, budget, **options)
-    command = f"hybrid-mpc data {scenario.name} --out {out.name} --seed {seed} --budget {budget}"
-    command += f" --set {data_set}" if data_set else ""
-    write_text(out / "README.md", readme(scenario, files, command))
+    words = ["hybrid-mpc", "data", scenario.name, "--out", out.name, "--seed", str(seed), "--budget", budget]
+    words += ["--set", data_set] if data_set else []
+    write_text(out / "README.md", readme(scenario, files, shlex.join(words)))
     return files
 
 
@@ -74,10 +76,14 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
     arrays = all(path.suffix == ".npz" for path in files)
     stamp = "one number, the sampling time" if arrays else "time stamp of the row, as it was sampled"
     lines = [
-        f"# Recordings: {scenario.title}", "", scenario.description, "", f"Written by `{command}`.", "",
+        f"# Recordings: {markdown(scenario.title)}", "", markdown(scenario.description), "",
+        f"Written by `{command}`.", "",
         "| column | unit | meaning |", "| --- | --- | --- |",
-        *([f"| {spec.time} | s | {stamp} |"] if isinstance(spec.time, str) else []),
-        *(f"| {column} | {s.unit} | {_meaning(column in spec.inputs)} {s.name} |" for column, s in signals),
+        *([f"| {markdown(spec.time)} | s | {stamp} |"] if isinstance(spec.time, str) else []),
+        *(
+            f"| {markdown(column)} | {markdown(s.unit)} | {_meaning(column in spec.inputs)} {markdown(s.name)} |"
+            for column, s in signals
+        ),
         "",
         f"Sampling: {1e3 * period:.3g} ms, even; arrays of numpy by these names."
         if arrays
@@ -87,7 +93,7 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
         f"'hybrid-mpc run' first smooths and differentiates the outputs by a local quartic over "
         f"{spec.smoothing:g} s (-3 dB at {band:.1f} Hz) and brings them to {1e3 * spec.dt:g} ms.",
         "", "| file | role |", "| --- | --- |",
-        *(f"| {path.name} | {_role(scenario, path)} |" for path in files), "",
+        *(f"| {markdown(path.name)} | {_role(scenario, path)} |" for path in files), "",
     ]  # fmt: skip
     return "\n".join(lines)
 

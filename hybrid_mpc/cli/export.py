@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Annotated
 
 import typer
@@ -12,7 +13,7 @@ EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc export c runs/golf --out controller\n\n"
     "  hybrid-mpc export c runs/golf --task track --float --out controller\n\n"
-    "  hybrid-mpc export c runs/golf --guard --out controller"
+    "  hybrid-mpc export c runs/golf --guard --check --out controller"
 )
 
 app = typer.Typer(
@@ -39,6 +40,12 @@ def c(
             "--adapt", help="--guard, and a second controller that learns what has become of the machine."
         ),
     ] = False,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Compile it and run its test: code made of the folder's content runs here."
+        ),
+    ] = False,
 ) -> None:
     """Estimator, real-time iteration, safeguards, monitor and guard as self-contained C11, with a test program."""
     from hybrid_mpc.files import check_folder
@@ -48,6 +55,9 @@ def c(
     check_folder(out)
     reaction = "adapt" if adapt else "rest" if guard else ""
     folder = generate_controller(
-        load(model), out, model=name, task=task, single=single, monitor=monitor, guard=reaction
+        load(model), out, model=name, task=task, single=single, monitor=monitor, guard=reaction, check=check
     )
-    print(f"C in {folder.resolve()}; README.md has the sizes. Next: make -C {folder} test")
+    said = (
+        "compiled, its test passed, README.md has the sizes" if check else "nothing of it was compiled or run"
+    )
+    print(f"C in {folder.resolve()}; {said}. Next: make -C {shlex.quote(str(folder))} test")

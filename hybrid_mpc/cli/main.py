@@ -13,7 +13,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 try:
     import typer
     from rich.console import Console
-    from typer.core import TyperCommand
+    from rich.markup import escape
+    from typer.core import TyperCommand, TyperGroup
 except ImportError as missing:  # the online half installs without the command line's libraries
     raise SystemExit(
         f"hybrid-mpc: {missing}. Install the command line with: pip install 'hybrid-mpc[all]'"
@@ -36,8 +37,9 @@ from hybrid_mpc.cli import (
     study,
     tune,
 )
-from hybrid_mpc.errors import InputError, StorageError
+from hybrid_mpc.errors import InputError, StorageError, named_extra, no_exit
 from hybrid_mpc.files import reason
+from hybrid_mpc.rules import printable
 
 BAD_INPUT, CTRL_C = 2, 130
 SAVED = {
@@ -75,8 +77,20 @@ class Command(TyperCommand):
         return {name for p in self.params if getattr(p, "multiple", False) for name in p.opts}
 
 
+class Commands(TyperGroup):
+    """The commands. In all of them code of a user that ends Python is an error, and a package that is not installed is
+    named with its extra.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """As typer does it."""
+        with no_exit(), named_extra("this command"):
+            return super().invoke(ctx)
+
+
 app = typer.Typer(
     name="hybrid-mpc",
+    cls=Commands,
     help="Measurements and an ODE in, a guarded real-time nonlinear MPC out.",
     no_args_is_help=True,
     add_completion=False,
@@ -134,7 +148,7 @@ def main() -> None:
         sys.exit(BAD_INPUT)
     except OSError as error:
         place = f" {error.filename}" if error.filename is not None else ""
-        errors.print(f"[bold red]error:[/] the file system refused{_escape(place)}: {reason(error)}")
+        errors.print(f"[bold red]error:[/] the file system refused{_escape(place)}: {_escape(reason(error))}")
         _say_what_is_saved(errors)
         sys.exit(BAD_INPUT)
     except SystemExit as stop:
@@ -151,4 +165,4 @@ def _say_what_is_saved(errors: Console) -> None:
 
 
 def _escape(text: str) -> str:
-    return text.replace("[", r"\[")
+    return escape(printable(text))

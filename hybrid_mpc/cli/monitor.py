@@ -18,7 +18,7 @@ EXAMPLES = (
     "  hybrid-mpc monitor runs/golf/model today.csv --out today\n\n"
     "  hybrid-mpc monitor runs/golf/model day1.csv day2.csv --learn 1 --out nominal\n\n"
     "  hybrid-mpc monitor runs/golf/model today.csv --calibration nominal/calibration.json --out today\n\n"
-    "  hybrid-mpc monitor runs/mine/model today.csv --scenario my_machine.py --out today"
+    "  hybrid-mpc monitor runs/mine/model today.csv --scenario edited_machine.py --out today"
 )
 
 
@@ -27,7 +27,10 @@ def monitor(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings: CSV, .npz or .mat.")],
     out: EmptyFolder,
     scenario: Annotated[
-        str, typer.Option(help="Columns and period: a name or a .py file. Default: the model's own.")
+        str,
+        typer.Option(
+            help="Columns, sensors, control problem: a name or a .py file. Default: the folder's own."
+        ),
     ] = "",
     learn: Annotated[
         float,
@@ -66,9 +69,12 @@ def monitor(
 
     check_folder(out)
     folder = artifact_folder(model)
-    machine = scenario_of(read_description(folder).provenance.scenario, folder / FILE, scenario)
-    if machine is None:
-        raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
+    held = read_description(folder)
+    machine = None
+    if scenario or held.predicting is None:  # else the folder has all that is needed
+        machine = scenario_of(held.provenance.scenario, folder / FILE, scenario)
+        if machine is None:
+            raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
     job = prepared(
         machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration, residuals=residuals,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -29,19 +30,24 @@ def new(
 
     What only you can know is marked TODO; 'hybrid-mpc check' lists what is left.
     """
-    from hybrid_mpc.job.new import left_to_decide, write_scenario
+    from hybrid_mpc.job.new import left_to_decide, printable, write_scenario
 
     named = (tuple(columns or ()) for columns in (input_column, output_column, disturbance_column))
     inputs, outputs, disturbances = named
     draft = write_scenario(path, data, inputs, outputs, time_column, disturbances)
-    time = draft.time.full if draft.time else "none found"
-    print(f"time: {time}, sampled every {draft.period:.4g} s")
-    print(f"inputs: {', '.join(c.full for c in draft.inputs)}")
-    print(f"outputs: {', '.join(c.full for c in draft.outputs)}")
+    lines = [
+        f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.period:.4g} s",
+        *([f"  to decide: {draft.doubt}"] if draft.doubt else []),
+        f"inputs: {', '.join(c.full for c in draft.inputs)}",
+        f"outputs: {', '.join(c.full for c in draft.outputs)}",
+    ]
     if draft.disturbances:
-        print(f"measured disturbances: {', '.join(c.full for c in draft.disturbances)}")
-    if draft.left_out:
-        print(f"not used: {', '.join(draft.left_out)}")
-    print(
-        f"{path}: {len(left_to_decide(path))} lines are left to decide. Next: hybrid-mpc check {path} --data {data}"
+        lines.append(f"measured disturbances: {', '.join(c.full for c in draft.disturbances)}")
+    lines += [f"not used: {name} ({reason})" for name, reason in draft.left_out.items()]
+    count = len(left_to_decide(path))
+    scenario, recording = shlex.quote(str(path)), shlex.quote(str(data))
+    lines.append(
+        f"{path}: {count} lines are left to decide. Next: hybrid-mpc check {scenario} --data {recording}"
     )
+    for line in lines:
+        print(printable(line))

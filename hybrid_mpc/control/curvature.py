@@ -14,7 +14,7 @@ from hybrid_mpc.model.stages import Linearization
 Array = NDArray[np.float64]
 
 SHIFT = 1e-5
-"""Step of the difference of two Jacobians, in tolerated deviations (states), scales of the inputs and 1 (hidden)."""
+"""Step of the difference of two Jacobians, in sizes of states and hidden states and scales of the inputs."""
 FLOOR = 1e-3
 """Least curvature along a direction, as a share of Gauss-Newton's."""
 MATTERS = 0.2
@@ -33,9 +33,10 @@ class StageCurvature:
     """
 
     def __init__(
-        self, stages: Linearization, ocp: OCP, sizes: Array, n_h: int = 0, soft: SoftRows | None = None
+        self, stages: Linearization, ocp: OCP, sizes: Array, hidden: Array, soft: SoftRows | None = None
     ) -> None:
-        self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, n_h
+        self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, hidden.size
+        n_h, self._hidden_shift = hidden.size, SHIFT * hidden
         self._soft = soft if soft is not None and soft.functions else None
         self._shift = SHIFT * np.concatenate([sizes, ocp.input_scale])
         self._by_few = stages.slopes(self._shift.size)
@@ -101,7 +102,7 @@ class StageCurvature:
         for first in range(0, self._n_h, m):
             chosen = (first + each) % self._n_h  # the last group is filled with the first ones
             moved = np.repeat(z[None], m, axis=0)
-            moved[each, :, n_x + chosen] += SHIFT
+            moved[each, :, n_x + chosen] += self._hidden_shift[chosen][:, None]
             taken = moved[each, :, n_x + chosen] - z.T[n_x + chosen]
             slopes = (weights @ self._by_hidden(moved.reshape(m * n, -1), inputs)).reshape(m, n, -1)
             rows[chosen] = (slopes - here) / taken[:, :, None]

@@ -35,7 +35,7 @@ class Rows(NamedTuple):
 class IpoptController(Controller):
     """Nonlinear MPC by IPOPT on the sparse multiple-shooting problem: the reference, slower than real time.
 
-    Inputs count in :attr:`OCP.input_scale`, states in :attr:`Problem.state_sizes`, soft bounds in half their range.
+    Inputs count in :attr:`OCP.input_scale`, states in :attr:`Problem.sizes`, soft bounds in half their range.
     Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound. Second
     derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps model and limits; it
     is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
@@ -195,7 +195,10 @@ class IpoptController(Controller):
         self._step = stage_step(model).map(n)
         z_next = self._step(z[:, :-1], ca.vertcat(u + added[:n_u, :], added[n_u:, :]))
         du = u - ca.horzcat(u_prev, u[:, :-1])
-        u_scale, z_scale = ocp.input_scale, np.concatenate([self.problem.state_sizes, np.ones(model.n_h)])
+        u_scale, z_scale = (
+            ocp.input_scale,
+            np.concatenate([self.problem.sizes.states, self.problem.sizes.hidden]),
+        )
         rows = [Rows(z[:, 0] - z0, 0.0, 0.0, z_scale), Rows(z[:, 1:] - z_next, 0.0, 0.0, np.tile(z_scale, n))]
         if ocp.du_max is not None:
             limit = np.tile(ocp.du_max, n)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as dataclass_fields
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.soft import (
+    PENALTY,
     HardBound,
     SoftBound,
     fixed,
@@ -21,17 +22,21 @@ from hybrid_mpc.control.soft import (
     state_bounds,
     tightest,
 )
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import Collected, InputError
 from hybrid_mpc.model.limits import input_limits, numbers
 from hybrid_mpc.model.model import output_with_jacobian
 from hybrid_mpc.model.riccati import coming_back, dare, linearization, unmoved, vector
 from hybrid_mpc.records import known
+from hybrid_mpc.rules import LARGEST
 
 if TYPE_CHECKING:
     from hybrid_mpc.model.model import HybridModel
 
 
 Array = NDArray[np.float64]
+Bound = TypeVar("Bound", SoftBound, HardBound)
+MOST_HORIZON = 10_000
+"""Longest horizon [periods]: a plan is in memory with its derivatives."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,7 @@ class Limits:
     u_max: Array
 
     def __init__(self, u_min: ArrayLike, u_max: ArrayLike) -> None:
-        lower, upper = np.asarray(u_min, dtype=float).ravel(), np.asarray(u_max, dtype=float).ravel()
+        lower, upper = numbers(u_min, "limits: u_min"), numbers(u_max, "limits: u_max")
         if lower.shape != upper.shape or not np.all(lower <= upper):
             raise InputError(
                 f"limits: u_min {lower}, u_max {upper} given; needed: a u_min <= u_max for each input"
@@ -106,7 +111,8 @@ class OCP:
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
         slack_quadratic: Penalties ``(n_x,)`` [cost/s/unit^2], positive. Default: ``1000 q``. Where ``q`` is
-            zero, 1 stands for it in both.
+            zero, ``cost / size^2`` stands for it in both: a state off by its size costs as much as any other signal
+            (:class:`~hybrid_mpc.control.sizes.Sizes`).
         soft: Soft bounds on expressions of ``(x, u)``, ``(x, u, w)`` or ``(x, u, w, p)``. Default: none.
         blocks: Move blocking: numbers of periods over which the input is held, one block after the other,
             e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now. Default: none.
@@ -128,8 +134,8 @@ class OCP:
             measured last. Default: it holds them.
 
     Raises:
-        InputError: If shapes do not fit, bounds cross, a weight is negative or not finite, or the blocks'
-            lengths do not sum to the horizon.
+        InputError: If an argument is of another kind, shapes do not fit, bounds cross, a weight is negative or not
+            finite, or the blocks' lengths do not sum to the horizon; all of it together.
 
     Example:
         >>> from hybrid_mpc.records import plain, record
@@ -190,46 +196,47 @@ class OCP:
         preview: bool = True,
         preview_w: bool = False,
     ) -> None:
-        if not _whole(horizon) or horizon < 1:
-            raise InputError(f"horizon must be a whole number of periods, at least 1; got {horizon}")
-        q_v, r_v = _diagonal(q, "q"), _diagonal(r, "r")
-        n_x, n_u = q_v.size, r_v.size
-        weights = {"q": q_v, "r": r_v, "r_delta": vector(r_delta, n_u, "r_delta")}
-        _check_weights(weights)
-        lower, upper = input_limits(u_min, u_max, n_u)
-        if du_max is not None:
-            du_max = vector(du_max, n_u, "du_max")
-            if not np.all(du_max > 0):
-                raise InputError(f"du_max must be positive, got {du_max}; leave it out for no limit")
-        if not (isinstance(terminal, str) and terminal == "riccati"):
-            terminal = _terminal_matrix(terminal, n_x)
-        outputs = numbers(q_y, "q_y")
-        if not np.all(np.isfinite(outputs) & (outputs >= 0)):
-            raise InputError(f"q_y: weights must be finite and not negative, got {outputs}")
-        y_low, y_up = output_bounds(outputs, y_min, y_max)[:2]
-        low, up, linear, quadratic = state_bounds(q_v, x_min, x_max, slack_linear, slack_quadratic)
-        if wrong := [bound for bound in soft if not isinstance(bound, SoftBound)]:
-            raise InputError(f"soft: {wrong[0]!r} given; needed: SoftBound(expression, lower, upper, ...)")
-        _check_hard(hard, n_x, outputs.size)
-        parametric = _parametric(soft, hard)
-        own = {economic.numel_in(2)} if isinstance(economic, ca.Function) and economic.n_in() > 2 else set()
-        if len(given := own | {f.numel_in(3) for f in parametric}) > 1:
-            raise InputError(
-                f"parameters p of {sorted(given)} numbers given; all costs and bounds that have some share them"
+        own = Collected()
+        n = own(_horizon, horizon)
+        q_v, r_v = own(_diagonal, q, "q"), own(_diagonal, r, "r")
+        n_x, n_u = (None if v is None else v.size for v in (q_v, r_v))
+        soft_b, hard_b = own(_bounds, soft, SoftBound, "soft"), own(_bounds, hard, HardBound, "hard")
+        flags = [own(_flag, v, name) for v, name in ((preview, "preview"), (preview_w, "preview_w"))]
+        outputs = own(_weights, q_y, "q_y")
+        fields: dict[str, Any] = {
+            "horizon": n, "q": q_v, "r": r_v, "economic": own(_stage_cost, economic), "q_y": outputs,
+            "preview": flags[0], "preview_w": flags[1], "soft": soft_b, "hard": hard_b,
+            "du_max": None, "working_point": None, "blocks": None,
+        }  # fmt: skip
+        if q_v is not None and n_x is not None:
+            fields["terminal"] = own(_terminal_matrix, terminal, n_x)
+            fields["states"] = own(
+                state_bounds, np.where(q_v > 0, q_v, 1.0), x_min, x_max, slack_linear, slack_quadratic
             )
-        if economic is not None and not _is_stage_cost(economic):
-            raise InputError(f"economic: {economic} given; needed: a function (x, u) or (x, u, p) -> scalar")
-        fields = {
-            "horizon": int(horizon), **weights, "u_min": lower, "u_max": upper, "du_max": du_max, "terminal": terminal,
-            "working_point": None if working_point is None else _point(working_point, n_x, n_u),
-            "x_min": low, "x_max": up,
+        if r_v is not None and n_u is not None:
+            fields["r_delta"] = own(_change_weights, r_delta, r_v)
+            fields["u"] = own(input_limits, u_min, u_max, n_u)
+            if du_max is not None:
+                fields["du_max"] = own(_largest_change, du_max, n_u)
+        if n_x is not None and n_u is not None and working_point is not None:
+            fields["working_point"] = own(_point, working_point, n_x, n_u)
+        if n is not None and blocks is not None:
+            fields["blocks"] = own(_block_lengths, blocks, n)
+        if n is not None and n_u is not None:
+            fields["starts"] = own(_plans, starts, n, n_u)
+        if outputs is not None:
+            fields["y"] = own(output_bounds, np.where(outputs > 0, outputs, 1.0), y_min, y_max)
+        if n_x is not None and outputs is not None and hard_b is not None:
+            own(_check_hard, hard_b, n_x, outputs.size)
+        if soft_b is not None and hard_b is not None:
+            own(_check_shared, fields["economic"], soft_b, hard_b)
+        own.refuse()
+        (low, up, linear, quadratic), (y_low, y_up, *_) = fields.pop("states"), fields.pop("y")
+        fields["u_min"], fields["u_max"] = fields.pop("u")
+        fields |= {
+            "x_min": low, "x_max": up, "y_min": y_low, "y_max": y_up,
             "slack_linear": None if slack_linear is None else linear,
             "slack_quadratic": None if slack_quadratic is None else quadratic,
-            "soft": tuple(soft), "blocks": None if blocks is None else _block_lengths(blocks, int(horizon)),
-            "economic": economic,
-            "starts": tuple(input_plan(s, int(horizon), n_u, f"starts[{i}]") for i, s in enumerate(starts)),
-            "q_y": outputs, "y_min": y_low, "y_max": y_up, "hard": tuple(hard),
-            "preview": bool(preview), "preview_w": bool(preview_w),
         }  # fmt: skip
         for name, value in fields.items():
             for array in value if isinstance(value, tuple) else (value,):
@@ -299,8 +306,12 @@ class OCP:
 
     @property
     def penalties(self) -> tuple[Array, Array]:
-        """Linear and quadratic penalties of the states' bounds ``(n_x,)`` each, the defaults filled in."""
-        return state_bounds(self.q, self.x_min, self.x_max, self.slack_linear, self.slack_quadratic)[2:]
+        """Linear and quadratic penalties of the states' bounds ``(n_x,)`` each, the defaults by ``q`` filled in; NaN
+        where the default needs a size, since ``q`` is zero.
+        """
+        q = np.where(self.q > 0, self.q, np.nan)
+        linear = PENALTY * np.sqrt(q) if self.slack_linear is None else self.slack_linear
+        return linear, PENALTY * q if self.slack_quadratic is None else self.slack_quadratic
 
     @property
     def input_range(self) -> Array:
@@ -389,11 +400,15 @@ class OCP:
             raise InputError(f"{error}{why and '; ' + why}") from None
         if not model.n_h:
             return p
+        own = np.sqrt(np.diag(p)[:n_x])  # in sizes: rounding must not depend on units
+        late, n_own = np.resize(self.input_scale, model.delay_states), model.n_h - model.delay_states
+        size = np.concatenate([np.where(own > 0, own, 1.0), 1.0 / late, np.ones(n_own)])
+        p = p / np.outer(size, size)
         reduced = (
             p[:n_x, :n_x] - p[:n_x, n_x:] @ np.linalg.pinv(p[n_x:, n_x:], hermitian=True) @ p[n_x:, :n_x]
         )
         values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
-        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T) * np.outer(size[:n_x], size[:n_x])
 
     def point(self, model: HybridModel) -> tuple[Array, Array]:
         """State and input at which terminal weight and fallback are linearized: the working point, else the model's
@@ -417,13 +432,73 @@ class OCP:
         return a, b, q, np.diag(self.r + self.r_delta) * model.dt
 
 
+def _horizon(value: object) -> int:
+    """A number of periods."""
+    if not _whole(value) or not 1 <= value <= MOST_HORIZON:  # type: ignore[operator]
+        raise InputError(
+            f"horizon must be a whole number of periods, from 1 to {MOST_HORIZON}; got {value!r:.80}"
+        )
+    return int(value)  # type: ignore[call-overload]
+
+
+def _flag(value: object, name: str) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False, got {value!r:.80}")
+    return bool(value)
+
+
+def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:
+    """Soft or hard bounds, as a tuple."""
+    example = (
+        "SoftBound(expression, lower, upper, ...)"
+        if kind is SoftBound
+        else "HardBound(what, lower, upper, ...)"
+    )
+    if not isinstance(given, tuple | list):
+        raise InputError(f"{name}: {given!r:.80} given; needed: a list of {example}")
+    if wrong := [bound for bound in given if not isinstance(bound, kind)]:
+        raise InputError(f"{name}: {wrong[0]!r:.80} given; needed: {example}")
+    return tuple(given)
+
+
 def _check_hard(hard: Sequence[HardBound], n_x: int, n_y: int) -> None:
+    """Refuse hard bounds of another size than states or outputs."""
     for bound in hard:
-        if not isinstance(bound, HardBound):
-            raise InputError(f"hard: {bound!r} given; needed: HardBound(what, lower, upper, ...)")
         needed = {"x": n_x, "y": n_y}.get(bound.what if isinstance(bound.what, str) else "", 0)
         if needed and bound.lower.size != needed:
             raise InputError(f"hard bound on {bound.what}: {bound.lower.size} values given, {needed} needed")
+
+
+def _check_shared(economic: ca.Function | None, soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> None:
+    """Refuse parameters of different sizes: all costs and bounds that have some share them."""
+    own = {economic.numel_in(2)} if economic is not None and economic.n_in() > 2 else set()
+    if len(given := own | {f.numel_in(3) for f in _parametric(soft, hard)}) > 1:
+        raise InputError(
+            f"parameters p of {sorted(given)} numbers given; all costs and bounds that have some share them"
+        )
+
+
+def _stage_cost(value: ca.Function | None) -> ca.Function | None:
+    """An economic stage cost ``(x, u) -> scalar`` or ``(x, u, p) -> scalar``, or none."""
+    if value is not None and not _is_stage_cost(value):
+        raise InputError(f"economic: {value!r:.80} given; needed: a function (x, u) or (x, u, p) -> scalar")
+    return value
+
+
+def _largest_change(value: ArrayLike, n_u: int) -> Array:
+    found = vector(numbers(value, "du_max", most=LARGEST), n_u, "du_max")
+    if not np.all(found > 0):
+        raise InputError(f"du_max must be positive, got {found}; leave it out for no limit")
+    return found
+
+
+def _plans(starts: object, horizon: int, n_u: int) -> tuple[Array, ...]:
+    """Plans of the inputs, as a tuple."""
+    if not isinstance(starts, tuple | list | np.ndarray):
+        raise InputError(f"starts: {starts!r:.80} given; needed: a list of plans of the inputs")
+    for i, plan in enumerate(starts):
+        numbers(plan, f"starts[{i}]", most=LARGEST)
+    return tuple(input_plan(s, horizon, n_u, f"starts[{i}]") for i, s in enumerate(starts))
 
 
 def _parametric(soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> list[ca.Function]:
@@ -433,15 +508,40 @@ def _parametric(soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> list[ca
 
 
 def _whole(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and bool(np.isfinite(value)) and int(value) == value
+    return (
+        isinstance(value, int | float | np.number)
+        and not isinstance(value, bool | complex | np.complexfloating)
+        and bool(np.isfinite(value))
+        and int(value) == value
+    )
 
 
 def _diagonal(values: ArrayLike, name: str) -> Array:
-    """Weights as a vector; a matrix is refused."""
-    array = numbers(values, name)
+    """Weights as a vector, at least one; a matrix is refused."""
+    array = _weights(values, name)
     shape = np.shape(values)
     if len(shape) > 1 and max(shape) < array.size:
         raise InputError(f"{name}: shape {shape} given; needed: the diagonal alone, a weight each")
+    if not array.size:
+        raise InputError(f"{name}: no weight given; needed: one each")
+    return array
+
+
+def _weights(values: ArrayLike, name: str) -> Array:
+    """Weights, finite and not negative."""
+    array = numbers(values, name, most=LARGEST)
+    if not (np.all(np.isfinite(array)) and np.all(array >= 0)):
+        raise InputError(f"{name}: weights must be finite and not negative, got {array}")
+    return array
+
+
+def _change_weights(values: ArrayLike, r: Array) -> Array:
+    """Weights of input changes, which with those of the inputs determine every input."""
+    array = _weights(vector(values, r.size, "r_delta"), "r_delta")
+    if not np.all(r + array > 0):
+        raise InputError(
+            "every input needs a positive weight in r or r_delta, otherwise it is not determined"
+        )
     return array
 
 
@@ -459,7 +559,15 @@ def _point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
     """A state ``(n_x,)`` and an input ``(n_u,)``, finite."""
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise InputError(f"working_point: {value!r} given; needed: (x, u), a state and an input")
-    return vector(value[0], n_x, "working_point x"), vector(value[1], n_u, "working_point u")
+    own = Collected()
+    x, u = (
+        own(vector, numbers(part, f"working_point {name}", most=LARGEST), size, f"working_point {name}")
+        for part, size, name in ((value[0], n_x, "x"), (value[1], n_u, "u"))
+    )
+    own.refuse()
+    assert x is not None
+    assert u is not None
+    return x, u
 
 
 def _is_stage_cost(f: object) -> bool:
@@ -467,37 +575,32 @@ def _is_stage_cost(f: object) -> bool:
     return isinstance(f, ca.Function) and f.n_in() in (2, 3) and (f.n_out(), f.numel_out(0)) == (1, 1)
 
 
-def _block_lengths(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
+def _block_lengths(blocks: object, horizon: int) -> tuple[int, ...]:
     """Lengths of move blocks that fit the horizon."""
-    lengths = tuple(int(length) for length in blocks if _whole(length))
-    if len(lengths) < len(blocks) or min(lengths, default=0) < 1 or sum(lengths) != horizon:
+    given = tuple(blocks) if isinstance(blocks, tuple | list | np.ndarray) else ()
+    lengths = tuple(int(length) for length in given if _whole(length))
+    if not given or len(lengths) < len(given) or min(lengths) < 1 or sum(lengths) != horizon:
         raise InputError(
-            f"blocks: {tuple(blocks)} given, {sum(blocks)} periods in all; needed: whole numbers of at least 1 "
-            f"that sum to the horizon of {horizon}"
+            f"blocks: {blocks!r:.80} given; needed: whole numbers of at least 1 that sum to the horizon of {horizon}"
         )
     return lengths
 
 
-def _check_weights(weights: dict[str, Array]) -> None:
-    """Refuse weights that are negative, not finite, or leave an input undetermined."""
-    for name, value in weights.items():
-        if value.size == 0 or not np.all(np.isfinite(value)) or np.any(value < 0):
-            raise InputError(f"{name}: weights must be finite and not negative, got {value}")
-    if not np.all(weights["r"] + weights["r_delta"] > 0):
-        raise InputError(
-            "every input needs a positive weight in r or r_delta, otherwise it is not determined"
-        )
-
-
-def _terminal_matrix(value: ArrayLike, n_x: int) -> Array:
-    """A finite, symmetric, positive semi-definite ``(n_x, n_x)`` matrix."""
+def _terminal_matrix(value: ArrayLike, n_x: int) -> Array | Literal["riccati"]:
+    """``"riccati"``, or a finite, symmetric, positive semi-definite ``(n_x, n_x)`` matrix."""
+    if isinstance(value, str) and value == "riccati":
+        return "riccati"
     if isinstance(value, str):
         raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
-    matrix = numbers(value, "terminal").reshape(np.shape(value))
-    if matrix.shape != (n_x, n_x) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
+    matrix = numbers(value, "terminal", most=LARGEST).reshape(np.shape(value))
+    fits = matrix.shape == (n_x, n_x) and bool(np.all(np.isfinite(matrix)))
+    size = np.sqrt(np.abs(np.diag(matrix))) if fits else np.ones(n_x)
+    size = np.where(size > 0, size, 1.0)
+    scaled = matrix / np.outer(size, size) if fits else matrix  # entries have units of their own
+    if not fits or not np.allclose(scaled, scaled.T):
         raise InputError(
             f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix"
         )
-    if np.min(np.linalg.eigvalsh(matrix)) < -1e-9 * max(1.0, float(np.max(np.abs(matrix)))):
+    if np.min(np.linalg.eigvalsh(scaled)) < -1e-9 * float(np.max(np.abs(scaled))):
         raise InputError("terminal: the matrix has a negative eigenvalue; needed: positive semi-definite")
     return matrix

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
-from hybrid_mpc.control.soft import GIVES_WAY, HIGHER, HardBound, fixed, output_bounds
-from hybrid_mpc.control.targets import Steady, Targets, state_sizes
+from hybrid_mpc.control.sizes import Sizes
+from hybrid_mpc.control.soft import GIVES_WAY, HIGHER, HardBound, fixed, output_bounds, state_bounds
+from hybrid_mpc.control.targets import Steady, Targets
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
@@ -116,8 +117,7 @@ class SoftRows:
 
     Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), those on outputs and expressions for ``(x_0, u_0) ..
     (x_{N-1}, u_{N-1})``. Outputs and expressions of ``w`` or ``p`` depend on more, ``e`` ``(N, n_d + n_w + n_p)``: the
-    unmeasured and the measured disturbances and the parameters of each period; without it they are zero. ``model`` is
-    needed for them and for hard bounds.
+    unmeasured and the measured disturbances and the parameters of each period; without it they are zero.
 
     Hard bounds are rows with exact penalties, a factor of :data:`~hybrid_mpc.control.soft.HIGHER` apart from one
     priority to the next. Rows that no input reaches have no bounds.
@@ -134,11 +134,11 @@ class SoftRows:
     parametric: bool
     """Whether a bounded value depends on ``e``."""
 
-    def __init__(self, ocp: OCP, model: HybridModel | None = None) -> None:
+    def __init__(self, ocp: OCP, model: HybridModel, sizes: Sizes) -> None:
         n = ocp.horizon
         self._n_x, self._n_u, self._horizon = ocp.n_x, ocp.n_u, n
-        self._n_e = ocp.n_p + (0 if model is None else model.n_d + model.n_w)
-        groups = _bounded(ocp, model)
+        self._n_e = ocp.n_p + model.n_d + model.n_w
+        groups = _bounded(ocp, model, sizes)
         self.parametric = any(
             f is not None and f.jac_sparsity(0, 2).nnz() > 0 for f in (g.function for g in groups)
         )
@@ -151,26 +151,26 @@ class SoftRows:
         each = [
             np.hstack([g.rows for g in block]) for block in blocks
         ]  # of a period; rows go period by period
-        lower, upper, self.linear, self.quadratic, hard, at_end = np.hstack(
+        lower, upper, self.linear, self.quadratic, hard, at_end, size = np.hstack(
             [np.tile(rows, n) for rows in each]
         )
-        sizes = [rows.shape[1] for rows in each]
+        counts = [rows.shape[1] for rows in each]
         self.hard = hard > 0
         self.stage = np.concatenate(
-            [np.repeat(np.arange(n) + (b == 0), size) for b, size in enumerate(sizes)]
+            [np.repeat(np.arange(n) + (b == 0), count) for b, count in enumerate(counts)]
         )
-        last = np.concatenate([np.full(n * size, n - (b > 0)) for b, size in enumerate(sizes)])
+        last = np.concatenate([np.full(n * count, n - (b > 0)) for b, count in enumerate(counts)])
         before = (at_end > 0) & (self.stage < last)
         lower, upper = np.where(before, -np.inf, lower), np.where(before, np.inf, upper)
-        move = [np.repeat([size] * (n - 1) + [0], size) for size in sizes]
+        move = [np.repeat([count] * (n - 1) + [0], count) for count in counts]
         self.later = np.arange(self.stage.size) + np.concatenate(move)
         self.names = tuple(name for block in blocks for name in n * sum((g.names for g in block), ()))
-        if ocp.hard and model is not None:
+        if ocp.hard:
             lower, upper = self._reached(model, lower, upper)
         self.lower, self.upper = lower, upper
         half = 0.5 * (upper - lower)
-        # One-sided bounds have no range: the violation that costs as much quadratically as linearly, or 1.
-        other = np.where(self.linear > 0, self.linear / self.quadratic, 1.0)
+        # One-sided bounds have no range: the violation that costs as much quadratically as linearly, or the size.
+        other = np.where(self.linear > 0, self.linear / self.quadratic, size)
         self.scale: Array = np.where(np.isfinite(half), half, other)
         kept = np.where(self.hard, KEPT * self.scale, 0.0)
         self._kept = lower - kept, upper + kept
@@ -266,8 +266,8 @@ class SoftRows:
 class _Bounded:
     """What is bounded in a period: states, or the values of a function ``(x, u, e)``.
 
-    ``rows`` ``(6, n)`` are lower and upper bounds, linear and quadratic penalties, 1 for hard bounds, and 1 for those
-    of the end alone.
+    ``rows`` ``(7, n)`` are lower and upper bounds, linear and quadratic penalties, 1 for hard bounds, 1 for those of
+    the end alone, and sizes of what is bounded.
     """
 
     function: ca.Function | None
@@ -276,60 +276,111 @@ class _Bounded:
     names: tuple[str, ...]
 
 
-def _bounded(ocp: OCP, model: HybridModel | None) -> list[_Bounded]:
+def _bounded(ocp: OCP, model: HybridModel, sizes: Sizes) -> list[_Bounded]:
     """All that a problem bounds besides its inputs; states first."""
-    x_names = [s.name for s in model.states] if model is not None else [f"x[{i}]" for i in range(ocp.n_x)]
-    y_names = tuple(f"output {s.name}" for s in model.outputs) if model is not None else ()
+    y_names = tuple(f"output {s.name}" for s in model.outputs)
     none = np.zeros(0, dtype=np.int64)
 
     def states(*rows: Array) -> _Bounded:
         chosen = np.flatnonzero(np.isfinite(rows[0]) | np.isfinite(rows[1]))
-        return _Bounded(None, chosen, np.array(rows)[:, chosen], tuple(x_names[i] for i in chosen))
+        return _Bounded(None, chosen, np.array(rows)[:, chosen], tuple(model.states[i].name for i in chosen))
 
-    def values(f: ca.Function, *rows: Array) -> _Bounded:
+    def values(f: ca.Function, name: str, *rows: Array) -> _Bounded:
         n = rows[0].size
-        names = (f.name(),) if n == 1 else tuple(f"{f.name()}[{i}]" for i in range(n))
-        return _Bounded(_of_point(f, ocp, model), none, np.array(rows), names)
+        names = (name,) if n == 1 else tuple(f"{name}[{i}]" for i in range(n))
+        return _Bounded(f, none, np.array(rows), names)
 
-    def outputs(model: HybridModel, *rows: Array) -> _Bounded:
+    def outputs(*rows: Array) -> _Bounded:
         return _Bounded(_outputs(model, ocp.n_p), none, np.array(rows), y_names)
 
-    found = [states(ocp.x_min, ocp.x_max, *ocp.penalties, *np.zeros((2, ocp.n_x)))]
-    found += [
-        states(*_hard_rows(b, ocp, ocp.q)) for b in ocp.hard if isinstance(b.what, str) and b.what == "x"
-    ]
-    for b in ocp.soft:
+    weights = _weights(ocp.q, ocp.x_min, ocp.x_max, sizes.states, sizes, "state")
+    bounds = state_bounds(weights, ocp.x_min, ocp.x_max, ocp.slack_linear, ocp.slack_quadratic)
+    found = [states(*bounds, *np.zeros((2, ocp.n_x)), sizes.states)]
+    for b in ocp.hard:
+        if isinstance(b.what, str) and b.what == "x":
+            found.append(states(*_hard_rows(b, ocp, sizes.states, ocp.q)))
+    for bound in ocp.soft:
+        f, name = _of_point(bound.expression, ocp, model), bound.expression.name()
+        size = _violations(bound.lower, bound.upper, sizes.values(f), f"soft bound {name}", bound.linear > 0)
         found.append(
-            values(b.expression, b.lower, b.upper, b.linear, b.quadratic, *np.zeros((2, b.lower.size)))
+            values(
+                f,
+                name,
+                bound.lower,
+                bound.upper,
+                bound.linear,
+                bound.quadratic,
+                *np.zeros((2, bound.lower.size)),
+                size,
+            )
         )
-    if ocp.y_min.size and model is not None:
+    if ocp.y_min.size:
+        size = sizes.outputs
+        weights = _weights(ocp.q_y, ocp.y_min, ocp.y_max, size, sizes, "output")
         found.append(
-            outputs(model, *output_bounds(ocp.q_y, ocp.y_min, ocp.y_max), *np.zeros((2, ocp.y_min.size)))
+            outputs(*output_bounds(weights, ocp.y_min, ocp.y_max), *np.zeros((2, weights.size)), size)
         )
-    for hard in ocp.hard:
-        if not isinstance(hard.what, str):
-            found.append(values(hard.what, *_hard_rows(hard, ocp)))
-        elif hard.what == "y" and model is not None:
-            found.append(outputs(model, *_hard_rows(hard, ocp, ocp.q_y)))
+    for b in ocp.hard:
+        if not isinstance(b.what, str):
+            f = _of_point(b.what, ocp, model)
+            found.append(values(f, b.what.name(), *_hard_rows(b, ocp, sizes.values(f))))
+        elif b.what == "y":
+            found.append(outputs(*_hard_rows(b, ocp, sizes.outputs, ocp.q_y)))
     return found
 
 
-def _hard_rows(bound: HardBound, ocp: OCP, weights: Array | None = None) -> list[Array]:
-    """Bounds of a hard bound, the penalties by which it gives way, that it is hard, and of the end, ``(n,)`` each."""
-    ranks = sorted({b.priority for b in ocp.hard})
-    size, range_ = bound.sizes, ocp.input_range
+def _weights(weight: Array, lower: Array, upper: Array, size: Array, sizes: Sizes, what: str) -> Array:
+    """Weights that the penalties of bounds ``(n,)`` go by: the signals' own; without one, that by which a signal off by
+    its size costs as much as any other that is.
+    """
+    own = np.where(weight > 0, weight, 1.0) if weight.size else np.ones(lower.size)
+    open_ = (np.isfinite(lower) | np.isfinite(upper)) & ~(
+        (weight > 0) if weight.size else np.zeros(lower.size, bool)
+    )
+    if not np.any(open_):
+        return own
+    if lost := np.flatnonzero(open_ & np.isnan(size)).tolist():
+        raise InputError(
+            f"soft bounds: how large {what} {lost[0]} may be is not known, so neither what a violation costs; give its "
+            "signal a range, or it a weight"
+        )
+    return np.where(open_, sizes.cost / size**2, own)
+
+
+def _violations(
+    lower: Array, upper: Array, size: Array, what: str, other: NDArray[np.bool_] | bool = False
+) -> Array:
+    """What counts as one violation of bounds ``(n,)``: half the range, else the bound's value, else the size of what is
+    bounded.
+
+    ``other`` says where it does not matter.
+    """
+    half = 0.5 * (upper - lower)
+    value = np.abs(np.where(np.isfinite(upper), upper, lower))
+    found = np.where(np.isfinite(half), half, np.where(np.isfinite(value) & (value > 0), value, size))
+    if lost := np.flatnonzero(
+        np.isnan(found) & (np.isfinite(lower) | np.isfinite(upper)) & ~np.asarray(other)
+    ).tolist():
+        raise InputError(
+            f"{what}: how large value {lost[0]} may be is not known: nothing moves it at the operating point. Give it "
+            "both bounds"
+        )
+    return np.where(np.isnan(found), 1.0, found)  # of what is not bounded, or does not matter
+
+
+def _hard_rows(bound: HardBound, ocp: OCP, sizes: Array, weights: Array | None = None) -> list[Array]:
+    """Bounds of a hard bound, the penalties by which it gives way, that it is hard, of the end, and sizes, ``(n,)``
+    each.
+    """
+    name = bound.what if isinstance(bound.what, str) else bound.what.name()
+    ranks, range_ = sorted({b.priority for b in ocp.hard}), ocp.input_range
+    size = _violations(bound.lower, bound.upper, sizes, f"hard bound {name}")
     cost = np.full(size.size, max(1.0, float(np.max((ocp.r + ocp.r_delta) * range_**2))))
     if weights is not None and weights.size:
         cost = np.maximum(cost, weights * size**2)
     linear = GIVES_WAY * HIGHER ** ranks.index(bound.priority) * cost / size
-    return [
-        bound.lower,
-        bound.upper,
-        linear,
-        linear / size,
-        np.ones(size.size),
-        np.full(size.size, bound.at_end),
-    ]
+    ends = np.full(size.size, bound.at_end)
+    return [bound.lower, bound.upper, linear, linear / size, np.ones(size.size), ends, size]
 
 
 def _first_stages(model: HybridModel, functions: tuple[ca.Function, ...]) -> tuple[Array, list[Array]]:
@@ -351,10 +402,10 @@ def _first_stages(model: HybridModel, functions: tuple[ca.Function, ...]) -> tup
     return states, rows
 
 
-def _of_point(f: ca.Function, ocp: OCP, model: HybridModel | None) -> ca.Function:
+def _of_point(f: ca.Function, ocp: OCP, model: HybridModel) -> ca.Function:
     """A bounded expression as a function of ``(x, u, e)``."""
-    n_w, n_p = 0 if model is None else model.n_w, ocp.n_p
-    n_e = n_p + (0 if model is None else model.n_d + n_w)
+    n_w, n_p = model.n_w, ocp.n_p
+    n_e = n_p + model.n_d + n_w
     wanted = [(ocp.n_x, 1), (ocp.n_u, 1), (n_w, 1), (n_p, 1)][: f.n_in()]
     if [f.size_in(i) for i in range(f.n_in())] != wanted:
         raise InputError(
@@ -424,8 +475,11 @@ def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None
 class EconomicCost:
     """:func:`stage_cost` along a trajectory, with first and second derivatives; zero where there is none."""
 
-    def __init__(self, ocp: OCP, dt: float, model: HybridModel | None = None) -> None:
+    def __init__(
+        self, ocp: OCP, dt: float, model: HybridModel | None = None, sizes: Array | None = None
+    ) -> None:
         self.function, self._dt, self._n = stage_cost(ocp, model), dt, ocp.horizon
+        self._size = np.concatenate([np.ones(ocp.n_x) if sizes is None else sizes, ocp.input_scale])
         f, n_x, n_u = self.function, ocp.n_x, ocp.n_u
         self.n_p = int(f.numel_in(2)) if f is not None and f.n_in() > 2 else 0
         """Number of its parameters."""
@@ -456,13 +510,17 @@ class EconomicCost:
         return slope, self._dt * f.outputs[1].reshape(n, slope.shape[1], -1)
 
     def convex(self, x: Array, u: Array, p: Array | None = None) -> tuple[Array, Array]:
-        """The same, second derivatives made positive semi-definite: what curves down counts as flat."""
+        """The same, second derivatives made positive semi-definite: what curves down counts as flat.
+
+        Directions are those of states and inputs in their sizes: which curve down must not depend on units.
+        """
         slope, curvature = self.derivatives(x, u, p)
         if not np.all(np.isfinite(curvature)):
             return slope, curvature
-        values, vectors = np.linalg.eigh(curvature)
+        both = np.outer(self._size, self._size)
+        values, vectors = np.linalg.eigh(curvature * both)
         flat = np.maximum(values, 0.0)[:, None, :]
-        return slope, (vectors * flat) @ vectors.transpose(0, 2, 1)
+        return slope, (vectors * flat) @ vectors.transpose(0, 2, 1) / both
 
     def _fill(self, f: BufferedFunction, x: Array, u: Array, p: Array | None) -> None:
         f.inputs[0][:], f.inputs[1][:] = x[: self._n].ravel(), u.ravel()
@@ -513,7 +571,8 @@ class Problem:
     """A model with an :class:`~hybrid_mpc.control.ocp.OCP`, and what every solver needs of the two.
 
     Raises:
-        InputError: If problem and model do not fit, or the terminal weight cannot be found.
+        InputError: If problem and model do not fit, the terminal weight cannot be found, or the size of a state or of
+            what is bounded is not known.
     """
 
     def __init__(self, model: HybridModel, ocp: OCP) -> None:
@@ -532,16 +591,14 @@ class Problem:
                 raise InputError(
                     f"hard bound on y: {bound.lower.size} values given, model {model.name} has {model.n_y} outputs"
                 )
-        self.model, self.ocp = model, ocp
-        self.targets = Targets(model, ocp) if ocp.n_y else None
+        self.model, self.ocp, self.sizes = model, ocp, Sizes(model, ocp)
+        self.targets = Targets(model, ocp, self.sizes) if ocp.n_y else None
         """Steady states for set-points; None where references are the states'."""
         self.terminal = ocp.terminal_weight(model)
-        self.soft = SoftRows(ocp, model)
-        self.economic = EconomicCost(ocp, model.dt, model)
+        self.soft = SoftRows(ocp, model, self.sizes)
+        self.economic = EconomicCost(ocp, model.dt, model, self.sizes.states)
         self.run = free_run(model, ocp.horizon)
         self._rows = np.arange(ocp.horizon + 1)
-        self.state_sizes = state_sizes(model, ocp)
-        """By what solvers scale the states ``(n_x,)``."""
         self._u0 = fixed(np.tile(model.u0, (ocp.horizon, 1)))
         self._even = fixed(np.ones((ocp.horizon + 1, ocp.n_x)))
         self._even_stages = fixed(np.tile(ocp.q * model.dt, (ocp.horizon, 1)))

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Controller, Solution, SplitController, Status
+from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
-from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.model import Expression, HybridModel
 from hybrid_mpc.model.riccati import dare, vector
 
 Array = NDArray[np.float64]
@@ -116,7 +117,7 @@ class SafeController:
             gain = dare(*ocp.linear_quadratic(fallback))[1]
             self._gain = gain[:, : ocp.n_x]
             self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
-            self._rest_input = _equilibrium_input(fallback, ocp.q)
+            self._rest_input = _equilibrium_input(fallback, ocp)
             self._rest_input(fallback.x0, fallback.w)  # a CasADi function's first call is slow
 
     def initial(
@@ -243,13 +244,20 @@ def checked_safe_input(given: ArrayLike, ocp: OCP) -> Array:
     return u
 
 
-def _equilibrium_input(model: HybridModel, q: Array) -> ca.Function:
-    """``(x, w) -> u`` that holds a state best: one Newton step of least squares of ``xdot(x, 0, u)`` from the operating
-    point's input. Rates count in deviations ``1 / sqrt(q)`` of their states.
-    """
+def _equilibrium_input(model: HybridModel, ocp: OCP) -> ca.Function:
+    """``(x, w) -> u`` that holds a state best; see :func:`holding`."""
     x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
-    rates = np.sqrt(np.where(q > 0, q, 1.0)) * model.xdot(x, ca.DM.zeros(model.n_h, 1), u, w, model.p)
-    slope = ca.jacobian(rates, u)
-    damping = 1e-12 * ca.DM.eye(model.n_u)
-    best = u - ca.solve(slope.T @ slope + damping, slope.T @ rates)
-    return ca.Function("equilibrium_input", [x, w], [ca.substitute(best, u, ca.DM(model.u0))])
+    rates = model.xdot(x, ca.DM.zeros(model.n_h, 1), u, w, model.p)
+    return ca.Function("equilibrium_input", [x, w], [holding(rates, u, model, ocp)])
+
+
+def holding(rates: Expression, u: Expression, model: HybridModel, ocp: OCP) -> Expression:
+    """The input that holds a state best, of ``rates`` ``(n_x,)`` of the state with the symbol ``u``: one Newton step of
+    least squares from the operating point's input. Rates count in the sizes of their states, inputs in their scales.
+    """
+    scale, rates = ca.DM(ocp.input_scale), rates / ca.DM(Sizes(model, ocp).states)
+    slope = ca.jacobian(rates, u) @ ca.diag(scale)
+    square = slope.T @ slope
+    damping = (1e-12 * ca.trace(square) + 1e-300) * ca.DM.eye(model.n_u)
+    best = u - scale * ca.solve(square + damping, slope.T @ rates)
+    return ca.densify(ca.substitute(best, u, ca.DM(model.u0)))

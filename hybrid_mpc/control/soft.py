@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import Collected, InputError
 from hybrid_mpc.model.limits import numbers
+from hybrid_mpc.rules import LARGEST
 from nn_export import ExportError, program_of
 
 Array = NDArray[np.float64]
@@ -19,6 +20,9 @@ PENALTY = 1e3
 """Default penalty of a bound's violation, in multiples of what the tolerated deviation ``1 / sqrt(q)`` costs."""
 
 
+EXPRESSION = "(x, u), (x, u, w) or (x, u, w, p) -> column"
+MOST_PRIORITY = 10_000
+"""Largest priority of a hard bound: it is a place in an order."""
 GIVES_WAY = 1e5
 """Penalty of a hard bound's violation by its size, where it cannot be kept, in multiples of what inputs over their
 whole range, or states off by that size, cost: far above the multipliers of a bound that can."""
@@ -72,13 +76,15 @@ class SoftBound:
         linear: ArrayLike,
         quadratic: ArrayLike,
     ) -> None:
-        if not _is_expression(expression):
-            raise InputError(
-                f"soft bound: {expression} given; needed: a function (x, u), (x, u, w) or (x, u, w, p) -> column"
-            )
+        own = Collected()
+        fits = _is_expression(expression)
+        if not fits:
+            own.add(f"soft bound: {expression} given; needed: a function {EXPRESSION}")
+        n = int(expression.size1_out(0)) if fits else None
+        arrays = own(_checked, "soft bound", n, lower, upper, linear, quadratic)
+        own.refuse()
+        assert arrays is not None
         object.__setattr__(self, "expression", expression)
-        n = int(expression.size1_out(0))
-        arrays = _checked("soft bound", n, lower, upper, linear, quadratic)
         for name, value in zip(("lower", "upper", "linear", "quadratic"), arrays, strict=True):
             object.__setattr__(self, name, fixed(value))
 
@@ -136,19 +142,21 @@ class HardBound:
         priority: int = 0,
         at_end: bool = False,
     ) -> None:
-        if what not in ("x", "y") if isinstance(what, str) else not _is_expression(what):
-            raise InputError(
-                f"hard bound: {what!r} given; needed: 'x', 'y', or a function (x, u), (x, u, w) or (x, u, w, p) -> "
-                "column"
+        own = Collected()
+        fits = what in ("x", "y") if isinstance(what, str) else _is_expression(what)
+        if not fits:
+            own.add(f"hard bound: {what!r:.80} given; needed: 'x', 'y', or a function {EXPRESSION}")
+        if not isinstance(priority, int) or isinstance(priority, bool) or abs(priority) > MOST_PRIORITY:
+            own.add(
+                f"hard bound: priority must be a whole number of at most {MOST_PRIORITY} in size, got {priority!r:.80}"
             )
-        if not isinstance(priority, int) or isinstance(priority, bool):
-            raise InputError(f"hard bound: priority must be a whole number, got {priority!r}")
         if not isinstance(at_end, bool):
-            raise InputError(f"hard bound: at_end must be True or False, got {at_end!r}")
-        low, up = numbers(lower, "hard bound: lower"), numbers(upper, "hard bound: upper")
-        n = low.size if isinstance(what, str) else int(what.size1_out(0))
-        one = np.ones(n)
-        low, up = _checked("hard bound", n, low, up, one, one)[:2]
+            own.add(f"hard bound: at_end must be True or False, got {at_end!r:.80}")
+        n = int(what.size1_out(0)) if fits and isinstance(what, ca.Function) else None
+        ends = own(_range, "hard bound", n, lower, upper)
+        own.refuse()
+        assert ends is not None
+        low, up = ends
         for name, value in (
             ("what", what),
             ("lower", fixed(low)),
@@ -157,13 +165,6 @@ class HardBound:
             ("at_end", at_end),
         ):
             object.__setattr__(self, name, value)
-
-    @property
-    def sizes(self) -> Array:
-        """What counts as one violation ``(n,)``: half the range, else the bound's value, else 1."""
-        half = 0.5 * (self.upper - self.lower)
-        value = np.abs(np.where(np.isfinite(self.upper), self.upper, self.lower))
-        return np.where(np.isfinite(half), half, np.where(np.isfinite(value) & (value > 0), value, 1.0))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, HardBound):
@@ -195,52 +196,81 @@ def tightest(lower: Array, upper: Array, hard: Sequence[HardBound], what: str, n
 
 
 def state_bounds(
-    q: Array,
+    weights: Array,
     x_min: ArrayLike | None,
     x_max: ArrayLike | None,
     linear: ArrayLike | None,
     quadratic: ArrayLike | None,
 ) -> tuple[Array, Array, Array, Array]:
-    """Bounds on the states and their penalties ``(n_x,)`` each, the defaults filled in, checked as a soft bound's."""
-    weight = np.where(q > 0, q, 1.0)
+    """Bounds on the states and their penalties ``(n_x,)`` each, the defaults by positive ``weights`` filled in, checked
+    as a soft bound's.
+    """
+    n = weights.size
     return _checked(
-        "state bounds", q.size,
-        np.full(q.size, -np.inf) if x_min is None else x_min,
-        np.full(q.size, np.inf) if x_max is None else x_max,
-        PENALTY * np.sqrt(weight) if linear is None else linear,
-        PENALTY * weight if quadratic is None else quadratic,
+        "state bounds", n,
+        np.full(n, -np.inf) if x_min is None else x_min,
+        np.full(n, np.inf) if x_max is None else x_max,
+        PENALTY * np.sqrt(weights) if linear is None else linear,
+        PENALTY * weights if quadratic is None else quadratic,
     )  # fmt: skip
 
 
-def output_bounds(q_y: Array, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Array, Array]:
-    """Bounds on the outputs and their penalties ``(n_y,)`` each, by the weights ``q_y``; empty where there are none."""
-    given = [numbers(v, name) for v, name in ((lower, "y_min"), (upper, "y_max"))]
+def output_bounds(weights: Array, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Array, Array]:
+    """Bounds on the outputs and their penalties ``(n_y,)`` each, by positive ``weights`` (none: 1); empty where there
+    are none.
+    """
+    given = [numbers(v, name, most=LARGEST) for v, name in ((lower, "y_min"), (upper, "y_max"))]
     n = max(v.size for v in given)
     if not n:
         return tuple(np.zeros(0) for _ in range(4))  # type: ignore[return-value]
-    if q_y.size not in (0, n):
-        raise InputError(f"output bounds: {n} values given, q_y has {q_y.size}; give one for each output")
+    if weights.size not in (0, n):
+        raise InputError(f"output bounds: {n} values given, q_y has {weights.size}; give one for each output")
     low, up = (v if v.size else np.full(n, side) for v, side in zip(given, (-np.inf, np.inf), strict=True))
-    weight = np.where(q_y > 0, q_y, 1.0) if q_y.size else np.ones(n)
+    weight = weights if weights.size else np.ones(n)
     return _checked("output bounds", n, low, up, PENALTY * np.sqrt(weight), PENALTY * weight)
 
 
 def _checked(
-    what: str, n: int, lower: ArrayLike, upper: ArrayLike, linear: ArrayLike, quadratic: ArrayLike
+    what: str, n: int | None, lower: ArrayLike, upper: ArrayLike, linear: ArrayLike, quadratic: ArrayLike
 ) -> tuple[Array, Array, Array, Array]:
-    given = {"lower": lower, "upper": upper, "linear": linear, "quadratic": quadratic}
-    arrays = {name: numbers(value, f"{what}: {name}") for name, value in given.items()}
-    low, up, lin, quad = arrays.values()
-    for name, value in arrays.items():
-        if value.shape != (n,):
-            raise InputError(f"{what}: {name} has {value.size} values, {n} needed")
-    if not np.all(low < up):
-        raise InputError(f"{what} cross: lower {low}, upper {up}; every lower must be below its upper")
-    if not (np.all(np.isfinite(lin)) and np.all(lin >= 0)):
-        raise InputError(f"{what}: linear penalties must be finite and not negative, got {lin}")
-    if not (np.all(np.isfinite(quad)) and np.all(quad > 0)):
-        raise InputError(f"{what}: quadratic penalties must be finite and positive, got {quad}")
+    """Bounds and penalties, ``(n,)`` each; None for ``n``: as many as there are lower bounds."""
+    own = Collected()
+    low, up = own(_range, what, n, lower, upper) or (None, None)
+    lin, quad = (
+        own(_sized, value, n if low is None else low.size, f"{what}: {name}")
+        for name, value in (("linear", linear), ("quadratic", quadratic))
+    )
+    if lin is not None and not (np.all(np.isfinite(lin)) and np.all(lin >= 0)):
+        own.add(f"{what}: linear penalties must be finite and not negative, got {lin}")
+    if quad is not None and not (np.all(np.isfinite(quad)) and np.all(quad > 0)):
+        own.add(f"{what}: quadratic penalties must be finite and positive, got {quad}")
+    own.refuse()
+    assert low is not None
+    assert up is not None
+    assert lin is not None
+    assert quad is not None
     return low, up, lin, quad
+
+
+def _range(what: str, n: int | None, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
+    """Lower and upper bounds, ``(n,)`` each; None for ``n`` as in :func:`_checked`."""
+    own = Collected()
+    low = own(_sized, lower, n, f"{what}: lower")
+    up = own(_sized, upper, n if n is not None or low is None else low.size, f"{what}: upper")
+    if low is not None and up is not None and low.shape == up.shape and not np.all(low < up):
+        own.add(f"{what} cross: lower {low}, upper {up}; every lower must be below its upper")
+    own.refuse()
+    assert low is not None
+    assert up is not None
+    return low, up
+
+
+def _sized(values: ArrayLike, n: int | None, name: str) -> Array:
+    """``values`` as a vector ``(n,)``, or of any size where none is known."""
+    array = numbers(values, name, most=LARGEST)
+    if n is not None and array.shape != (n,):
+        raise InputError(f"{name} has {array.size} values, {n} needed")
+    return array
 
 
 def fixed(array: Array) -> Array:

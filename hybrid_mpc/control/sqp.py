@@ -60,8 +60,8 @@ class ReducedCost:
 
     def __init__(self, inner: CondensedController) -> None:
         self.inner, self.problem = inner, inner.problem
-        sizes, n_h = inner.problem.state_sizes, inner.model.n_h
-        self.stages = StageCurvature(inner.stages, inner.ocp, sizes, n_h, inner.problem.soft)
+        sizes = inner.problem.sizes
+        self.stages = StageCurvature(inner.stages, inner.ocp, sizes.states, sizes.hidden, inner.problem.soft)
         self.metric: Array = np.tile(inner.ocp.input_scale**-2.0, inner.ocp.horizon)
 
     def run(self, z0: Array, u: Array, case: Case) -> Rollout:

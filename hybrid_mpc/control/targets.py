@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
@@ -26,6 +27,9 @@ REACHED = 1e-6
 """Largest deviation of an output that counts as reached, in tolerated deviations ``1 / sqrt(q_y)``."""
 RANK = 1e-9
 """Singular values below this share of the largest count as zero."""
+HEED = 0.2
+"""Rest of a state counts as much as this share of it in a hidden state: of a network that rests hardly, or anywhere
+(its gates are shut), the states' equations are to hold first."""
 FREE = 1e-6
 """Weight of the inputs' distance from the operating point along directions that the outputs do not see."""
 ASIDE = 0.1
@@ -48,6 +52,8 @@ NEARER = 1e-3
 """Largest lack of a steady state, in the states' scales, at which a run has nearly come to rest."""
 PARTS = (2, 4, 8)
 """Parts of the way to a set-point to which no start leads at once."""
+FOLLOWED = 8
+"""Parts of the way from the operating point along which the first set-point is met."""
 LEAST_SHARE = 1e-3
 """Smallest share of a step that is tried."""
 
@@ -109,18 +115,24 @@ class Targets:
     nearest that can, and ``reached`` is False. Where no steady state keeps the bounds of states and outputs, they are
     left out.
 
-    It is Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. It begins
-    where it is told to, then at the operating point, beside it, and where the model's own run from there ends; at the
-    operating point, too, where it misses a set-point because outputs do not answer to the inputs where it was told to
-    begin (``FLAT``). Where all of that leads to no steady state, set-points on the way are met first. No method changes
-    the object's answers; not for several threads at once.
+    It is Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. It
+    begins where it is told to. Where there is no such start, or whole steps do not lead from it to a steady state,
+    the set-point is met by way of ``FOLLOWED`` others between the operating point's outputs and it: of several
+    steady states the one on the operating point's branch is taken, which rounding does not change; shortened steps
+    over a long way may end at any of them. Then it begins at the operating point, beside it, and where the model's
+    own run from there ends; at the operating point, too, where it misses a set-point because outputs do not answer
+    to the inputs where it began (``FLAT``). Where all of that leads to no steady state, set-points on the way from
+    the start are met first. All counts in the :class:`~hybrid_mpc.control.sizes.Sizes` of the problem, so that no
+    answer depends on units. No method changes the object's answers; not for several threads at once.
 
     Args:
         model: The model, with its disturbance model.
         ocp: A problem with weights on outputs.
+        sizes: Sizes of the signals. Default: made of the two.
 
     Raises:
-        InputError: If the problem has no weights on outputs, or they are another number than the model's.
+        InputError: If the problem has no weights on outputs, or they are another number than the model's; if the size
+            of a state is not known.
 
     Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2017, section 1.5.
 
@@ -136,7 +148,7 @@ class Targets:
         (array([1.5]), array([2.]), False)
     """
 
-    def __init__(self, model: HybridModel, ocp: OCP) -> None:
+    def __init__(self, model: HybridModel, ocp: OCP, sizes: Sizes | None = None) -> None:
         if ocp.q_y.size != model.n_y or not ocp.n_y:
             raise InputError(
                 f"targets: the problem has q_y = {ocp.q_y}, model {model.name} {model.n_y} outputs; give a weight each"
@@ -149,8 +161,11 @@ class Targets:
         self._on_u, self._on_x, self._on_y = model.disturbed
         self._tracked = np.flatnonzero(ocp.q_y > 0)
         self._root = np.sqrt(ocp.q_y[self._tracked])
-        self.scale: Array = np.concatenate([state_sizes(model, ocp), np.ones(model.n_h), ocp.input_scale])
+        sizes = Sizes(model, ocp) if sizes is None else sizes
+        self.scale: Array = np.concatenate([sizes.states, sizes.hidden, ocp.input_scale])
         """What 1 means of the unknowns ``(x, h, u)`` ``(n_z + n_u,)``."""
+        self.heed: Array = np.concatenate([np.full(model.n_x, HEED), np.ones(model.n_h)])
+        """Shares ``(n_z,)`` of these that count as much in the equations of rest."""
         ranges = [np.array([(s.lower, s.upper) for s in group]).T for group in (model.states, model.outputs)]
         x_min, x_max = ocp.state_range
         y_min, y_max = ocp.output_range(model.n_y)
@@ -190,13 +205,23 @@ class Targets:
         if given is None:
             _ = self.run_out  # thousands of periods: at the first plan, not in some later period
         best: Steady | None = None
+        own, follows = None if given is None else given.unknowns, wide
         for bounded in (True, False):
             beside = None if wide and bounded else int(wide or given is None)
-            for first in self._firsts(given, beside):
-                found, off, slopes = self._descend(first, goal, d, w, bounded)
+            for first in self._firsts(own, beside):
+                if follows and first is not own:
+                    follows = False
+                    if (followed := self._approached(None, goal, d, w, (FOLLOWED,))) is not None:
+                        return followed
+                    if best is not None and best.steady:
+                        return best
+                found, off, slopes, straight = self._descend(first, goal, d, w, bounded)
+                if follows and not straight:
+                    best = found
+                    continue
                 missed = found.steady and not found.reached and first is not self.beside[0]
                 if missed and np.vdot(slopes, self.slopes) < self.flat:
-                    other, nearer, _ = self._descend(self.beside[0], goal, d, w, bounded)
+                    other, nearer, *_ = self._descend(self.beside[0], goal, d, w, bounded)
                     found = other if other.steady and nearer < off else found
                 if found.steady:
                     return found
@@ -206,24 +231,26 @@ class Targets:
         assert best is not None
         return best
 
-    def _firsts(self, given: Steady | None, most: int | None) -> Iterator[Array]:
+    def _firsts(self, given: Array | None, most: int | None) -> Iterator[Array]:
         """Points at which a descent begins: the given one and ``most`` of :attr:`beside`; with None all of these, and
         :attr:`run_out` last. What is not needed is not computed.
         """
         if given is not None:
-            yield given.unknowns
+            yield given
         if most != 0:
             yield from self.beside[:most]
         if most is None:
             yield from self.run_out
 
-    def _approached(self, given: Steady | None, goal: Array, d: Array, w: Array) -> Steady | None:
+    def _approached(
+        self, given: Steady | None, goal: Array, d: Array, w: Array, every: Sequence[int] = PARTS
+    ) -> Steady | None:
         """The steady state to which descents lead along set-points between the outputs at a point near rest and the
         goal, a few, then more of them; None where they lead to none.
         """
         first = (self.run_out or self.beside)[0] if given is None else given.unknowns
         begun = self._outputs(first, d, w)[0]
-        for parts in PARTS:
+        for parts in every:
             v = first
             for k in range(1, parts + 1):
                 found = self._descend(v, begun + k / parts * (goal - begun), d, w, True)[0]
@@ -286,14 +313,14 @@ class Targets:
     @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
     def _descend(
         self, v: Array, goal: Array, d: Array, w: Array, bounded: bool
-    ) -> tuple[Steady, float, Array]:
+    ) -> tuple[Steady, float, Array, bool]:
         """Gauss-Newton from ``v = (x, h, u)``; ``bounded``: within the bounds of states and outputs.
 
         Returns:
-            The answer, its largest deviation, and :attr:`slopes` there.
+            The answer, its largest deviation, :attr:`slopes` there, and whether all steps were whole ones.
         """
         n_x, n_z = self.model.n_x, self._n_z
-        at, done = self._point(v, goal, d, w), False
+        at, done, straight = self._point(v, goal, d, w), False, True
         lacks = [at.lacks]
         for _ in range(ITERATIONS):
             step, slopes = self._newton(at, goal, bounded)
@@ -306,7 +333,7 @@ class Targets:
             share = 1.0
             after = self._settled(at.v + step, goal, d, w)
             while not after.merit < at.merit and share > LEAST_SHARE:
-                share *= 0.5
+                share, straight = 0.5 * share, straight and size < NEAR
                 after = self._settled(at.v + share * step, goal, d, w)
             if not after.merit < at.merit:
                 done = size < NEAR and at.lacks <= STILL  # rounding is all that is left
@@ -317,13 +344,15 @@ class Targets:
                 break
         off = float(np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0))
         u = np.clip(at.v[n_z:], self._ocp.u_min, self._ocp.u_max)
-        return Steady(at.v[:n_x], at.v[n_x:n_z], u, at.y, done and off <= REACHED, done), off, slopes
+        steady = Steady(at.v[:n_x], at.v[n_x:n_z], u, at.y, done and off <= REACHED, done)
+        return steady, off, slopes, straight
 
     def _newton(self, at: _Point, goal: Array, bounded: bool) -> tuple[Array | None, Array]:
         """The step that the linearization asks for, None where its QP has no answer; and :attr:`slopes` there."""
-        m, scale, v, y, rest = self.model, self.scale, at.v, at.y, at.rest
+        m, scale, v, y = self.model, self.scale, at.v, at.y
         n_z, n_x = self._n_z, m.n_x
-        e, j = at.rest_by_v * scale, at.y_by_v * scale
+        own = scale[:n_z] * self.heed  # rows have units, too: which rank they have must not depend on these
+        rest, e, j = at.rest / own, at.rest_by_v * scale / own[:, None], at.y_by_v * scale
         if not (np.all(np.isfinite(e)) and np.all(np.isfinite(j)) and np.all(np.isfinite(rest))):
             return None, np.full((self._tracked.size, m.n_u), np.nan)
         left, sizes, right = np.linalg.svd(e)
@@ -365,11 +394,12 @@ class Targets:
         plain = at = self._point(v, goal, d, w)
         hidden = slice(self.model.n_x, self._n_z)
         for _ in range(SETTLING if self.model.n_h else 0):
-            off = at.rest[hidden]
+            size = self.scale[hidden]
+            off = at.rest[hidden] / size
             if not np.all(np.isfinite(at.rest)) or np.max(np.abs(off)) < STEADY:
                 break
             try:
-                move = np.linalg.solve(at.rest_by_v[hidden, hidden], -off)
+                move = size * np.linalg.solve(at.rest_by_v[hidden, hidden] * size / size[:, None], -off)
             except np.linalg.LinAlgError:
                 return plain
             v = at.v.copy()
@@ -447,13 +477,3 @@ def bounded_least_squares(h: Array, g: Array, rows: Array, lower: Array, upper: 
         return None
     t = -rest[:-1] / rest[-1]
     return np.asarray(free + np.linalg.solve(root.T, t))
-
-
-def state_sizes(model: HybridModel, ocp: OCP) -> Array:
-    """A size of each state ``(n_x,)``: what its weight tolerates, ``1 / sqrt(q)``; without a weight half its range,
-    else the operating point's value, else 1.
-    """
-    half = np.array([0.5 * (s.upper - s.lower) for s in model.states])
-    point = np.where(model.x0 != 0, np.abs(model.x0), 1.0)
-    other = np.where(np.isfinite(half), half, point)
-    return np.where(ocp.q > 0, 1.0 / np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0)), other)

@@ -16,9 +16,9 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
 
 Array = NDArray[np.float64]
-NOTHING = 1e-6
-"""Spread of a signal over its size at or below which it counts as constant: rounding of a file, far below any
-converter."""
+ROUNDING = 1e-12
+"""Span of a signal over its largest value at or below which it is constant: what is left of equal numbers after they
+are converted and interpolated. Any larger span is a motion, however small beside the level or the range."""
 WEAKEST = 0.1
 """Amplitude of a spectral line over that of the strongest, from which on it counts."""
 LOBE = 2
@@ -315,10 +315,10 @@ def check_excitation(
     found, problems = excitation_of(trajectories, inputs), []
     names = ", ".join(dict.fromkeys(piece.file for piece in trajectories))
     for j, one in enumerate(found):
-        if one.spread <= NOTHING * _size([piece.u[:, j] for piece in trajectories], inputs, j):
+        if is_constant(np.concatenate([piece.u[:, j] for piece in trajectories])):
             level = trajectories[0].u[0, j]
             problems.append(
-                f"{names}: the input {one.name} is {level:g} throughout; what it does cannot be learned. Add a "
+                f"{names}: the input {one.name} is {level:.10g} throughout; what it does cannot be learned. Add a "
                 "recording in which it moves, or check that the DataSpec names the right column."
             )
     for j in range(trajectories[0].y.shape[1]):
@@ -326,15 +326,25 @@ def check_excitation(
         every = every[np.isfinite(every)]
         if not len(every):
             continue  # not measured here, perhaps elsewhere: nothing to say
-        if float(every.std()) <= NOTHING * _size([every], outputs, j):
+        if is_constant(every):
             name = outputs[j].name if j < len(outputs) else f"output {j + 1}"
             problems.append(
-                f"{names}: the output {name} is {every[0]:g} throughout: the machine never moved. Excite it harder "
+                f"{names}: the output {name} is {every[0]:.10g} throughout: the machine never moved. Excite it harder "
                 "than its friction, or check that the DataSpec names the right column."
             )
     refuse(problems)
     need = -(-parameters // 2)
     return tuple(_too_few(one, parameters, need) for one in found if len(one.lines) < need)
+
+
+def is_constant(values: Array) -> bool:
+    """Whether numbers ``(m,)`` are one and the same but for rounding.
+
+    Example:
+        >>> is_constant(np.array([0.1 + 0.2, 0.3])), is_constant(1e6 + np.array([0.0, 1e-3]))
+        (True, False)
+    """
+    return bool(np.ptp(values) <= ROUNDING * np.abs(values).max(initial=0.0))
 
 
 def _too_few(one: Excitation, parameters: int, need: int) -> str:
@@ -347,19 +357,11 @@ def _too_few(one: Excitation, parameters: int, need: int) -> str:
     )
 
 
-def _size(pieces: Sequence[Array], signals: Sequence[Signal], j: int) -> float:
-    """Largest value of a signal, or of its plausible range where that is bounded."""
-    size = max(float(np.abs(piece).max()) for piece in pieces)
-    if j < len(signals):
-        size = max([size, *(abs(b) for b in (signals[j].lower, signals[j].upper) if np.isfinite(b))])
-    return size
-
-
 def _lines(pieces: Sequence[tuple[Array, float]]) -> tuple[float, ...]:
     """Frequencies of distinct lines of one input over all pieces."""
     spectra = [_hann_spectrum(u, dt) for u, dt in pieces if len(u) > 2 * LOBE]
     strongest = max((float(a.max()) for _, a in spectra), default=0.0)
-    if strongest <= NOTHING * max(float(np.abs(u).max()) for u, _ in pieces):
+    if strongest <= ROUNDING * max(float(np.abs(u).max()) for u, _ in pieces):
         return ()  # constants, and what rounding makes of them
     found: list[tuple[float, float]] = []
     for f, amplitude in spectra:

@@ -16,9 +16,9 @@ import re
 import warnings
 from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -49,6 +49,8 @@ LONGEST_ROW = 2**20
 """Longest row of a CSV file [byte]: ten thousand columns of a hundred characters."""
 ALIKE = 0.7
 """How alike a column's name must be to be proposed: ``inflow_degC`` is by 0.6 like ``tank_degC``, by its unit alone."""
+OBJECTS = "objects (timeseries, timetable, datetime)"
+"""What MATLAB's objects are called in messages."""
 LISTED = 30
 """Most names that a message lists."""
 COMPARED = 1000
@@ -59,19 +61,39 @@ TOP = 2**16
 """Bytes of the header that are looked at for the separator [byte]."""
 BLANK = ("", "nan", "na", "n/a")
 """Cells that say that there is no value, in small letters."""
+SAMPLE = 2**17
+"""Bytes at the beginning of a CSV file that show where its table begins: preambles have some hundred lines [byte]."""
+STEADY = 3
+"""Fewest rows of numbers at the end of that sample that show a table."""
+OTHERS = {"|": "vertical bars", " ": "blanks"}
+"""Separators that are recognised and not read."""
+ENGLISH, GERMAN = "on off true false yes no open closed high low", "ein aus an auf zu ja"
+SWITCH = frozenset(f"{ENGLISH} {GERMAN}".split())
+"""Words for the two positions of a switch, in small letters."""
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[.,'’ \u00a0\u202f]\d{3})+(?:[.,]\d*)?")
+_DATE = re.compile(
+    r"\d{1,4}([-/. ])(\d{1,2}|[a-z]{3,9})\.?\1\d{1,4}([T ,].*)?|\d{1,3}:\d{2}(:\d{2})?([.,]\d+)?(\s?[ap]m)?",
+    re.I,
+)
+_WITH_UNIT = re.compile(r"[+-]?\d+(?:[.,]\d*)?(?:e[+-]?\d+)?\s*(?P<unit>[^\W\d_][^\d_,;]{0,11}|%|°\w?)", re.I)
 
 
 def name_and_unit(column: str) -> tuple[str, str]:
     """A column's name and the unit that stands behind it in brackets; ``""`` if there is none.
 
+    A whole number in brackets is an index, as in ``state[0]`` and ``y(1)``; ``[1]`` behind a blank is the unit 1.
+
     Example:
         >>> name_and_unit("level [mm]"), name_and_unit("time (s)"), name_and_unit("phi")
         (('level', 'mm'), ('time', 's'), ('phi', ''))
+        >>> name_and_unit("state[0]"), name_and_unit("slip [1]")
+        (('state[0]', ''), ('slip', '1'))
     """
     for opening, closing in ("[]", "()"):
         name, bracket, unit = column.removesuffix(closing).rpartition(opening)
         if column.endswith(closing) and bracket and name.strip():
-            return name.strip(), unit.strip()
+            index = re.fullmatch(r"[\d\s,;:]*", unit) and not (unit.strip() == "1" and name[-1].isspace())
+            return (column, "") if index else (name.strip(), unit.strip())
     return column, ""
 
 
@@ -85,18 +107,39 @@ class Columns:
 
     ``values`` ``(m, n)`` has a column for each name asked for, NaN where there is no finite number. ``row`` is what
     the file's own tools call a row, ``"row"`` or ``"index"``, and ``numbers`` are the rows' numbers as they count.
-    ``problems`` of single columns have place and remedy, without the file's name; a blank cell is one only in columns
-    that may have none.
+    ``faults`` say by column what is wrong with its cells, with place and remedy, without the file's name; a blank cell
+    is a fault only in columns that may have none. Those of the name ``""`` concern all columns.
     """
 
     values: Array
     row: str
     numbers: Sequence[int]
-    problems: tuple[str, ...] = ()
+    faults: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """All faults."""
+        return tuple(self.faults.values())
 
     def place(self, k: int) -> str:
         """Where sample ``k`` stands in the file, e.g. ``"row 12"``."""
         return f"{self.row} {self.numbers[k]}"
+
+    def disorder(self, t: Array, stamps: str) -> str:
+        """Where time stamps ``t`` ``(m,)`` [s] do not increase, and what to do; empty where all do.
+
+        ``stamps`` says what they come from, e.g. ``"column 't'"``.
+        """
+        wrong = np.diff(t) <= 0
+        if not wrong.any():
+            return ""
+        k, such = int(np.argmax(wrong)), int(wrong.sum())
+        what = "repeats" if t[k] == t[k + 1] else "decreases"
+        return (
+            f"{self.place(k + 1)}, {stamps}: time {what} ({t[k]:.10g} s, then {t[k + 1]:.10g} s"
+            f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete the repeated rows or "
+            "split the file into recordings."
+        )
 
 
 @dataclass(frozen=True)
@@ -104,7 +147,8 @@ class Source:
     """A recording's file, opened: ``read(full name of the time, full names, blanks)`` gives the columns, time first.
 
     ``blanks`` are the names of columns that may have blank cells; a time of None is no column. ``sha256`` is that of
-    the file's bytes; ``note`` is what else a user should know who misses a column.
+    the file's bytes; ``note`` is what else a user should know who misses a column, ``unread`` the names of variables
+    of kinds that are not read.
     """
 
     path: Path
@@ -112,6 +156,7 @@ class Source:
     header: tuple[str, ...]
     read: Callable[[str | None, Sequence[str], Collection[str]], Columns]
     note: str = ""
+    unread: tuple[str, ...] = ()
 
     def find(self, name: str) -> str:
         """Full name of a column: its own, ``struct.field`` where just one struct has it, or with its unit in brackets.
@@ -218,6 +263,7 @@ def _csv(path: Path) -> Source:
     content = _content(path, text.check)
     text.check(b"", last=True)
     separator = _separator(content)
+    _check_layout(path, content, separator)
     line, header = next(_rows(path, content, separator), (1, []))
     names = tuple(name.strip() for name in header)
 
@@ -239,6 +285,133 @@ def _separator(content: bytes) -> str:
         SEPARATORS,
         key=lambda separator: max((len(row) for row in csv.reader(line, delimiter=separator)), default=0),
     )
+
+
+class _Look(NamedTuple):
+    """What a row looks like: its number, its cells, how many hold something, how many of these a number."""
+
+    line: int
+    cells: int
+    filled: int
+    numbers: int
+    ends_blank: bool
+
+    @property
+    def is_data(self) -> bool:
+        """Whether it may be a row of a table of numbers."""
+        return self.cells > 1 and self.numbers > 0 and 2 * self.numbers >= self.filled
+
+
+def _looks(text: str, separator: str, whole: bool) -> list[_Look]:
+    """The rows of a sample; the last one may be cut off unless the sample is the ``whole`` file."""
+    if separator == " ":
+        rows: Iterator[Row] = ((i, line.split()) for i, line in enumerate(text.splitlines(), 1))
+    else:
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        rows = ((reader.line_num, cells) for cells in reader)
+    found = []
+    try:
+        for line, cells in rows:
+            filled = [cell.strip() for cell in cells if cell.strip()]
+            if filled:
+                numbers = sum(math.isfinite(_number(_pointed(cell, separator))) for cell in filled)
+                found.append(_Look(line, len(cells), len(filled), numbers, not cells[-1].strip()))
+    except csv.Error:  # reading the rows says where
+        return []
+    return found if whole else found[:-1]
+
+
+def _table(rows: Sequence[_Look], strict: bool = False) -> int:
+    """How many rows at the end are a table's rows of numbers, all with as many cells; ``strict``: of numbers alone."""
+    count = 0
+    for row in reversed(rows):
+        if not row.is_data or row.cells != rows[-1].cells or (strict and row.numbers < row.filled):
+            break
+        count += 1
+    return count
+
+
+def _check_layout(path: Path, content: bytes, separator: str) -> None:
+    """Refuse a file whose first row is not the header of its table, by its cause: nothing in it could be found.
+
+    Where its beginning, split by the header's separator, does not end with a table, it is split by all others.
+    """
+    text, whole = content[:SAMPLE].decode("utf-8-sig", errors="ignore"), len(content) <= SAMPLE
+    _, first = next(_rows(path, content, separator), (1, list[str]()))
+    best, rows = separator, _looks(text, separator, whole)
+    length, told = _table(rows), list[str]()
+    if length < STEADY:
+        looks = {one: _looks(text, one, whole) for one in (*SEPARATORS, *OTHERS) if one != separator}
+        best = max(looks, key=lambda one: _table(looks[one], strict=True))
+        length = _table(looks[best], strict=True)
+        best, rows, length = (best, looks[best], length) if length >= STEADY else (separator, rows, 0)
+    begin = len(rows) - length
+    header = begin - 1
+    above = rows[header - 1] if header > 0 else None
+    if above and above.cells == rows[header].cells == rows[-1].cells and above.filled >= rows[header].filled:
+        header -= 1  # a row of units below it
+    if best in OTHERS:
+        told.append(f"cells are separated by {OTHERS[best]}. Separate them by commas, semicolons or tabs.")
+    elif best != separator and header <= 0:
+        told.append(
+            f"cells are separated by {SEPARATORS[best]}, and the first row has {SEPARATORS[separator]}, too. Leave "
+            "these out there."
+        )
+    other = length > sum(row.is_data and row.cells == rows[0].cells for row in rows[:begin])
+    if _are_values(first, separator) if best == separator else begin == 0:
+        told.append(
+            f"row {rows[0].line if rows else 1} holds values, where the header is due. Write a first row with a name "
+            "for each column, e.g. 'time [s]'."
+        )
+    elif other and rows[0].cells != rows[-1].cells:
+        if header > 0:
+            told.append(
+                f"a preamble stands before the table, whose header seems to be row {rows[header].line}. Delete the "
+                "rows before it."
+            )
+        elif rows[-1].cells - rows[0].cells == 1 and all(row.ends_blank for row in rows[begin:]):
+            told.append(
+                f"rows end with a separator and the header (row {rows[0].line}) does not: {rows[-1].cells} cells for "
+                f"{rows[0].cells} names. Delete the separators at the ends of the rows."
+            )
+        elif rows[0].cells - rows[-1].cells == 1 and rows[0].ends_blank:
+            told.append(
+                f"the header (row {rows[0].line}) ends with a separator and the rows do not. Delete it there."
+            )
+    refuse([f"{path}: {one}" for one in told])
+
+
+def _are_values(cells: Sequence[str], separator: str) -> bool:
+    """Whether cells are those of a row of numbers or dates, not names: all that are not blank, and one at least."""
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    numbers = [
+        math.isfinite(_number(_pointed(cell, separator))) or bool(_DATE.fullmatch(cell)) for cell in filled
+    ]
+    return any(numbers) and all(
+        number or cell.casefold() in {*BLANK, *SWITCH} or bool(_WITH_UNIT.fullmatch(cell))
+        for number, cell in zip(numbers, filled, strict=True)
+    )
+
+
+def _pointed(cell: str, separator: str) -> str:
+    """A cell with a decimal point: where no comma separates, the decimal mark may be a comma."""
+    return cell if separator == "," else cell.replace(",", ".")
+
+
+def _cause(cell: str) -> str:
+    """What a cell that is no number is, and what to write; empty where nobody knows."""
+    if _THOUSANDS.fullmatch(cell):
+        return "it has a mark between thousands. Write numbers without that, with a decimal point"
+    if re.fullmatch(r"[+-]?\d*,\d+", cell):
+        return "it has a decimal comma. Write a decimal point, or separate cells by semicolons"
+    if _DATE.fullmatch(cell):
+        return "it is a date or a time of day. Write numbers, of a time seconds since the beginning"
+    if cell.casefold() in SWITCH:
+        return "it is a word for a switch. Write 1 and 0"
+    if found := _WITH_UNIT.fullmatch(cell):
+        unit = found["unit"]
+        return f"it is a number with a unit. Write the number alone and the unit into the header, e.g. 'name [{unit}]'"
+    return ""
 
 
 class _Text:
@@ -298,6 +471,7 @@ def _parsed(
     bad = [0] * len(places)  # cells of each column that are no number, and the first of them
     first_bad = [(0, "")] * len(places)
     unequal, first_unequal = 0, (0, 0)
+    words = 0  # the first row, if it holds no number at all
     marks: dict[
         str, tuple[int, str]
     ] = {}  # decimal marks where they may be commas, and the first cell of each
@@ -309,6 +483,8 @@ def _parsed(
             continue
         if len(numbers) == most:
             raise InputError(f"{path}: has more than {most} rows, more than are read. Split the recording.")
+        if not numbers and not any(math.isfinite(_number(_pointed(cell, separator))) for cell in cells):
+            words = line
         numbers.append(line)
         for j, place in enumerate(places):
             cell = cells[place]
@@ -316,8 +492,7 @@ def _parsed(
                 for mark in ",.":
                     if mark in cell:
                         marks.setdefault(mark, (line, cell.strip()))
-                cell = cell.replace(",", ".")
-            value = _number(cell)
+            value = _number(_pointed(cell, separator))
             columns[j].append(value)
             if value != value and not (lax[j] and cell.strip().lower() in BLANK):
                 first_bad[j] = first_bad[j] if bad[j] else (line, cells[place].strip())
@@ -329,22 +504,27 @@ def _parsed(
             f"{path}: row {line} has {count} cells, the header (row {header}) has {len(names)}{such}. "
             f"Separate cells by {SEPARATORS[separator]}, write decimals with a point, and complete or delete the row."
         )
-    problems = []
+    faults = {}
     for name, count, (line, cell) in zip(wanted, bad, first_bad, strict=True):
         if count:
             what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
             such = f" ({count} such rows)" if count > 1 else ""
-            problems.append(
-                f"row {line}, column {shown(name)} {what}{such}. Delete the row (longer gaps are cut out) or repair "
-                "the value."
-            )
+            remedy = ". Delete the row (longer gaps are cut out) or repair the value."
+            if line == words:
+                remedy = (
+                    ", as no cell of that row: a row of units? Delete it, and write the units behind the names, e.g. "
+                    "'time [s]'."
+                )
+            elif cause := _cause(cell):
+                remedy = f": {cause}."
+            faults[name] = f"row {line}, column {shown(name)} {what}{such}{remedy}"
     if len(marks) > 1:
         (with_comma, comma), (with_point, point) = marks[","], marks["."]
-        problems.append(
+        faults[""] = (
             f"numbers have commas and points: {shown(comma)} in row {with_comma}, {shown(point)} in row {with_point}. "
             "Write the file with one decimal mark and nothing between thousands."
         )
-    return Columns(np.column_stack([np.array(column) for column in columns]), "row", numbers, tuple(problems))
+    return Columns(np.column_stack([np.array(column) for column in columns]), "row", numbers, faults)
 
 
 def _number(cell: str) -> float:
@@ -427,9 +607,11 @@ def _mat(path: Path) -> Source:
             f"save('{path.name}', ..., '-v7')."
         )
     try:
-        check_structure(content, _budget(content))
+        objects = check_structure(content, _budget(content))
         with warnings.catch_warnings():
             warnings.simplefilter("error", MatReadWarning)  # two variables of one name, for one
+            # scipy gives all objects this name; they are named by the file's structure
+            warnings.filterwarnings("ignore", 'Duplicate variable name "None"', MatReadWarning)
             variables = loadmat(io.BytesIO(content), struct_as_record=True)
     except Exception as error:  # a damaged file raises nearly anything
         raise InputError(
@@ -437,29 +619,33 @@ def _mat(path: Path) -> Source:
             f"save('{path.name}', ..., '-v7'), large vectors with '-v6'."
         ) from error
     vectors: dict[str, NDArray[Any]] = {}
-    unread: set[str] = set()
+    unread: dict[str, list[str]] = {}  # kinds of variables that are not read, and their names
+    if objects:
+        unread[OBJECTS] = list(objects)
     for name, value in variables.items():
-        if name.startswith("__"):
+        if name.startswith("__") or isinstance(value, MatlabOpaque):
             continue
         if what := _unread(value):
-            unread.add(what)
+            unread.setdefault(what, []).append(name)
         elif value.dtype.names is None:
             vectors[name] = value
         else:
             for field in value.dtype.names:
                 inner = value[field].item()
                 if what := _unread(inner) or ("structs in structs" if inner.dtype.names else ""):
-                    unread.add(what)
+                    unread.setdefault(what, []).append(f"{name}.{field}")
                 else:
                     vectors[f"{name}.{field}"] = inner
-    note = f" Not read are {' and '.join(sorted(unread))}: save their vectors as variables." if unread else ""
-    return _vectors(path, content, tuple(vectors), vectors.__getitem__, "row", 1, note)
+    told = [f"{what} ({', '.join(map(shown, names[:LISTED]))})" for what, names in sorted(unread.items())]
+    note = f" Not read are {' and '.join(told)}. Save their vectors as variables." if told else ""
+    lost = tuple(name for names in unread.values() for name in names)
+    return _vectors(path, content, tuple(vectors), vectors.__getitem__, "row", 1, note, lost)
 
 
 def _unread(value: Any) -> str:
     """What kind of variable this is if it is of a kind that is not read."""
     if isinstance(value, MatlabOpaque | MatlabObject):
-        return "objects (timeseries, timetable, datetime)"
+        return OBJECTS
     if isinstance(value, np.ndarray) and value.dtype.names is not None and value.size != 1:
         return "arrays of structs"
     return "" if isinstance(value, np.ndarray) else "sparse matrices"
@@ -478,6 +664,7 @@ def _vectors(
     row: str,
     first: int,
     note: str = "",
+    unread: tuple[str, ...] = (),
 ) -> Source:
     """A source of vectors of one length, whose rows are counted from ``first``.
 
@@ -509,18 +696,18 @@ def _vectors(
             each = ", ".join(f"{shown(name)} {length}" for name, length in lengths.items())
             raise InputError(f"{path}: columns differ in length: {each}. Save vectors of one length.")
         values = np.column_stack(columns)
-        found = []
+        found = {}
         for name, column in zip(names, values.T, strict=True):
             bad = np.flatnonzero(np.isinf(column) if name in blanks else ~np.isfinite(column))
             if len(bad):
-                found.append(
+                found[name] = (
                     f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
                     f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value."
                 )
         values[~np.isfinite(values)] = np.nan
-        return Columns(values, row, range(first, first + len(values)), tuple(found))
+        return Columns(values, row, range(first, first + len(values)), found)
 
-    return Source(path, hashlib.sha256(content).hexdigest(), header, read, note)
+    return Source(path, hashlib.sha256(content).hexdigest(), header, read, note, unread)
 
 
 def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:

@@ -139,21 +139,25 @@ def still_stretches(
     """Stretches of equal samples that no rest of the machine explains; an encoder, however coarse, at rest is none.
 
     ``"abrupt"``: a machine comes to rest and starts from it with changes of speed that it also makes elsewhere, and
-    this one is ``ABRUPT`` times as sharp. Steps of the sensor count as changes. ``"noise"``: a sensor whose noise is
-    larger than its steps flickers at rest, and here it does not; exact zeros, which speeds made from counts have at
-    rest, do not count. ``"driven"``: the inputs go on for longer than ``patience``.
+    this one is ``ABRUPT`` times as sharp. Steps of the sensor count as changes; where an input steps, a machine may
+    start or stop as sharply as it likes. ``"noise"``: a sensor whose noise is larger than its steps flickers at
+    rest, and here it does not; exact zeros, which speeds made from counts have at rest, do not count. ``"driven"``:
+    the inputs go on for longer than ``patience``.
     """
     flat = np.r_[False, (np.diff(y) == 0) & ~gaps(t, max_gap), False]
     edges = np.flatnonzero(np.diff(flat.astype(np.int8)))
     first, last = edges[::2], edges[1::2]
+    # in bursts of samples a sensor does not change either: they are to last as long as usual ones
+    usual = np.diff(t)[~gaps(t, max_gap)]
     long = last - first + 1 >= SHORTEST
+    long &= t[last] - t[first] >= (SHORTEST - 1.5) * (float(usual.mean()) if len(usual) else 0.0)
     first, last = first[long], last[long]
     if not len(first):
         return ()
     step = np.diff(y)
     ordinary = _elsewhere(len(step), first, last) & ~gaps(t, max_gap)
     resolution = float(np.quantile(np.abs(step[step != 0]), STEP)) if step.any() else math.inf
-    at = _abrupt(t, y, first, last, ordinary, resolution)
+    at = _abrupt(t, y, first, last, ordinary, resolution, _stepped(u, spreads))
     noise, longest = _noise(t, y, ordinary, resolution)
     found = []
     for a, b, speed in zip(first.tolist(), last.tolist(), at.tolist(), strict=True):
@@ -166,8 +170,24 @@ def still_stretches(
     return tuple(found)
 
 
-def _abrupt(t: Array, y: Array, first: Indices, last: Indices, ordinary: Mask, resolution: float) -> Array:
-    """Speed right before or after each stretch if no ordinary change of speed explains it, else zero."""
+def _stepped(u: Array, spreads: Array) -> Indices:
+    """Samples from which on an input is another one by half of its spread: the machine is free to start or stop."""
+    moving = spreads > 0
+    changes = np.abs(np.diff(u[:, moving], axis=0)) > STIRRED * spreads[moving]
+    return np.flatnonzero(changes.any(axis=1)) + 1
+
+
+def _abrupt(
+    t: Array, y: Array, first: Indices, last: Indices, ordinary: Mask, resolution: float, stepped: Indices
+) -> Array:
+    """Speed right before or after each stretch if neither an ordinary change of speed nor a step of an input explains
+    it, else zero.
+    """
+
+    def explained(at: Indices, span: int) -> Mask:  # by a step up to a span and two samples away
+        near = np.searchsorted(stepped, at - span - 2), np.searchsorted(stepped, at + span + 3)
+        return np.asarray(near[0] < near[1])
+
     found = np.zeros(len(first))
     period = float(np.median(np.diff(t)))
     near = np.r_[0, np.cumsum(~ordinary)]  # steps that are not ordinary, up to each sample
@@ -182,8 +202,10 @@ def _abrupt(t: Array, y: Array, first: Indices, last: Indices, ordinary: Mask, r
             chosen = change > 0  # a sensor slower than its recording repeats itself always
         most = float(np.quantile(change[chosen], ORDINARY)) if chosen.any() else 0.0
         limit = ABRUPT * max(most, resolution / (span * period))
-        before = np.where(first >= span, np.abs(speed[np.maximum(first - span, 0)]), 0.0)
-        after = np.where(last + span < len(y), np.abs(speed[np.minimum(last, len(speed) - 1)]), 0.0)
+        begins = (first >= span) & ~explained(first, span)
+        ends = (last + span < len(y)) & ~explained(last, span)
+        before = np.where(begins, np.abs(speed[np.maximum(first - span, 0)]), 0.0)
+        after = np.where(ends, np.abs(speed[np.minimum(last, len(speed) - 1)]), 0.0)
         there = np.maximum(before, after)
         found = np.maximum(found, np.where(there > limit, there, 0.0))
     return found

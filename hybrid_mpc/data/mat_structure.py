@@ -63,26 +63,27 @@ def version(content: bytes) -> str:
     return "7.3" if content[125 if mark == b"IM" else 124] == 2 else "5"
 
 
-def check_structure(content: bytes, budget: int) -> None:
+def check_structure(content: bytes, budget: int) -> tuple[str, ...]:
     """Follow all elements of a file of level 4 or 5; a compressed variable is decompressed as far as the budget allows.
 
     ``budget`` is the most bytes of numbers that the file may hold, each counted as 8 of them; ValueError if there are
-    more, or an element is damaged.
+    more, or an element is damaged. Returned are the names of MATLAB's objects, which scipy does not tell apart.
     """
-    left = Left(budget)
+    left, objects = Left(budget), list[str]()
     if version(content) == "4":
         _check_4(content, left)
-        return
+        return ()
     order = "<" if content[126:128] == b"IM" else ">"
     for element in _elements(content, 128, len(content), order, left):
         if element.kind == COMPRESSED:
             before = left.size
             inner = _unpacked(memoryview(content)[element.begin : element.end], left)
             for matrix in _elements(inner, 0, len(inner), order, left):
-                _check_matrix(inner, matrix, order, 0, left)
+                objects += _check_matrix(inner, matrix, order, 0, left)
             left.take(max(0, len(inner) - (before - left.size)))
         else:
-            _check_matrix(content, element, order, 0, left)
+            objects += _check_matrix(content, element, order, 0, left)
+    return tuple(objects)
 
 
 def _unpacked(data: memoryview, left: Left) -> bytes:
@@ -136,13 +137,14 @@ def _elements(data: bytes, begin: int, end: int, order: str, left: Left) -> Iter
         begin = after
 
 
-def _check_matrix(data: bytes, matrix: Element, order: str, depth: int, left: Left) -> None:
+def _check_matrix(data: bytes, matrix: Element, order: str, depth: int, left: Left) -> list[str]:
+    """The name of what it is if that is an object."""
     if matrix.kind != MATRIX:
         raise ValueError(f"an element of type {matrix.kind} where a variable is due")
     if depth > DEEPEST:
         raise ValueError("structs lie too deep in each other")
     if matrix.begin == matrix.end:
-        return
+        return []
     parts = list(_elements(data, matrix.begin, matrix.end, order, left))
     if parts[0].kind != 6 or parts[0].end - parts[0].begin != 8:
         raise ValueError("a variable without its flags")
@@ -157,6 +159,9 @@ def _check_matrix(data: bytes, matrix: Element, order: str, depth: int, left: Le
             _check_matrix(data, part, order, depth + 1, left)
         elif part.kind not in NUMBERS + TEXT:
             raise ValueError(f"an element of type {part.kind} in a variable")
+    if kind != OPAQUE or len(parts) < 2:
+        return []
+    return [data[parts[1].begin : parts[1].end].decode("ascii", errors="replace")]
 
 
 def _check_head(parts: list[Element]) -> None:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
@@ -19,29 +20,18 @@ from hybrid_mpc.data.files import Columns, MissingColumn, Source, name_and_unit,
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
-from hybrid_mpc.machine.units import alike, factor
+from hybrid_mpc.machine.units import Conversion, conversion
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.int8]
 TURN = 2 * math.pi
-UNITS: Mapping[str, Mapping[str, float]] = {
-    "s": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
-    "rad": {"deg": TURN / 360, "mrad": 1e-3, "rev": TURN},
-    "rad/s": {"deg/s": TURN / 360, "rev/s": TURN, "rpm": TURN / 60, "mrad/s": 1e-3},
-    "m": {"mm": 1e-3, "cm": 1e-2, "um": 1e-6},
-    "m/s": {"mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6},
-    "N m": {"mN m": 1e-3, "N cm": 1e-2, "N mm": 1e-3, "kN m": 1e3},
-    "N": {"mN": 1e-3, "kN": 1e3},
-    "V": {"mV": 1e-3},
-    "A": {"mA": 1e-3},
-    "Pa": {"kPa": 1e3, "mbar": 1e2, "bar": 1e5},
-    "kg": {"g": 1e-3},
-    "W": {"mW": 1e-3, "kW": 1e3},
-}
-"""For each unit of a signal the units a recording may have, as multiples of it."""
-TEMPERATURES = frozenset({"K", "degC", "°C", "degF", "°F"})
-"""Units of temperature, which have zeros of their own."""
+PROPOSED = (
+    "ms", "us", "min", "h", "deg", "mrad", "rev", "deg/s", "rpm", "Hz", "rev/s", "mm", "cm", "um", "km", "mm/s", "cm/s",
+    "km/h", "mN m", "N cm", "N mm", "kN m", "mN", "kN", "mV", "kV", "mA", "Pa", "kPa", "mbar", "bar", "g", "kg", "mW",
+    "kW", "K", "degC", "degF", "%", "-", "l/min", "l/s", "m^3/h",
+)  # fmt: skip
+"""Units that are proposed for a column that leaves its signal's range."""
 FILLED = 0.01
 """Share of a signal's range that a column would have to fill in another unit for that unit to be proposed."""
 SHARE = 0.05
@@ -50,6 +40,16 @@ BEYOND = 4.0
 """Times the range's limit that a column must reach for a unit to be proposed: less may be a wrong range."""
 NEARLY = 0.25
 """Share of a full turn within which a jump is one: what the angle truly moves from one sample to the next is less."""
+DIGITS = 1e-9
+"""Share by which equal numbers differ in files of other formats: ten digits."""
+FAR_OFF = 3.0
+"""Times the span and the size of all other values by which a code for missing ones is away from them."""
+_CODE = re.compile(r"999+(\.9+)?|32767|32768|65535|2147483647|2147483648|1e\+?\d\d+")
+HOLE = 1.5
+"""Usual distances of the time stamps from which on samples are missing between two."""
+UNSURE = 0.4
+"""Share of a turn by which the way over missing samples may differ from that at the speeds before and after: at half a
+turn another number of turns would fit as well."""
 SPAN = 1.05
 """Turns that a wrapped angle spans at most: one, and some noise. An angle that counts on and turns fast spans more."""
 MIN_SCORED = 10
@@ -101,7 +101,8 @@ class Recording:
     outputs ``y`` ``(m, n_y)`` of periodic signals count on. ``findings`` are the angles that were wrapped and the
     samples that are missing. ``w`` ``(m, n_w)`` are the disturbances, by default none. ``y`` and ``w`` are NaN where a
     sample is missing. ``censored`` ``(m, n_y)`` is -1 where an output is at the lower end of its sensor's range, +1 at
-    the upper end, else 0, which is the default.
+    the upper end, else 0, which is the default. ``cuts`` are the samples before which it is cut, as over a gap, since
+    nobody knows how many turns an angle made before them; by default none.
     """
 
     name: str
@@ -113,6 +114,7 @@ class Recording:
     findings: tuple[Finding, ...] = ()
     w: Array = field(default_factory=empty)
     censored: Flags = field(default_factory=no_flags)
+    cuts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         complete(self)
@@ -224,6 +226,12 @@ def read_recordings(
             "Columns differ between the recordings. All need those that the DataSpec names; inputs_of names other "
             f"inputs for single recordings:{differ}",
         )
+    for i, one in enumerate(recordings):
+        if same := next((other for other in recordings[:i] if _alike(one, other)), None):
+            problems.append(
+                f"{one.path} holds the same samples as {same.path.name}. Leave one out: what is recorded once is "
+                "evidence once."
+            )
     stems = [Path(path).stem for path in paths]
     if len(set(stems)) < len(stems):
         problems.append(
@@ -231,6 +239,15 @@ def read_recordings(
             "rename one: pieces and windows are named by the stem."
         )
     return recordings, problems
+
+
+def _alike(one: Recording, other: Recording) -> bool:
+    """Whether two recordings hold the same numbers, but for the digits of another format."""
+    pairs = [(getattr(one, key), getattr(other, key)) for key in ("t", "u", "w", "y")]
+    return all(a.shape == b.shape for a, b in pairs) and all(
+        np.allclose(a, b, rtol=DIGITS, atol=DIGITS * float(np.nanmax(np.abs(a), initial=0.0)), equal_nan=True)
+        for a, b in pairs
+    )
 
 
 def _count_problems(spec: DataSpec, prior: Signals) -> list[str]:
@@ -342,13 +359,15 @@ def _recording(
     first, split = 1 + len(inputs), 1 + len(inputs) + len(disturbances)
     problems = list(columns.problems)
     findings: list[Finding] = []
+    unclear: set[int] = set()  # columns whose unit is none of their signal's
+    cuts: set[int] = set()
     with np.errstate(over="ignore"):  # what overflows is out of its range
         for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
-            if name in spec.units:
-                values[:, j] *= _factor(name, spec.units[name], signal)
-            else:
-                values[:, j] *= _written_factor(found[j], signal)
-                problems += [problem for problem in [_unit_problem(found[j], signal)] if problem]
+            to, problem = _converted(spec, name, found[j], signal)
+            values[:, j] = to.factor * values[:, j] + to.offset
+            if problem:
+                problems.append(problem)
+                unclear.add(j)
     t = values[:, 0]
     if (np.abs(t) <= ABSURD).all():  # the ranges tell of the others, and of what is no number
         problems += _time_problems(t, columns, spec, path.stem)
@@ -364,15 +383,22 @@ def _recording(
                 "recording out."
             )
         if clean and j >= first and turn is not None:
-            angle, jumps = unwrapped(t[there], values[there, j], turn, spec.max_gap)
-            if len(jumps):
-                findings.append(_wrapped(path.name, name, signal, t[there], values[there, j], jumps))
+            found_turns = unwrapped(t[there], values[there, j], turn, spec.max_gap, periodic=signal.periodic)
+            if len(jumps := found_turns.jumps):
+                findings.append(_wrapped(path.name, name, signal, t[there], values[there, j], found_turns))
                 if signal.periodic:
-                    values[there, j] = angle
+                    values[there, j] = found_turns.angle
                     note = f", with {len(jumps)} jumps of a full turn taken out"
+                    cuts |= set(np.flatnonzero(there)[found_turns.unclear].tolist())
         if clean and j >= first and there.any() and not there.all():
             findings.append(_missing(path.name, name, t, there))
-        problems += _range_problems(signal, name, values[:, j], columns, note)
+        if j and (code := _code(values[:, j])) is not None:
+            problems.append(
+                f"column {name!r}: {code:.10g} in {int((values[:, j] == code).sum())} of {len(t)} rows, far from all "
+                "other values: a code for missing ones? Leave these cells blank; inputs are needed in every row."
+            )
+        elif j not in unclear:
+            problems += _range_problems(signal, name, values[:, j], columns, note)
     problems += [finding.message for finding in findings if finding.refused]
     refuse([f"{path}: {problem}" for problem in problems])
     return Recording(
@@ -385,6 +411,7 @@ def _recording(
         findings=tuple(findings),
         w=values[:, first:split],
         censored=censored,
+        cuts=tuple(sorted(cuts)),
     )
 
 
@@ -418,17 +445,9 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
     """What is wrong with the time stamps, which are finite."""
     if len(t) < 2:
         return [f"{len(t)} row(s) of numbers; a recording needs many. Record it again."]
-    steps = np.diff(t)
-    if (steps <= 0).any():
-        k = int(np.argmax(steps <= 0))
-        what = "repeats" if steps[k] == 0 else "decreases"
-        such = int((steps <= 0).sum())
-        return [
-            f"{columns.place(k + 1)}, {_stamps(spec)}: time {what} ({t[k]:g} s, then {t[k + 1]:g} s"
-            f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete the repeated rows or "
-            "split the file into recordings."
-        ]
-    problems = []
+    if disorder := columns.disorder(t, _stamps(spec)):
+        return [disorder]
+    steps, problems = np.diff(t), []
     if gaps(t, spec.max_gap).all():
         problems.append(
             f"sampling is {np.median(steps):g} s, declared max_gap is {spec.max_gap:g} s: every step "
@@ -469,6 +488,22 @@ def _range_problems(signal: Signal, name: str, column: Array, columns: Columns, 
     ]
 
 
+def _code(column: Array) -> float | None:
+    """A number that logging programs write for a missing value, where a column has it again and again, far from all
+    others; None without.
+    """
+    known = column[np.isfinite(column)]
+    for code in (known.min(initial=math.inf), known.max(initial=-math.inf)):
+        others = known[known != code]
+        if 2 <= len(known) - len(others) < len(known) and _CODE.fullmatch(f"{abs(code):.10g}"):
+            away = float(np.abs(others - code).min())
+            if not np.ptp(others) > 0:  # what switches between two values
+                continue
+            if away > FAR_OFF * float(np.ptp(others)) and away > FAR_OFF * float(np.abs(others).max()):
+                return float(code)
+    return None
+
+
 # Units
 
 
@@ -478,56 +513,29 @@ def check_unit(spec: DataSpec, column: str, signal: Signal) -> None:
     Raises:
         InputError: Naming column, unit and signal.
     """
-    if column in spec.units:
-        _factor(column, spec.units[column], signal)
-    elif problem := _unit_problem(column, signal):
-        raise InputError(problem)
+    refuse([problem for problem in [_converted(spec, column, column, signal)[1]] if problem])
 
 
-def _unit_problem(column: str, signal: Signal) -> str:
-    """What is wrong with the unit behind a column's name; empty if nothing, or if it may be an index, ``y(1)``."""
-    unit = name_and_unit(column)[1]
-    if unit in ("", "1") or alike(unit, signal.unit):
-        return ""
-    return (
-        f"column {column!r} is in {unit}, which is no unit of {signal.label}. Name the column of that signal, correct "
-        "the unit of one of them, or give the factor: units={...} in the DataSpec."
+def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[Conversion, str]:
+    """How the numbers of a column, ``name`` in the specification, become those of the signal; and what is wrong with
+    its unit, empty if nothing is.
+    """
+    given = spec.units.get(name)
+    if isinstance(given, float | int):
+        size = float(given)
+        wrong = "" if math.isfinite(size) and size else "the factor must be finite and not zero"
+        return Conversion(size), wrong and f"data specification: units={{{name!r}: {given}}}: {wrong}."
+    unit = name_and_unit(column)[1] if given is None else given
+    if given is None and unit in ("", "1"):
+        return Conversion(1.0), ""
+    found = conversion(unit, signal.unit)
+    if isinstance(found, Conversion):
+        return found, ""
+    remedy = "Name the column of that signal, correct the unit of one of them, or give the factor"
+    return Conversion(1.0), (
+        f"column {column!r} is in {unit!r}, {found} for {signal.label}. {remedy}: units={{{name!r}: FACTOR}} in the "
+        "DataSpec."
     )
-
-
-def _factor(column: str, unit: str | float, signal: Signal) -> float:
-    """What a column's numbers are multiplied by to be in the signal's unit."""
-    if isinstance(unit, str):
-        known = {signal.unit: 1.0, **UNITS.get(signal.unit, {})}
-        if size := known.get(unit) or factor(unit, signal.unit):
-            return size
-        remedy = f"there are: {', '.join(known)}. Or give the factor to {signal.unit} as a number."
-        if {unit, signal.unit} <= TEMPERATURES:
-            remedy = (
-                f"they differ by an offset, and no factor brings that: write the column in {signal.unit}."
-            )
-        raise InputError(
-            f"data specification: unit {unit!r} of column {column!r} is none for {signal.label}; {remedy}"
-        )
-    if not math.isfinite(unit) or unit == 0:
-        raise InputError(
-            f"data specification: factor {unit} of column {column!r} to {signal.label} must be finite and not zero"
-        )
-    return float(unit)
-
-
-def _written_factor(column: str, signal: Signal) -> float:
-    """The same by the unit behind the column's name, where it is known; else the column is in the signal's own."""
-    _, unit = name_and_unit(column)
-    if unit in ("", "1"):  # none, or an index
-        return 1.0
-    known = {_plainly(name): size for name, size in UNITS.get(signal.unit, {}).items()}
-    return known.get(_plainly(unit)) or factor(unit, signal.unit) or 1.0
-
-
-def _plainly(unit: str) -> str:
-    """A unit without what writers differ in."""
-    return unit.replace(" ", "").replace("·", "").replace("µ", "u").replace("μ", "u").replace("°", "deg")
 
 
 def _likely_unit(column: Array, signal: Signal) -> str:
@@ -537,9 +545,13 @@ def _likely_unit(column: Array, signal: Signal) -> str:
     beyond = float(((column < signal.lower) | (column > signal.upper)).mean())
     if beyond < SHARE or not BEYOND * limit < largest < math.inf:
         return ""
-    for unit, size in UNITS.get(signal.unit, {}).items():
-        low, high = size * float(column.min()), size * float(column.max())
-        if size * largest >= FILLED * limit and signal.lower <= low and high <= signal.upper:
+    for unit in PROPOSED:
+        found = conversion(unit, signal.unit)
+        if isinstance(found, str) or found == Conversion(1.0):
+            continue
+        values = found.factor * column + found.offset
+        low, high = float(values.min()), float(values.max())
+        if max(-low, high) >= FILLED * limit and signal.lower <= low and high <= signal.upper:
             return unit
     return ""
 
@@ -549,21 +561,59 @@ def _likely_unit(column: Array, signal: Signal) -> str:
 
 def _turn(signal: Signal) -> float | None:
     """A full turn in the signal's unit; None if the unit is none of an angle."""
-    radians = {"rad": 1.0, **UNITS["rad"]}.get(signal.unit)
-    return None if radians is None else TURN / radians
+    found = conversion("rev", signal.unit)
+    angle = isinstance(found, Conversion) and signal.unit not in ("-", "1", "%", "ppm")
+    return found.factor if isinstance(found, Conversion) and angle else None
 
 
-def unwrapped(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[Array, NDArray[np.intp]]:
-    """An angle that counts on, and the indices of the samples where it jumped by about a full turn.
+@dataclass(frozen=True)
+class Unwrapped:
+    """An angle that counts on.
 
-    An angle is wrapped if it keeps within one turn and jumps by about one between neighbouring samples.
+    Args:
+        angle: Its samples ``(m,)``.
+        jumps: Indices of the samples before which it jumped by whole turns as it was recorded.
+        unclear: Indices of the samples before which so many were lost that nobody knows how many turns it made.
     """
-    step = np.diff(angle)
-    jumps = ~gaps(t, max_gap) & (np.abs(np.abs(step) - turn) <= NEARLY * turn)
-    if not jumps.any() or np.ptp(angle) > SPAN * turn:
-        return angle, np.zeros(0, dtype=np.intp)
-    turns = np.cumsum(np.r_[0.0, np.where(jumps, np.sign(step), 0.0)])
-    return angle - turn * turns, np.flatnonzero(jumps) + 1
+
+    angle: Array
+    jumps: NDArray[np.intp]
+    unclear: NDArray[np.intp]
+
+
+def unwrapped(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: bool = True) -> Unwrapped:
+    """The samples that are there of an angle, counted on.
+
+    An angle is wrapped if it keeps within one turn and moves by more than half a turn between neighbouring samples;
+    one that is not declared periodic must jump by about a full one. From one sample to the next it is taken to move by
+    less than half a turn. Where samples are missing it may move by more at the speeds that it has: there the speeds
+    before and after say how many turns it makes, if they agree.
+    """
+    step, none = np.diff(angle), np.zeros(0, dtype=np.intp)
+    near = ~gaps(t, max_gap)
+    large = near & (np.abs(step) > 0.5 * turn)
+    full = large & (np.abs(np.abs(step) - turn) <= NEARLY * turn)
+    if not (large if periodic else full).any() or np.ptp(angle) > SPAN * turn:
+        return Unwrapped(angle, none, none)
+    turns = np.where(near, -np.round(step / turn), 0.0)
+    span, moved = np.diff(t), step + turn * turns
+    usual = float(np.median(span))
+    regular = near & (span <= HOLE * usual)
+    speed = np.where(regular, moved / span, np.nan)
+    unclear = []
+    fastest = float(np.nanmax(np.abs(speed), initial=0.0))
+    for k in np.flatnonzero(near & ~regular & (fastest * span > 0.5 * turn)):
+        before, after = (
+            speed[:k][np.isfinite(speed[:k])][-1:],
+            speed[k + 1 :][np.isfinite(speed[k + 1 :])][:1],
+        )
+        sides = np.concatenate([before, after]) * span[k]  # the way at the speed before, and at that after
+        turns[k] = np.round((sides.mean() - step[k]) / turn) if len(sides) else 0.0
+        off = abs(step[k] + turn * turns[k] - sides.mean()) if len(sides) else math.inf
+        if off + np.ptp(sides) > UNSURE * turn:
+            unclear.append(int(k) + 1)
+    counted = angle + turn * np.concatenate([[0.0], np.cumsum(turns)])
+    return Unwrapped(counted, np.flatnonzero(turns) + 1, np.array(unclear, dtype=np.intp))
 
 
 def _missing(file: str, name: str, t: Array, there: NDArray[np.bool_]) -> Finding:
@@ -578,9 +628,9 @@ def _missing(file: str, name: str, t: Array, there: NDArray[np.bool_]) -> Findin
     return Finding("missing", file, name, float(t[first]), count, message)
 
 
-def _wrapped(file: str, name: str, signal: Signal, t: Array, raw: Array, jumps: NDArray[np.intp]) -> Finding:
+def _wrapped(file: str, name: str, signal: Signal, t: Array, raw: Array, found: Unwrapped) -> Finding:
     """The finding of an angle as it was recorded ``raw`` ``(m,)`` that jumps."""
-    k, count = int(jumps[0]), len(jumps)
+    k, count = int(found.jumps[0]), len(found.jumps)
     what = (
         f"column {name!r} jumps {count} time{'s' * (count > 1)} by about a full turn (first from {raw[k - 1]:.4g} to "
         f"{raw[k]:.4g} {signal.unit} at {t[k]:.6g} s): a wrapped angle"
@@ -588,6 +638,12 @@ def _wrapped(file: str, name: str, signal: Signal, t: Array, raw: Array, jumps: 
     remedy = (
         f". {signal.name} is periodic, so the turns were added up and the angle counts on. An estimator or monitor "
         "that runs on the sensor itself needs an angle that counts on, too."
+        + (
+            f" Before {len(found.unclear)} samples (first at {t[found.unclear[0]]:.6g} s) so many are missing that "
+            "nobody knows how many turns it made: the recording is cut there."
+            if len(found.unclear)
+            else ""
+        )
         if signal.periodic
         else f", which no smooth motion explains. Declare Signal(..., periodic=True) for {signal.name} in the prior, "
         "and it is made to count on; or record an angle that does."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -228,9 +229,13 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
     They are smoothed if ``n_x`` is None; else their ``n_x`` states are NaN.
     """
     ends = np.flatnonzero(gaps(recording.t, spec.max_gap))
+    for first in recording.cuts:
+        why = "the number of turns that an angle made while its samples were missing is not known"
+        cuts.append(Cut(recording.path.name, float(recording.t[first - 1]), float(recording.t[first]), why))
     for k in ends:
         why = f"gap of {recording.t[k + 1] - recording.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
         cuts.append(Cut(recording.path.name, float(recording.t[k]), float(recording.t[k + 1]), why))
+    ends = np.union1d(ends, np.array(recording.cuts, dtype=np.intp) - 1)
     shortest = _fewest(spec) * spec.dt
     if n_x is None:
         samples = window_samples(spec.smoothing, recording.dt)
@@ -516,7 +521,9 @@ def _windows(recording: Recording, spec: DataSpec) -> tuple[Window, ...]:
     for role, fraction in zip(ROLES, spec.fractions, strict=True):
         if fraction > 0:
             distance = spec.smoothing if windows else 0.0
-            windows.append(Window(start + distance, start + fraction * length, role))
+            # a part shorter than that distance becomes one without a sample, which is cut and told as any other
+            end = max(start + fraction * length, math.nextafter(start + distance, math.inf))
+            windows.append(Window(start + distance, end, role))
             start += fraction * length
     last = windows[-1]
     windows[-1] = replace(last, end=last.end + spec.dt)

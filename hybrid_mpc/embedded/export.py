@@ -28,10 +28,13 @@ from hybrid_mpc.embedded.generate import (
 )
 from hybrid_mpc.embedded.scalar import table
 from hybrid_mpc.embedded.watch import Watch
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.files import replacing_folder, write_text
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.rules import markdown
 
 Array = NDArray[np.float64]
 VECTORS = 25
@@ -74,12 +77,16 @@ class Footprint:
 def write_controller(
     folder: Path, model: HybridModel, ocp: OCP, *, estimator: Filter | None = None,
     fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
-    monitor: Watch | None = None, guard: Guard | None = None,
+    monitor: Watch | None = None, guard: Guard | None = None, check: bool = False,
 ) -> Sources:  # fmt: skip
     """Write the C of a controller, its test and its README; arguments as :func:`make_sources` takes them.
 
+    With ``check`` the C is compiled and its test is run before it takes its place, and the README has its sizes;
+    without, nothing of it is compiled or run.
+
     Raises:
-        InputError: If something has no C, by name, before anything is written.
+        InputError: If something has no C, by name, before anything is written; if the check fails.
+        StorageError: If it cannot be written; the folder is then as it was.
     """
     found = make_sources(
         model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input, single=single, monitor=monitor,
@@ -90,17 +97,18 @@ def write_controller(
     for name in ("Makefile", "CMakeLists.txt"):
         texts[name] = texts[name].replace("@SOURCES@", " ".join(sources_of(found)))
     texts["hmpc_vectors.h"] = _vectors(safe, estimator, single, monitor)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        (folder / name).write_text(text)
-    (folder / "README.md").write_text(_readme(model, found, footprint(folder, sources_of(found)), single))
+    with replacing_folder(folder) as new:
+        for name, text in texts.items():
+            write_text(new / name, text)
+        sizes = checked(new, sources_of(found)) if check else None
+        write_text(new / "README.md", _readme(model, found, sizes, single))
     return found
 
 
 def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monitor: Watch | None) -> str:
     """A short loop from the operating point towards a set-point beside it, on the model itself."""
     model, ocp = safe.controller.model, safe.controller.ocp
-    size = safe.controller.problem.state_sizes
+    size = safe.controller.problem.sizes.states
     tolerated = (
         1.0 / np.sqrt(np.where(ocp.q_y > 0, ocp.q_y, np.inf)) if ocp.n_y else np.where(ocp.q > 0, size, 0.0)
     )
@@ -161,20 +169,28 @@ def _noise(estimator: Filter) -> Array:
     return first.noise[1]
 
 
-def footprint(folder: Path, names: Sequence[str] = SOURCES) -> Footprint | None:
-    """Sizes of the sources ``names`` by gcc -O3 for this machine; None where there is none."""
+def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
+    """Compile the sources ``names`` by gcc -O3, run the test program, and measure them for this machine.
+
+    Raises:
+        InputError: If there is no gcc, it fails, or the test does.
+    """
     gcc, size = shutil.which("gcc"), shutil.which("size")
     if gcc is None or size is None:
-        return None
+        raise InputError("the check needs gcc and size (binutils), which are not installed; leave it out")
     with tempfile.TemporaryDirectory() as work:
         flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
         sources = [str((folder / name).resolve()) for name in names]
-        made = subprocess.run([gcc, *flags, "-c", *sources], cwd=work, capture_output=True, check=False)
+        made = subprocess.run(
+            [gcc, *flags, "-c", *sources], cwd=work, capture_output=True, text=True, check=False
+        )
         objects = sorted(str(p) for p in Path(work).glob("*.o"))
         test = [str((folder / "hmpc_test.c").resolve()), *objects, "-lm", "-o", "test"]
-        linked = subprocess.run([gcc, *flags[:3], *test], cwd=work, capture_output=True, check=False)
+        linked = subprocess.run(
+            [gcc, *flags[:3], *test], cwd=work, capture_output=True, text=True, check=False
+        )
         if made.returncode or linked.returncode:
-            return None
+            raise InputError(f"the generated C does not compile: {(made.stderr + linked.stderr)[-2000:]}")
         table_of = subprocess.run([size, *objects], capture_output=True, text=True, check=True).stdout
         flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
         frames = [
@@ -182,8 +198,10 @@ def footprint(folder: Path, names: Sequence[str] = SOURCES) -> Footprint | None:
             for p in Path(work).glob("hmp*_*.su")
             for line in p.read_text().splitlines()
         ]
-        told = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False).stderr
-        state = re.search(r"the state has (\d+) bytes", told)
+        done = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise InputError(f"the generated C decides otherwise than Python: {done.stderr[-2000:]}")
+        state = re.search(r"the state has (\d+) bytes", done.stderr)
         return Footprint(flash, int(state[1]) if state else 0, sum(frames))
 
 
@@ -248,22 +266,22 @@ def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single:
     n = found.sizes
     rows = "".join(f"| {name} | {count:,} |\n" for name, count in operations(found).items())
     if sizes is None:
-        memory = "Not measured: no gcc was found where this was generated. `make test` prints the size of the state.\n"
+        memory = (
+            "Not measured: this was generated without `--check`. `make test` prints the size of the state.\n"
+        )
     else:
         memory = (
             "| | bytes |\n| --- | ---: |\n"
             f"| flash: code and tables | {sizes.flash:,} |\n| RAM: one `hmpc_state` | {sizes.state:,} |\n"
-            f"| stack: all frames, an upper bound (nothing recurses) | {sizes.stack:,} |\n"
+            f"| stack: all frames, an upper bound (nothing recurses) | {sizes.stack:,} |\n\n"
+            "By `gcc -O3` for the machine on which this was generated.\n"
         )
     values: Mapping[str, object] = {
-        "NAME": model.name, "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
+        "NAME": markdown(model.name), "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
         "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
         "DT": model.dt, "TOLERANCE": TOLERANCE[single],
         "MONITOR": _monitor_readme(n), "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
         "ESTIMATOR": f"{n['MODES']} Kalman filters side by side" if n["MODES"] else "none: it is given an estimate",
         "FILES": ", ".join(f"`{name}`" for name in GENERATED),
     }  # fmt: skip
-    text = template("README.md")
-    for name, value in values.items():
-        text = text.replace(f"@{name}@", str(value))
-    return text
+    return re.sub("@([A-Z]+)@", lambda found: str(values[found[1]]), template("README.md"))

@@ -14,8 +14,10 @@ from hybrid_mpc.control import targets
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import KEPT, KNOTS, Problem, SoftRows
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
+from hybrid_mpc.control.safeguard import holding
+from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.embedded.cut import Cut, cut, reduced
-from hybrid_mpc.embedded.scalar import c_function, number, table
+from hybrid_mpc.embedded.scalar import c_function, comment, number, table
 from hybrid_mpc.embedded.watch import (
     NOTHING,
     Watch,
@@ -111,7 +113,7 @@ def make_sources(
     if refused or parts is None:
         raise InputError("no C for this controller: " + "; ".join(refused))
     problem = Problem(model, ocp)
-    soft = SoftRows(ocp, model)
+    soft = problem.soft
     expressions = sum(int(f.numel_out(0)) for f in soft.functions)
     modes = () if estimator is None else _modes(estimator)
     starts, aims = ocp.block_starts, target_starts(problem.targets)
@@ -124,6 +126,7 @@ def make_sources(
         "SOFT_D": int(any(np.any(np.array(f.jac_sparsity(0, 2).get_triplet()[1]) < model.n_d) for f in soft.functions)),
         "TARGET_ITERATIONS": targets.ITERATIONS, "TARGET_SETTLING": targets.SETTLING, "TARGET_WITHIN": targets.WITHIN,
         "TARGET_PARTS_LEAST": targets.PARTS[0], "TARGET_PARTS_MOST": targets.PARTS[-1], "TARGET_STARTS": len(aims),
+        "TARGET_FOLLOWED": targets.FOLLOWED,
         "TARGET_NEAREST": len(aims) - 1 if problem.targets is not None and problem.targets.run_out else 0,
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
@@ -178,20 +181,26 @@ def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, single: boo
     }
     found = [what for what, wrong in cases.items() if wrong]
     if estimator is not None or ocp.n_y:
-        found += _refused_outputs(model, estimator is not None)
+        found += _refused_outputs(model, ocp, estimator is not None)
     return found
 
 
-def _refused_outputs(model: HybridModel, measured: bool) -> list[str]:
+def _refused_outputs(model: HybridModel, ocp: OCP, measured: bool) -> list[str]:
     slopes = output_with_jacobian(model)
     rng = np.random.default_rng(0)
+    room = [0.5 * (s.upper - s.lower) for s in model.disturbances]
+    scale = Sizes(model, ocp).states, ocp.input_scale, np.where(np.isfinite(room), room, 1.0)
     points: list[tuple[Array, ...]] = [(model.x0, model.u0, model.w)]
-    points += [tuple(p + rng.standard_normal(p.size) for p in points[0]) for _ in range(3)]
-    c, d = ([slopes(*p)[i].full() for p in points] for i in (1, 2))
-    moved = max(float(np.max(np.abs(m - ms[0]), initial=0.0)) for ms in (c, d) for m in ms)
-    if not moved <= 1e-12 * max(1.0, float(np.max(np.abs(c[0])))):
+    points += [
+        tuple(p + size * rng.standard_normal(p.size) for p, size in zip(points[0], scale, strict=True))
+        for _ in range(3)
+    ]
+    rows = [np.hstack([m.full() for m in slopes(*p)[1:]]) * np.concatenate(scale[:2]) for p in points]
+    largest = np.max(np.abs(rows[0]), axis=1, keepdims=True)  # of each output, in its unit
+    if not all(np.all(np.abs(m - rows[0]) <= 1e-12 * largest) for m in rows):
         return ["outputs that are not linear in state and input, for an estimator or weights on them"]
-    if measured and np.linalg.matrix_rank(c[0]) < model.n_y:
+    c = rows[0][:, : model.n_x] / np.where(largest > 0, largest, 1.0)
+    if measured and np.linalg.matrix_rank(c) < model.n_y:
         return ["an estimator with more sensors than states that they show"]
     return []
 
@@ -225,7 +234,7 @@ def _first_periods(soft: SoftRows, horizon: int) -> list[int]:
 
 def _config(sizes: Mapping[str, int], single: bool, names: list[str], watched: Watched) -> str:
     defined = "".join(f"#define HMPC_{name} {value}\n" for name, value in sizes.items())
-    hard = "".join(f"   {i}: {name.replace('*/', '')}\n" for i, name in enumerate(names) if name)
+    hard = "".join(f"   {i}: {comment(name)}\n" for i, name in enumerate(names) if name)
     defined += f"/* Hard bounds by their place in given_way:\n{hard}*/\n" if hard else ""
     # A float has seven digits: the QP is as exact as that allows.
     exact = ("2e-5", "1e-4", "2e-3", "1e-3", "1e-3") if single else (
@@ -366,10 +375,7 @@ def _expressions(
         )
     if fallback is not None:
         rates = _scalar("the prior", fallback.xdot)(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
-        rates = ca.DM(np.sqrt(np.where(ocp.q > 0, ocp.q, 1.0))) * rates
-        by_u = ca.jacobian(rates, u)
-        best = u - ca.solve(by_u.T @ by_u + 1e-12 * ca.DM.eye(n_u), by_u.T @ rates)
-        best = ca.densify(ca.substitute(best, u, ca.DM(fallback.u0)))
+        best = holding(rates, u, fallback, ocp)
         outs = [(f"best[{i}]", best[i]) for i in range(n_u)]
         add("equilibrium", ["const real *x", "const real *w", "real *best"], {"x": x, "w": w}, outs)
     guard = "HMPC_EXPRESSIONS_H"
@@ -421,7 +427,8 @@ def _tables(
     if problem.targets is not None:
         own = problem.targets
         reals |= {
-            "target_scale": own.scale, "target_root": np.sqrt(ocp.q_y), "target_starts": target_starts(own),
+            "target_scale": own.scale, "target_heed": own.scale[: own.heed.size] * own.heed,
+            "target_root": np.sqrt(ocp.q_y), "target_starts": target_starts(own),
             "target_x_range": np.array(own.x_range).T, "target_y_range": np.array(own.y_range).T,
             "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
         }  # fmt: skip
@@ -430,7 +437,8 @@ def _tables(
         switching = estimator if isinstance(estimator, SwitchingFilter) else None
         reals |= {
             "noise": np.array([f.noise[0] for f in modes]), "noise_y": modes[0].noise[1],
-            "first_variance": np.array([f.first for f in modes]), "lost_variance": np.array([f.most for f in modes]),
+            "first_variance": np.array([f.first for f in modes]), "start_weight": modes[0].nearness ** 2,
+            "lost_variance": np.array([np.where(f.most < np.finfo(float).max, f.most, np.inf) for f in modes]),
             "switches": np.ones((1, 1)) if switching is None else switching.transition,
             "first_probability": np.ones(1) if switching is None else switching.first_probability,
         }  # fmt: skip

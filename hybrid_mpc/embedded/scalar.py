@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 import casadi as ca
@@ -45,6 +46,19 @@ def number(value: float) -> str:
     if math.isfinite(value):
         return f"R({float(value)!r})"
     return "R(NAN)" if math.isnan(value) else "R(INFINITY)" if value > 0 else "-R(INFINITY)"
+
+
+def comment(text: str) -> str:
+    """A text of anybody's as it may stand in a C comment: one line, that neither closes it nor goes on with the next.
+
+    Everything but letters, digits, blanks and ``_ . , : ; = + < > ( ) [ ]`` and ``-`` becomes ``_``: no ``*/``, no
+    backslash at a line's end, and no ``?`` that begins a trigraph.
+
+    Example:
+        >>> comment("level [0]"), comment("x */ system(1); //")
+        ('level [0]', 'x __ system(1); __')
+    """
+    return re.sub(r"[^\w .,:;=+<>()\[\]-]", "_", text)
 
 
 def table(name: str, values: ArrayLike, kind: str = "real") -> str:

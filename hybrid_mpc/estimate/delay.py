@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, Estimator, TrueState
+from hybrid_mpc.model.limits import sampled
 
 Array = NDArray[np.float64]
 
@@ -75,7 +76,7 @@ class DelayCompensation:
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> DelayedEstimate:
         """First estimate, of the instant ``t`` plus the input delay, from the first measurement."""
         resting = (self.model.u0,) * self._input
-        first = self.estimator.start(np.asarray(y, dtype=float), t, **_given(w))
+        first = self.estimator.start(y, t, **_given(w))
         return self._ahead(first, resting, self._sensor)
 
     def update(
@@ -84,8 +85,8 @@ class DelayCompensation:
         """Estimate one period later, from what arrives and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
             raise InputError("DelayCompensation goes on from its own estimates only; begin with start()")
-        base, y = estimate.filtered, np.asarray(y, dtype=float)
-        inputs = (*estimate.inputs, np.asarray(u_prev, dtype=float).ravel())
+        base, y = estimate.filtered, sampled(y, (None,), "y")
+        inputs = (*estimate.inputs, sampled(u_prev, (None,), "u_prev"))
         if estimate.missing:
             missing = estimate.missing - 1
             if not missing:  # this one was taken at the start itself
@@ -103,7 +104,7 @@ class DelayCompensation:
 
 
 def _given(w: ArrayLike | None) -> dict[str, Array]:
-    return {} if w is None else {"w": np.asarray(w, dtype=float)}
+    return {} if w is None else {"w": sampled(w, (None,), "w")}
 
 
 def whole_periods(delay: float, name: str) -> int:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
@@ -21,6 +22,10 @@ FITS = 1e-6
 """Squared error of the first outputs, in the sensors' deviations, below which a state fits them."""
 LOST = 1e12
 """Growth of a variance that leaves few digits of a covariance: nothing is known any more."""
+EXACT = 1e-9
+"""Error of the first outputs, in the sensors' deviations, that is rounding."""
+DEPENDENT = 1e-9
+"""Share of the largest singular value below which sensors count as showing the same."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +71,12 @@ class Estimator(Protocol):
     def model(self) -> HybridModel:
         """The model whose ``(x, h)`` is estimated."""
 
-    def start(self, y: Array, t: float = 0.0, *, w: Array | None = None) -> Estimate:
+    def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> Estimate:
         """First estimate from the first measurement."""
 
-    def update(self, estimate: Estimate, y: Array, u_prev: Array, *, w: Array | None = None) -> Estimate:
+    def update(
+        self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
+    ) -> Estimate:
         """Estimate one period later, from ``y`` and the input held since."""
 
 
@@ -82,7 +89,8 @@ class ExtendedKalmanFilter:
     (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). On a linear model this is the Kalman filter. No
     method changes what the object gives; not for several threads at once (it reuses its buffers).
 
-    A prediction is lost if it is not finite, or a deviation is a million times the largest one given here (an unstable
+    A prediction is lost if it is not finite, or a deviation is a million times what is given here for it: the larger of
+    its first one and its step per period, and of a state that a sensor shows what that shows of it (an unstable
     model long without measurements, an absurd measurement). The next measurement then starts anew.
 
     Args:
@@ -141,10 +149,10 @@ class ExtendedKalmanFilter:
         self._first = np.concatenate(
             [_variance(sigma_x0, n_x, "sigma_x0"), hidden0, _variance(sigma_d0, n_d, "sigma_d0")]
         )
-        self._lost = LOST * max(np.max(v) for v in (self._noise, self._first, self._noise_y))
         assert model.with_jacobian is not None
         self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
         self._step.inputs[4][:] = model.p
+        self._lost = self._most_known()
 
     @property
     def noise(self) -> tuple[Array, Array]:
@@ -157,16 +165,29 @@ class ExtendedKalmanFilter:
         return self._first.copy()
 
     @property
-    def most(self) -> float:
-        """Variance beyond which nothing is known any more."""
-        return float(self._lost)
+    def most(self) -> Array:
+        """Variances of ``(x, h, d)`` ``(n,)`` beyond which nothing is known any more; the largest number where none is
+        given.
+        """
+        return self._lost.copy()
+
+    def _most_known(self) -> Array:
+        """:attr:`most`: each in its own unit."""
+        own = np.maximum(self._noise, self._first)
+        by_x = self._measured(self.model.x0, self.model.u0, self.model.w)[1]
+        for row, variance in zip(by_x, self._noise_y, strict=True):
+            shown = np.flatnonzero(row)
+            if shown.size == 1 and np.isfinite(row[shown[0]]):
+                own[shown[0]] = max(own[shown[0]], variance / row[shown[0]] ** 2)
+        return np.where(own > 0, LOST * own, np.finfo(np.float64).max)
 
     def lost(self, estimate: Estimate) -> bool:
         """Whether an estimate is not finite, or so uncertain that nothing is known any more."""
-        return not (estimate.finite and np.max(np.diag(estimate.P)) <= self._lost)
+        return not (estimate.finite and np.all(np.diag(estimate.P) <= self._lost))
 
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> Estimate:
         """Estimate at rest: the state nearest to the operating point's with the output ``y`` ``(n_y,)``, ``d`` zero.
+        Distances count in ``sigma_x0``, so a state that is known exactly stays; in units where all are.
 
         Elements of ``y`` that are not finite tell nothing. Where several states have the output (``l sin q``, a
         speed's size) or the output does not move at the operating point, Newton's method begins one deviation
@@ -175,11 +196,17 @@ class ExtendedKalmanFilter:
         """
         model, u = self.model, self.model.u0
         w = self.known_w(None, w)
-        target = np.asarray(y, dtype=float).ravel()
+        target = sampled(y, (model.n_y,), "y")
         x = self._fitting(model.x0, target, u, w)
         h = hidden_fixed_point(model, x, u, w=w, limit=START_LIMIT)
         empty = np.full(model.n_y, np.nan)
         return Estimate(float(t), x, h, np.zeros(model.n_d), np.diag(self._first), empty, float("nan"), w=w)
+
+    @property
+    def nearness(self) -> Array:
+        """What 1 means of a distance between first states ``(n_x,)``: ``sigma_x0``; ones where all of it is zero."""
+        size = np.sqrt(self._first[: self._sizes[0]])
+        return size if np.any(size > 0) else np.ones(size.size)
 
     def _fitting(self, x0: Array, y: Array, u: Array, w: Array) -> Array:
         """The state ``(n_x,)`` nearest to ``x0`` whose output is ``y`` where that is finite."""
@@ -189,14 +216,15 @@ class ExtendedKalmanFilter:
         spread = np.diag(np.sqrt(self._first[: x0.size]))
         found = [(unlike, x), *(self._newton(x0 + step, y, u, w)[1::-1] for step in (*spread, *-spread))]
         least = min(score for score, _ in found)
-        fitting = [x for score, x in found if score <= max(least, FITS)] or [x0]
-        return min(fitting, key=lambda x: float(np.sum((x - x0) ** 2)))
+        fitting = [x for score, x in found if score <= max(least * (1 + EXACT), FITS)] or [x0]
+        size = self.nearness
+        return min(fitting, key=lambda x: float(np.sum(((x - x0) / np.where(size > 0, size, 1.0)) ** 2)))
 
     def _newton(self, x: Array, y: Array, u: Array, w: Array) -> tuple[Array, float, bool]:
         """A state whose output is ``y`` by Newton's method, the squared error in deviations of the sensors, and whether
         no step had to be shortened. One step if the outputs are linear in the state.
         """
-        seen, whole = np.isfinite(y), True
+        seen, whole, size_x, sigma = np.isfinite(y), True, self.nearness, np.sqrt(self._noise_y)
 
         def lacks(at: Array) -> tuple[Array, Array, float]:
             y_hat, by_x, _ = self._measured(at, u, w)
@@ -205,9 +233,10 @@ class ExtendedKalmanFilter:
 
         error, by_x, size = lacks(x)
         for _ in range(20):
-            if not np.all(np.isfinite(by_x)) or np.max(np.abs(error)) < 1e-12:
+            if not np.all(np.isfinite(by_x)) or np.max(np.abs(error) / sigma) < EXACT:
                 break
-            step = np.linalg.pinv(np.where(seen[:, None], by_x, 0.0)) @ error
+            rows = np.where(seen[:, None], by_x, 0.0) * size_x / sigma[:, None]
+            step = size_x * (np.linalg.pinv(rows, rcond=DEPENDENT) @ (error / sigma))
             for halving in range(60):
                 moved = x + step * 0.5**halving
                 after = lacks(moved)
@@ -227,7 +256,7 @@ class ExtendedKalmanFilter:
         last = estimate.w if estimate is not None and estimate.w.size == n_w else self.model.w
         if w is None or not n_w:
             return last
-        given = np.asarray(w, dtype=float).ravel()
+        given = sampled(w, (n_w,), "w")
         return np.where(np.isfinite(given), given, last)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
@@ -253,7 +282,7 @@ class ExtendedKalmanFilter:
         (n_x, n_h, n_d, _), step = self._sizes, self._step
         n_z = n_x + n_h
         step.inputs[0][:], step.inputs[1][:] = estimate.x, estimate.h
-        step.inputs[2][:] = np.asarray(u, dtype=float).ravel() + self._on_u @ estimate.d
+        step.inputs[2][:] = sampled(u, (self.model.n_u,), "u") + self._on_u @ estimate.d
         step.inputs[3][:] = self.known_w(estimate, None)
         step()
         _, _, a, b = step.outputs
@@ -277,7 +306,7 @@ class ExtendedKalmanFilter:
         Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
         """
         n_x, n_h, _, _ = self._sizes
-        y = np.asarray(y, dtype=float).ravel()
+        y = sampled(y, (self.model.n_y,), "y")
         seen = np.isfinite(y)
         if not seen.any():
             return estimate, 0.0
@@ -311,7 +340,7 @@ class ExtendedKalmanFilter:
         lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
         """
         predicted = self.measuring(self.predict(estimate, u_prev), w)
-        if self.lost(predicted) and np.any(np.isfinite(np.asarray(y, dtype=float))):
+        if self.lost(predicted) and np.any(np.isfinite(sampled(y, (self.model.n_y,), "y"))):
             return self.start(y, predicted.t, w=predicted.w)
         return self.correct(predicted, y, u_prev)
 
@@ -321,7 +350,7 @@ class ExtendedKalmanFilter:
 
     def _predicted(self, estimate: Estimate, u: ArrayLike | None) -> tuple[Array, Array]:
         """Output ``(n_y,)`` of an estimate and its Jacobian by ``(x, h, d)``."""
-        held = self.model.u0 if u is None else np.asarray(u, dtype=float).ravel()
+        held = self.model.u0 if u is None else sampled(u, (self.model.n_u,), "u")
         y, c_x, c_u = self._measured(estimate.x, held + self._on_u @ estimate.d, self.known_w(estimate, None))
         on_d = c_u @ self._on_u + self._on_y
         return y + self._on_y @ estimate.d, np.hstack([c_x, np.zeros((y.size, self._sizes[1])), on_d])
@@ -351,16 +380,12 @@ class ExtendedKalmanFilter:
         Raises:
             InputError: If the shapes do not fit.
         """
-        ys, us = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
+        ys = sampled(y, (None, self.model.n_y), "y")
         n = len(ys)
-        if n == 0 or ys.shape != (n, self.model.n_y) or us.shape != (n, self.model.n_u):
-            raise InputError(
-                f"y {ys.shape} and u {us.shape} given; "
-                f"needed: (n, {self.model.n_y}) and (n, {self.model.n_u}) with n > 0"
-            )
-        ws = np.tile(self.model.w, (n, 1)) if w is None else np.asarray(w, dtype=float)
-        if ws.shape != (n, self.model.n_w):
-            raise InputError(f"w {ws.shape} given; needed: {(n, self.model.n_w)}")
+        if not n:
+            raise InputError("y has no samples")
+        us = sampled(u, (n, self.model.n_u), "u")
+        ws = np.tile(self.model.w, (n, 1)) if w is None else sampled(w, (n, self.model.n_w), "w")
         estimates = [self.start(ys[0], t, w=ws[0])]
         for y_k, u_k, w_k in zip(ys[1:], us[:-1], ws[1:], strict=True):
             estimates.append(self.update(estimates[-1], y_k, u_k, w=w_k))
@@ -394,12 +419,12 @@ class TrueState:
 
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> Estimate:
         """Estimate that is the truth ``y = (x, hidden)``, ``(n_x + n_h,)`` or longer; ``d`` zero."""
-        m, z = self.model, np.asarray(y, dtype=float).ravel()
+        m, z = self.model, sampled(y, (None,), "the true state")
         n_z = m.n_x + m.n_h
         if z.size < n_z:
             raise InputError(f"true state: the plant gives {z.size} states, the oracle model needs {n_z}")
         p, empty = np.zeros((n_z + m.n_d, n_z + m.n_d)), np.full(m.n_y, np.nan)
-        known = m.w if w is None else np.asarray(w, dtype=float)
+        known = m.w if w is None else sampled(w, (m.n_w,), "w")
         return Estimate(
             float(t), z[: m.n_x], z[m.n_x : n_z], np.zeros(m.n_d), p, empty, float("nan"), w=known
         )
@@ -409,7 +434,7 @@ class TrueState:
         m = self.model
         x, h = (
             v.full().ravel()
-            for v in m.step(estimate.x, estimate.h, np.asarray(u, dtype=float), estimate.w, m.p)
+            for v in m.step(estimate.x, estimate.h, sampled(u, (m.n_u,), "u"), estimate.w, m.p)
         )
         return self.start(np.concatenate([x, h]), estimate.t + m.dt, w=estimate.w)
 

@@ -136,25 +136,34 @@ def offset_free(
     )  # fmt: skip
 
 
-def distinguishable(model: HybridModel) -> OffsetFree:
+def distinguishable(model: HybridModel, sizes: ArrayLike | None = None) -> OffsetFree:
     """The rank test at the operating point, or in motion around it where that alone tells the disturbances.
 
     At rest a bristle of friction takes up a load, so there the two are one; in motion they are not.
+
+    Args:
+        model: The model.
+        sizes: Sizes of the states ``(n_x,)``, which are moved by a tenth of them. Default: by the spread in recordings
+            or half the signals' ranges; a state without either stays.
     """
+    around = _sizes(model) if sizes is None else 0.1 * vector(sizes, model.n_x, "sizes")
     found = offset_free(model)
     rng = np.random.default_rng(0)
     for _ in range(AROUND):
         if found.detectable:
             break
-        other = offset_free(model, x=model.x0 + rng.uniform(-1.0, 1.0, model.n_x) * _sizes(model))
+        other = offset_free(model, x=model.x0 + rng.uniform(-1.0, 1.0, model.n_x) * around)
         found = other if other.detectable else found
     return found
 
 
 def _sizes(model: HybridModel) -> Array:
-    """How far around the operating point: a tenth of a state's range, or else of its own size."""
-    ranges = np.array([s.upper - s.lower for s in model.states])
-    return 0.1 * np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(model.x0), 1.0))
+    """How far around the operating point: a tenth of a state's spread, or of half its range."""
+    half = np.array([0.5 * (s.upper - s.lower) for s in model.states])
+    half = np.where(np.isfinite(half), half, 0.0)
+    return 0.1 * (
+        np.where(np.array(model.state_spread) > 0, model.state_spread, half) if model.state_spread else half
+    )
 
 
 def _rank(matrix: Array) -> int:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
 from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import output_with_jacobian
 
 Array = NDArray[np.float64]
@@ -145,7 +146,7 @@ class SwitchingFilter:
         x, h, v, w, _ = self._step_at
         d = mean[:, n_z:]
         x[:], h[:] = mean[:, :n_x], mean[:, n_x:n_z]
-        v[:], w[:] = np.asarray(u, dtype=float).ravel() + d @ on_u.T, self._w(before, None)
+        v[:], w[:] = sampled(u, (self.model.n_u,), "u") + d @ on_u.T, self._w(before, None)
         self._step()
         x_next, h_next, a, b = (found.reshape(m, -1) for found in self._step.outputs)
         f = self._unit.copy()
@@ -165,7 +166,7 @@ class SwitchingFilter:
         self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None
     ) -> tuple[SwitchingEstimate, float]:
         """:meth:`correct`, and the log-likelihood of the measurement, without its constant."""
-        before, y = self._own(estimate), np.asarray(y, dtype=float).ravel()
+        before, y = self._own(estimate), sampled(y, (self.model.n_y,), "y")
         if not np.isfinite(y).any():
             return before, 0.0
         return self._assessed(before.t, before.w, before.z, before.covariances, before.probability, y, u)
@@ -205,7 +206,7 @@ class SwitchingFilter:
         x, v, held = self._output_at
         d = z[:, n_z:]
         x[:], held[:] = z[:, :n_x], w
-        v[:] = (self.model.u0 if u is None else np.asarray(u, dtype=float).ravel()) + d @ on_u.T
+        v[:] = (self.model.u0 if u is None else sampled(u, (self.model.n_u,), "u")) + d @ on_u.T
         self._output()
         y, by_x, by_u = self._output.outputs
         c = np.zeros((m, n_y, z.shape[1]))
@@ -226,12 +227,12 @@ class SwitchingFilter:
 
         A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
         """
-        before, y = self._own(estimate), np.asarray(y, dtype=float).ravel()
+        before, y = self._own(estimate), sampled(y, (self.model.n_y,), "y")
         z, p, probability = self._predicted(before, u_prev)
         t, w = before.t + self.model.dt, self._w(before, w)
         if not np.isfinite(y).any():
             return self._together(t, w, z, p, probability)
-        variances = np.max(np.diagonal(p, axis1=1, axis2=2), axis=1)
+        variances = np.diagonal(p, axis1=1, axis2=2)
         if not (np.isfinite(z).all() and np.isfinite(w).all() and (variances <= self._most).all()):
             return self.start(y, t, w=w)
         return self._assessed(t, w, z, p, probability, y, u_prev)[0]

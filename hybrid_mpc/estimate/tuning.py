@@ -94,8 +94,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
             "process noise: no recording with at least two samples given; pass training recordings"
         )
     sizes = np.sqrt(np.mean(np.square(np.concatenate([r.x for r in recordings])), axis=0))
-    least = ROUNDING * np.where(sizes > 0, sizes, 1.0)
-    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), least)
+    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), ROUNDING * sizes)
 
 
 def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> float:

@@ -16,7 +16,7 @@ from typing import Literal, TypeAlias
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.linalg import expm
 from scipy.stats import qmc
 
 from hybrid_mpc.data import scales
@@ -24,19 +24,23 @@ from hybrid_mpc.data.scales import evenly, robust_spread, within
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.delay import NONE, shifted
-from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.prior_result import PREDICTIONS, Combination, PriorFit, winner
 from hybrid_mpc.identify.simulation import (
+    MAX_SUBSTEPS,
     Points,
     Simulation,
     flow_slope,
+    growth_rate,
     required_substeps,
     rest_of,
     simulation_of,
     visited,
+    with_unknown_rates,
 )
-from hybrid_mpc.identify.smooth import SAMPLE, Smoother, fit_smoother, rough_smoother, unseen_states
-from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.identify.smooth import Smoother, fit_smoother, output_slope, rough_smoother, unseen_states
+from hybrid_mpc.machine.prior import Equations, Prior
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
@@ -56,8 +60,42 @@ STARTS = 6
 """Starts between the bounds that are tried over the shortest windows, beside the nominal values."""
 START_ITERATIONS = 6
 """Gauss-Newton steps from each start before the best is taken on."""
+POOR = 0.3
+"""What is left of the outputs' spread from which on the longest windows are fitted from every start."""
+FOLLOWED = 3
+"""Starts at most that are followed from one length to the next, where the best alone may be a wrong optimum."""
+PROMISING = 1.5
+"""Ratio to the least error up to which another start is followed."""
+DISTINCT, FACTOR = 0.1, 3.0
+"""Share of a parameter's half range, or this many times that share of its value, by which starts that are followed
+differ in one of them at least."""
+GROWN = 10.0, 100.0
+"""Growth of a small error over the two shortest windows of a machine that runs away."""
+WHOLE = 1.2
+"""Ratio of the longest recording to the windows before from which on whole recordings are fitted, where it pays."""
+LONGEST = 20_000
+"""Periods of a whole recording at most: longer ones are cut."""
+QUIET = 3.0
+"""Ratio of what is left to the sensors' noise up to which windows grow on beyond that."""
+ROUNDING = 1e-12
+"""Share that is added to the diagonal of the normal equations: first states that act alike stay solvable."""
+STEEP = 1e5
+"""Slopes beyond this many spreads of an output per size of a first state or parameter do not count: a run diverges."""
+LOOSE = 30.0
+"""Half ranges from its nominal value that cost a parameter as much as a single error of one standard deviation: what
+the data tell moves by a thousandth of its standard error at most, what they do not tell stays."""
+UNTOLD = 1.0
+"""Standard error, in half ranges, from which on a combination of parameters counts as not told by the data."""
+COMPARED_SAMPLES = 1000
+"""First samples by which trajectories of the same length are put in order."""
+CLUSTERS = 48
+"""Parts of the windows at least whose scatter tells the standard errors."""
+SHIFT, EXACT = 0.2, 1e-5
+"""Shift of a parameter by half as long integration steps that is small enough: standard errors, and share of it."""
 OUTLIERS = 3.0
 """Residuals beyond this many robust standard deviations count by their size, not by its square."""
+GROSS = 10.0
+"""Residuals beyond this many are no measurements at the end of a fit; what they weigh before would bias it."""
 SCALINGS = 4
 """Times at most that outputs are weighed by what is left of them: outliers hide how little that is."""
 SETTLED = 0.8
@@ -89,18 +127,26 @@ explained four fifths of that."""
 TELLING = 0.9
 """Share of the error, of training and of validation, to which such a delay must bring it to be told; it must be twice
 its standard error, too."""
-DIFFERENCE = 1e-5
-"""Of the differences for the slopes of predictions, in sizes of the parameters: far above rounding."""
-PREDICTIONS = 12
-"""Evaluations at most of a fit of predictions; it starts near its end."""
+PREDICTION_STEPS = 12
+"""Gauss-Newton steps of a fit of predictions at most; it starts near its end."""
+FORGETS = 2.0
+"""Length of the windows of predictions [the machine's seconds]: an observer forgets where it began."""
+GAIN = 1e3
+"""Largest element of an observer's gain [sizes of a state a spread of an output]."""
+QUIETLY = 0.01
+"""Least noise of sensors and states that an observer's first gain counts with, over their spread and their size."""
 PAST, ANSWERS = 10, 3
 """Samples of an input's own past, and of prediction errors, that are asked for feedback."""
 MEMORY = 200
 """Lags up to which series are asked how far they hang together."""
 CHANCE = 4.0
 """Standard deviations of a correlation by chance that count as 1: of some dozen, one in a thousand is larger."""
-UNKNOWN = 1e-6
-"""Ratio of singular values below which a combination of parameters is not identified."""
+ROUNDED = 1e-11
+"""Ratio of singular values of the slopes below which they are rounding errors."""
+ALIKE_WEIGHTS = 0.8
+"""Ratio of the weights from which on parameters of one unit are taken to add up, instead of to multiply."""
+INVOLVED = 0.2
+"""Share of the largest from which on a parameter counts as a part of a combination."""
 Progress = Callable[[int, int, str], None]
 Slopes: TypeAlias = Literal["", "x", "all"]
 """Which derivatives are asked for: none, by the first states, by the parameters too."""
@@ -211,38 +257,50 @@ class OutputWindows:
 
 def cut_outputs(
     trajectories: Sequence[Trajectory],
-    periods: int,
+    periods: int | None,
     lead: int,
     most: int,
     states: Sequence[Signal] = (),
     outputs: Sequence[Signal] = (),
     first: FirstStates = FREE,
 ) -> OutputWindows:
-    """At most ``most`` windows of ``periods``, one behind the other, evenly chosen.
+    """At most ``most`` windows of ``periods``, one behind the other, evenly chosen; or whole trajectories.
 
+    Whole ones are cut where they are longer than ``LONGEST``, and filled up with missing samples to the longest.
     First states are guessed within the ranges of ``states``. Default: as the trajectories have them. What is known of
     them by their names, and by those of the ``outputs``, says ``first``; it needs ``states``.
 
     Raises:
         InputError: If no trajectory is long enough.
     """
-    starts = [(t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)]
-    if not starts:
-        longest = max((len(t.t) for t in trajectories), default=0)
-        raise InputError(
-            f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
-            f"{lead} samples before it needs {periods + lead + 1}"
-        )
-    chosen = [starts[i] for i in evenly(len(starts), most)]
-    if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
-        begins = [one for one in starts if one[1] == 0][:most]
-        others = [one for one in starts if one[1] > 0]
-        chosen = begins + [others[i] for i in evenly(len(others), most - len(begins))]
+    if periods is None:
+        periods = min(LONGEST, _longest(trajectories) - lead - 1)
+        chosen = [(t, k) for t in trajectories for k in range(lead, len(t.t) - 2, periods)]
+    else:
+        starts = [(t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)]
+        if not starts:
+            longest = _longest(trajectories)
+            raise InputError(
+                f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
+                f"{lead} samples before it needs {periods + lead + 1}"
+            )
+        chosen = [starts[i] for i in evenly(len(starts), most)]
+        if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
+            begins = [one for one in starts if one[1] == 0][:most]
+            others = [one for one in starts if one[1] > 0]
+            chosen = begins + [others[i] for i in evenly(len(others), most - len(begins))]
 
     def cut(key: str, before: int) -> Array:
-        return np.stack([getattr(t, key)[k - before : k + periods + 1] for t, k in chosen])
+        found = []
+        for t, k in chosen:
+            part = getattr(t, key)[k - before : k + periods + 1]
+            more = before + periods + 1 - len(part)
+            fill = (
+                np.full((more, part.shape[1]), np.nan) if key == "y" else np.repeat(part[-1:], more, axis=0)
+            )
+            found.append(np.concatenate([part, fill]) if more else part)
+        return np.stack(found)
 
-    censored = [t.censored for t, _ in chosen]
     guesses = np.stack([t.x[k] for t, k in chosen])
     if states:
         guesses = np.clip(guesses, [s.lower for s in states], [s.upper for s in states])
@@ -262,7 +320,7 @@ def cut_outputs(
                 known[there, j], guesses[there, j] = True, y[there, 0, i]
     return OutputWindows(
         y, cut("u", lead), cut("w", 0), guesses,
-        np.stack([c[k : k + periods + 1] for c, (_, k) in zip(censored, chosen, strict=True)]), lead, known, group,
+        cut("censored", 0), lead, known, group,
         min(first.samples(trajectories[0].dt), periods - 1),
     )  # fmt: skip
 
@@ -285,6 +343,8 @@ class OutputFit:
         self._simulations: dict[tuple[int, ...], Simulation] = {}
         self.points: Points | None = None
         """Where the recordings go, once their states are known."""
+        self.least = 1
+        """Sub-steps a period at least."""
         self.nominal = (
             np.array([*(p.value for p in self.free), *(0.5 * largest_delay for _ in late)]) / self.unit
         )
@@ -294,8 +354,18 @@ class OutputFit:
     def with_delay(self, largest: float) -> OutputFit:
         """The same fit, of a delay of up to ``largest`` [s], too."""
         other = OutputFit(self.make, self.dt, largest)
-        other._simulations, other.points = self._simulations, self.points
+        other._simulations, other.points, other.least = self._simulations, self.points, self.least
         return other
+
+    @property
+    def half(self) -> Array:
+        """Half ranges of ``theta``."""
+        return 0.5 * (self.upper - self.lower)
+
+    @property
+    def pull(self) -> Array:
+        """Root of the weights that hold ``theta`` at the nominal values."""
+        return 1.0 / (LOOSE * self.half)
 
     @property
     def names(self) -> list[str]:
@@ -324,7 +394,12 @@ class OutputFit:
 
     def substeps(self, theta: Array) -> int:
         """Sub-steps a period that the stiffness at ``theta`` asks for, at rest and where the recordings go."""
-        return required_substeps(self.make(self.values(theta)), self.dt, self.points)
+        return max(self.least, required_substeps(self.make(self.values(theta)), self.dt, self.points))
+
+    def reach(self, theta: Array) -> float:
+        """Time [s] over which a small error grows by the larger of ``GROWN`` at ``theta``, where the recordings go."""
+        rate = 0.0 if self.points is None else growth_rate(self.make(self.values(theta)), self.points)
+        return math.log(GROWN[-1]) / rate if rate > 0 else math.inf
 
     def outputs(
         self, theta: Array, x: Array, windows: OutputWindows, substeps: int, slopes: Slopes
@@ -336,8 +411,7 @@ class OutputFit:
         """
         thetas, n = np.atleast_2d(theta), len(x)
         each = n // len(thetas)
-        # the last parameter is a small change of the delay
-        p = np.repeat([[*self.values(one).values(), 0.0] for one in thetas], each, axis=0)
+        p = np.repeat([self._constants(one) for one in thetas], each, axis=0)
         acting = [self._acting(one, windows.u[i * each :][:each], windows) for i, one in enumerate(thetas)]
         simulation = self._simulation(tuple(self._free) if slopes == "all" else ())
         given = x, np.concatenate(acting), windows.w, p, substeps
@@ -345,12 +419,17 @@ class OutputFit:
             return simulation.values(*given), np.zeros(0)
         y, by = simulation.by_all(*given)
         if slopes == "all":
-            by[..., : len(self.unit)] *= self.unit
+            with np.errstate(over="ignore"):  # what runs away is left out where it is used
+                by[..., : len(self.unit)] *= self.unit
         return y, by
+
+    def _constants(self, theta: Array) -> list[float]:
+        """What a simulation has as its parameters: the prior's, and a small change of the delay."""
+        return [*self.values(theta).values(), 0.0]
 
     @cached_property
     def _free(self) -> list[int]:
-        """Places in ``p``, with the delay behind the parameters, of what is fitted."""
+        """Places of what is fitted in :meth:`_constants`."""
         every = [*(p.name for p in self.prior.parameters), "delay"]
         return [every.index(name) for name in self.names]
 
@@ -373,44 +452,127 @@ class OutputFit:
         return np.concatenate([(1 - share) * younger + share * older, (older - younger) / self.dt], axis=-1)
 
 
-def fit_by_prediction(
-    fit: OutputFit, theta: Array, trajectories: Sequence[Trajectory], smoother: Smoother
-) -> Fitted:
-    """Fit ``theta`` to the errors of a filter's predictions, one period ahead; the delay stays.
+class PredictionFit(OutputFit):
+    """The same parameters beside the gain of an observer: predictions one period ahead instead of free runs.
 
-    At most ``SAMPLE`` trajectories, evenly chosen, are taken.
+    ``z+ = f(z + K (y - g(x, u)), u)`` with ``z = (x, d)``, of which ``d`` are the unknown rates of the states that the
+    prior has corrected; ``theta`` has ``K`` ``(n_z, n_y)`` behind the parameters. The delay stays: inputs are those
+    that act.
+
+    Args:
+        fit: The fit of free runs.
+        smoother: Of a fitted prior. Its filter at rest has the first ``K``.
+    """
+
+    def __init__(self, fit: OutputFit, smoother: Smoother) -> None:
+        super().__init__(fit.make, fit.dt)
+        self.points, self.least, self.n = fit.points, fit.least, len(self.unit)
+        self._corrected = smoother.prior.corrected
+        self.sizes = np.concatenate([smoother.sizes.x, np.array(smoother.sizes.rate)[list(self._corrected)]])
+        unit = np.outer(self.sizes, 1.0 / np.array(smoother.sizes.y)).ravel()
+        self._gains = [f"gain {i}" for i in range(len(unit))]
+        self.unit = np.concatenate([self.unit, unit])
+        first = np.clip(_gain_at_rest(smoother, self.sizes).ravel() / unit, -GAIN, GAIN)
+        self.nominal = np.concatenate([self.nominal, first])
+        self.lower, self.upper = (
+            np.concatenate([own, np.full(len(unit), limit)])
+            for own, limit in ((self.lower, -GAIN), (self.upper, GAIN))
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Names of what is fitted."""
+        return [*super().names, *self._gains]
+
+    def of(self, windows: OutputWindows) -> OutputWindows:
+        """Windows with first states ``z``, of which ``d`` begins at zero."""
+        more = np.zeros((len(windows.x), len(self._corrected)))
+        known = np.concatenate([windows.known, more > 0], axis=1)
+        return replace(windows, x=np.concatenate([windows.x, more], axis=1), known=known)
+
+    def _constants(self, theta: Array) -> list[float]:
+        return [*super()._constants(theta), *(theta * self.unit)[self.n :].tolist()]
+
+    @cached_property
+    def _free(self) -> list[int]:
+        every = [*(p.name for p in self.prior.parameters), "delay", *self._gains]
+        return [every.index(name) for name in self.names]
+
+    def _simulation(self, free: tuple[int, ...]) -> Simulation:
+        if free not in self._simulations:
+            xdot, output, correct = _observed(self.prior.equations, self._corrected)
+            self._simulations[free] = Simulation(xdot, self.dt, free, output, correct)
+        return self._simulations[free]
+
+    def _acting(self, theta: Array, commanded: Array, windows: OutputWindows) -> Array:
+        there = np.isfinite(windows.y)
+        acting = super()._acting(theta, commanded, windows)
+        return np.concatenate([acting, np.where(there, windows.y, 0.0), there], axis=-1)
+
+
+@lru_cache(maxsize=32)
+def _observed(
+    equations: Equations, corrected: tuple[int, ...]
+) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Rates and outputs of ``z``, and ``z`` corrected by a measurement, as functions ``(z, u, w, p)``.
+
+    Inputs are ``[u, slope by the delay, y, whether it is there]``, parameters ``[p, change of the delay, K]``.
+    """
+    rates, late = _delayed(with_unknown_rates(equations.xdot, corrected)), _delayed(equations.output)
+    n_y, n_z, n_x = late.size1_out(0), rates.size1_in(0), late.size1_in(0)
+    z, u, w, p = (ca.SX.sym(rates.name_in(i), rates.size1_in(i)) for i in range(4))
+    y, there, gain = ca.SX.sym("y", n_y), ca.SX.sym("there", n_y), ca.SX.sym("K", n_z * n_y)
+    given = [z, ca.vertcat(u, y, there), w, ca.vertcat(p, gain)]
+    shown = late(z[:n_x], u, w, p)
+    corrected_z = z + ca.reshape(gain, n_y, n_z).T @ (there * (y - shown))
+    values = {"rates": rates(z, u, w, p), "shown": shown, "corrected": corrected_z}
+    found = [ca.Function(name, given, [value]) for name, value in values.items()]
+    return found[0], found[1], found[2]
+
+
+def _gain_at_rest(smoother: Smoother, sizes: Array) -> Array:
+    """Gain ``(n_z, n_y)`` of a smoother's filter at rest; none where the outputs do not tell of all states there."""
+    prior, n_x = smoother.prior, len(smoother.prior.states)
+    x, u, w = rest_of(prior)
+    z = np.concatenate([x, np.zeros(len(prior.corrected))])
+    a = expm(
+        flow_slope(with_unknown_rates(prior.equations.xdot, prior.corrected))(z, u, w, prior.p).full()
+        * smoother.dt
+    )
+    c = np.zeros((len(smoother.sigma), len(z)))
+    c[:, :n_x] = output_slope(prior.equations)(x, u, w, prior.p)[1].full()
+    walk = np.concatenate([QUIETLY * sizes[:n_x], smoother.walk]) / sizes
+    spread = np.array(smoother.sizes.y)
+    c, a = c * sizes / spread[:, None], a * sizes / sizes[:, None]
+    noise = np.diag(np.square(np.maximum(smoother.sigma / spread, QUIETLY)))
+    try:
+        p, _ = dare(a.T, c.T, np.diag(np.square(np.maximum(walk, QUIETLY * smoother.dt))), noise)
+    except InputError:  # the fit finds one by itself
+        return np.zeros((len(z), len(spread)))
+    return np.asarray(np.linalg.solve(c @ p @ c.T + noise, c @ p).T * np.outer(sizes, 1.0 / spread))
+
+
+def fit_by_prediction(fit: OutputFit, theta: Array, windows: OutputWindows, smoother: Smoother) -> Fitted:
+    """Fit ``theta`` to the errors of predictions one period ahead, with the gain of their observer; the delay stays.
 
     A machine that is unstable, or that was recorded under feedback with disturbances of its own, biases free runs:
     inputs then answer to what free runs take for their error. Predictions know the measured past.
 
-    Source: Ljung, *System Identification: Theory for the User*, 1999, section 7.3.
+    Args:
+        fit: The fit of free runs.
+        theta: What it found.
+        windows: Windows of the recordings with inputs that act.
+        smoother: That of the prior with ``theta``.
+
+    Source: Ljung, *System Identification: Theory for the User*, 1999, sections 4.3 and 7.3.
     """
-    n = len(fit.free)
-    chosen = [trajectories[i] for i in evenly(len(trajectories), SAMPLE)]
-    given = shifted(chosen, fit.delay(theta))
-    fixed = theta[n:]
-
-    def parameters(thetas: Array) -> Array:
-        return np.stack([np.array(list(fit.values(np.append(one, fixed)).values())) for one in thetas])
-
-    def errors(one: Array) -> Array:
-        return np.clip(
-            np.nan_to_num(smoother.prediction_errors(given, parameters(one[None]))[0][0]), -LARGEST, LARGEST
-        )
-
-    def slope(one: Array) -> Array:
-        side = np.where(one + DIFFERENCE > fit.upper[:n], -DIFFERENCE, DIFFERENCE)
-        every, _ = smoother.prediction_errors(given, parameters(np.vstack([one, one + np.diag(side)])))
-        return np.asarray(np.nan_to_num((every[1:] - every[0]) / side[:, None]).T)
-
-    low, high = fit.lower[:n], fit.upper[:n]
-    inside = np.clip(theta[:n], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
-    found = least_squares(errors, inside, jac=slope, bounds=(low, high), loss="soft_l1", max_nfev=PREDICTIONS)
-    information = found.jac.T @ found.jac
-    variance = float(np.mean(np.square(found.fun)))
+    n, own = len(fit.free), PredictionFit(fit, smoother)
+    first = np.concatenate([theta[:n], own.nominal[n:]])
+    found = Shooting(own, own.of(windows), own.sizes).solve(first, PREDICTION_STEPS)
     covariance = np.zeros((len(theta), len(theta)))
-    covariance[:n, :n] = variance * np.linalg.pinv(information, rcond=1e-12)
-    return Fitted(np.append(found.x, fixed), covariance, ())
+    covariance[:n, :n] = found.covariance[:n, :n]
+    known = tuple(one for one in found.unidentified if set(one.parameters) <= set(fit.names))
+    return Fitted(np.concatenate([found.theta[:n], theta[n:]]), covariance, known)
 
 
 def feedback(trajectories: Sequence[Trajectory], errors: Sequence[Array]) -> float:
@@ -469,11 +631,11 @@ def _without_jumps(values: Array) -> Array:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit to windows found: ``theta`` with its covariance, and names of what the windows do not identify."""
+    """What a fit to windows found: ``theta`` with its covariance, and what the windows do not tell."""
 
     theta: Array
     covariance: Array
-    unidentified: tuple[str, ...]
+    unidentified: tuple[Combination, ...]
 
 
 @dataclass(frozen=True)
@@ -482,6 +644,7 @@ class _Point:
 
     ``error`` ``(n, (T + 1) n_y)`` is zero where nothing counts, ``slopes`` ``(n, (T + 1) n_y, columns)`` are by
     ``theta`` (or not) and by ``x`` in its sizes. ``scale`` ``(n_y,)`` is what an error of each output is counted in.
+    Errors beyond ``far`` scales are no measurements: they cost the same wherever they are.
     """
 
     theta: Array
@@ -490,6 +653,7 @@ class _Point:
     scale: Array
     error: Array
     slopes: Array
+    far: float = math.inf
 
     @property
     def scales(self) -> Array:
@@ -509,7 +673,7 @@ class _Point:
 class Shooting:
     """Windows of outputs as a least-squares problem over ``theta`` and the first states.
 
-    ``sizes`` ``(n_x,)`` are the states' natural ones: first states keep to their guess as if it were known to that.
+    ``sizes`` ``(n_x,)`` are those of the states: first states keep to their guess as if it were known to that.
     """
 
     def __init__(
@@ -570,7 +734,24 @@ class Shooting:
                 if k and (rescaled.scale > SETTLED * point.scale).all():
                     break
                 point = self._descend(rescaled, iterations)
+            if (np.abs(point.error) > GROSS * point.scales).any():
+                point = self._descend(replace(point, far=GROSS), iterations)
         return Fitted(point.theta, *self._covariance(point))
+
+    def forget(self) -> None:
+        """Forget the first states that were found with other integration steps."""
+        self._known.clear()
+
+    def shift(self, theta: Array, substeps: int) -> Array:
+        """How far a Gauss-Newton step moves ``theta`` where the outputs are those of so many sub-steps a period."""
+        point = self.start(theta, self.first_states(theta), "all")
+        point = replace(point, scale=self._left(point.error))
+        finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
+        moved = [
+            self._step(self._behind(p) if self.windows.warm else self._normal(p), 0.0, theta)[0]
+            for p in (point, replace(point, error=finer.error))
+        ]
+        return np.abs(moved[1] - moved[0])
 
     def start(self, theta: Array, x: Array, slopes: Slopes) -> _Point:
         """Errors at ``theta`` from ``x``, each output's over its spread."""
@@ -588,24 +769,33 @@ class Shooting:
         counts = seen & ~((windows.censored != 0) & beyond)
         inside = counts & (np.abs(error) < limit)
         error = np.where(counts, np.clip(error, -limit, limit), 0.0).reshape(n, -1)
-        by[~inside] = 0.0
-        by[..., -x.shape[1] :] *= np.where(self.windows.known, 0.0, self.sizes)[:, None, None]
-        by = np.nan_to_num(by, copy=False).reshape(n, error.shape[1], by.shape[-1])
+        if slopes:
+            with np.errstate(over="ignore", invalid="ignore"):
+                by[..., -x.shape[1] :] *= np.where(self.windows.known, 0.0, self.sizes)[:, None, None]
+                inside &= np.abs(by).max(axis=-1) < STEEP * self.spread  # not where it is NaN
+            by[~inside] = 0.0
+            by = by.reshape(n, error.shape[1], by.shape[-1])
         return replace(before, theta=theta, x=x, error=error, slopes=by)
 
     def _costs(self, point: _Point) -> Array:
         """Robust sum of squares of each group of windows that counts for its first state, with what this moved."""
         c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
-        own = 2 * c2 * (np.sqrt(1 + np.square(point.error / point.scales) / c2) - 1)
+        over = np.minimum(np.abs(point.error / point.scales), point.far)
+        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
         return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
 
     def _cost(self, point: _Point) -> float:
         """What ``theta`` is fitted by: the same sum, or of a warm-up what comes behind it."""
         if not self.windows.warm:
-            return float(self._costs(point).sum())
+            return float(self._costs(point).sum()) + self._pulled(point)
         c2 = OUTLIERS**2
-        own = 2 * c2 * (np.sqrt(1 + np.square(point.error / point.scales) / c2) - 1)
-        return float((own * self.count).sum())
+        over = np.minimum(np.abs(point.error / point.scales), point.far)
+        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
+        return float((own * self.count).sum()) + self._pulled(point)
+
+    def _pulled(self, point: _Point) -> float:
+        """What parameters beside their nominal values cost."""
+        return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
 
     def _moved(self, point: _Point) -> Array:
         """What first states moved from their guess, in their sizes."""
@@ -676,7 +866,7 @@ class Shooting:
     def _weighted(self, point: _Point) -> Array:
         """Slopes and, behind them, errors, over their scale and by the root of their robust weight."""
         error = point.error / point.scales
-        root = (1 + np.square(error / OUTLIERS)) ** -0.25
+        root = np.where(np.abs(error) < point.far, (1 + np.square(error / OUTLIERS)) ** -0.25, 0.0)
         slopes = point.slopes * (root / point.scales)[..., None]
         return np.concatenate([slopes, (root * error)[..., None]], axis=-1)
 
@@ -685,31 +875,48 @@ class Shooting:
         rows, n_x = self._weighted(point) * np.sqrt(self.tell)[:, None], point.x.shape[1]
         every = rows.swapaxes(1, 2) @ rows
         t, x = slice(0, -1 - n_x), slice(-1 - n_x, -1)
-        moved = self._moved(point) / self.members[:, None]
+        moved, n = self._moved(point) / self.members[:, None], rows.shape[-1] - 1 - n_x
+        pull, from_nominal = self._pull(point, n)
         return (
-            self._grouped(every[:, x, x]) + np.eye(n_x), self._grouped(every[:, x, t]), every[:, t, t].sum(axis=0),
-            self._grouped(every[:, x, -1] + moved), every[:, t, -1].sum(axis=0),
+            _regular(self._grouped(every[:, x, x])), self._grouped(every[:, x, t]),
+            every[:, t, t].sum(axis=0) + pull, self._grouped(every[:, x, -1] + moved),
+            every[:, t, -1].sum(axis=0) + from_nominal,
         )  # fmt: skip
 
-    def _eliminated(self, point: _Point) -> tuple[Array, Array, Array]:
-        """Slopes by ``theta`` and errors of what counts, with first states that follow, by how much these do."""
+    def _pull(self, point: _Point, n: int) -> tuple[Array, Array]:
+        """What holds ``theta`` at the nominal values: its part of the normal matrix, and of the gradient."""
+        if not n:  # of the first states alone
+            return np.zeros((0, 0)), np.zeros(0)
+        weights = np.square(self.own.pull)
+        return np.diag(weights), weights * (point.theta - self.own.nominal)
+
+    def _eliminated(self, point: _Point) -> tuple[Array, Array, Array, float]:
+        """Slopes by ``theta`` and errors of what counts, with first states that follow; by how much these do, and how
+        many numbers of those that count they take for themselves.
+        """
         rows, n_x = self._weighted(point), point.x.shape[1]
         b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
         at = (a * self.tell[:, None]).swapaxes(1, 2)
-        xx = self._grouped(at @ a) + np.eye(n_x)
+        xx = _regular(self._grouped(at @ a))
         follow = np.linalg.solve(xx, self._grouped(at @ np.concatenate([b, error], axis=-1)))
         left = np.concatenate([b, error], axis=-1) - a @ follow[self.windows.group]
         left *= self.count[:, None]
-        return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64)
+        taken = (
+            0.0
+            if self.windows.warm
+            else float(np.trace(np.eye(n_x) - np.linalg.inv(xx), axis1=1, axis2=2).sum())
+        )
+        return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64), taken
 
     def _behind(self, point: _Point) -> tuple[Array, ...]:
         """As :meth:`_normal`, of what comes behind the warm-up; first states follow from the warm-up alone."""
-        b, error, follow = self._eliminated(point)
+        b, error, follow, _ = self._eliminated(point)
         n_x = point.x.shape[1]
+        pull, from_nominal = self._pull(point, b.shape[-1])
         return (
             np.broadcast_to(np.eye(n_x), (len(follow), n_x, n_x)), follow[..., :-1],
-            (b.swapaxes(1, 2) @ b).sum(axis=0), follow[..., -1],
-            (b.swapaxes(1, 2) @ error[..., None])[..., 0].sum(axis=0),
+            (b.swapaxes(1, 2) @ b).sum(axis=0) + pull, follow[..., -1],
+            (b.swapaxes(1, 2) @ error[..., None])[..., 0].sum(axis=0) + from_nominal,
         )  # fmt: skip
 
     def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
@@ -740,34 +947,78 @@ class Shooting:
         of_states = 0.0 if self.windows.warm else float(np.sum(gx * moved))
         return step, moved, -2.0 * (float(gt @ step) + of_states)
 
-    def _covariance(self, point: _Point) -> tuple[Array, tuple[str, ...]]:
-        """Covariance of ``theta``, from the scatter of the windows' slopes: errors within one are no white noise.
+    def _covariance(self, point: _Point) -> tuple[Array, tuple[Combination, ...]]:
+        """Covariance of ``theta``, and what the windows do not tell.
 
-        Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters.
+        It follows from the scatter of the slopes of ``CLUSTERS`` parts of the windows at least, since errors within one
+        are no white noise, and from what holds ``theta`` at the nominal values; none is larger than a half range.
+
+        Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters; Huber
+        and Ronchetti, *Robust Statistics* (2009), section 7.6, of the robust loss.
         """
-        b, error, _ = self._eliminated(point)
-        root = (1 + np.square(point.error / point.scales / OUTLIERS)) ** -0.25
-        information = (b.swapaxes(1, 2) @ b).sum(0)
-        told = np.flatnonzero(np.diag(information) > 0)  # of the others the outputs say nothing at all
-        unknown = set(range(len(information))) - set(told.tolist())
-        covariance = np.full(information.shape, math.nan)
-        if len(told):
-            information, b = information[np.ix_(told, told)], b[..., told]
-            size = np.sqrt(np.diag(information))
-            values, directions = np.linalg.eigh(information / np.outer(size, size))
-            weak = np.abs(directions[:, values < UNKNOWN * values[-1]]) > 0.2
-            unknown |= set(told[weak.any(axis=1)].tolist())
-            inverse = (
-                directions / np.maximum(values, 1e-12 * values[-1]) @ directions.T / np.outer(size, size)
-            )
-            scores = (b.swapaxes(1, 2) @ error[..., None])[..., 0]
-            n = len(scores)
-            if n >= 2 * scores.shape[1]:  # fewer windows tell nothing of their scatter
-                middle = n / (n - 1) * scores.T @ scores
-            else:
-                middle = information * float(np.mean(np.square(root * error)))
-            covariance[np.ix_(told, told)] = inverse @ middle @ inverse
-        return covariance, tuple(self.own.names[i] for i in sorted(unknown))
+        b, error, _, taken = self._eliminated(point)
+        n, k = len(b), b.shape[-1]
+        if not k:
+            return np.zeros((0, 0)), ()
+        falling = 1.0 / (1.0 + np.square(point.error / point.scales / OUTLIERS))  # psi'(r) over psi(r) / r
+        half = self.own.half
+        rows = (b * np.sqrt(falling)[..., None]).reshape(-1, k) * half
+        _, values, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
+        told = np.zeros(k)
+        told[: len(values)] = np.where(values > ROUNDED * values[0], values, 0.0)
+        back = directions.T * half[:, None]  # theta from coordinates in which the information is diag(told^2)
+        outputs = len(self.spread)
+        scores = (b * error[..., None]).reshape(n, -1, outputs, k).sum(axis=2)
+        parts = min(math.ceil(CLUSTERS / n), scores.shape[1])
+        begins = np.arange(parts) * scores.shape[1] // parts
+        scores = np.add.reduceat(scores, begins, axis=1).reshape(-1, k)
+        counted = float((self.seen.reshape(n, -1) * self.count).sum())
+        left = max(counted - k - taken, 0.5 * counted)  # degrees of freedom
+        scores = scores @ back * (told > 0)
+        middle = scores.T @ scores * (counted / max(left, 1.0)) * len(scores) / max(len(scores) - 1, 1)
+        inverse = 1.0 / (np.square(told) + LOOSE**-2)
+        covariance = back @ ((middle + LOOSE**-2 * np.eye(k)) * np.outer(inverse, inverse)) @ back.T
+        covariance = 0.5 * (covariance + covariance.T)
+        values, directions = np.linalg.eigh(covariance / np.outer(half, half))
+        untold = directions[:, values >= UNTOLD**2].T
+        found = tuple(_combination(self.own, point.theta, covariance, one) for one in untold)
+        bounded = directions * np.minimum(values, 1.0) @ directions.T * np.outer(half, half)
+        return bounded, tuple({one.parameters: one for one in found}.values())
+
+
+def _regular(xx: Array) -> Array:
+    """Normal matrices of first states ``(n, n_x, n_x)`` with what holds these at their guess."""
+    eye = np.eye(xx.shape[-1])
+    return np.asarray(xx * (1.0 + ROUNDING * eye) + eye)
+
+
+def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Array) -> Combination:
+    """What the data do not tell along a direction [half ranges], and the best known combination of the same."""
+    among = np.flatnonzero(np.abs(direction) > INVOLVED * np.abs(direction).max())
+    names = tuple(fit.names[i] for i in among)
+    if len(among) == 1:
+        return Combination(names)
+    sizes = fit.unit[among]
+
+    def known(size: Array) -> tuple[Array, float]:
+        """Weights of the parameters, each over its size, and what they add up to is known to."""
+        own = covariance[np.ix_(among, among)] * np.outer(sizes, sizes) / np.outer(size, size)
+        values, directions = np.linalg.eigh(own)
+        weights = directions[:, 0] / size
+        return weights, math.sqrt(max(float(values[0]), 0.0))
+
+    weights, error = known(fit.half[among] * sizes)
+    ratio = np.abs(weights / np.abs(weights).max())
+    units = {fit.free[i].unit if i < len(fit.free) else "s" for i in among}
+    value = theta[among] * sizes
+    sign = np.sign(theta[among])
+    one_sign = (sign * np.where(sign > 0, fit.lower[among], fit.upper[among]) >= 0).all() and sign.all()
+    product = bool(one_sign) and not (len(units) == 1 and ratio.min() > ALIKE_WEIGHTS)
+    if product:
+        weights, error = known(value)
+        weights = weights * value
+    largest = float(weights[np.abs(weights).argmax()])
+    return Combination(names, tuple((weights / largest).tolist()), product, error / abs(largest))
 
 
 def fit_prior(
@@ -786,10 +1037,15 @@ def fit_prior(
     """Fit parameters and delay to the measured outputs over longer and longer windows, and find what smooths states.
 
     Each length starts from what explains its windows best of what is known: the nominal values, the best of several
-    starts between the bounds, and what shorter windows found. Of the nominal values and all lengths the one wins that
-    explains the windows of the longest length best, over training and validation recordings together: few parameters do
-    not overfit, and where a machine drifts a short validation part alone misleads. A prior without free parameters
-    stays as it is.
+    starts between the bounds, and what shorter windows found; up to ``FOLLOWED`` of them are followed where they do
+    about as well. A machine on which small errors grow gets windows no longer than these take to grow a hundredfold,
+    unless little more than the sensors' noise is left; where that is all that is left, whole recordings come last. Of
+    the nominal values and all lengths the one wins that explains the longest windows best, over training and validation
+    recordings together: few parameters do not overfit, and where a machine drifts a short validation part alone
+    misleads. A prior without free parameters stays as it is.
+
+    Parameters are held loosely at their nominal values, so that what the data do not tell stays where it is. At the end
+    integration steps are halved until that moves no parameter by what counts. The order of the recordings is no matter.
 
     Recordings whose inputs answer to the outputs (:func:`feedback`) warn, and the errors of predictions are fitted too.
     Inputs that seem to act late warn where parameters are fitted and no delay is, and first states are not known ones.
@@ -822,6 +1078,7 @@ def fit_prior(
 
     Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
     """
+    train, valid = (sorted(part, key=_place) for part in (train, valid))  # the order of files is no matter
     fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
     check_observable(fit.prior, dt, unit)
@@ -833,11 +1090,9 @@ def fit_prior(
         )
     if length is None:
         length = max(LENGTHS[-1] * unit, SLOWEST * slowest(fit.prior))
-    lengths = _lengths(train, dt, unit, length, fit.lead)
-    total = len(lengths) + 2
-    on_progress(0, total, "smoothing by the nominal prior")
+    on_progress(0, 1, "smoothing by the nominal prior")
     smoother = rough_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
-    sizes = np.array(smoother.sizes.x)
+    noise = np.array(smoother.sizes.noise)
     every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
     fit.points = visited(every)
     if fit.substeps(fit.nominal) > smoother.substeps:  # stiff where the recordings go
@@ -845,62 +1100,87 @@ def fit_prior(
         every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
         fit.points = visited(every)
     guesses = every[: len(train)], every[len(train) :]
-    found: list[tuple[str, Fitted]] = []
-    theta = fit.nominal
+    moved = [robust_spread(column) for column in np.concatenate([t.x for t in guesses[0]]).T]
+    sizes = np.maximum(smoother.sizes.x, moved)  # a rough guess is no measurement
+    lengths = _lengths(train, dt, unit, length, fit.lead, fit.reach(fit.nominal))
+    total = len(lengths) + 2
 
-    def problem_of(part: Sequence[Trajectory], periods: int, most: int = WINDOWS) -> Shooting:
+    def problem_of(part: Sequence[Trajectory], periods: int | None, most: int = WINDOWS) -> Shooting:
         known = fit.prior.states, fit.prior.outputs, first_states
         return Shooting(fit, cut_outputs(part, periods, fit.lead, most, *known), sizes)
 
-    problems = [problem_of(guesses[0], periods) for periods in lengths]
-    if len(theta):
+    def parts_of(periods: int | None) -> list[Shooting]:
+        """Training and validation windows by which candidates are compared, as far as recordings hold them."""
+        return [problem_of(part, periods) for part in guesses if _longest(part) > (periods or 2) + fit.lead]
+
+    periods, scoring = lengths[-1], parts_of(lengths[-1])
+    found: list[tuple[str, list[Fitted]]] = []
+    if len(fit.nominal):
         on_progress(1, total, "several starts")
-        short, long = (problem_of(guesses[0], lengths[i], WINDOWS // 2) for i in (0, -1))
-        theta = _best_start(fit, short, long, start)
-        for i, (periods, problem) in enumerate(zip(lengths, problems, strict=True)):
-            name = f"free runs of {periods * dt:.3g} s"
+        far = max(p for p in lengths if p == lengths[0] or 0.8 * p * dt <= fit.reach(fit.nominal))
+        short, long = (problem_of(guesses[0], own, WINDOWS // 2) for own in (lengths[0], far))
+        begun = _starts(fit, short, long, start)
+        followed, problem = begun, short
+        for i, own in enumerate(lengths):
+            if i and 0.8 * own * dt > fit.reach(followed[0]) and not _quiet(problem, followed[0], noise):
+                break
+            name, periods, problem = f"free runs of {own * dt:.3g} s", own, problem_of(guesses[0], own)
             on_progress(2 + i, total, name)
-            known = [
-                fit.nominal,
-                theta,
-                *(f.theta for _, f in found[-1:]),
-            ]  # short windows may have led astray
-            found.append((name, problem.solve(known[int(np.argmin(problem.explained(known)))])))
-    scoring = [problems[-1]] if _longest(guesses[0]) > lengths[-1] + fit.lead else []
-    if _longest(guesses[1]) > lengths[-1] + fit.lead:
-        scoring.append(problem_of(guesses[1], lengths[-1]))
-    candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ())), *found]
+            every_start = [fit.nominal, *begun, *followed]  # short windows may have led astray
+            solved = [problem.solve(one) for one in _promising(fit, problem, every_start)]
+            if own == lengths[-1]:
+                solved += _further(fit, problem, solved)
+            scoring = parts_of(own) or [problem]
+            errors = _errors_of([one.theta for one in solved], scoring)
+            solved = [solved[k] for k in np.argsort(errors, kind="stable")]
+            found.append((name, solved))
+            followed = [one.theta for one in solved]
+        whole = _longest(guesses[0]) - fit.lead - 1
+        more = whole > WHOLE * periods and 0.8 * min(whole, LONGEST) * dt < fit.reach(followed[0])
+        if more and _quiet(problem, followed[0], noise):  # each window spends some numbers on its first state
+            on_progress(total - 1, total, "whole recordings")
+            problem, scoring = problem_of(guesses[0], None), parts_of(None)
+            found.append(("whole recordings", [problem.solve(followed[0])]))
+    candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ()))]
+    for name, solved in found:  # of each length what is best over the longest windows
+        errors = _errors_of([one.theta for one in solved], scoring)
+        candidates.append((name, solved[int(np.argmin(errors))]))
     scores = _errors_of([c.theta for _, c in candidates], scoring)
     on_progress(total - 1, total, "smoothing by the fitted prior")
 
-    def best() -> tuple[Fitted, Smoother]:
-        if not np.isfinite(min(scores)):
-            raise InputError(
-                "the prior diverges with every set of parameters tried; check its signs and units"
-            )
-        chosen = candidates[int(np.argmin(scores))][1]
-        acting = shifted([*train, *valid], fit.delay(chosen.theta))
-        fitted, substeps = make(fit.values(chosen.theta)), fit.substeps(chosen.theta)
-        return chosen, fit_smoother(fitted, acting, dt, time_unit=unit, substeps=substeps)
+    if not np.isfinite(min(scores)):
+        raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
 
-    chosen, smoother = best()
+    def smoother_of(found: Fitted) -> Smoother:
+        acting = shifted([*train, *valid], fit.delay(found.theta))
+        fitted, substeps = make(fit.values(found.theta)), fit.substeps(found.theta)
+        return fit_smoother(fitted, acting, dt, time_unit=unit, substeps=substeps)
+
+    chosen = candidates[winner([name for name, _ in candidates], scores)][1]
+    if len(chosen.covariance):
+        chosen = _with_enough_substeps(fit, problem, chosen)
+    smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
     answered = feedback(acting, smoother.prediction_errors(acting, smoother.prior.p[None])[1])
-    if answered > 1.0 and fit.free:
-        on_progress(total - 1, total, "predictions, as inputs answer to the outputs")
-        candidates.append(("predictions", fit_by_prediction(fit, chosen.theta, train, smoother)))
+    if fit.free and (answered > 1.0 or fit.reach(chosen.theta) < length):
+        on_progress(total - 1, total, PREDICTIONS)
+        known = [replace(t, x=s.x) for t, s in zip(acting, smoother.smooth(acting), strict=True)]
+        forgotten = min(scales.periods(FORGETS * unit, dt, 2), lengths[-1], _longest(known) - 1)
+        windows = cut_outputs(known, forgotten, 0, WINDOWS // 2, fit.prior.states)
+        candidates.append((PREDICTIONS, fit_by_prediction(fit, chosen.theta, windows, smoother)))
         scores += _errors_of([candidates[-1][1].theta], scoring)
-        if int(np.argmin(scores)) == len(scores) - 1:
-            chosen, smoother = best()
+        if winner([name for name, _ in candidates], scores) == len(scores) - 1:
+            chosen = candidates[-1][1]
+            smoother = smoother_of(chosen)
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     warnings = _warnings(fit, chosen, answered, min(scores) / max(scores[0], 1e-300))
     if fit.free and not largest_delay and first_states.kind not in ("known", "shared"):
-        warnings += _late(fit, chosen.theta, guesses, lengths[-1], sizes, first_states)
+        warnings += _late(fit, chosen.theta, guesses, periods, sizes, first_states)
     on_progress(total, total, "done")
     return PriorFit(
         fit.values(chosen.theta), _errors(fit, chosen), warnings, stages,
         _correlations(fit, chosen), fit.delay(chosen.theta), smoother.sigma, smoother.walk, smoother.sizes,
-        smoother.fading, smoother.substeps,
+        smoother.fading, smoother.substeps, chosen.unidentified,
     )  # fmt: skip
 
 
@@ -1001,7 +1281,7 @@ def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
 def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: float) -> list[Trajectory]:
     """Trajectories with states smoothed roughly, inputs as commanded, and without the samples that a delay costs."""
     made = []
-    for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay), sweeps=1), strict=True):
+    for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay)), strict=True):
         made.append(replace(t.part(slice(len(t.t) - len(s.t), None)), x=s.x, xdot=s.xdot))
     return made
 
@@ -1013,37 +1293,110 @@ def slowest(prior: Prior) -> float:
     return float(1.0 / rates.min()) if len(rates) else 0.0
 
 
+def _place(trajectory: Trajectory) -> tuple[int, list[float]]:
+    """Place of a trajectory among others, by what was measured alone."""
+    first = np.hstack([trajectory.y, trajectory.u])[:COMPARED_SAMPLES]
+    return len(trajectory.t), np.nan_to_num(first, nan=-math.inf).ravel().tolist()
+
+
 def _longest(trajectories: Sequence[Trajectory]) -> int:
     return max((len(t.t) for t in trajectories), default=0)
 
 
-def _lengths(train: Sequence[Trajectory], dt: float, unit: float, length: float, lead: int) -> list[int]:
-    """Periods of the windows, the longest last; what the recordings do not hold is cut to half of the longest."""
+def _lengths(
+    train: Sequence[Trajectory], dt: float, unit: float, length: float, lead: int, reach: float
+) -> list[int]:
+    """Periods of the windows, the longest last; what the recordings do not hold is cut to half of the longest.
+
+    Of a machine on which a small error grows by the larger of ``GROWN`` over ``reach`` [s] two shorter ones come first.
+    """
     longest = _longest(train) - 2 * lead - 1  # smoothing under a delay costs as many samples again
     length = min(length, longest * dt)
     wanted = [own for own in (unit * own for own in LENGTHS) if own < 0.7 * length]
     while wanted and length > 1.5 * APART * wanted[-1]:  # from one length to the next errors must stay small
         wanted.append(wanted[-1] * APART)
     wanted.append(length)
+    grown = [reach * math.log(own) / math.log(GROWN[-1]) for own in GROWN]
+    slow = [own for own in wanted if own > 1.5 * grown[-1]]
+    if slow:
+        wanted = [*grown, *slow]
     fitting = [p for p in (scales.periods(own, dt, 2) for own in wanted) if p <= longest]
     return sorted(dict.fromkeys(fitting)) or [max(2, longest // 2)]
 
 
-def _best_start(fit: OutputFit, short: Shooting, long: Shooting, start: Mapping[str, float] | None) -> Array:
-    """What a few steps over short windows find from several starts: what explains the longest windows best."""
-    starts = [fit.nominal, *([] if start is None else [fit.scaled(start)])]
-    if len(fit.nominal):
-        between = qmc.Sobol(len(fit.nominal), seed=0).random_base2(3)[:STARTS]
-        starts += list(fit.lower + between * (fit.upper - fit.lower))
+def _starts(
+    fit: OutputFit, short: Shooting, long: Shooting, start: Mapping[str, float] | None
+) -> list[Array]:
+    """What a few steps over short windows find from several starts, what explains long ones best first."""
     found = []
-    for one in starts:
+    for one in [fit.nominal, *([] if start is None else [fit.scaled(start)]), *_draws(fit)]:
         try:
             found.append(short.solve(one, START_ITERATIONS).theta)
         except InputError:  # too stiff for the period there
             continue
-    if not found:
-        return fit.nominal
-    return found[int(np.argmin(long.explained(found)))]
+    return _promising(fit, long, found) if found else [fit.nominal]
+
+
+def _draws(fit: OutputFit) -> list[Array]:
+    """Starts between the bounds."""
+    between = qmc.Sobol(len(fit.nominal), seed=0).random_base2(3)[:STARTS]
+    return list(fit.lower + between * (fit.upper - fit.lower))
+
+
+def _further(fit: OutputFit, problem: Shooting, solved: Sequence[Fitted]) -> list[Fitted]:
+    """What is found from the nominal values and from draws, one after the other, as long as too much is left."""
+    found = list(solved)
+    for one in (fit.nominal, *_draws(fit)):
+        if min(problem.explained([f.theta for f in found])) <= POOR:
+            break
+        try:
+            found.append(problem.solve(one))
+        except InputError:  # too stiff for the period there
+            continue
+    return found[len(solved) :]
+
+
+def _promising(fit: OutputFit, problem: Shooting, thetas: Sequence[Array]) -> list[Array]:
+    """What explains windows best, and others that do nearly as well and lie elsewhere, the best first."""
+    errors = problem.explained(thetas)
+    order = sorted(range(len(thetas)), key=errors.__getitem__)
+    kept: list[Array] = []
+    for i in order:
+        far = all(_apart(fit, thetas[i], one) for one in kept)
+        if far and errors[i] <= PROMISING * errors[order[0]] and len(kept) < FOLLOWED:
+            kept.append(thetas[i])
+    return kept
+
+
+def _apart(fit: OutputFit, one: Array, other: Array) -> bool:
+    """Whether two starts are not the same but for what a few steps leave."""
+    off = np.abs(one - other)
+    share = off / np.maximum(np.maximum(np.abs(one), np.abs(other)), DISTINCT * fit.half)
+    return bool(np.max(np.maximum(off / fit.half, share / FACTOR)) > DISTINCT)
+
+
+def _quiet(problem: Shooting, theta: Array, noise: Array) -> bool:
+    """Whether of the windows little more is left than the sensors' noise ``(n_y,)``."""
+    share = problem.seen.sum(axis=(0, 1)) / max(problem.seen.sum(), 1)
+    least = math.sqrt(float(share @ np.square(noise / problem.spread)))
+    return problem.explained([theta])[0] <= QUIET * least
+
+
+def _with_enough_substeps(fit: OutputFit, problem: Shooting, found: Fitted) -> Fitted:
+    """The same fit with integration steps so short that halving them moves no parameter by what counts.
+
+    Their number stays the least of this fit. The move is that of a Gauss-Newton step by the change of the outputs.
+    """
+    while (substeps := fit.substeps(found.theta)) <= MAX_SUBSTEPS // 2:
+        error = np.sqrt(np.diag(found.covariance))
+        if (
+            problem.shift(found.theta, 2 * substeps) <= np.maximum(SHIFT * error, EXACT * np.abs(found.theta))
+        ).all():
+            break
+        fit.least = 2 * substeps
+        problem.forget()
+        found = problem.solve(found.theta)
+    return found
 
 
 def _errors_of(thetas: Sequence[Array], parts: Sequence[Shooting]) -> list[float]:
@@ -1087,8 +1440,7 @@ def _warnings(fit: OutputFit, chosen: Fitted, answered: float = 0.0, gained: flo
             f"the fit hardly improves on the nominal parameters (its error is {gained:.3f} of theirs): they are right, "
             "or the prior lacks something that no parameter stands for"
         )
-    if chosen.unidentified:
-        warnings.append(f"the data cannot tell apart: {', '.join(chosen.unidentified)}")
+    warnings += [str(one) for one in chosen.unidentified]
     for p, value, low, high in zip(fit.free, chosen.theta, fit.lower, fit.upper, strict=False):
         if min(value - low, high - value) < AT_BOUND * (high - low):
             warnings.append(f"{p.label} ends at a bound ({value * (abs(p.value) or p.upper - p.lower):.4g})")

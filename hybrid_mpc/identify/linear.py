@@ -11,11 +11,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.excitation import NOTHING
-from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.data.excitation import is_constant
+from hybrid_mpc.errors import InputError, named_extra, refuse
 from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
+RANK = 1e-6
+"""Singular values below this share of the largest count as zero: what rounding of a file leaves."""
 Weighting: TypeAlias = Literal["cva", "n4sid"]
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 25, 32)
 """Orders that are tried where nobody says which: lags of an ARX model, states of a subspace model."""
@@ -215,12 +217,8 @@ class LinearModel:
         Raises:
             InputError: If python-control is not installed.
         """
-        try:
+        with named_extra("a state space"):
             import control
-        except ImportError as missing:
-            raise InputError(
-                f"a state space needs python-control ({missing}); install it: pip install 'hybrid-mpc[analysis]'"
-            ) from None
         scale = self.y_scale[:, None]
         return control.ss(
             self.A, self.B / self.u_scale, self.C * scale, self.D * scale / self.u_scale, self.dt,
@@ -474,10 +472,10 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
     runs = list(pairs.values())[: len(train)]
     y, u = np.concatenate([y for y, _ in runs]), np.concatenate([u for _, u in runs])
     n_commanded = np.asarray(train[0].u).shape[1]
-    still = [j for j in range(u.shape[1]) if np.ptp(u[:, j]) <= NOTHING * np.abs(u[:, j]).max()]
+    still = [j for j in range(u.shape[1]) if is_constant(u[:, j])]
     for j in range(y.shape[1]):
         seen = y[np.isfinite(y[:, j]), j]
-        if not len(seen) or np.ptp(seen) <= NOTHING * np.abs(seen).max():
+        if not len(seen) or is_constant(seen):
             problems.append(
                 f"output {j + 1} never changes in the training recordings; leave it out, or train where it moves"
             )
@@ -737,7 +735,7 @@ def _doubts(data: _Data, inputs: Array, what: str) -> tuple[str, ...]:
         for j in data.still
     ]
     size = np.linalg.svd(inputs[:, np.abs(inputs).max(axis=0) > 0], compute_uv=False)
-    rank = int(np.sum(size > NOTHING * size[0]))
+    rank = int(np.sum(size > RANK * size[0]))
     if rank < len(size):
         doubts.append(
             f"the inputs excite {rank} of the {len(size)} directions of {what}: another model explains the recordings "

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.data.scales import Sizes
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter
@@ -18,8 +18,61 @@ if TYPE_CHECKING:
 
 CORRELATED = 0.99
 """Two parameters whose errors are correlated by more can hardly be told apart."""
+ENOUGH = 1.01
+"""Ratio to the least error up to which the longest windows win: they tell most of the parameters."""
+PREDICTIONS = "predictions"
+"""Name of the stage that is fitted by predictions one period ahead instead of free runs."""
 LEAST_T = 2.0
 """A parameter below so many standard errors may be zero."""
+
+
+def winner(stages: Sequence[str], errors: Sequence[float]) -> int:
+    """Place of the stage that wins: the last of those whose error is the least but for one per cent, since it had the
+    longest windows; ``PREDICTIONS`` must be better by that.
+
+    Example:
+        >>> winner(["nominal", "short", "long", "longer"], [0.5, 0.1, 0.1005, 0.2])
+        2
+    """
+    runs = [i for i, stage in enumerate(stages) if stage != PREDICTIONS]
+    least = min(errors[i] for i in runs)
+    found = max(i for i in runs if errors[i] <= ENOUGH * least)
+    others = [i for i, stage in enumerate(stages) if stage == PREDICTIONS and ENOUGH * errors[i] < least]
+    return min(others, key=errors.__getitem__, default=found)
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Parameters that the recordings do not tell apart, and what they tell of them together.
+
+    Args:
+        parameters: Their names. A single one they do not tell within its range.
+        weights: Of each in the combination that is known best, the largest 1. Default: none is known.
+        product: The combination is the product of the parameters, each to the power of its weight, instead of the sum
+            of the parameters times theirs. Default: the sum.
+        error: Standard error of the combination: of a product relative to it [-], of a sum in its unit.
+
+    Example:
+        >>> print(Combination(("k", "m"), (1.0, -1.0), True, 0.01))
+        the data cannot tell apart: k, m; known is k * m^-1, to 1 %
+    """
+
+    parameters: tuple[str, ...]
+    weights: tuple[float, ...] = ()
+    product: bool = False
+    error: float = 0.0
+
+    def __str__(self) -> str:
+        if not self.weights:
+            return f"the data do not tell {', '.join(self.parameters)} within its range"
+        of = [(name, w) for name, w in zip(self.parameters, self.weights, strict=True) if abs(w) >= 0.005]
+        if self.product:
+            text = " * ".join(name if abs(w - 1.0) < 0.005 else f"{name}^{w:.2g}" for name, w in of)
+            text += f", to {100 * self.error:.2g} %"
+        else:
+            text = " + ".join(name if abs(w - 1.0) < 0.005 else f"{w:.3g} {name}" for name, w in of)
+            text = text.replace("+ -", "- ") + f", to {self.error:.2g}"
+        return f"the data cannot tell apart: {', '.join(self.parameters)}; known is {text}"
 
 
 @dataclass(frozen=True)
@@ -28,8 +81,8 @@ class PriorFit:
 
     Args:
         values: Fitted values [SI] by name, fixed ones included.
-        standard_errors: Standard errors [SI] of the fitted ones, clustered by window (they hold for a model without
-            structural error, so read them as lower bounds).
+        standard_errors: Standard errors [SI] of the fitted ones, from the scatter over parts of the windows (they hold
+            for a model without structural error, so read them as lower bounds); half of its range at most.
         warnings: Parameters at a bound, or ones that the data do not identify.
         stages: One row per stage: its name and the validation error that chose the winner.
         correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.
@@ -40,6 +93,7 @@ class PriorFit:
         fading: What is left of an unexplained rate after a period, where nothing tells of it [-].
         substeps: Runge-Kutta sub-steps a period that the fitted prior needs where the recordings go. Default 0: as many
             as it needs at rest.
+        unidentified: Parameters that the recordings do not tell apart. Default: none.
     """
 
     values: dict[str, float]
@@ -53,6 +107,7 @@ class PriorFit:
     sizes: Sizes | None = None
     fading: float = 1.0
     substeps: int = 0
+    unidentified: tuple[Combination, ...] = ()
 
     def smoother(self, prior: Prior, dt: float) -> Smoother:
         """The smoother around the fitted prior."""
@@ -63,7 +118,8 @@ class PriorFit:
     @property
     def best(self) -> str:
         """Name of the stage that won."""
-        return str(min(self.stages, key=lambda row: row["validation_error"])["stage"])
+        names, errors = ([row[key] for row in self.stages] for key in ("stage", "validation_error"))
+        return str(names[winner(names, errors)])
 
     @property
     def t_ratios(self) -> dict[str, float]:
@@ -115,12 +171,8 @@ class PriorFit:
 
     def table(self, parameters: Sequence[Parameter]) -> pd.DataFrame:
         """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters).to_csv(path)`` writes it."""
-        try:
+        with named_extra("the table (rows() gives the same without)"):
             import pandas as pd
-        except ImportError as missing:
-            raise InputError(
-                "the table needs pandas, which is not installed: pip install 'hybrid-mpc[report]'; rows() does not"
-            ) from missing
         return pd.DataFrame(self.rows(parameters)).set_index("parameter")
 
     def _correlation(self, first: str, second: str) -> float:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.machine.specification import check_prior_replay
+from hybrid_mpc.machine.specification import Count, CountOrNone
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import Name, NotNegative, Positive
 
 Kind = Literal["rnn", "pgrnn", "mopgrnn"]
 PriorParameters = Literal["fixed", "trained"]
@@ -71,34 +72,35 @@ class TrainingSettings:
     """
 
     kind: Kind
-    hidden: int
-    networks: int
-    teacher_steps: int
-    free_run_steps: int
+    hidden: Count
+    networks: Count
+    teacher_steps: CountOrNone
+    free_run_steps: CountOrNone
     seed: int
-    warm: int
-    horizon: int = 50
-    batch: int = 32
-    decay: float = 300.0
-    learning_rates: tuple[float, float, float, float] = (2e-2, 2e-3, 1e-2, 5e-4)
-    every: int = 25
-    validation_horizon: int | None = None
-    objectives: tuple[str, ...] = ("output", "balances")
+    warm: CountOrNone
+    horizon: Count = 50
+    batch: Count = 32
+    decay: NotNegative = 300.0
+    learning_rates: tuple[Positive, Positive, Positive, Positive] = (2e-2, 2e-3, 1e-2, 5e-4)
+    every: Count = 25
+    validation_horizon: Count | None = None
+    objectives: tuple[Name, ...] = ("output", "balances")
     prior_parameters: PriorParameters = "fixed"
-    prior_replay: float = 0.0
-    parts: int = 0
+    prior_replay: NotNegative = 0.0
+    parts: CountOrNone = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "objectives", tuple(self.objectives))  # a list, where it comes from a file
-        _check_choice("kind", self.kind, KINDS)
-        _check_choice("prior_parameters", self.prior_parameters, get_args(PriorParameters))
-        if not self.objectives:
-            raise InputError("objectives is empty; a training needs at least one, e.g. ('error',)")
-        if self.kind == "rnn" and self.prior_parameters == "trained":
-            raise InputError("an rnn has no prior to train along; leave prior_parameters 'fixed'")
-        check_prior_replay(self.prior_replay)
-        if self.parts < 0 or self.parts == 1:
-            raise InputError(f"parts must be 0, or 2 and more, got {self.parts}")
+        own = Fields(self, "training settings")
+        own.need(
+            "objectives", lambda: self.objectives,
+            "objectives is empty; a training needs at least one, e.g. ('error',)",
+        )  # fmt: skip
+        own.need(
+            "kind prior_parameters", lambda: self.use_prior or self.prior_parameters == "fixed",
+            "an rnn has no prior to train along; leave prior_parameters 'fixed'",
+        )  # fmt: skip
+        own.need("parts", lambda: self.parts != 1, "parts must be 0, or 2 and more, got 1")
+        own.refuse()
 
     @property
     def shortest(self) -> int:
@@ -109,8 +111,3 @@ class TrainingSettings:
     def use_prior(self) -> bool:
         """Whether the network sees the prior."""
         return self.kind != "rnn"
-
-
-def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
-    if value not in choices:
-        raise InputError(f"{name}: unknown {value!r}; choose one of: {', '.join(map(str, choices))}")

@@ -39,12 +39,19 @@ class Simulation:
         dt: Period [s].
         free: Places in ``p`` of the parameters by which it is differentiated, in this order.
         output: ``(x, u, w, p) -> y``, what is asked for at every sample. Default: the states.
+        correct: ``(x, u, w, p) -> x``, the state from which a period starts, by what is known at its begin. Default:
+            the state itself.
     """
 
     def __init__(
-        self, xdot: ca.Function, dt: float, free: Sequence[int] = (), output: ca.Function | None = None
+        self,
+        xdot: ca.Function,
+        dt: float,
+        free: Sequence[int] = (),
+        output: ca.Function | None = None,
+        correct: ca.Function | None = None,
     ) -> None:
-        self.dt, self.free, self._xdot, self._output = dt, list(free), xdot, output
+        self.dt, self.free, self._xdot, self._output, self._correct = dt, list(free), xdot, output, correct
         self.n_x, self.n_p = xdot.size1_in(0), xdot.size1_in(3)
         self._period = cache(self._period_function)
 
@@ -85,7 +92,8 @@ class Simulation:
         x = z[:, 0]
         found = []
         y = x if self._output is None else self._output(x, u, w, p)
-        for value in (stepped(self._xdot, x, u, w, p, self.dt, substeps), y):
+        begin = x if self._correct is None else self._correct(x, u, w, p)
+        for value in (stepped(self._xdot, begin, u, w, p, self.dt, substeps), y):
             slopes = ca.jacobian(value, x) @ z[:, 1:]
             if columns:
                 slopes[:, : len(self.free)] += ca.jacobian(value, p)[:, self.free]
@@ -192,12 +200,21 @@ def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> 
     substeps = substeps_for(prior.equations.xdot, *rest_of(prior), prior.p, dt, name)
     if points is None or not len(points[0]):
         return substeps
-    slopes = _slopes_at(prior.equations.xdot, len(points[0]))(*(v.T for v in points), prior.p).full()
-    every = np.moveaxis(slopes.reshape(len(prior.states), -1, len(prior.states)), 1, 0)
-    every = every[np.isfinite(every).all(axis=(1, 2))]
-    modes = np.linalg.eigvals(every)
+    modes = np.linalg.eigvals(_flow_slopes(prior, points))
     rate = float(np.abs(modes[modes.real <= 0]).max(initial=0.0))
     return max(substeps, _substeps(rate, dt, name, "where the recordings go"))
+
+
+def growth_rate(prior: Prior, points: Points) -> float:
+    """Mean rate [1/s] at which two runs of the prior part where the recordings go; 0 where they do not.
+
+    It is the mean over the points of the largest real part of an eigenvalue that is positive: what a swing passes in a
+    moment counts little, what holds throughout counts whole.
+    """
+    if not len(points[0]):
+        return 0.0
+    modes = np.linalg.eigvals(_flow_slopes(prior, points))
+    return float(np.mean(np.maximum(modes.real.max(axis=1), 0.0))) if len(modes) else 0.0
 
 
 def visited(trajectories: Sequence[Trajectory]) -> Points:
@@ -248,6 +265,13 @@ def _substeps(rate: float, dt: float, name: str, where: str) -> int:
             f"at zero speed) or take a smaller dt."
         )
     return substeps
+
+
+def _flow_slopes(prior: Prior, points: Points) -> Array:
+    """Derivatives of the rates by the state at those points where they are finite ``(m, n_x, n_x)``."""
+    slopes = _slopes_at(prior.equations.xdot, len(points[0]))(*(v.T for v in points), prior.p).full()
+    every = np.moveaxis(slopes.reshape(len(prior.states), -1, len(prior.states)), 1, 0)
+    return np.asarray(every[np.isfinite(every).all(axis=(1, 2))])
 
 
 @lru_cache(maxsize=64)

@@ -15,6 +15,7 @@ from scipy.linalg import expm
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.scales import Sizes, evenly, robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.identify.horizon import Horizon, Stretches
 from hybrid_mpc.identify.simulation import (
     flow_slope,
     over_time,
@@ -27,14 +28,10 @@ from hybrid_mpc.identify.simulation import (
 from hybrid_mpc.machine.prior import Equations, Prior
 
 Array = NDArray[np.float64]
-SWEEPS = 4
-"""Linearizations along the smoothed trajectory at most, after the first along the filter's estimates."""
 STILL = 0.01
 """A trajectory whose estimates move by less than this share of their standard deviations is smoothed."""
 NEWTON = 15
 """Newton steps to the equilibrium of the first inputs."""
-MOST_SWEEPS = 20
-"""Linearizations at most, where the censored samples that count are not yet the same from one to the next."""
 DECADES = (-6.0, 2.0)
 """Range searched for the walk of the unexplained rates, as a power of ten of their natural size: from a prior that is
 right to one that explains nothing."""
@@ -52,22 +49,29 @@ SAMPLE = 12
 FADING = 10.0
 """Machine's seconds in which an unexplained rate fades that nothing tells of: without, what it drives would drift
 away."""
+GROWN = 10.0
+"""Growth up to which the outputs of a machine that runs away tell its states' sizes."""
 QUIETEST = 1e-6
 """Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none, and what
 is not known at first is some 10 spreads, whose square holds no more digits."""
+SLACK = 0.1
+"""What the states may leave their equations by over the machine's second, as a share of what shows as the sensors'
+noise: too little to be seen, enough for the problem to be well conditioned. All else that is not explained is ``d``."""
 UNSEEN = 1e-6
 """Share of the outputs' spread below which a state's whole range shows in no output."""
 
 
 @dataclass(frozen=True)
 class Smoother:
-    """Fixed-interval smoother over ``(x, d)``: ``d`` is what the prior does not explain of the rates that it corrects.
+    """The most likely ``(x, d)`` of recordings: ``d`` is what the prior does not explain of the rates that it corrects.
 
     ``x_{k+1} = f(x_k, u_k, w_k, d_k)`` is the prior integrated over a period with ``d_k`` held, ``d`` walks at random,
-    ``y_k = g(x_k, u_k, w_k) + noise``. Where nothing that is measured tells of ``d``, it fades (``fading``). So states
-    that no sensor sees are estimated, and the input's part of a motion is known where a local polynomial would smear
-    it. Missing samples (NaN) of single outputs are passed over; a censored one counts only where the estimate
-    contradicts it.
+    ``y_k = g(x_k, u_k, w_k) + noise``; all samples of a recording are estimated together
+    (:class:`~hybrid_mpc.identify.horizon.Horizon`). Where nothing that is measured tells of ``d``, it fades
+    (``fading``). So states that no sensor sees are estimated, and the input's part of a motion is known where a local
+    polynomial would smear it. States stay within thrice their ranges. Missing samples (NaN) of single outputs are
+    passed over; a censored one counts only where the estimate contradicts it; one that lies far off counts by its size
+    alone.
 
     Args:
         prior: The fitted prior.
@@ -78,8 +82,8 @@ class Smoother:
         fading: What is left of ``d`` after a period [-].
         substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
 
-    Source: Rauch, Tung, Striebel, *Maximum likelihood estimates of linear dynamic systems* (1965); iterated
-    linearization: Bell, *The iterated Kalman smoother as a Gauss-Newton method* (1994).
+    Source: as for the horizon; the filter that starts it and whose innovations tell the noise: Jazwinski, *Stochastic
+    processes and filtering theory* (1970), section 8.3.
     """
 
     prior: Prior
@@ -90,14 +94,11 @@ class Smoother:
     fading: float = 1.0
     substeps: int = 0
 
-    def smooth(self, trajectories: Sequence[Trajectory], *, sweeps: int = SWEEPS) -> list[Trajectory]:
-        """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it.
-
-        ``sweeps`` is how often the prior is linearized along the smoothed trajectory, at most.
-        """
+    def smooth(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+        """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it."""
         smoothed: dict[int, Trajectory] = {}
         for group in _together(trajectories):
-            for (i, t), z in zip(group.items(), self._estimate(list(group.values()), sweeps), strict=True):
+            for (i, t), z in zip(group.items(), self._estimate(list(group.values())), strict=True):
                 smoothed[i] = self._with_states(t, z)
         return [smoothed[i] for i in range(len(trajectories))]
 
@@ -113,15 +114,13 @@ class Smoother:
         return len(self.prior.states) + len(self.prior.corrected)
 
     @cached_property
-    def _passes(self) -> tuple[ca.Function, ca.Function]:
-        """One period of the filter: linearized along its own estimates, and along given ones."""
-        return _filters(
-            self.prior.equations,
-            self.prior.corrected,
-            self.dt,
-            self.substeps or required_substeps(self.prior, self.dt),
-            self.fading,
-        )
+    def _period(self) -> ca.Function:
+        """One period of the filter."""
+        own = self._horizon
+        return _filter(
+            own.equations, own.corrected, own.dt, own.substeps, own.fading,
+            (tuple(own.lower.tolist()), tuple(own.upper.tolist())),
+        )  # fmt: skip
 
     def _with_states(self, trajectory: Trajectory, z: Array) -> Trajectory:
         n_x = len(self.prior.states)
@@ -131,23 +130,51 @@ class Smoother:
         xdot[:, list(self.prior.corrected)] += d
         return replace(trajectory, x=x, xdot=xdot)
 
-    def _estimate(self, group: Sequence[Trajectory], sweeps: int) -> list[Array]:
-        """Smoothed ``(x, d)`` ``(n, n_z)`` of trajectories; each is done when it does not change any more."""
-        runs = _Runs.of(self, group)
-        found = self._filtered(runs)
-        z = _smoothed(found, runs.lengths)
-        open_ = np.ones(len(group), dtype=bool)
-        for i in range(MOST_SWEEPS):
-            found, before = self._filtered(runs, along=z), found.counted
-            after = _smoothed(found, runs.lengths)
-            same = (before == found.counted).all(axis=(1, 2))
-            deviation = np.sqrt(np.maximum(np.diagonal(found.now[..., 1:], axis1=-2, axis2=-1), 1e-300))
-            moved = np.where(runs.inside[..., None], np.abs(after - z) / deviation, 0.0).max(axis=(1, 2))
-            z = np.where(open_[:, None, None], after, z)
-            open_ &= ~(same & ((moved < STILL) | (i + 1 >= sweeps)))
-            if not open_.any():
-                break
-        return [one[:n] for one, n in zip(z, runs.lengths, strict=True)]
+    def _estimate(self, group: Sequence[Trajectory]) -> list[Array]:
+        """Most likely ``(x, d)`` ``(n, n_z)`` of trajectories, from what of the filter's estimates and the first states
+        explains them better.
+        """
+        runs, lengths = _Runs.of(self, group), [len(t.t) for t in group]
+        begins = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.intp)
+        y, censored, u, w = (
+            np.concatenate([np.asarray(getattr(t, key), dtype=float) for t in group])
+            for key in ("y", "censored", "u", "w")
+        )
+        n_x = len(self.prior.states)
+        first = np.concatenate([runs.first, np.zeros((len(group), self._n_z - n_x))], axis=1)
+        stretches, horizon = Stretches(y, censored, u, w, begins, first), self._horizon
+        filtered = self._filtered(runs).now[runs.inside]
+        held = np.repeat(np.clip(first, horizon.lower, horizon.upper), lengths, axis=0)
+        return np.split(horizon.solve(stretches, [filtered, held]), begins[1:])
+
+    @cached_property
+    def _horizon(self) -> Horizon:
+        states, sizes = self.prior.states, self.sizes
+        rate = np.array([sizes.rate[i] for i in self.prior.corrected])
+        low, high = (np.array([getattr(s, end) for s in states]) for end in ("lower", "upper"))
+        beyond, unknown = high - low, np.full(len(rate), np.inf)
+        seconds = self.dt * sizes.rate[0] / sizes.x[0]  # of the machine, in a period
+        quiet = max(float(np.min(np.array(self.sigma) / np.array(sizes.y))), QUIETEST)
+        exact = SLACK * quiet * math.sqrt(seconds) * np.array(sizes.x)
+        walk = np.maximum(self.walk, QUIETEST * QUIETEST * rate)
+        return Horizon(
+            self.prior.equations, self.prior.corrected, self.prior.p, self.dt,
+            self.substeps or required_substeps(self.prior, self.dt), self.fading, np.array(self.sigma),
+            np.concatenate([exact, walk]), self._ignorance(np.array(self.walk)), np.concatenate([sizes.x, rate]),
+            np.concatenate([np.where(np.isfinite(beyond), low - beyond, -np.inf), -unknown]),
+            np.concatenate([np.where(np.isfinite(beyond), high + beyond, np.inf), unknown]),
+        )  # fmt: skip
+
+    def _ignorance(self, walk: Array) -> Array:
+        """Standard deviations ``(..., n_z)`` of the first ``(x, d)``, by the walk ``(..., n_d)``."""
+        if self.fading < 1.0:
+            settled = walk / math.sqrt(1.0 - self.fading**2)  # of d, when it has long walked
+        else:
+            own = IGNORANCE * np.array([self.sizes.rate[i] for i in self.prior.corrected])
+            settled = np.broadcast_to(own, walk.shape)
+        ranges = np.array([0.5 * (s.upper - s.lower) for s in self.prior.states])
+        known = np.minimum(IGNORANCE * np.array(self.sizes.x), ranges)
+        return np.concatenate([np.broadcast_to(known, (*walk.shape[:-1], len(known))), settled], axis=-1)
 
     def prediction_errors(self, trajectories: Sequence[Trajectory], p: Array) -> tuple[Array, list[Array]]:
         """Prediction errors of the filter for several sets of parameters ``(m, n_p)``.
@@ -173,42 +200,33 @@ class Smoother:
     def _filtered(
         self,
         runs: _Runs,
-        along: Array | None = None,
         p: Array | None = None,
         levels: tuple[Array, Array] | None = None,
     ) -> _Filtered:
-        """What the filter finds, linearized along its own estimates or along ``(x, d)`` ``(b, n, n_z)``.
+        """What the filter finds.
 
         Parameters are the prior's, or ``p`` ``(b, n_p)``; noise and walk are the smoother's own, or those of each run
         in ``levels`` ``(b, n_y)``, ``(b, n_d)``.
         """
         b, n_z, n_x = len(runs.y), self._n_z, len(self.prior.states)
         sigma, walk = (np.broadcast_to(v, (b, np.shape(v)[-1])) for v in levels or (self.sigma, self.walk))
-        if self.fading < 1.0:
-            settled = walk / math.sqrt(1.0 - self.fading**2)  # of d, when it has long walked
-        else:
-            own = IGNORANCE * np.array([self.sizes.rate[i] for i in self.prior.corrected])
-            settled = np.broadcast_to(own, walk.shape)
-        ranges = np.array([0.5 * (s.upper - s.lower) for s in self.prior.states])
-        known = np.minimum(IGNORANCE * np.array(self.sizes.x), ranges)
-        spread = np.concatenate([np.broadcast_to(known, (b, n_x)), settled], axis=1)
+        spread = self._ignorance(walk)
         first = np.concatenate([runs.first, np.zeros((b, n_z - n_x))], axis=1)
         ahead = np.concatenate([first[:, None], spread[..., None] ** 2 * np.eye(n_z)], axis=1)
         signals = [np.where(runs.seen, runs.y, 0.0), runs.seen, runs.censored, runs.u, runs.w]
-        period = self._passes[0 if along is None else 1]
         values = np.broadcast_to(self.prior.p, (b, len(self.prior.parameters))) if p is None else p
         noise = np.concatenate([np.zeros((b, n_x)), np.square(walk)], axis=1)
-        z, others = over_time(
-            period,
+        _, others = over_time(
+            self._period,
             np.moveaxis(ahead, 0, -1),
-            [np.moveaxis(v, 0, -1) for v in (*signals, *([] if along is None else [along]))],
+            [np.moveaxis(v, 0, -1) for v in signals],
             [v.T for v in (values, np.square(sigma), noise)],
         )
-        expected, now, slope, e, s, counts = (
+        now, e, s, counts = (
             np.moveaxis(v.reshape(len(v), -1, rows, b), (3, 0, 2, 1), (0, 1, 2, 3))
-            for v, rows in zip((z[:-1], *others), (n_z, n_z, n_z, *(3 * [runs.y.shape[2]])), strict=True)
+            for v, rows in zip(others, (n_z, *(3 * [runs.y.shape[2]])), strict=True)
         )
-        return _Filtered(counts[..., 0] > 0, expected, now, slope, e[..., 0], s)
+        return _Filtered(counts[..., 0] > 0, now[..., 0], e[..., 0], s)
 
     def _starts(self, trajectories: Sequence[Trajectory]) -> Array:
         """States ``(b, n_x)`` at the first samples: nearest to where the first inputs would hold the machine, in their
@@ -226,7 +244,7 @@ class Smoother:
         )  # fmt: skip
         x = self._held(rest[0], u, w)
         y = np.stack([_first_seen(t.y) for t in trajectories])
-        output = _output_slope(self.prior.equations).map(n)
+        output = output_slope(self.prior.equations).map(n)
         size, outputs = np.array(self.sizes.x), np.array(self.sizes.y)
         for _ in range(5):
             found, c = (v.full() for v in output(x.T, u.T, w.T, np.tile(self.prior.p[:, None], (1, n))))
@@ -306,44 +324,15 @@ class _Runs:
 
 @dataclass(frozen=True)
 class _Filtered:
-    """A filter's results for ``b`` runs of ``n`` samples; the last axis of ``ahead`` and ``now`` is ``[z, P]``.
+    """A filter's results for ``b`` runs of ``n`` samples: estimates, innovations and their covariances.
 
     ``counted`` are the samples that are there, without the censored ones that nothing contradicts.
     """
 
     counted: NDArray[np.bool_]
-    ahead: Array
     now: Array
-    slope: Array
     e: Array
     s: Array
-
-
-def _smoothed(found: _Filtered, lengths: Sequence[int]) -> Array:
-    """Rauch-Tung-Striebel smoother behind a filter: ``z`` ``(b, n, n_z)``, for each run up to its own length."""
-    b, n, n_z, _ = found.now.shape
-    own = found.now[..., 0]
-    if n < 2:
-        return own
-    forward = found.slope[:, :-1] @ found.now[:, :-1, :, 1:]
-    # where data are exact some directions are known to rounding: it is added to the correlations
-    covariance = found.ahead[:, 1:, :, 1:]
-    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 1e-300))[..., None]
-    correlation = covariance / (size * np.swapaxes(size, -1, -2)) + 1e-14 * np.eye(n_z)
-    last = np.array(lengths)[:, None] - 1
-    over = np.arange(n - 1) >= last
-    correlation[over], forward[over] = np.eye(n_z), 0.0
-    back = np.swapaxes(np.linalg.solve(correlation, forward / size) / size, -1, -2)
-    ahead = np.where(over[..., None], 0.0, found.ahead[:, 1:, :, 0])
-    end = own[np.arange(b), last[:, 0]]
-    offset = np.where(over[..., None], end[:, None], own[:, :-1] - np.einsum("bnij,bnj->bni", back, ahead))
-    later, _ = over_time(
-        _backward(n_z),
-        end.T,
-        [np.moveaxis(v[:, ::-1], 0, -1) for v in (offset, np.swapaxes(back, -1, -2).reshape(b, n - 1, -1))],
-        [],
-    )
-    return np.ascontiguousarray(np.moveaxis(later[::-1], -1, 0))
 
 
 def _innovations(
@@ -409,8 +398,10 @@ def fit_smoother(
         best, width = float(ratios[np.argmin(costs(ratios))]), 2 * width / (AT_ONCE - 1)
     ((squares, _, count),) = _innovations([at(best)], sample)
     sizes = at(best).sizes
-    least = QUIETEST * float(np.max(np.array(sizes.y) / np.array(sizes.noise)))
-    return at(best, max(math.sqrt(squares / max(count, 1)), least))
+    spreads = np.array(sizes.y) / np.array(sizes.noise)  # a sensor's noise is no larger than what it shows
+    return at(
+        best, float(np.clip(math.sqrt(squares / max(count, 1)), QUIETEST * spreads.max(), spreads.max()))
+    )
 
 
 def rough_smoother(
@@ -458,21 +449,24 @@ def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_u
 def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
     """How each state at a time shows in each output over the machine's second after it ``(n_y, n, n_x)``.
 
+    Where the machine runs away it is the time, if that is shorter, in which what is small grows by ``GROWN``.
+
     The prior is linearized at rest (:func:`~hybrid_mpc.identify.simulation.rest_of`) and a little beside it, since a
     sensor may be blind at one point: ``|v|`` at rest.
     """
     x, u, w = rest_of(prior)
     ranges = np.array([s.upper - s.lower for s in prior.states])
     beside = x + np.where(np.isfinite(ranges), 0.1 * ranges, 1.0)
-    periods = max(2, round(time_unit / dt))
-    skip = max(1, periods // 50)  # fifty instants tell as much as a thousand
-    slope, output = flow_slope(prior.equations.xdot), _output_slope(prior.equations)
+    slope, output = flow_slope(prior.equations.xdot), output_slope(prior.equations)
     found = []
     for point in (x, beside):
         a = slope(point, u, w, prior.p).full()
         c = output(point, u, w, prior.p)[1].full()
         if not (np.isfinite(a).all() and np.isfinite(c).all()):
             continue
+        rate = float(np.linalg.eigvals(a).real.max(initial=0.0))
+        periods = max(2, round(min(time_unit, math.log(GROWN) / rate if rate > 0 else math.inf) / dt))
+        skip = max(1, periods // 50)  # fifty instants tell as much as a thousand
         step, rows, at = expm(a * dt * skip), [], np.eye(len(x))
         with np.errstate(over="ignore", invalid="ignore"):  # what runs away is cut off below
             for _ in range(0, periods, skip):
@@ -528,7 +522,7 @@ def _together(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]]
 
 
 @lru_cache(maxsize=32)
-def _output_slope(equations: Equations) -> ca.Function:
+def output_slope(equations: Equations) -> ca.Function:
     """``(x, u, w, p) -> y`` and its derivative by ``x``."""
     f = equations.output
     point = [ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4)]
@@ -537,14 +531,19 @@ def _output_slope(equations: Equations) -> ca.Function:
 
 
 @lru_cache(maxsize=32)
-def _filters(
-    equations: Equations, corrected: tuple[int, ...], dt: float, substeps: int, fading: float
-) -> tuple[ca.Function, ca.Function]:
-    """A period of the filter, along its own estimates and along given ones.
+def _filter(
+    equations: Equations,
+    corrected: tuple[int, ...],
+    dt: float,
+    substeps: int,
+    fading: float,
+    bounds: tuple[tuple[float, ...], tuple[float, ...]],
+) -> ca.Function:
+    """A period of the extended Kalman filter, whose expectations stay within bounds.
 
-    Takes what is expected ``[z, P]``, a sample ``y``, which outputs were seen, which are censored, ``u, w``, ``z`` to
-    linearize along, ``p``, variances of the noise and of the walk. Gives what is expected of the next sample, the
-    estimate ``[z, P]``, the transition, the innovation with its covariance, and which samples counted.
+    Takes what is expected ``[z, P]``, a sample ``y``, which outputs were seen, which are censored, ``u, w``, ``p``,
+    variances of the noise and of the walk. Gives what is expected of the next sample, the estimate, the innovation with
+    its covariance, and which samples counted.
     """
     xdot = with_unknown_rates(equations.xdot, corrected)
     n_x, n_z, n_y = equations.xdot.size1_in(0), xdot.size1_in(0), equations.output.size1_out(0)
@@ -553,47 +552,33 @@ def _filters(
         ca.SX.sym("ahead", n_z, 1 + n_z), *(ca.SX.sym(name, n_y) for name in ("y", "seen", "censored"))
     )  # fmt: skip
     u, w, p = (ca.SX.sym(name, n) for name, n in sizes.items())
-    along, r, noise = ca.SX.sym("along", n_z), ca.SX.sym("r", n_y), ca.SX.sym("noise", n_z)
-
-    def linear(of: ca.SX, at: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Output at ``of``, linearized at ``at``, and its slope."""
-        x = ca.SX.sym("x", n_x)
-        value = equations.output(x, u, w, p)
-        slope = ca.horzcat(ca.jacobian(value, x), ca.SX(n_y, n_z - n_x))
-        value, slope = (ca.substitute(v, x, at[:n_x]) for v in (value, slope))
-        return value + slope @ (of - at), slope
-
-    def moved(of: ca.SX, at: ca.SX) -> tuple[ca.SX, ca.SX]:
-        z = ca.SX.sym("z", n_z)
-        value = stepped(xdot, z, u, w, p, dt, substeps)
-        value[n_x:] *= fading
-        value, slope = (ca.substitute(v, z, at) for v in (value, ca.jacobian(value, z)))
-        return value + slope @ (of - at), slope
-
-    made = []
-    for own in (True, False):
-        z, covariance = ahead[:, 0], ahead[:, 1:]
-        expected, c = linear(z, z if own else along)
-        # a censored sample counts where the estimate lies on the measured side of its limit: that of all samples, once
-        # there is one, since later samples may draw an earlier state across
-        estimate = expected if own else equations.output(along[:n_x], u, w, p)
-        counts = seen * (1 - ca.logic_and(censored != 0, censored * (estimate - y) > 0))
-        e, c = counts * (y - expected), ca.diag(counts) @ c
-        s = c @ covariance @ c.T + ca.diag(counts * r + (1 - counts))
-        gain = ca.solve(s, c @ covariance).T if n_y > 1 else (covariance @ c.T) / s
-        rest = ca.SX.eye(n_z) - gain @ c  # Joseph's form: rounding leaves no variance negative
-        covariance = rest @ covariance @ rest.T + gain @ ca.diag(counts * r) @ gain.T
-        z, covariance = z + gain @ e, 0.5 * (covariance + covariance.T)
-        after, slope = moved(z, z if own else along)
-        later = ca.horzcat(after, slope @ covariance @ slope.T + ca.diag(noise))
-        outputs = [ca.densify(v) for v in (later, ca.horzcat(z, covariance), slope, e, s, counts)]
-        given = [ahead, y, seen, censored, u, w, *([] if own else [along]), p, r, noise]
-        made.append(ca.Function("filter" if own else "again", given, [ca.cse(v) for v in outputs]))
-    return made[0], made[1]
+    r, noise = ca.SX.sym("r", n_y), ca.SX.sym("noise", n_z)
+    z, covariance = ahead[:, 0], ahead[:, 1:]
+    expected = equations.output(z[:n_x], u, w, p)
+    # a censored sample counts where the estimate lies on the measured side of its limit
+    counts = seen * (1 - ca.logic_and(censored != 0, censored * (expected - y) > 0))
+    e, c = counts * (y - expected), ca.diag(counts) @ ca.jacobian(expected, z)
+    s = c @ covariance @ c.T + ca.diag(counts * r + (1 - counts))
+    gain = ca.solve(s, c @ covariance).T if n_y > 1 else (covariance @ c.T) / s
+    rest = ca.SX.eye(n_z) - gain @ c  # Joseph's form: rounding leaves no variance negative
+    after = rest @ covariance @ rest.T + gain @ ca.diag(counts * r) @ gain.T
+    after = 0.5 * (after + after.T)
+    now = ca.SX.sym("now", n_z)
+    moved = stepped(xdot, now, u, w, p, dt, substeps)
+    moved[n_x:] *= fading
+    estimate = _between(z + gain @ e, *bounds)
+    slope = ca.substitute(ca.jacobian(moved, now), now, estimate)
+    moved = _between(ca.substitute(moved, now, estimate), *bounds)
+    later = ca.horzcat(moved, slope @ after @ slope.T + ca.diag(noise))
+    outputs = [ca.densify(v) for v in (later, estimate, e, s, counts)]
+    given = [ahead, y, seen, censored, u, w, p, r, noise]
+    return ca.Function("filter", given, [ca.cse(v) for v in outputs])
 
 
-@lru_cache(maxsize=32)
-def _backward(n_z: int) -> ca.Function:
-    """``z_k = offset_k + back_k z_{k+1}``."""
-    z, offset, back = ca.SX.sym("z", n_z), ca.SX.sym("offset", n_z), ca.SX.sym("back", n_z, n_z)
-    return ca.Function("earlier", [z, offset, back], [offset + back @ z])
+def _between(z: ca.SX, lower: tuple[float, ...], upper: tuple[float, ...]) -> ca.SX:
+    """``z``, of which the first components have bounds."""
+    bounded = [
+        ca.fmin(ca.fmax(z[i], low), high) if math.isfinite(low) and math.isfinite(high) else z[i]
+        for i, (low, high) in enumerate(zip(lower, upper, strict=True))
+    ]
+    return ca.vertcat(*bounded)

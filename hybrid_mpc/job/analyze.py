@@ -192,12 +192,16 @@ class ResponseError:
 
 @dataclass(frozen=True)
 class ResponseAnalysis:
-    """Responses of machine and models to the same inputs, and each model's distance from the machine."""
+    """Responses of machine and models to the same inputs, and each model's distance from the machine.
+
+    ``left_out`` says of a model without one why: its free run diverges.
+    """
 
     source: str
     machine: MeasuredResponse
     models: Mapping[str, MeasuredResponse]
     errors: Mapping[str, ResponseError]
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -546,12 +550,11 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
     if given.recordings:
         length = min(10.0 * unit, 0.25 * max(u.size for u, _, _ in given.recordings) * some.dt)
         machine = welch_response([(u, y) for u, y, _ in given.recordings], some.dt, length=length)
-        responses = {
-            name: welch_response(
-                [(u, run_model(model, x0)(u)) for u, _, x0 in given.recordings], some.dt, length=length
-            )
-            for name, model in models.items()
-        }
+
+        def response(model: HybridModel) -> MeasuredResponse:
+            driven = [(u, run_model(model, x0)(u)) for u, _, x0 in given.recordings]
+            return welch_response(driven, some.dt, length=length)
+
         source = f"H1 estimate of {len(given.recordings)} recordings, Hann windows of {length:g} s"
     elif given.plant is not None:
         low_u, high_u = given.u_range[0].tolist()
@@ -562,9 +565,10 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
             "periods": PERIODS,
         }  # fmt: skip
         machine = multisine_response(run_plant(given.plant, some.x0, some.dt), some.dt, **driven)
-        responses = {
-            name: multisine_response(run_model(m, some.x0), m.dt, **driven) for name, m in models.items()
-        }
+
+        def response(model: HybridModel) -> MeasuredResponse:
+            return multisine_response(run_model(model, some.x0), model.dt, **driven)
+
         size = f"{amplitude:g} {some.inputs[0].unit}"
         around = f" around {bias:g} {some.inputs[0].unit}" if bias else ""
         source = f"odd multisine of {size}{around}, {low:g} to {high:g} Hz, {PERIODS} periods"
@@ -572,8 +576,11 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
         raise InputError(
             "there is neither a recording nor a simulated machine to take a response from; give --data FILE"
         )
+    tried = {name: _tried(partial(response, model)) for name, model in models.items()}
+    responses = {name: one for name, one in tried.items() if not isinstance(one, Missing)}
     errors = {name: _response_error(one, machine) for name, one in responses.items()}
-    return ResponseAnalysis(source, machine, responses, errors)
+    left_out = {name: one.reason for name, one in tried.items() if isinstance(one, Missing)}
+    return ResponseAnalysis(source, machine, responses, errors, left_out)
 
 
 def _response_error(model: MeasuredResponse, machine: MeasuredResponse) -> ResponseError:

@@ -326,7 +326,9 @@ def _channel(some: HybridModel, i: int, j: int) -> tuple[str, str]:
 
 def _draw_measured(given: AnalysisInput, part: ResponseAnalysis) -> Named:
     some = _some(given)
-    found = {"measured": part.machine} | {name: part.models[name] for name in _names(given)}
+    found = {"measured": part.machine} | {
+        name: part.models[name] for name in _names(given) if name in part.models
+    }
     curves = {name: vars(one) | {"trusted": one.trusted} for name, one in found.items()}
     figure = plots.measured_bode(
         curves, input_signal=some.inputs[0], output_signal=some.outputs[0], source=part.source
@@ -419,6 +421,8 @@ def _sections(result: AnalysisResult, tables: Mapping[str, Table], drawn: Drawn)
     for part, (title, names, figures) in SECTIONS.items():
         found = getattr(result, part)
         notes = [f"Left out: {found.reason}."] if isinstance(found, Missing) else []
+        if isinstance(found, ResponseAnalysis):
+            notes += [f"Left out: {name}: {why}." for name, why in found.left_out.items()]
         shown = [tables[n] if n != "modes" else _leading(tables[n]) for n in names if n in tables]
         pictures = [own for f in figures for name, own in drawn.items() if name.partition(CHANNEL)[0] == f]
         sections.append(Section(title, texts[part], pictures, shown, notes))

@@ -45,6 +45,7 @@ from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.folder import JobNote, write_note
 from hybrid_mpc.job.stages.choose import CANDIDATES
 from hybrid_mpc.job.stages.identify import PARTS, load_trained, save_trained, train_kinds
+from hybrid_mpc.kit.artifact import BENCHMARK_NOTE
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import plain, record
@@ -52,7 +53,6 @@ from hybrid_mpc.scenario import Scenario, load_scenario
 
 Array = NDArray[np.float64]
 SCHEMA = 3
-MODEL_NOTE = "benchmark_model.json"
 SHOWN = 20.0
 """Length of a run that is drawn sample by sample [the machine's seconds]."""
 IN_MOTION = 0.1
@@ -394,7 +394,7 @@ def save_model(folder: Path, model: BenchmarkModel) -> None:
     for trained in model.networks.values():
         save_trained(folder, trained)
     description = {f.name: getattr(model, f.name) for f in fields(_Description)}
-    write_document(folder / MODEL_NOTE, {"schema": SCHEMA, **description})
+    write_document(folder / BENCHMARK_NOTE, {"schema": SCHEMA, **description})
 
 
 def load_model(folder: Path, scenario: str) -> BenchmarkModel:
@@ -403,8 +403,8 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
     Raises:
         InputError: If there is none, it is damaged, or of another machine.
     """
-    folder = folder if (folder / MODEL_NOTE).is_file() else folder / "model"
-    path = folder / MODEL_NOTE
+    folder = folder if (folder / BENCHMARK_NOTE).is_file() else folder / "model"
+    path = folder / BENCHMARK_NOTE
     if not path.is_file():
         raise InputError(
             f"{folder.parent} holds no model of a benchmark; give the folder that 'hybrid-mpc benchmark {scenario} "

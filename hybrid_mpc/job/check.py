@@ -15,7 +15,7 @@ from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.recording import COARSE, check_unit
-from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.errors import InputError, named_extra, no_exit, refuse
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of
 from hybrid_mpc.job.check_prior import DRIFT, Report, check_prior
@@ -93,6 +93,8 @@ class Preflight:
     default_tasks: tuple[Task, ...] = ()
 
 
+@no_exit()
+@named_extra("the check")
 def check_scenario(
     scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
 ) -> Preflight:
@@ -106,6 +108,7 @@ def check_scenario(
     return found
 
 
+@no_exit()
 def preflight(
     scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
 ) -> Preflight:
@@ -124,8 +127,6 @@ def preflight(
     prior, asked = check_prior(report, scenario.prior)
     if prior is not None:
         _check_columns(report, scenario, prior)
-    for name, one in scenario.budgets.items() if budget is None else [("budget", budget)]:
-        _check_budget(report, name, one)
     before = len(report.problems)
     rest = model = None
     if prior is not None and asked:
@@ -318,23 +319,6 @@ def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
         )
 
 
-def _check_budget(report: Report, name: str, budget: Budget) -> None:
-    least = {
-        "hidden": 1,
-        "networks": 1,
-        "teacher_steps": 0,
-        "free_run_steps": 0,
-        "seeds": 1,
-        "oracle_seeds": 0,
-    }
-    for key, lowest in least.items():
-        value = getattr(budget, key)
-        if not isinstance(value, int) or isinstance(value, bool) or value < lowest:
-            report.add(f"budget {name}: {key} must be a whole number of at least {lowest}, got {value!r}")
-    if not 0 <= budget.decay < math.inf:
-        report.add(f"budget {name}: decay must be 0 or more, got {budget.decay!r}")
-
-
 def _check_control(
     report: Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None, rest: Rest | None
 ) -> None:
@@ -359,10 +343,8 @@ def _check_control(
             _check_problem(report, scenario, what, task.control, prior, model if new else None, rest)
 
 
-def _structure(control: Any) -> tuple[Any, ...]:
-    """What tells controllers apart that are built differently; an object that is no OCP is reported elsewhere."""
-    if not isinstance(control, OCP):
-        return ()
+def _structure(control: OCP) -> tuple[Any, ...]:
+    """What tells controllers apart that are built differently."""
     bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())
     expressions = control.soft, control.hard, id(control.economic)
     return control.horizon, control.blocks, control.du_max is None, bounded, expressions
@@ -374,14 +356,14 @@ def _check_sensors(report: Report, scenario: Scenario, prior: Prior | None) -> N
         report.add(f"sensor_sigma needs {len(prior.outputs)} numbers, got {len(given)}: {given}")
     for name in ("sensor_sigma", "first_sigma"):
         values = getattr(scenario, name)
-        if values is not None and not all(math.isfinite(s) and s > 0 for s in values):
-            report.add(f"{name} must be positive and finite, got {values}")
+        if values is not None and not all(s > 0 for s in values):
+            report.add(f"{name} must be positive, got {values}")
     for name, sigma in scenario.state_noise.items():
         if prior is not None and name not in [s.name for s in prior.states]:
             names = ", ".join(s.name for s in prior.states)
             report.add(f"state_noise: no state {name!r}; there are: {names}")
-        if not (math.isfinite(sigma) and sigma > 0):
-            report.add(f"state_noise of {name} must be positive and finite, got {sigma}")
+        if not sigma > 0:
+            report.add(f"state_noise of {name} must be positive, got {sigma}")
 
 
 def _check_problem(
@@ -394,9 +376,6 @@ def _check_problem(
     rest: Rest | None,
 ) -> None:
     before = len(report.problems)
-    if not isinstance(control, OCP):
-        report.add(f"{what}: OCP(...) needed, got {control!r:.60}")
-        return
     if prior is None:
         return
     for name, size in {"q": len(prior.states), "r": len(prior.inputs)}.items():
@@ -423,9 +402,6 @@ def _check_problem(
 def _check_plant(
     report: Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None, rest: Rest | None
 ) -> None:
-    names = [task.name for task in scenario.tasks]
-    if len(set(names)) < len(names):
-        report.add(f"tasks: two have the same name: {names}")
     plant: Plant | None = None
     if scenario.plant is not None and prior is not None:
         with report.part("plant"):
@@ -501,9 +477,9 @@ def _check_task(
 ) -> None:
     n_x, dt, what = len(prior.states), scenario.data.dt, f"task {task.name}"
     control = task.control or scenario.control
-    n_p = control.n_p if isinstance(control, OCP) else 0
-    if len(task.x0) != n_x or not all(math.isfinite(v) for v in task.x0):
-        report.add(f"{what}: x0 needs {n_x} finite numbers, got {task.x0}")
+    n_p = 0 if control is None else control.n_p
+    if len(task.x0) != n_x:
+        report.add(f"{what}: x0 needs {n_x} numbers, got {task.x0}")
     else:
         with report.part(what):
             _check_within("x0", np.array([task.x0]), np.zeros(1), prior.states)
@@ -511,11 +487,11 @@ def _check_task(
         with report.part(what):
             names = ([s.name for s in signals] for signals in (prior.outputs, prior.inputs))
             check_channels(install(plant, task.faults)[1], *names)
-    if not (math.isfinite(task.duration) and task.duration >= dt):
-        report.add(f"{what}: duration must be at least a period of {dt} s and finite, got {task.duration}")
+    if task.duration < dt:
+        report.add(f"{what}: duration must be at least a period of {dt} s, got {task.duration}")
         return
     t = np.arange(0.0, task.duration, dt)
-    by_output = isinstance(control, OCP) and control.n_y > 0
+    by_output = control is not None and control.n_y > 0
     signals = prior.outputs if by_output else prior.states
     n_r = len(signals) + n_p
     for name, preview, columns in (("reference", task.reference, n_r), ("weight", task.weight, n_x)):
@@ -539,7 +515,7 @@ def _check_task(
                 raise InputError("weight: factors must not be negative")
             if name == "reference":
                 _check_within(name, values[:, : len(signals)], t, signals)
-                if isinstance(control, OCP) and rest is not None:
+                if control is not None and rest is not None:
                     set_points = values[:, : len(signals)]
                     _check_set_point(report, task, set_points, control, prior, rest, by_output)
 

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra, no_exit
 from hybrid_mpc.identify.simulation import rest_of
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import POINT, BalanceEquations, OperatingPoint, Prior, column
@@ -81,7 +81,8 @@ class Report:
     def part(self, what: str) -> Iterator[None]:
         """A part of the scenario; what it raises is a problem of its own, and the next part is looked at."""
         try:
-            yield
+            with no_exit(), named_extra():
+                yield
         except InputError as error:
             for text in error.problems:
                 self.add(f"{what}: {text}")

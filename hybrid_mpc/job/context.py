@@ -6,7 +6,7 @@ import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -206,7 +206,15 @@ class Context:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
+    """Versions of what a result depends on, by package; those that are not installed are left out."""
     packages = ("casadi", "numpy", "scipy", "safetensors", "torch", "control", "pandas")
     own = {"hybrid-mpc": __version__, "python": platform.python_version()}
-    return own | {name: version(name) for name in packages}
+    return own | {name: found for name in packages if (found := installed(name))}
+
+
+def installed(package: str) -> str:
+    """Version of an installed package; empty where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""

@@ -14,8 +14,8 @@ from hybrid_mpc.files import digest, write_json
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.folder import JobNote, check_out, open_folder
-from hybrid_mpc.job.loops import DRAWN, Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
-from hybrid_mpc.job.stages.on_model import ON_MODEL
+from hybrid_mpc.job.loops import DRAWN, ON_MODEL, Bench, LoopRow, LoopSpec, read_rows, run_loops, write_rows
+from hybrid_mpc.job.stage import program
 from hybrid_mpc.job.study import Study
 from hybrid_mpc.job.study_log import NoiseNote
 from hybrid_mpc.job.study_run import StudyModel, load_models
@@ -135,7 +135,7 @@ def _rows(bench: Bench, study: Study, model: StudyModel, folder: Path, progress:
 
 
 def _digest(spec: LoopSpec, model: StudyModel) -> str:
-    return digest([spec.id, spec.keep, model.sha256])
+    return digest([spec.id, spec.keep, model.sha256, program()])
 
 
 def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[LoopRow]) -> ControlResults:

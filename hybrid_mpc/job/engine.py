@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection, wait
 from queue import Empty, Queue
 from typing import Any, Generic, TypeVar
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra, no_exit
 
 WORKERS = min(2, os.cpu_count() or 1)
 """Processes side by side: the machine this is made for has two cores."""
@@ -386,10 +386,11 @@ def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, Exceptio
         reports.send((done, total, text))
 
     try:
-        return function(*args, report), None
+        with no_exit():
+            return function(*args, report), None
     except InputError as error:
         return None, error
-    except BaseException:  # SystemExit too: every failure travels to the parent, which raises it
+    except BaseException:  # every failure travels to the parent, which raises it
         return None, RuntimeError(traceback.format_exc())
 
 
@@ -413,10 +414,8 @@ def _check(workers: int) -> None:
 
 
 def _connected(address: str) -> Any:
-    try:
+    with named_extra("a scheduler"):
         from distributed import Client
-    except ImportError as error:
-        raise InputError(f"{error}; pip install 'hybrid-mpc[studies]'") from error
     if not ADDRESS.fullmatch(address):
         raise InputError(
             f"the scheduler's address must be tcp://HOST:PORT, got {address!r}; for another kind (tls://) connect a "

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController, Source
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, no_exit
 from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
 from hybrid_mpc.job.controllers import CONTROLLERS, build
@@ -28,6 +28,7 @@ from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.loop.simulate import ClosedLoopResult, Step, simulate
 from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel, kinematics
+from hybrid_mpc.model.riccati import hidden_fixed_point
 from hybrid_mpc.monitor.calibrate import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.residuals import ResidualMonitor
@@ -55,6 +56,12 @@ DRAWN = ("t", "x", "u", "y", "w", "reference", "y_ref")
 TIMES = ("total", "solve", "estimate")
 MOST_BUILT = 64
 """Controllers that a bench holds; loops come ordered by controller, so few are asked for again."""
+ON_MODEL = "on the model, not the machine"
+"""What stands wherever a loop is shown in which a model stands in for the machine."""
+DRAWN_PRIOR = "prior_drawn"
+"""Name of the prior with parameters drawn from their fitted covariance, where it stands in for a machine."""
+SAME_MOTION = 1e-6
+"""Runs of two models that differ by less than this share of the motion are those of one model, but for rounding."""
 REPORT_PERIODS = 25
 """Periods between two reports of :func:`run_loops`."""
 
@@ -281,6 +288,7 @@ class Bench:
         ``row, result = Bench(scenario, {"model": hm.load("runs/golf")}).run(spec)``
     """
 
+    @no_exit()
     def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
         if not isinstance(scenario, Scenario):
             raise InputError(f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME)")
@@ -374,6 +382,7 @@ class Bench:
             return varied(stand_in(self.kit(spec), spec.controller), spec.parameters)
         return varied(self.scenario.plant(), spec.parameters)
 
+    @no_exit()
     def run(
         self,
         spec: LoopSpec,
@@ -619,23 +628,91 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
     """The model that a controller meets where there is no plant: the prior's meets the hybrid, the hybrid's the
     best of its networks alone.
 
+    Where these move as the controller's own model does, as with a correction of zero, it is the prior with parameters
+    drawn from what the fit knows of them (:data:`DRAWN_PRIOR`).
+
     Raises:
-        InputError: If the controller is an oracle's, or the artifact holds no such model.
+        InputError: If the controller is an oracle's, or the artifact holds no other model than the controller's.
     """
     of = CONTROLLERS[controller].model
     if of == "oracle":
         raise InputError(
             f"controller {controller} knows the equations of a plant, and there is none; leave it out"
         )
-    model = kit.models.get("hybrid") if of == "prior" else next(iter(kit.members.values()), None)
-    if model is None:
+    held = kit.models.get("hybrid")
+    others = kit.members.values() if of == "hybrid" else () if held is None else (held,)
+    if not others:
         needed = "a hybrid" if of == "prior" else "a network of its training alone"
         raise InputError(
             f"there is no plant, and the model of scenario {kit.name} holds no model to stand in for the machine of "
             f"controller {controller}: needed is {needed}. Train 2 networks or more (networks of the budget) and run "
             "it again, leave this controller out, or write a plant"
         )
-    return ModelPlant(model, kit.sensor_sigma)
+    own = kit.models[of]
+    problem = next(iter(kit.loop.control.values()), None)
+    inputs = None if problem is None else (problem.u_min, problem.u_max)
+    for model in others:
+        if moves_otherwise(own, model, inputs):
+            return ModelPlant(model, kit.sensor_sigma)
+    drawn = drawn_prior(kit.models["prior"])
+    if drawn is None or not moves_otherwise(own, drawn, inputs):
+        raise InputError(
+            f"there is no plant, and all models of scenario {kit.name} move as that of controller {controller} does: "
+            "the networks correct nothing, and the fit tells no spread of the prior's parameters. A loop on the "
+            "controller's own model would tell nothing; leave this controller out, or write a plant"
+        )
+    return ModelPlant(drawn, kit.sensor_sigma)
+
+
+def drawn_prior(prior: HybridModel) -> HybridModel | None:
+    """The prior with parameters drawn from a normal distribution of their fitted covariance, within their bounds;
+    always the same draw. None where the covariance is unknown or zero.
+    """
+    covariance = np.array(prior.covariance, dtype=np.float64)
+    if not covariance.any():
+        return None
+    # scaled by the deviations: parameters of very different units are factored alike
+    deviation = np.sqrt(np.diag(covariance))
+    scale = np.where(deviation > 0, deviation, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    normal = np.random.default_rng(0).standard_normal(prior.n_p)
+    p = prior.p + scale * (vectors @ (np.sqrt(np.maximum(values, 0.0)) * normal))
+    parameters = tuple(
+        replace(own, value=float(np.clip(value, own.lower, own.upper)))
+        for own, value in zip(prior.parameters, p, strict=True)
+    )
+    return replace(prior, name=DRAWN_PRIOR, parameters=parameters)
+
+
+def moves_otherwise(
+    one: HybridModel, other: HybridModel, inputs: tuple[Array, Array] | None = None, *, periods: int = 50
+) -> bool:
+    """Whether two models of a machine differ by more than rounding along a run from the operating point.
+
+    Args:
+        one: A model.
+        other: Another one, of the same signals.
+        inputs: Lower and upper bounds ``(n_u,)`` within which inputs are drawn. Default: one to either side of the
+            operating point.
+        periods: Length of the run.
+    """
+    low, high = (one.u0 - 1.0, one.u0 + 1.0) if inputs is None else inputs
+    low, high = np.where(np.isfinite(low), low, one.u0 - 1.0), np.where(np.isfinite(high), high, one.u0 + 1.0)
+    drawn = np.random.default_rng(0).uniform(low, high, (periods, one.n_u))
+    runs = []
+    for model in (one, other):
+        x, h, run = one.x0, hidden_fixed_point(model, one.x0, one.u0), []
+        for u in drawn:
+            x, h = (part.full().ravel() for part in model.step(x, h, u, one.w, model.p))
+            run.append(x)
+        runs.append(np.array(run))
+    both = np.isfinite(runs[0]) & np.isfinite(runs[1])
+    moved = np.abs(np.where(both, runs[0] - one.x0, 0.0)).max(axis=0)
+    # a state that stands still differs by rounding of its own size
+    moved = np.maximum(moved, SAME_MOTION * np.abs(np.where(both, runs[0], 0.0)).max(axis=0))
+    apart = np.abs(np.where(both, runs[0] - runs[1], 0.0)).max(axis=0)
+    finite = np.isfinite(runs[0]), np.isfinite(runs[1])
+    return bool(np.any(apart > SAME_MOTION * moved)) or not np.array_equal(*finite)
 
 
 def check_complete(scenario: Scenario, *, plant: bool = False) -> None:

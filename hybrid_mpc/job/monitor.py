@@ -144,7 +144,7 @@ class MonitorJob:
 
 
 def prepared(
-    scenario: Scenario,
+    scenario: Scenario | None,
     model: Path,
     recordings: Sequence[Path],
     *,
@@ -154,35 +154,46 @@ def prepared(
 ) -> MonitorJob:
     """Load and check everything.
 
-    ``model`` is an artifact's folder or its run's. The ``resolution`` is the step of each sensor; default: with a
-    detector what the filters' assumed noise comes to, as in the main job, else the limits of the residuals know it.
+    ``model`` is an artifact's folder or its run's. Without a ``scenario`` the artifact says how recordings are read,
+    and what the estimator assumes; with one, the scenario does. The ``resolution`` is the step of each sensor; default:
+    with a detector what the filters' assumed noise comes to, as in the main job, else the limits of the residuals know
+    it.
     ``calibration`` is a ``calibration.json`` with a detector, or limits of residuals; default: the artifact's, if it
     has them. ``residuals``: watch these where the energy can be watched, too.
 
     Raises:
-        InputError: If the scenario defines no control problem, a file is bad, or things do not fit each other.
+        InputError: If there is no control problem, a file is bad, or things do not fit each other; without a scenario
+            also if the artifact does not say how its recordings are read.
     """
-    if scenario.control is None:
+    if scenario is not None and scenario.control is None:
         raise InputError(
             f"scenario {scenario.name} defines no control problem, so the estimator knows no input range; give the "
             "scenario control=OCP(...)"
         )
     folder = artifact_folder(model)
-    kit = load(folder).on(scenario)
+    kit = load(folder)
+    if scenario is not None:
+        kit, spec = kit.on(scenario), scenario.data
+    elif kit.predicting is not None:
+        spec = kit.predicting.data
+    else:
+        raise InputError(
+            f"{folder} does not say how its recordings are read: an older version wrote it; give --scenario, or run "
+            "the scenario again"
+        )
     hybrid = kit.models.get("hybrid", kit.models[kit.recommended])
     energy = not residuals and energy_is_watched(hybrid)
-    if abs(hybrid.dt - scenario.data.dt) > 1e-9:
-        raise InputError(
-            f"the model's period is {hybrid.dt} s, scenario {scenario.name} resamples to {scenario.data.dt} s"
-        )
+    if abs(hybrid.dt - spec.dt) > 1e-9:
+        raise InputError(f"the model's period is {hybrid.dt} s, scenario {kit.name} resamples to {spec.dt} s")
     # all of a recording is watched: nothing warms up, and no part of it has a role
-    spec = replace(scenario.data, windows={}, warm_up=scenario.data.dt, fractions=(1.0, 0.0, 0.0))
+    spec = replace(spec, windows={}, warm_up=spec.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(recordings, hybrid, spec, needed=())
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
         raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
     watched = "hybrid" if energy else kit.recommended
-    kit = kit.with_noise(find_noise(scenario, kit, (f"{watched}_observer",), 0)[0])
+    if scenario is not None:
+        kit = kit.with_noise(find_noise(scenario, kit, (f"{watched}_observer",), 0)[0])
     if not energy:
         limits = kit.residuals.get(watched) if calibration is None else read_limits(calibration)
         return MonitorJob(kit, data, resolution, None, False, limits)
@@ -191,7 +202,7 @@ def prepared(
     else:
         found = None if kit.calibration is None else kit.calibration.detector
     if found is not None and resolution is None:
-        resolution = sensor_steps(scenario.sensor_sigma)
+        resolution = sensor_steps(kit.sensor_sigma)
     return MonitorJob(kit, data, resolution, found)
 
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra, no_exit
 from hybrid_mpc.files import read_object
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.context import Context, Progress
 from hybrid_mpc.job.folder import open_folder
 from hybrid_mpc.job.settings import RunSettings, check_device, run_note
-from hybrid_mpc.job.stage import Absent, Stage, bring_up_to_date, changed
+from hybrid_mpc.job.stage import Absent, Stage, bring_up_to_date, changed, differing
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CANDIDATES, CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -44,6 +44,8 @@ SECONDS = {
 of a run may take follows from what its first stages took."""
 
 
+@no_exit()
+@named_extra("a run")
 def run(
     settings: RunSettings,
     out: Path,
@@ -102,7 +104,7 @@ def run(
             context.progress.start(stage.title + remaining(took, ahead))
             begun = time.monotonic()
             if only and stage.name not in (*only, REPORT.name):
-                context.progress.finish(_as_it_is(context, stage))
+                context.progress.finish(_as_it_is(context, stage, only))
             else:
                 said = bring_up_to_date(context, stage, stage.name in skip)
                 if not said and stage in (PRIOR, TRAINING, EVALUATION):
@@ -170,16 +172,35 @@ def _end(context: Context, only: Sequence[str]) -> Stage[Any] | None:
     return None
 
 
-def _as_it_is(context: Context, stage: Stage[Any]) -> str:
-    """Take a stage as the folder holds it."""
+def _as_it_is(context: Context, stage: Stage[Any], only: Sequence[str] = ()) -> str:
+    """Take a stage as the folder holds it; its part of the artifact is put back where nothing has changed.
+
+    Raises:
+        InputError: If what it read differs, and a stage that may run (``only``) needs it.
+    """
     stored = context.stored(stage)
     if stored is None or stored.unfit:
         context.leave_out(stage, f"stage {stage.name} was left out")
         return "left out"
-    why = changed(stored.keys, stage.keys(context))
+    keys = stage.keys(context)
+    if differ := differing(stored.keys, keys):
+        needing = [s.name for s in STAGES if s.name in only and s is not REPORT and stage in _needed(s)]
+        if needing:
+            raise InputError(
+                f"stage {stage.name} is out of date: {differ}, and {needing[0]} needs it; add --only {stage.name}, "
+                "or leave --only out"
+            )
+    why = changed(stored.keys, keys)
+    if not why and not isinstance(stored.result, Absent):
+        why = stage.restore(context, stored.result)
     if why:
         context.progress.warn(f"stage {stage.name} is out of date: {why}")
     return "taken as it is"
+
+
+def _needed(stage: Stage[Any]) -> list[Stage[Any]]:
+    """All stages that a stage reads, directly or by others."""
+    return [one for need in stage.needs for one in (need, *_needed(need))]
 
 
 def failed_stages(out: Path) -> dict[str, str]:

@@ -35,6 +35,24 @@ def looks(most: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys(n for n in thirds if n >= FEWEST or n == most))
 
 
+def level_at(n: int, most: int) -> float:
+    """Level of an interval at the look of ``n`` seeds, such that those of all looks hold together with 95 %.
+
+    Look ``k`` of ``K`` has the level ``1 - 0.05 k / (1 + ... + K)``.
+
+    Args:
+        n: Seeds that were run.
+        most: Largest number of seeds, fixed before the first loop.
+
+    Example:
+        >>> [round(level_at(n, 30), 4) for n in (10, 20, 30)], level_at(3, 3)
+        ([0.9917, 0.9833, 0.975], 0.95)
+    """
+    every = looks(most)
+    k = 1 + sum(look < n for look in every)
+    return 1.0 - (1.0 - LEVEL) * k / (len(every) * (len(every) + 1) / 2)
+
+
 @dataclass(frozen=True)
 class Comparison:
     """How one controller's cost compares with another's on the same seeds.
@@ -94,12 +112,11 @@ def hardest(comparisons: Mapping[str, Comparison]) -> str:
 def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> Comparison:
     """Compare costs with those of a base on the same seeds, at one of the looks.
 
-    The interval is Student's t of the logarithms of the ratios. Look ``k`` of ``K`` has the level
-    ``1 - 0.05 k / (1 + ... + K)``. So the probability that an interval of any look misses the ratio is at most 5 %
-    (the union bound), and loops may stop at the look that decides; the rules of stopping do not matter. It assumes that
-    the logarithms are normal and the seeds independent. It is the level of one comparison: of twenty tasks that are
-    alike one may be told apart. Later looks get the larger part, so the last interval is little wider than that of a
-    fixed number of seeds.
+    The interval is Student's t of the logarithms of the ratios, at the level of its look (:func:`level_at`). So the
+    probability that an interval of any look misses the ratio is at most 5 % (the union bound), and loops may stop at
+    the look that decides; the rules of stopping do not matter. It assumes that the logarithms are normal and the seeds
+    independent. It is the level of one comparison: of twenty tasks that are alike one may be told apart. Later looks
+    get the larger part, so the last interval is little wider than that of a fixed number of seeds.
 
     Args:
         costs: ``(n,)``, one a seed.
@@ -132,9 +149,7 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
     ratio = float(np.exp(logs.mean()))
     if n == 1:
         return Comparison(ratio, None, None, n, "one seed has no interval")
-    k = every.index(n) + 1
-    miss = (1.0 - LEVEL) * k / (len(every) * (len(every) + 1) / 2)
-    half = float(student.ppf(1.0 - miss / 2, n - 1) * logs.std(ddof=1) / math.sqrt(n))
+    half = float(student.ppf(0.5 + level_at(n, most) / 2, n - 1) * logs.std(ddof=1) / math.sqrt(n))
     if half > MOST_LOG:
         return Comparison(ratio, None, None, n, "the ratios scatter too far for an interval")
     return Comparison(ratio, ratio * math.exp(-half), ratio * math.exp(half), n)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.files import read_json, sha256
 from hybrid_mpc.job.folder import JobNote
 
@@ -103,7 +103,8 @@ def check_device(device: str) -> None:
     """Refuse a device that cannot compute with 64-bit floats, before a long job starts."""
     if device == "cpu":
         return
-    import torch
+    with named_extra(f"--device {device}"):
+        import torch
 
     try:
         torch.ones(1, dtype=torch.float64, device=device).sum().item()

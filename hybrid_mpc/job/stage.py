@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError, StorageError
+import nn_export
+from hybrid_mpc.errors import InputError, StorageError, no_exit
 from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document, write_text
 from hybrid_mpc.records import plain, record
 
@@ -33,7 +34,13 @@ R = TypeVar("R")
 UNKNOWN = object()
 """Stands for an input whose change cannot be detected: the stage always runs again."""
 LIBRARY = ("hybrid_mpc", "nn_export")
-"""Packages whose source counts by their version."""
+"""Packages whose source counts as a whole, see :func:`program`."""
+LOOK = (
+    "cli", "plots", "report",
+    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report")),
+    *(f"job/{name}.py" for name in ("loop_figures", "step_response")),
+)  # fmt: skip
+"""Folders and modules of ``hybrid_mpc`` that no result depends on but the report, which reads them by itself."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +78,29 @@ class Stage(Generic[R]):
 
     def keys(self, context: Context) -> dict[str, str]:
         """Digest of each thing that the stage reads; an empty one where it is not known."""
-        read = dict(self.reads(context)) | {"library": context.versions}
+        read = dict(self.reads(context)) | {"library": context.versions, "the program": program()}
         read |= {f"result of {stage.name}": context.digest_of(stage) for stage in self.needs}
         return {name: "" if value is UNKNOWN else digest(value) for name, value in read.items()}
+
+
+@functools.cache
+def program(*packages: Path) -> str:
+    """Digest of the sources that results depend on: Python and C of the packages, but for :data:`LOOK`.
+
+    Read once in a process.
+
+    Args:
+        packages: Folders of the packages. Default: those of :data:`LIBRARY`, as they are installed.
+    """
+    places = packages or (Path(__file__).parents[1], Path(nn_export.__file__).parent)
+    found = hashlib.sha256()
+    for package in places:
+        for path in sorted(package.rglob("*")):
+            name = path.relative_to(package).as_posix()
+            own = path.suffix in (".py", ".c", ".h") and "__pycache__" not in name
+            if own and not any(name == look or name.startswith(f"{look}/") for look in LOOK):
+                found.update(f"{package.name}/{name}\0".encode() + path.read_bytes() + b"\0")
+    return found.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -144,14 +171,17 @@ def _has_arrays(stage: Stage[Any]) -> bool:
     return any(f.name == "arrays" for f in fields(stage.result))
 
 
-def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What has changed of what a stage reads, in words; empty for nothing."""
-    unknown = [name for name, key in now.items() if not key]
-    differ = [name for name in now if name not in unknown and now[name] != before.get(name)]
+def differing(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """What surely differs of what a stage reads, in words; empty for nothing."""
+    differ = [name for name, key in now.items() if key and key != before.get(name)]
     differ += [name for name in before if name not in now]
-    words = []
-    if differ:
-        words.append(f"{', '.join(differ)} {'has' if len(differ) == 1 else 'have'} changed")
+    return f"{', '.join(differ)} {'has' if len(differ) == 1 else 'have'} changed" if differ else ""
+
+
+def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """What has changed of what a stage reads, in words, and of what that is not known; empty for nothing."""
+    unknown = [name for name, key in now.items() if not key]
+    words = [found] if (found := differing(before, now)) else []
     if unknown:
         words.append(
             f"nobody knows whether {', '.join(unknown)} {'has' if len(unknown) == 1 else 'have'} changed"
@@ -192,7 +222,8 @@ def _computed(context: Context, stage: Stage[Any]) -> Any:
     if not stage.optional:
         return stage.compute(context)
     try:
-        return stage.compute(context)
+        with no_exit():
+            return stage.compute(context)
     except StorageError:
         raise
     except InputError as error:

@@ -18,6 +18,8 @@ AT_REST = 0.2
 before a step must have been held for that share of the time after it."""
 SETTLED = 0.05
 """Share of a step within which a signal has settled."""
+RISE = (0.1, 0.9)
+"""Shares of a step between which a signal rises, as python-control's ``step_info`` counts it."""
 CLEAR = 10.0
 """Size of a step, in standard deviations of the signal at the end, from which it tells of a rise."""
 LARGEST = 0.5
@@ -64,8 +66,6 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
         >>> step_response(t, np.sin(t), np.sin(t)) is None
         True
     """
-    import control
-
     t, y, r = (np.asarray(v, dtype=np.float64) for v in (t, values, reference))
     there = np.isfinite(y) & np.isfinite(r)
     t, y, r = t[there], y[there], r[there]
@@ -87,12 +87,17 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
     if abs(size) <= least or jump < JUMP * abs(size) or not stood:
         return StepResponse(offset)
     answer = (y[begin:] - y[begin]) * np.sign(size)
-    if np.max(answer) < 0.9 * abs(size):  # it never arrives
+    if np.max(answer) < RISE[1] * abs(size):  # it never arrives
         return StepResponse(offset, overshoot=0.0)
-    info = control.step_info(answer, T=t[begin:] - t[begin], yfinal=abs(size), SettlingTimeThreshold=SETTLED)
-    rise, settling, overshoot = (float(info[key]) for key in ("RiseTime", "SettlingTime", "Overshoot"))
+    share, times = answer / abs(size), t[begin:] - t[begin]
+    low, high = (int(np.argmax(share >= level)) for level in RISE)
+    outside = np.flatnonzero(np.abs(share - 1.0) >= SETTLED)
+    settled = int(outside[-1]) + 1 if outside.size else 0
     return StepResponse(
-        offset, *(value if np.isfinite(value) else None for value in (rise, settling, overshoot))
+        offset,
+        float(times[high] - times[low]),
+        float(times[settled]) if settled < len(times) else None,
+        100.0 * max(0.0, float(share.max()) - 1.0),
     )
 
 

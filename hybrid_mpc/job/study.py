@@ -15,14 +15,16 @@ from typing import Any, cast
 
 import numpy as np
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.control.ocp import MOST_HORIZON
+from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.files import read_bytes
 from hybrid_mpc.job.controllers import CONTROLLERS, OBSERVERS, ORACLES
 from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec
 from hybrid_mpc.job.tasks import ready, selected_tasks
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault, parsed_fault
-from hybrid_mpc.records import MOST_SEED, known, plain, record
+from hybrid_mpc.records import MOST_SEED, Fields, known, plain, record
+from hybrid_mpc.rules import Duration, Label, Name, NameOrNone, Number, Seconds, name_problem
 from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
 
 LATE = "late"
@@ -30,8 +32,6 @@ LATE = "late"
 DEFAULT_CONTROLLERS = OBSERVERS
 MOST_DRAWS = 1_000_000
 """Most seeds, and most draws, of a study: all of them are in memory."""
-MOST_HORIZON = 10_000
-"""Longest horizon [periods] of a study: a plan is in memory with its derivatives."""
 AXES = ("models", "tasks", "controllers", "solvers", "horizons", "monitors", "faults", "seeds")
 
 
@@ -54,15 +54,16 @@ class FaultKind:
     Example: ``FaultKind("plant_friction", 1.5, 4.0)``
     """
 
-    target: str
-    low: float = 0.0
-    high: float = 0.0
+    target: Name
+    low: Number = 0.0
+    high: Number = 0.0
     signed: bool = False
-    ramp: float = 0.0
+    ramp: Duration = 0.0
     length: Sequence[float] | None = None
-    channel: str = ""
+    channel: NameOrNone = ""
 
     def __post_init__(self) -> None:
+        Fields(self, f"random fault {self.target}").refuse()
         if self.target != LATE and not str(self.target).startswith("plant_"):
             known(self.target, (*SIGNAL_TARGETS, LATE), "fault target")
         _span((self.low, self.high), f"random fault {self.target}: low to high")
@@ -224,10 +225,10 @@ hybrid, hybrid_observer, oracle, oracle_state
     draws: int = 1
     seeds: int | Sequence[int] = 10
     seed: int = 0
-    duration: float | None = None
+    duration: Seconds | None = None
     guard: str = ""
     run_seed: int = 0
-    name: str = "study"
+    name: Label = "study"
 
     def __post_init__(self) -> None:
         for field, value in _normal(self).items():
@@ -243,9 +244,9 @@ hybrid, hybrid_observer, oracle, oracle_state
                 known(word, table, what[:-1])
         if self.guard:
             known(self.guard, GUARDS[1:], "guard")
-        for label in self.folders:
-            if not re.fullmatch(r"[A-Za-z0-9_.-]*[A-Za-z0-9_-]", label):
-                raise InputError(f"study: a model's label is made of letters, digits, _ . -; got {label!r}")
+        own = Fields(self, f"study {self.name!r}")
+        own.add(f"models: {wrong}" for label in self.folders if (wrong := name_problem(label)))
+        own.refuse()
         self._check_numbers()
         self._check_combinations()
 
@@ -327,10 +328,6 @@ hybrid, hybrid_observer, oracle, oracle_state
         for name, span in self.spans:
             if not (isinstance(span, int | float) and 0.0 < span < 1.0):
                 raise InputError(f"study: vary {name}: a share between 0 and 1 is needed, got {span!r}")
-        if self.duration is not None and not (
-            isinstance(self.duration, int | float) and 0 < self.duration < math.inf
-        ):
-            raise InputError(f"study: duration must be a positive number of seconds, got {self.duration!r}")
 
     def _check_combinations(self) -> None:
         oracles = [name for name in self.controllers if name in ORACLES]
@@ -441,7 +438,8 @@ def read_study(path: str | Path, **instead: Any) -> Study:
 
 
 def _mapping(path: Path) -> dict[str, Any]:
-    import yaml
+    with named_extra("a study's file"):
+        import yaml
 
     try:
         found = yaml.load(read_bytes(path, MOST_YAML), Loader=_loader())

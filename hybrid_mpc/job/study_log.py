@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.files import locked, replacing
 from hybrid_mpc.job.folder import read_note
 from hybrid_mpc.records import NUMBERS, plain, record
@@ -216,6 +216,7 @@ def _repaired(path: Path) -> int:
     return count
 
 
+@named_extra("a study")
 def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
     """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts."""
     import pyarrow as pa
@@ -240,6 +241,7 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
             writer.write_table(pa.Table.from_pylist(group, schema=schema))
 
 
+@named_extra("a study")
 def intact(path: Path) -> bool:
     """Whether a Parquet file is there and can be read to its end."""
     import pyarrow as pa
@@ -256,6 +258,7 @@ def intact(path: Path) -> bool:
     return True
 
 
+@named_extra("a study")
 def provenance_of(path: Path) -> dict[str, Any]:
     """What a Parquet file of a study says of itself; InputError if it is no such file."""
     import pyarrow as pa

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -296,7 +297,8 @@ def _report(results: StudyResults, folder: Path) -> Report:
     ]
     return Report(
         f"Study {study['name']}", note.title, note.description,
-        f"hybrid-mpc study run {study['name']} --out {results.folder.name}", _head(results), sections,
+        shlex.join(["hybrid-mpc", "study", "run", study["name"], "--out", results.folder.name]), _head(results),
+        sections,
         f"hybrid-mpc {note.versions['hybrid-mpc']}, {note.engine or 'not finished'}",
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra, no_exit
 from hybrid_mpc.files import MOST_CONTENT, read_bytes, sha256
 from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES, find_noise
@@ -106,9 +106,7 @@ def load_models(
         kit = load(folder)
         check_kit(scenario, kit, str(folder))
         _check_plant(scenario, study, kit)
-        if "energy" in study.monitors and kit.calibration is None:
-            raise InputError(f"study: monitor energy: {folder} holds no calibration; take monitor own")
-        for kind in {"guard", "residuals"}.intersection(study.monitors):
+        for kind in {"energy", "guard", "residuals"}.intersection(study.monitors):
             kit.on(scenario).monitor("hybrid", kind=kind)
         if study.guard == "adapt":
             adaptable(kit.models["hybrid"], scenario.causes)
@@ -222,6 +220,8 @@ def _digest(files: Sequence[tuple[str, bytes]]) -> str:
 # The study
 
 
+@no_exit()
+@named_extra("a study")
 def run_study(
     study: Study,
     out: str | Path,
@@ -334,7 +334,8 @@ def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Config]
         begin, cpu = perf_counter(), process_time()
         status, error, results = "done", "", {}
         try:
-            results = dict(run(config))
+            with no_exit():
+                results = dict(run(config))
         except Exception:  # the study goes on; the traceback is what there is to report
             status, error = "failed", traceback.format_exc()
         times = {f"{TIMING}total_s": perf_counter() - begin, f"{TIMING}cpu_s": process_time() - cpu}
@@ -474,6 +475,8 @@ class Plan:
     kinds: dict[RunKind, float]
 
 
+@no_exit()
+@named_extra("a study")
 def dry_run(study: Study, *, workers: int = 2, say: Callable[[str], None] = lambda text: None) -> Plan:
     """Check a study as far as running it would, and expect its time from a few periods of each kind of run.
 

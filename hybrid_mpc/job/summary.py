@@ -10,6 +10,7 @@ import numpy as np
 
 from hybrid_mpc.control.safeguard import Source
 from hybrid_mpc.job.loops import LoopRow
+from hybrid_mpc.job.sequential import LEVEL, level_at
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Mean:
 
     Args:
         mean: The mean; None where a value is not finite, or there is none.
-        ci95: Half width of the interval; None of a single value.
+        ci95: Half width of the interval, which holds under stopping where loops stop early; None of a single value.
         n: Number of values.
     """
 
@@ -27,11 +28,13 @@ class Mean:
     n: int
 
 
-def interval(values: Sequence[float]) -> Mean:
-    """Mean of values and half width of its 95 % interval.
+def interval(values: Sequence[float], level: float = LEVEL) -> Mean:
+    """Mean of values and half width of its interval.
 
     Args:
         values: ``(n,)``.
+        level: Probability that the interval holds the mean, of normal values. Default 0.95; more where the number of
+            values was chosen by looking at them (:func:`~hybrid_mpc.job.sequential.level_at`).
 
     Example:
         >>> interval([1.0])
@@ -45,7 +48,7 @@ def interval(values: Sequence[float]) -> Mean:
     x, n = np.asarray(values, dtype=float), len(values)
     if not (n and np.all(np.isfinite(x))):
         return Mean(None, None, n)
-    half = float(student.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n)) if n > 1 else None
+    half = float(student.ppf(0.5 + level / 2, n - 1) * x.std(ddof=1) / math.sqrt(n)) if n > 1 else None
     return Mean(float(x.mean()), half, n)
 
 
@@ -78,28 +81,38 @@ def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
     return table
 
 
-def summaries(rows: Sequence[LoopRow]) -> dict[str, dict[str, Summary]]:
+def summaries(rows: Sequence[LoopRow], most: int | None = None) -> dict[str, dict[str, Summary]]:
     """Summaries of loops by task and controller.
+
+    Args:
+        rows: The loops.
+        most: Largest number of seeds where tasks stop early (:mod:`hybrid_mpc.job.sequential`): intervals then hold
+            together with 95 % at all looks. Default: the number of loops was fixed.
 
     Example: ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
     """
-    return {task: {name: summary(r) for name, r in cell.items()} for task, cell in by_task(rows).items()}
+    found = {}
+    for task, cells in by_task(rows).items():
+        # all controllers of a task stop together, those with fewer seeds of their own too
+        level = LEVEL if most is None else level_at(max(map(len, cells.values())), most)
+        found[task] = {name: summary(own, level) for name, own in cells.items()}
+    return found
 
 
-def summary(rows: Sequence[LoopRow]) -> Summary:
-    """The summary of loops of one task and controller, at least one."""
+def summary(rows: Sequence[LoopRow], level: float = LEVEL) -> Summary:
+    """The summary of loops of one task and controller, at least one, with intervals of a ``level``."""
 
     def of(
         pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float
     ) -> dict[str, Mean]:
-        return {key: interval([change(pick(row)[key]) for row in rows]) for key in pick(rows[0])}
+        return {key: interval([change(pick(row)[key]) for row in rows], level) for key in pick(rows[0])}
 
     limits: dict[str, float] = {}
     for row in rows:
         for key, share in row.limits.items():
             limits[key] = max(share, limits.get(key, 0.0))
     return Summary(
-        cost=interval([row.cost for row in rows]),
+        cost=interval([row.cost for row in rows], level),
         tracking_rmse=of(lambda row: row.tracking_rmse),
         figures=of(lambda row: row.figures),
         mean_abs_figures=of(lambda row: row.figures, abs),

@@ -6,7 +6,6 @@ torch and executes nothing from the folder.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -43,11 +42,14 @@ from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.monitor.lengths import SHARE
 from hybrid_mpc.monitor.residuals import ResidualLimits, ResidualMonitor
-from hybrid_mpc.records import known, plain, record
+from hybrid_mpc.records import Fields, known, plain, record
+from hybrid_mpc.rules import Duration, Line, Name, NameOrNone, NotNegative, Number, Positive, Seconds, Unit
 from hybrid_mpc.scenario import Scenario
 
 SCHEMA_VERSION = 4
 FILE, PROGRAMS = "model.json", "programs.json"
+BENCHMARK_NOTE = "benchmark_model.json"
+"""File of a benchmark's model, which is no artifact."""
 FILES = (FILE, PROGRAMS, "weights.safetensors")
 """All files of an artifact; others in its folder do not belong to it."""
 MOST_MODELS = 16
@@ -71,14 +73,21 @@ JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 WATCHES = ("own", "energy", "readings", "guard", "residuals")
 """Kinds of monitor, see :meth:`Kit.monitor`."""
 
+WITHOUT = (
+    'go without alarms: kind="own" records levels, monitor=None (export c: --no-monitor) watches nothing'
+)
+
 
 @dataclass(frozen=True)
 class BalanceInfo:
     """Name and units of a :class:`~hybrid_mpc.model.model.Balance`: of the storage, of its rate and of the residual."""
 
-    name: str
-    unit: str
-    rate_unit: str
+    name: Name
+    unit: Unit
+    rate_unit: Unit
+
+    def __post_init__(self) -> None:
+        Fields(self, f"balance {self.name!r}").refuse()
 
     @property
     def program(self) -> str:
@@ -104,31 +113,39 @@ class ModelInfo:
         balances: Balances that have programs. Default: none.
         nominal_x: State of the operating point. Default: zeros.
         nominal_u: Input of the operating point. Default: zeros.
+        state_spread: Spread of the states in the training recordings; 0 where one does not move. Default: not known.
+        output_spread: Likewise of the outputs.
 
     Raises:
-        InputError: If a time is not finite, the period or the machine's second not positive, or the delay negative.
+        InputError: If a field is of another kind, the period or the machine's second is not positive, the delay
+            negative, or two signals of one kind, parameters or balances have one name; all of it together.
     """
 
-    dt: float
+    dt: Seconds
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     parameters: tuple[Parameter, ...] = ()
-    input_delay: float = 0.0
-    time_unit: float = 1.0
+    input_delay: Duration = 0.0
+    time_unit: Positive = 1.0
     disturbances: tuple[Signal, ...] = ()
-    nominal_w: tuple[float, ...] = ()
+    nominal_w: tuple[Number, ...] = ()
     covariance: tuple[tuple[float, ...], ...] = ()
     balances: tuple[BalanceInfo, ...] = ()
-    nominal_x: tuple[float, ...] = ()
-    nominal_u: tuple[float, ...] = ()
+    nominal_x: tuple[Number, ...] = ()
+    nominal_u: tuple[Number, ...] = ()
+    state_spread: tuple[NotNegative, ...] = ()
+    output_spread: tuple[NotNegative, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, value in (("dt", self.dt), ("time_unit", self.time_unit)):
-            if not 0 < value < math.inf:
-                raise InputError(f"{name}: a positive number of seconds is needed, got {value}")
-        if not 0 <= self.input_delay < math.inf:
-            raise InputError(f"input_delay: a number of seconds is needed, got {self.input_delay}")
+        own = Fields(self, "model")
+        for role in ("states", "inputs", "outputs", "disturbances", "parameters", "balances"):
+            own.distinct(role, partial(_names, self, role), f"{role}: the name")
+        own.refuse()
+
+
+def _names(info: ModelInfo, role: str) -> list[str]:
+    return [one.name for one in getattr(info, role)]
 
 
 @dataclass(frozen=True)
@@ -144,12 +161,12 @@ class Provenance:
         prior_parameters: Fitted values [SI] of the prior's parameters by name.
     """
 
-    scenario: str = ""
+    scenario: Line = ""
     seed: int = 0
-    budget: str = ""
-    data_hash: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    prior_parameters: Mapping[str, float] = field(default_factory=dict)
+    budget: Line = ""
+    data_hash: Line = ""
+    versions: Mapping[Line, Line] = field(default_factory=dict)
+    prior_parameters: Mapping[Name, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -169,28 +186,30 @@ class LoopSettings:
         disturbance_model: What unmeasured disturbances are added to. Default: one at each input.
 
     Raises:
-        InputError: If a deviation is negative or not finite, or the safe input is outside a problem's limits.
+        InputError: If a field is of another kind, a deviation is negative or not finite, a task has two problems of one
+            name, or the safe input is outside a problem's limits; all of it together.
     """
 
-    control: Mapping[str, OCP] = field(default_factory=dict)
-    sensor_sigma: tuple[float, ...] = ()
-    first_sigma: tuple[float, ...] | None = None
-    process_noise: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    safe_input: tuple[float, ...] | None = None
-    tasks: tuple[str, ...] = ()
+    control: Mapping[NameOrNone, OCP] = field(default_factory=dict)
+    sensor_sigma: tuple[NotNegative, ...] = ()
+    first_sigma: tuple[NotNegative, ...] | None = None
+    process_noise: Mapping[Name, tuple[NotNegative, ...]] = field(default_factory=dict)
+    causes: Mapping[Name, tuple[Name, ...]] = field(default_factory=dict)
+    safe_input: tuple[Number, ...] | None = None
+    tasks: tuple[Name, ...] = ()
     disturbance_model: tuple[Disturbance, ...] | None = None
 
     def __post_init__(self) -> None:
-        sigmas = self.sensor_sigma, self.first_sigma or (), *self.process_noise.values()
-        if not all(0 <= sigma < math.inf for values in sigmas for sigma in values):
-            raise InputError("loop: standard deviations must be finite and not negative")
-        for name, problem in self.control.items():
-            if self.safe_input is not None and not _within(self.safe_input, problem):
-                raise InputError(
-                    f"safe_input {self.safe_input} is outside the limits {problem.u_min} to {problem.u_max} of the "
-                    f"control problem of {name or 'all tasks'}"
-                )
+        own = Fields(self, "loop")
+        own.distinct("tasks", lambda: self.tasks, "tasks: the name")
+        own.need(
+            "safe_input control",
+            lambda: (
+                self.safe_input is None or all(_within(self.safe_input, p) for p in self.control.values())
+            ),
+            f"safe_input {self.safe_input} is outside the limits of a control problem",
+        )
+        own.refuse()
 
 
 def _within(u: tuple[float, ...], problem: OCP) -> bool:
@@ -231,18 +250,19 @@ class Description:
         InputError: If there are no models, too many, or two of one name.
     """
 
-    models: tuple[str, ...]
-    programs_sha256: str
+    models: tuple[Name, ...]
+    programs_sha256: Line
     model: ModelInfo
     calibration: Calibration | None
     provenance: Provenance
     loop: LoopSettings = field(default_factory=LoopSettings)
-    recommended: str = ""
-    residuals: Mapping[str, ResidualLimits] = field(default_factory=dict)
+    recommended: NameOrNone = ""
+    residuals: Mapping[Name, ResidualLimits] = field(default_factory=dict)
     members: int = 0
     predicting: Predicting | None = None
 
     def __post_init__(self) -> None:
+        Fields(self, "artifact").refuse()
         if not 0 <= self.members <= (MOST_MEMBERS if HYBRID in self.models else 0):
             raise InputError(
                 f"members: 0 to {MOST_MEMBERS} networks beside a model {HYBRID!r} are needed, got {self.members}"
@@ -362,6 +382,13 @@ def artifact_folder(folder: Path) -> Path:
     for place in (folder, folder / "model"):
         if (place / FILE).is_file():
             return place
+    for place in (folder, folder / "model"):
+        if (place / BENCHMARK_NOTE).is_file():
+            raise InputError(
+                f"{folder} is the folder of a benchmark: its model ({place / BENCHMARK_NOTE}) predicts and has no "
+                f"controller. Evaluate it with: hybrid-mpc benchmark SCENARIO --model {folder} --test FILE. For loops "
+                "make an artifact of the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER"
+            )
     state = "holds no model.json" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
     raise InputError(
         f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
@@ -388,7 +415,7 @@ def build_model(name: str, programs: Mapping[str, nn_export.Program], info: Mode
         side_by_side=partial(nn_export.SideBySide, program),
         disturbances=info.disturbances, nominal_w=info.nominal_w, parameters=info.parameters,
         covariance=info.covariance, balances=balances, time_unit=info.time_unit, nominal_x=info.nominal_x,
-        nominal_u=info.nominal_u,
+        nominal_u=info.nominal_u, state_spread=info.state_spread, output_spread=info.output_spread,
     )  # fmt: skip
     return with_input_delay(model, info.input_delay) if info.input_delay else model
 
@@ -653,16 +680,16 @@ class Kit:
         Args:
             model: Name of the model that is compared with the machine. Default: the recommended one.
             kind: ``"guard"``: what a guard listens to: of the energy the detector, with its test for frozen sensors, of
-                any other machine the residuals; ``"energy"``: the energy, which alarms by thresholds, if there are
-                any; ``"residuals"``: the residuals, of a mechanical machine too; ``"own"``: records levels;
-                ``"readings"``: what a detector reads, without one. Default: the detector, else thresholds; the
-                residuals where the energy cannot be watched.
+                any other machine the residuals; ``"energy"``: the energy, which alarms by thresholds;
+                ``"residuals"``: the residuals, of a mechanical machine too; ``"own"``: records levels, and alarms only
+                where it has no valid reading; ``"readings"``: what a detector reads, without one. Default: the
+                detector, else thresholds; the residuals where the energy cannot be watched.
             task: Whose control problem gives the inputs' ranges. Default: the common one.
             diagnose: Whether the energy monitor remembers what a diagnosis of its alarms needs. Default: no.
 
         Raises:
-            InputError: If there is no such model, task or kind, no detector or no limits where one is asked for that
-                alarms, or the energy of a model is asked for that has none.
+            InputError: If there is no such model, task or kind, nothing was learned by which the monitor could alarm
+                (all kinds but ``"own"`` and ``"readings"``), or the energy of a model is asked for that has none.
         """
         watched, learned = self._model(model), self.calibration
         energy = energy_is_watched(watched)
@@ -671,13 +698,20 @@ class Kit:
         kind = known(kind or default, WATCHES, "kind of monitor")
         if kind == "residuals" or (kind in ("guard", "own") and not energy):
             limits = self.residuals.get(model or self.recommended)
-            if kind == "guard" and limits is None:
+            if kind != "own" and limits is None:
                 raise InputError(
-                    f"{self._whose} holds no limits of residuals: its run did not come to the stage residuals (its "
-                    "report says why); run the main job again, or take learn_residuals"
+                    f"{self._whose} holds no limits of residuals of {watched.name}: its run did not come to the stage "
+                    "residuals (its report says why), or learned them of another model; run the main job again, take "
+                    f"learn_residuals, or {WITHOUT}"
                 )
             return ResidualMonitor(watched, limits=None if kind == "own" else limits)
         if kind == "energy":
+            if energy and (learned is None or learned.threshold_w is None):
+                why = f" ({learned.method.rstrip('.')})" if learned is not None and learned.method else ""
+                raise InputError(
+                    f"{self._whose} holds no thresholds of the energy{why}: run the main job again with its stage "
+                    f"monitor, or {WITHOUT}"
+                )
             return make_monitor(watched, learned)
         if kind == "own":
             return make_monitor(watched, None, rest_speed=self.known_rest)

@@ -16,6 +16,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
+from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
 from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.embedded.native import NativeController
@@ -183,7 +184,7 @@ def make_estimator(
             f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...)"
         )
     first, span = first_deviations(model, scenario), disturbance_sizes(model, control)
-    if observer and not (found := distinguishable(model)).detectable:
+    if observer and not (found := distinguishable(model, Sizes(model, control).states)).detectable:
         raise InputError(
             f"an observer of model {model.name}: at its operating point {found.why_undetectable}; declare others: "
             'Scenario(disturbance_model=(Disturbance("output", ...), ...)), no more than there are outputs'
@@ -271,14 +272,6 @@ def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
             "deviations of the states that no output shows alone, or give the states' signals a range"
         )
     return found
-
-
-def disturbance_sizes(model: HybridModel, control: OCP) -> Array:
-    """Large values ``(n_d,)`` of the model's unmeasured disturbances: their own, or the input's range."""
-    if model.disturbance_model is None:
-        return control.input_range
-    ranges = dict(zip([s.name for s in model.inputs], control.input_range, strict=True))
-    return np.array([d.size or ranges[d.signal] for d in model.disturbance_model])
 
 
 def make_controller(

@@ -19,7 +19,7 @@ REACTIONS = ("", "rest", "adapt")
 
 def generate_controller(
     kit: Kit, folder: str | Path, *, model: str = "", task: str = "", load: bool = True, single: bool = False,
-    monitor: bool = True, guard: str = "",
+    monitor: bool = True, guard: str = "", check: bool = False,
 ) -> Path:  # fmt: skip
     """Write estimator, real-time iteration, safeguards, monitor and guard as C11, with a test program and a README.
 
@@ -36,13 +36,16 @@ def generate_controller(
         guard: What its alarms do, which are those of ``kit.monitor(kind="guard")`` then: ``"rest"``, no input while a
             sensor is frozen; ``"adapt"``, a second controller too that estimates the prior's changed parameters
             (:meth:`Kit.guard`). Default: nothing, they are told.
+        check: Whether the C is compiled and its test is run, and its README has its sizes: code that was made of the
+            folder's content runs. Default: no, nothing of it is compiled or run.
 
     Returns:
         The folder.
 
     Raises:
         InputError: If something of the controller has no C, all of it by name; if the folder holds something else; if
-            the kit lacks something that a loop, its monitor or its guard needs.
+            the kit lacks something that a loop, its monitor or its guard needs; if the check fails.
+        StorageError: If it cannot be written; the folder is then as it was.
 
     Example:
         ``hm.generate_controller(hm.load("runs/mine"), "controller")``
@@ -63,7 +66,7 @@ def generate_controller(
         place, kit.models[name], make_ocp(prior, kit.problem(task)), estimator=estimator, fallback=prior,
         safe_input=safe, single=single,
         monitor=kit.monitor(name, task=task, kind="guard" if guard else "") if monitor else None,
-        guard=_guard(kit, name, task, guard),
+        guard=_guard(kit, name, task, guard), check=check,
     )  # fmt: skip
     return place
 

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import Bound, Duration, Name, NameOrNone, Number
 
 Array = NDArray[np.float64]
 
@@ -46,32 +48,20 @@ class Fault:
         array([0.5])
     """
 
-    start: float
-    end: float
-    target: str
-    value: float = 0.0
-    channel: str = ""
-    ramp: float = 0.0
+    start: Bound
+    end: Bound
+    target: Name
+    value: Number = 0.0
+    channel: NameOrNone = ""
+    ramp: Duration = 0.0
 
     def __post_init__(self) -> None:
-        if self.target not in SIGNAL_TARGETS and not self.on_plant:
-            near = difflib.get_close_matches(self.target, SIGNAL_TARGETS, 1)
-            meant = f"; did you mean {near[0]!r}? There are" if near else "; known"
-            raise InputError(
-                f"fault target {self.target!r} is unknown{meant}: {', '.join(SIGNAL_TARGETS)}, and what a plant knows "
-                "as plant_..."
-            )
-        if not self.start < self.end:
-            raise InputError(f"fault {self.target}: the interval [{self.start}, {self.end}) s is empty")
-        if not isinstance(self.channel, str):
-            raise InputError(
-                f"fault {self.target}: channel is the name of an output or input, got {self.channel!r}; write "
-                'channel="NAME"'
-            )
-        if not math.isfinite(self.value):
-            raise InputError(f"fault {self.target}: value must be finite, got {self.value}")
-        if not (self.ramp >= 0 and math.isfinite(self.ramp)):
-            raise InputError(f"fault {self.target}: ramp must be 0 s or more and finite, got {self.ramp}")
+        own = Fields(self, f"fault {self.target}")
+        own.need("target", lambda: self.target in SIGNAL_TARGETS or self.on_plant, _unknown(self.target))
+        own.need(
+            "start end", lambda: self.start < self.end, f"the interval [{self.start}, {self.end}) s is empty"
+        )
+        own.refuse()
 
     @property
     def on_input(self) -> bool:
@@ -108,6 +98,13 @@ EFFECTS: Mapping[str, Callable[[Fault, float, float, float], float]] = {
 }
 """What a fault makes at ``t`` of a measured or commanded value; ``before`` is the measurement before it."""
 SIGNAL_TARGETS = tuple(EFFECTS)
+
+
+def _unknown(target: object) -> str:
+    near = difflib.get_close_matches(str(target), SIGNAL_TARGETS, 1)
+    meant = f"; did you mean {near[0]!r}? There are" if near else "; known"
+    targets = ", ".join(SIGNAL_TARGETS)
+    return f"fault target {target!r} is unknown{meant}: {targets}, and what a plant knows as plant_..."
 
 
 def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequence[str]) -> None:

@@ -31,8 +31,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
-from hybrid_mpc.loop.plant import fitting
 from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held
+from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -216,7 +216,7 @@ class Loop:
         sample, measured = self._sample(y), self._disturbed(w)
         x_ref, factors = self._preview(0, reference)
         estimate = self._estimator.start(self._seen(sample, truth), 0.0, **self._now_measured(measured))
-        until = None if applied is None else fitting(applied, self.ocp.n_u, "applied")
+        until = None if applied is None else sampled(applied, (self.ocp.n_u,), "applied")
         ahead = self._w_ahead(0, measured, estimate)
         first = self._safe.initial(estimate, until, x_ref, factors, ahead)
         self._state = self._first_state(sample, estimate, first)
@@ -256,7 +256,7 @@ class Loop:
         sample, measured, state = self._sample(y), self._disturbed(w), self.state
         previous, inputs = state.decision, state.inputs
         if applied is not None:
-            previous = _with_input(previous, fitting(applied, self.ocp.n_u, "applied"))
+            previous = _with_input(previous, sampled(applied, (self.ocp.n_u,), "applied"))
             inputs = (*inputs[:-1], previous.u)
         begin, k = self._now(), state.k + 1
         x_ref, factors = self._preview(k, reference)
@@ -333,8 +333,8 @@ class Loop:
 
         The estimator is led through them without a sample; after 250 it starts anew at the next one.
         """
-        if n < 0:
-            raise InputError(f"skip: a number of periods needed, got {n}")
+        if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 0:
+            raise InputError(f"skip: a number of periods needed, got {n!r}")
         self.finish()
         state, missing = self.state, np.full(self.model.n_y, np.nan)
         estimate, guard, u = state.estimate, state.guard, state.decision.u
@@ -432,20 +432,17 @@ class Loop:
         return LoopState(0, sample, estimate, first, GuardState(), memory, (first.u,) * self._n_inputs)
 
     def _sample(self, y: ArrayLike | None) -> Array:
-        return np.full(self.model.n_y, np.nan) if y is None else fitting(y, self.model.n_y, "the measurement")
+        return (
+            np.full(self.model.n_y, np.nan) if y is None else sampled(y, (self.model.n_y,), "the measurement")
+        )
 
     def _disturbed(self, w: ArrayLike | None) -> Array | None:
         """Measured disturbances ``(m, n_w)``, a row for now and each known ahead; None: nothing was measured."""
         if w is None:
             return None
-        rows, n_w = np.atleast_2d(np.asarray(w, dtype=np.float64)), self.model.n_w
-        if rows.size and not n_w:
-            raise InputError(f"w: {rows.size} measured disturbances given, model {self.model.name} has none")
-        if rows.ndim != 2 or rows.shape[1] != n_w or not len(rows):
-            raise InputError(
-                f"w: measured disturbances of shape {np.shape(w)} given, model {self.model.name} has {n_w}: ({n_w},), "
-                f"or (m, {n_w}) with a forecast, needed"
-            )
+        rows = sampled(w, (None, self.model.n_w), "w, the measured disturbances and their forecast,")
+        if not len(rows):
+            raise InputError("w has no rows; give the measured disturbances, or a row for each period ahead")
         return rows
 
     def _now_measured(self, measured: Array | None) -> dict[str, Array]:
@@ -471,7 +468,7 @@ class Loop:
             return sample
         if truth is None:
             raise InputError("this estimator takes the true state; give truth=, or take a filter")
-        return np.asarray(truth, dtype=np.float64)
+        return sampled(truth, (None,), "the truth")
 
     def _preview(self, k: int, reference: ArrayLike | None) -> tuple[Array, Array | None]:
         """Reference and factors of period k, at the instants at which its input acts."""
@@ -480,7 +477,11 @@ class Loop:
         else:
             x_ref, factors = self._previews((k + self._delay) * self.model.dt)
         if reference is not None:
-            x_ref = np.atleast_2d(np.asarray(reference, dtype=np.float64))
+            x_ref = sampled(reference, (None, x_ref.shape[1]), "the reference")
+            if not len(x_ref):
+                raise InputError(
+                    "the reference has no rows; give a set-point, or a row for each period ahead"
+                )
         return x_ref, factors
 
     def _prepared(self, previous: Decision, weight: Array | None) -> Any:

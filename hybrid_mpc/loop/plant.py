@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.loop.faults import Fault, corrupt_input, corrupt_measurement
+from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import hidden_fixed_point
 
@@ -145,12 +145,4 @@ class SimulatedMachine:
         self.state = step(self.state, u, self._dt, *(() if w is None else (w,)))
 
     def _sensor(self) -> Array:
-        return fitting(self._plant.measure(self.state, self._rng), self._n_y, "the plant's measurement")
-
-
-def fitting(values: ArrayLike, size: int, name: str) -> Array:
-    """``values`` as a vector ``(size,)``; NaN is allowed. ``name`` says whose they are."""
-    array: Array = np.array(values, dtype=np.float64)
-    if array.shape != (size,):
-        raise InputError(f"{name} has shape {array.shape}, the model needs {(size,)}")
-    return array
+        return sampled(self._plant.measure(self.state, self._rng), (self._n_y,), "the plant's measurement")

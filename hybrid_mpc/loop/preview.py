@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.limits import sampled
 
 Array = NDArray[np.float64]
 Preview = Callable[[Array], Array]
@@ -72,10 +73,7 @@ class Forecast:
         """Disturbances from ``t`` on; None: those measured last are held."""
         if self._w is None:
             return None
-        values = np.array(self._w(t + self._ahead), dtype=np.float64)
-        if values.shape != (self._ahead.size, self._n_w):
-            raise InputError(f"w returns {values.shape}, needed: {(self._ahead.size, self._n_w)}")
-        return values
+        return sampled(self._w(t + self._ahead), (self._ahead.size, self._n_w), "what w returns")
 
 
 def held(values: Array, first: Array) -> Array:
@@ -91,9 +89,5 @@ def _function_of(reference: Preview | ArrayLike | None, standing: Array) -> Prev
     """The reference as a function of time, also where a set-point or nothing was given."""
     if callable(reference):
         return reference
-    goal = standing if reference is None else np.asarray(reference, dtype=np.float64)
-    if goal.shape != standing.shape:
-        raise InputError(
-            f"reference: a function of time or a set-point of shape {standing.shape} needed, got shape {goal.shape}"
-        )
+    goal = standing if reference is None else sampled(reference, standing.shape, "the reference")
     return lambda t: np.tile(goal, (len(t), 1))

@@ -25,8 +25,8 @@ from hybrid_mpc.estimate.delay import sees_truth
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import Loop, Monitor, Reading
-from hybrid_mpc.loop.plant import fitting
 from hybrid_mpc.loop.preview import Preview
+from hybrid_mpc.model.limits import sampled
 
 Array = NDArray[np.float64]
 TIMED = ("measure", "estimate", "solve", "actuate", "monitor", "prepare")
@@ -262,7 +262,7 @@ class _Run:
 
     def _sample(self) -> Array | None:
         y = self._runner._measure()
-        return None if y is None else fitting(y, self._loop.model.n_y, "what measure() returns")
+        return None if y is None else sampled(y, (self._loop.model.n_y,), "what measure() returns")
 
     def _disturbances(self) -> ArrayLike | None:
         return None if self._runner._measure_w is None else self._runner._measure_w()

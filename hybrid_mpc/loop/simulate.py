@@ -15,13 +15,14 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.safeguard import Decision, SafeController
 from hybrid_mpc.control.targets import Steady
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
-from hybrid_mpc.loop.plant import Plant, SimulatedMachine, fitting
+from hybrid_mpc.loop.plant import Plant, SimulatedMachine
 from hybrid_mpc.loop.preview import Preview, Previews
+from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import vector
 
@@ -133,7 +134,7 @@ def simulate(
     rows: list[_Row] = []
     for k in range(periods):
         t = k * dt
-        x = fitting(plant.truth(machine.state), ocp.n_x, "the plant's truth")
+        x = sampled(plant.truth(machine.state), (ocp.n_x,), "the plant's truth")
         y = machine.measure(t)
         truth = np.concatenate([x, plant.hidden(machine.state)])
         in_time = None if late is None else partial(_in_time, late, t)
@@ -174,10 +175,7 @@ def _disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview 
 
 
 def _row_at(w: Preview, t: float, n_w: int) -> Array:
-    values = np.asarray(w(np.array([t])), dtype=np.float64)
-    if values.shape != (1, n_w):
-        raise InputError(f"w returns {values.shape} for one instant, needed: {(1, n_w)}")
-    return values[0]
+    return sampled(w(np.array([t])), (1, n_w), "what w returns for one instant")[0]
 
 
 class _Goal(NamedTuple):
@@ -394,7 +392,8 @@ class ClosedLoopResult:
 
         Example: ``result.to_pandas(model)["u torque [N m]"]``
         """
-        import pandas as pd
+        with named_extra("the table"):
+            import pandas as pd
 
         columns: dict[str, object] = {"t" if model is None else "t [s]": self.t}
         for name in ("x", "y", "u", "x_hat", "h", "d", "w", "reference", "y_ref"):

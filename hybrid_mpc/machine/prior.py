@@ -18,8 +18,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, no_exit
 from hybrid_mpc.machine.signals import Parameter, Signal
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import Name, Number, Unit
 
 Array = NDArray[np.float64]
 POINT = ("x", "u", "w", "p")
@@ -43,17 +45,23 @@ class Balance:
         unit: Unit of the storage. Default: J.
         rate_unit: Unit of supply and loss. Default: W.
 
+    Raises:
+        InputError: If the name is no name, or a unit none.
+
     Example:
         >>> Balance("mass", storage=2.0, supply=0.1, unit="kg", rate_unit="kg/s").loss
         0.0
     """
 
-    name: str
+    name: Name
     storage: Any
     supply: Any
     loss: Any = 0.0
-    unit: str = "J"
-    rate_unit: str = "W"
+    unit: Unit = "J"
+    rate_unit: Unit = "W"
+
+    def __post_init__(self) -> None:
+        Fields(self, f"balance {self.name!r}").refuse()
 
 
 @dataclass(frozen=True)
@@ -70,9 +78,12 @@ class OperatingPoint:
         ()
     """
 
-    x: tuple[float, ...]
-    u: tuple[float, ...]
-    w: tuple[float, ...] = ()
+    x: tuple[Number, ...]
+    u: tuple[Number, ...]
+    w: tuple[Number, ...] = ()
+
+    def __post_init__(self) -> None:
+        Fields(self, "operating point").refuse()
 
 
 class Prior:
@@ -138,7 +149,12 @@ class Prior:
                 )
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
-        given, kind = dict(values or {}), type(self).__name__
+        kind = type(self).__name__
+        if not isinstance(values, Mapping | None):
+            raise InputError(f"{kind}: values are a mapping (name: number), got {values!r:.80}")
+        given = dict(values or {})
+        if wrong := {k: v for k, v in given.items() if v is None or isinstance(v, bool | str)}:
+            raise InputError(f"{kind}: values must be numbers, got {wrong!r:.80}")
         missing = [role for role in ("states", "inputs", "outputs") if not hasattr(self, role)]
         if missing:
             raise InputError(
@@ -244,7 +260,8 @@ class Prior:
         """
         given = (named(self.names_of(key), ca.vertsplit(v)) for key, v in arguments)
         try:
-            return getattr(self, method)(*given)
+            with no_exit(f"{type(self).__name__}.{method}"):
+                return getattr(self, method)(*given)
         except (TypeError, AttributeError) as error:
             if "Tensor" not in str(error) and "'SX' object" not in str(error):
                 raise

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import Bound, Line, Name, Number, Unit
 
 
 @dataclass(frozen=True)
@@ -13,8 +14,9 @@ class Signal:
     """A physical signal: a state, an input or an output.
 
     Args:
-        name: Short name, e.g. ``"phi"``.
-        unit: SI unit, e.g. ``"rad"``; ``"-"`` for none.
+        name: Short name, e.g. ``"phi"``: letters and digits of any alphabet, ``_ . [ ] -`` and blanks
+            (:func:`~hybrid_mpc.rules.name_problem`).
+        unit: SI unit, e.g. ``"rad"``; ``"-"`` for none (:func:`~hybrid_mpc.rules.unit_problem`).
         lower: Smallest plausible value [unit]; data below it are refused, speeds
             differentiated from them raise a warning. Default: no bound.
         upper: Largest plausible value [unit], likewise. Default: no bound.
@@ -25,7 +27,8 @@ class Signal:
             most, this. Default: the sensor shows every value.
 
     Raises:
-        InputError: If the range is empty, the sensor's range is, or it is that of a periodic signal.
+        InputError: If a field is of another kind, the range is empty, the sensor's range is, or it is that of a
+            periodic signal; all of it together.
 
     Example:
         >>> Signal("phi", "rad").label
@@ -34,30 +37,27 @@ class Signal:
         (0.0, 10.0)
     """
 
-    name: str
-    unit: str
-    lower: float = -math.inf
-    upper: float = math.inf
+    name: Name
+    unit: Unit
+    lower: Bound = -math.inf
+    upper: Bound = math.inf
     periodic: bool = False
-    saturation: tuple[float, float] | None = None
+    saturation: tuple[Bound, Bound] | None = None
 
     def __post_init__(self) -> None:
-        if not self.lower < self.upper:
-            raise InputError(f"signal {self.label}: its range [{self.lower}, {self.upper}] is empty")
-        if self.saturation is not None:
-            self._check_saturation(tuple(self.saturation))
-
-    def _check_saturation(self, ends: tuple[float, ...]) -> None:
-        """Refuse a sensor's range that is none."""
-        if len(ends) != 2 or not ends[0] < ends[1]:
-            raise InputError(
-                f"signal {self.label}: saturation must be (lower, upper) of the sensor with lower < upper, got {ends}"
-            )
-        if self.periodic:
-            raise InputError(
-                f"signal {self.label}: a periodic signal has no saturation; its sensor begins again at a full turn. "
-                "Leave one of them out."
-            )
+        own, ends = Fields(self, f"signal {self.label}"), self.saturation
+        own.need(
+            "lower upper", lambda: self.lower < self.upper, f"its range [{self.lower}, {self.upper}] is empty"
+        )
+        own.need(
+            "saturation", lambda: self.saturation is None or self.saturation[0] < self.saturation[1],
+            f"saturation must be (lower, upper) of the sensor with lower < upper, got {ends}",
+        )  # fmt: skip
+        own.need(
+            "saturation periodic", lambda: self.saturation is None or not self.periodic,
+            "a periodic signal has no saturation; its sensor begins again at a full turn. Leave one of them out.",
+        )  # fmt: skip
+        own.refuse()
 
     @property
     def label(self) -> str:
@@ -78,26 +78,27 @@ class Parameter:
         description: A few words, printed in tables.
 
     Raises:
-        InputError: If the value lies outside its bounds.
+        InputError: If a field is of another kind, or the value lies outside its bounds; all of it together.
 
     Example:
         >>> Parameter("m", 0.5, "kg", 0.1, 2.0).fixed
         False
     """
 
-    name: str
-    value: float
-    unit: str
-    lower: float
-    upper: float
-    description: str = ""
+    name: Name
+    value: Number
+    unit: Unit
+    lower: Bound
+    upper: Bound
+    description: Line = ""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.value) and self.lower <= self.value <= self.upper):
-            raise InputError(
-                f"parameter {self.name} [{self.unit}]: value {self.value} is not within its bounds "
-                f"[{self.lower}, {self.upper}]"
-            )
+        own = Fields(self, f"parameter {self.label}")
+        own.need(
+            "value lower upper", lambda: self.lower <= self.value <= self.upper,
+            f"value {self.value} is not within its bounds [{self.lower}, {self.upper}]",
+        )  # fmt: skip
+        own.refuse()
 
     @property
     def fixed(self) -> bool:

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import (
+    Bound,
+    Column,
+    Duration,
+    Label,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Seconds,
+    Share,
+    Shift,
+    Within,
+)
 
 Role = Literal["train", "valid", "test", "nominal"]
 """What a part of a recording is used for, see :class:`Window`."""
+Count = Annotated[int, Within(1, 10**9, "a whole number from 1 to 1e9")]
+CountOrNone = Annotated[int, Within(0, 10**9, "a whole number from 0 to 1e9")]
 
 
 @dataclass(frozen=True)
@@ -22,11 +37,19 @@ class Window:
         end: Last time [s].
         role: ``"train"``, ``"valid"``, ``"test"``, or ``"nominal"``: known to be free of disturbances but used
             for no free run (standing at an unstable point, say); the monitor must stay quiet there.
+
+    Raises:
+        InputError: If a field is of another kind, or the end does not come after the start.
     """
 
-    start: float
-    end: float
+    start: Bound
+    end: Bound
     role: Role
+
+    def __post_init__(self) -> None:
+        own = Fields(self, f"window {self.start!r} to {self.end!r}")
+        own.need("start end", lambda: self.start < self.end, "its end must come after its start")
+        own.refuse()
 
 
 @dataclass(frozen=True)
@@ -61,7 +84,8 @@ class DataSpec:
         delays_of: Known delays of single recordings, by file stem and column, in place of those of ``delays``.
 
     Raises:
-        InputError: If a length is not positive, a delay is negative or not finite, or the fractions do not sum to one.
+        InputError: If a field is of another kind, a length is not positive, a delay is not finite, a column is named
+            twice, or the fractions do not sum to one; all of it together.
 
     Example:
         >>> spec = DataSpec(0.1, ("u",), ("y",), 0.1, 0.3, 1.0, 1.0, delays={"y": 0.2}, delays_of={"b": {"u": 0.1}})
@@ -69,22 +93,22 @@ class DataSpec:
         ({'y': 0.2}, {'y': 0.2, 'u': 0.1})
     """
 
-    time: str | float
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    dt: float
-    max_gap: float
-    smoothing: float
-    warm_up: float
+    time: Column | Seconds
+    inputs: tuple[Column, ...]
+    outputs: tuple[Column, ...]
+    dt: Seconds
+    max_gap: Seconds
+    smoothing: Seconds
+    warm_up: Seconds
     windows: Mapping[str, tuple[Window, ...]] = field(default_factory=dict)
-    fractions: tuple[float, float, float] = (0.6, 0.2, 0.2)
-    free_run: float | None = None
-    inputs_of: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    units: Mapping[str, str | float] = field(default_factory=dict)
-    largest_delay: float = 0.0
-    disturbances: tuple[str, ...] = ()
-    delays: Mapping[str, float] = field(default_factory=dict)
-    delays_of: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    fractions: tuple[Share, Share, Share] = (0.6, 0.2, 0.2)
+    free_run: Seconds | None = None
+    inputs_of: Mapping[str, tuple[Column, ...]] = field(default_factory=dict)
+    units: Mapping[Column, Label | Number] = field(default_factory=dict)
+    largest_delay: Duration = 0.0
+    disturbances: tuple[Column, ...] = ()
+    delays: Mapping[Column, Shift] = field(default_factory=dict)
+    delays_of: Mapping[str, Mapping[Column, Shift]] = field(default_factory=dict)
 
     def inputs_in(self, stem: str) -> tuple[str, ...]:
         """Input columns of the recording of this file stem."""
@@ -95,30 +119,18 @@ class DataSpec:
         return {**self.delays, **self.delays_of.get(stem, {})}
 
     def __post_init__(self) -> None:
-        if not isinstance(self.time, str) and not 0 < self.time < math.inf:
-            raise InputError(
-                "data specification: time must be the name of a column or a positive sampling time [s], got "
-                f"{self.time}"
-            )
-        for delays in (self.delays, *self.delays_of.values()):
-            for column, delay in delays.items():
-                if not math.isfinite(delay):
-                    raise InputError(
-                        f"data specification: the delay of column {column!r} must be a number of seconds, got {delay}"
-                    )
-        if not 0 <= self.largest_delay < math.inf:
-            raise InputError(
-                f"data specification: largest_delay must be 0 s or more, got {self.largest_delay}"
-            )
-        for name in ("dt", "max_gap", "smoothing", "warm_up"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"data specification: {name} must be positive, got {getattr(self, name)}")
-        if self.free_run is not None and not self.free_run > 0:
-            raise InputError(
-                f"data specification: free_run must be positive or left out, got {self.free_run}"
-            )
-        if abs(sum(self.fractions) - 1.0) > 1e-9 or min(self.fractions) < 0:
-            raise InputError(f"data specification: fractions must sum to 1, got {self.fractions}")
+        own = Fields(self, "data specification")
+        for name in ("inputs", "disturbances", "outputs"):
+            own.distinct(name, lambda name=name: getattr(self, name), f"{name}: column")  # type: ignore[misc]
+        own.need(
+            "inputs_of", lambda: all(len(set(c)) == len(c) for c in self.inputs_of.values()),
+            "inputs_of: a column stands twice in one recording",
+        )  # fmt: skip
+        own.need(
+            "fractions", lambda: abs(sum(self.fractions) - 1.0) <= 1e-9,
+            f"fractions must sum to 1, got {self.fractions}",
+        )  # fmt: skip
+        own.refuse()
 
 
 @dataclass(frozen=True)
@@ -140,23 +152,17 @@ class BenchmarkBudget:
         32
     """
 
-    hidden: int
-    networks: int
-    teacher_steps: int
-    free_run_steps: int
-    horizon: int
-    batch: int = 32
-    decay: float = 300.0
-    prior_replay: float = 0.0
+    hidden: Count
+    networks: Count
+    teacher_steps: CountOrNone
+    free_run_steps: CountOrNone
+    horizon: Count
+    batch: Count = 32
+    decay: NotNegative = 300.0
+    prior_replay: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        check_prior_replay(self.prior_replay)
-
-
-def check_prior_replay(weight: float) -> None:
-    """Refuse a weight of prior_replay that is none."""
-    if not 0 <= weight < math.inf:
-        raise InputError(f"prior_replay must be a weight of 0 or more, got {weight}")
+        Fields(self, "benchmark budget").refuse()
 
 
 @dataclass(frozen=True)
@@ -191,30 +197,31 @@ class BenchmarkSpec:
         True
     """
 
-    budgets: Mapping[str, BenchmarkBudget] = field(default_factory=dict)
-    units: Mapping[str, tuple[str, float]] = field(default_factory=dict, kw_only=True)
-    length: float | None = None
-    piece: float = 25.0
-    cycle: tuple[str, ...] = ()
-    valid_every: int = 0
+    budgets: Mapping[Name, BenchmarkBudget] = field(default_factory=dict)
+    units: Mapping[str, tuple[Label, Positive]] = field(default_factory=dict, kw_only=True)
+    length: Seconds | None = None
+    piece: Seconds = 25.0
+    cycle: tuple[Literal["train", "valid", "test"], ...] = ()
+    valid_every: CountOrNone = 0
     repeated: bool = field(default=False, kw_only=True)
-    fractions: tuple[float, float, float] | None = None
+    fractions: tuple[Share, Share, Share] | None = None
 
     def __post_init__(self) -> None:
-        if self.repeated and self.length is None:
-            raise InputError("benchmark specification: repeated runs need a length")
-        factors = [factor for _, factor in self.units.values()]
-        if not (min([*factors, self.piece]) > 0 and (self.length is None or self.length > 0)):
-            raise InputError(
-                f"benchmark specification: factors of units, piece and length must be positive, got {factors}, "
-                f"{self.piece}, {self.length}"
-            )
-        if self.cycle and not {"train", "valid"} <= set(self.cycle) <= {"train", "valid", "test"}:
-            raise InputError(
-                f"benchmark specification: cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle}"
-            )
-        if self.valid_every and (self.valid_every < 2 or self.cycle):
-            raise InputError(
-                f"benchmark specification: valid_every must be 2 or more (or 0 for never), and there must be no cycle "
-                f"beside it; got {self.valid_every} and cycle {self.cycle}"
-            )
+        own = Fields(self, "benchmark specification")
+        own.need(
+            "repeated length", lambda: not self.repeated or self.length is not None, "repeated runs need a length"
+        )  # fmt: skip
+        own.need(
+            "cycle", lambda: not self.cycle or {"train", "valid"} <= set(self.cycle),
+            f"cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle}",
+        )  # fmt: skip
+        own.need(
+            "valid_every cycle", lambda: not self.valid_every or (self.valid_every >= 2 and not self.cycle),
+            "valid_every must be 2 or more (or 0 for never), and there must be no cycle beside it; got "
+            f"{self.valid_every} and cycle {self.cycle}",
+        )  # fmt: skip
+        own.need(
+            "fractions", lambda: self.fractions is None or abs(sum(self.fractions) - 1.0) <= 1e-9,
+            f"fractions must sum to 1, got {self.fractions}",
+        )  # fmt: skip
+        own.refuse()

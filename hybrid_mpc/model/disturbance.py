@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import Name, NotNegative
 
 Array = NDArray[np.float64]
 
@@ -34,17 +36,17 @@ class Disturbance:
     """
 
     at: Literal["input", "rate", "output"]
-    signal: str
-    size: float = 0.0
+    signal: Name
+    size: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        if self.at not in ("input", "rate", "output"):
-            raise InputError(f"disturbance: at {self.at!r} given; needed: 'input', 'rate' or 'output'")
-        if not 0 <= self.size < np.inf or (self.at != "input" and self.size == 0):
-            raise InputError(
-                f"disturbance at the {self.at} {self.signal}: size {self.size} given; needed: how large it may be, a "
-                "positive number (an input's may be left out: its range)"
-            )
+        own = Fields(self, f"disturbance at the {self.at} {self.signal}")
+        own.need(
+            "at size", lambda: self.at == "input" or self.size > 0,
+            f"size {self.size} given; needed: how large it may be, a positive number (an input's may be left out: its "
+            "range)",
+        )  # fmt: skip
+        own.refuse()
 
 
 def disturbance_matrices(

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.rules import LARGEST
 
 Array = NDArray[np.float64]
 
 
 def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
     """Checked limits ``(n_u,)`` of the inputs; ``-inf`` and ``inf`` for none."""
-    lower, upper = numbers(u_min, "u_min"), numbers(u_max, "u_max")
+    lower, upper = (numbers(v, name, most=LARGEST) for v, name in ((u_min, "u_min"), (u_max, "u_max")))
     if lower.shape != (n_u,) or upper.shape != (n_u,):
         raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
     if not np.all(lower < upper):
@@ -22,12 +26,76 @@ def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, A
     return lower, upper
 
 
-def numbers(values: ArrayLike, name: str) -> Array:
-    """``values`` as a vector ``(n,)``, a copy; infinite ones and NaN too."""
+def numbers(values: ArrayLike, name: str, *, most: float = np.inf) -> Array:
+    """``values`` as a vector ``(n,)``, a copy; infinite ones and NaN too. Texts and flags are no numbers.
+
+    Raises:
+        InputError: If one is none, or finite and larger than ``most`` in size.
+    """
     try:
-        return np.array(values, dtype=float).ravel()
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: numbers needed, got {values!r}") from error
+        given = np.array(values)
+        array = np.array(values, dtype=float).ravel() if given.dtype.kind in "iufO" else None
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{name}: numbers needed, got {values!r:.80}") from error
+    if array is None or _not_numbers(values):
+        raise InputError(f"{name}: numbers needed, got {values!r:.80}")
+    if np.any(np.isfinite(array) & (np.abs(array) > most)):
+        raise InputError(f"{name}: numbers of at most {most:g} in size are needed, got {values!r:.80}")
+    return array
+
+
+def _not_numbers(values: object) -> bool:
+    """Whether a flag, a text or None stands in lists, which numpy would make numbers of."""
+    if isinstance(values, list | tuple):
+        return any(map(_not_numbers, values))
+    return isinstance(values, bool | np.bool_ | str | bytes) or values is None
+
+
+def sampled(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
+    """What a sensor, an actuator or a reference gives as a new float array; NaN and infinite numbers are values.
+
+    Args:
+        values: Numbers. What does not fit into double precision (``10**400``) is infinite; masked elements are NaN.
+        shape: Shapes that fit, None for any length. A number fits ``(1,)``, a row ``(n,)`` ``(None, n)``.
+        name: What it is, for messages.
+
+    Raises:
+        InputError: If it is something else than real numbers, or of another shape.
+
+    Example:
+        >>> sampled([1, float("nan")], (2,), "y"), sampled(10**400, (), "y")
+        (array([ 1., nan]), array(inf))
+    """
+    plain = type(values) is np.ndarray and values.dtype == np.float64  # a loop's every period
+    array = np.array(values) if plain else _floats(values, name)
+    if array.ndim < len(shape) and shape[: len(shape) - array.ndim] in ((1,), (None,), (1, 1), (None, 1)):
+        array = array.reshape((1,) * (len(shape) - array.ndim) + array.shape)
+    if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+        needed = f"({', '.join('m' if n is None else str(n) for n in shape)}{',' * (len(shape) == 1)})"
+        raise InputError(f"{name} has shape {np.shape(array)}, needed is {needed}")
+    return array
+
+
+def _floats(values: ArrayLike, name: str) -> Array:
+    """Real numbers of any kind as a float array."""
+    try:
+        if isinstance(values, np.ma.MaskedArray):
+            return np.array(np.ma.filled(values.astype(np.float64), np.nan))
+        given = np.asarray(values)
+        if given.dtype.kind in "biuf":
+            return np.array(given, dtype=np.float64)
+        if given.dtype.kind == "O" and all(isinstance(v, Real) for v in given.flat):
+            return np.array([_float(v) for v in given.flat], dtype=np.float64).reshape(given.shape)
+    except Exception as error:  # whatever an object of anybody's raises where it is asked for its numbers
+        raise InputError(f"{name}: numbers needed, got {type(values).__name__} ({error})") from error
+    raise InputError(f"{name}: numbers needed, got {type(values).__name__} {values!r:.80}")
+
+
+def _float(value: Real) -> float:
+    try:
+        return float(value)
+    except OverflowError:  # an int or a fraction beyond a float's range
+        return -math.inf if str(value).startswith("-") else math.inf
 
 
 def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike, rest: ArrayLike = 0.0) -> float:

@@ -78,6 +78,9 @@ class HybridModel:
             nothing else is known, loops start there. Default: zeros.
         nominal_u: Input ``(n_u,)`` that holds it there. Default: zeros.
         disturbance_model: What unmeasured disturbances are added to. Default: one at each input.
+        state_spread: Spread of the states ``(n_x,)`` in the recordings, the sizes that controllers count in
+            (:class:`~hybrid_mpc.control.sizes.Sizes`); 0 where it is not known. Default: not known.
+        output_spread: Likewise of the outputs ``(n_y,)``.
 
     Raises:
         InputError: If the functions' shapes do not fit the signals and parameters.
@@ -119,6 +122,8 @@ class HybridModel:
     nominal_x: tuple[float, ...] = ()
     nominal_u: tuple[float, ...] = ()
     disturbance_model: tuple[Disturbance, ...] | None = None
+    state_spread: tuple[float, ...] = ()
+    output_spread: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("dt", "time_unit"):
@@ -490,6 +495,12 @@ def _check_numbers(model: HybridModel) -> None:
         values = getattr(model, name)
         if len(values) != size or not all(map(math.isfinite, values)):
             raise InputError(f"model {model.name}: {name} needs {size} finite values, got {values}")
+    for name, size in (("state_spread", model.n_x), ("output_spread", model.n_y)):
+        values = getattr(model, name)
+        if values and (len(values) != size or not all(math.isfinite(v) and v >= 0 for v in values)):
+            raise InputError(
+                f"model {model.name}: {name} needs {size} finite values that are not negative, or none, got {values}"
+            )
     if model.covariance and [len(row) for row in model.covariance] != [n_p] * n_p:
         raise InputError(f"model {model.name}: covariance needs {n_p} rows of {n_p} values, one a parameter")
     for what, names in (

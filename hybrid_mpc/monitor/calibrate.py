@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.lengths import BLOCK_S
+from hybrid_mpc.rules import Line
 
 Array = NDArray[np.float64]
 MIN_BLOCKS = 30
@@ -35,7 +36,7 @@ class Calibration:
         residual_release: Residual level [unit of force] below which that ends.
         detector: Detector of scaled residuals, learned from nominal data. Default: none.
         rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all, for every monitor of
-            this model. Default 0.2; None where no recording gave them.
+            this model. Default: None, no recording gave them.
 
     Raises:
         InputError: If ``0 < release_w <= threshold_w`` does not hold, or not so for the residual.
@@ -52,8 +53,8 @@ class Calibration:
     false_alarms_per_hour: float
     n_samples: int
     hours: float
-    method: str
-    data_hash: str = ""
+    method: Line
+    data_hash: Line = ""
     residual_threshold: float | None = None
     residual_release: float | None = None
     detector: Detector | None = None

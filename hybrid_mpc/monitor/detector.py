@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.monitor.lengths import NOTHING_STICKS, SHORTEST_S, checked_rest
+from hybrid_mpc.rules import Line
 
 Array = NDArray[np.float64]
 CAP = 1.5
@@ -45,7 +46,8 @@ class Detector:
         force_threshold: Sum [deviations] above which the force's alarm starts.
         energy_threshold: Scaled power above which the energy's alarm starts; infinite without free runs.
         release: Share of the threshold at which an alarm ends.
-        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all. Default 0.2.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all. Default: nothing
+            sticks.
         false_alarms_per_hour: Wanted rate on nominal data [1/h].
         hours: Duration of the nominal data [h].
         interval: 5 % and 95 % of a block bootstrap of the thresholds: ``(force low, high, energy low, high)``.
@@ -80,8 +82,8 @@ class Detector:
     false_alarms_per_hour: float = math.nan
     hours: float = 0.0
     interval: tuple[float, ...] = ()
-    method: str = ""
-    data_hash: str = ""
+    method: Line = ""
+    data_hash: Line = ""
     time_unit: float = 1.0
 
     def __post_init__(self) -> None:
@@ -97,9 +99,14 @@ class Detector:
                 f"detector: dt {self.dt} and time_unit {self.time_unit} must be positive, drift {self.drift} not "
                 f"negative, release {self.release} within 0 to 1"
             )
-        if not (self.force_threshold > 0 and self.energy_threshold > 0):
+        if not (0 < self.force_threshold < math.inf and self.energy_threshold > 0):
             given = self.force_threshold, self.energy_threshold
-            raise InputError(f"detector: thresholds must be positive, got {given}")
+            raise InputError(f"detector: thresholds must be positive, that of forces finite, got {given}")
+        if bool(self.energy) != (self.energy_threshold < math.inf):
+            raise InputError(
+                f"detector: energy {self.energy} and energy_threshold {self.energy_threshold} do not fit: with "
+                "coefficients of the energy a finite threshold is needed, without them there is none; learn it anew"
+            )
 
     def initial(self) -> DetectorState:
         """State before the first sample."""

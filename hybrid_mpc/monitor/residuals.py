@@ -19,6 +19,7 @@ from hybrid_mpc.monitor.calibrate import alarm_intervals, calibrate
 from hybrid_mpc.monitor.energy import FROZEN_STEPS, SECONDS, Validity
 from hybrid_mpc.monitor.lengths import block_seconds, machine_second
 from hybrid_mpc.monitor.replay import REPORTED, EstimatorLike, TrajectoryLike
+from hybrid_mpc.rules import Line
 
 Array = NDArray[np.float64]
 SHORT_S, LONG_S = 0.3, 3.0
@@ -65,7 +66,7 @@ class ResidualLimits:
     repeats: tuple[int, ...]
     false_alarms_per_hour: float
     hours: float
-    method: str = ""
+    method: Line = ""
     rated: bool = True
 
     def __post_init__(self) -> None:

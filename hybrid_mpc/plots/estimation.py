@@ -68,7 +68,7 @@ def innovations(
     r = checked("autocorrelation", autocorrelation, lags, n_y)
     values = np.concatenate([np.asarray(v, dtype=float) for v in nis])
     t = dt * np.arange(len(values))
-    figure, axes = new_figure(2, 1, heights=(1.5, 1.0), size=(10, 6.2), title=plain(title))
+    figure, axes = new_figure(2, 1, heights=(1.5, 1.0), size=(10, 6.2), title=title)
     top, bottom = axes[:, 0]
     top.plot(t, values, ".", color=PALE, markersize=2.5, label="NIS")
     mean = np.array([np.nanmean(v) if np.isfinite(v).any() else np.nan for v in _windows(values)])

@@ -404,7 +404,7 @@ def prediction(
     """
     n, n_y = len(t), len(outputs)
     y = checked("measured", measured, n, n_y)
-    figure, panels = new_column([1.4, 0.9] * n_y, title=plain(title))
+    figure, panels = new_column([1.4, 0.9] * n_y, title=title)
     for j, signal in enumerate(outputs):
         top, bottom = panels[2 * j : 2 * j + 2]
         top.plot(t, y[:, j], color=INK, linewidth=1.0, label="measured")

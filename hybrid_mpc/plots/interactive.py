@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from dataclasses import dataclass, field
@@ -147,7 +148,12 @@ class _Panels:
         source = ColumnDataSource({"x": x, "y": y.astype(np.float32)})
         label = plain(str(line.get_label()))
         label = "" if label.startswith("_") else label
-        ink = {"color": to_hex(line.get_color()), "alpha": line.get_alpha() or 1.0, "name": label or "value"}
+        # a tooltip is HTML, which the browser's library fills in as it is
+        ink = {
+            "color": to_hex(line.get_color()),
+            "alpha": line.get_alpha() or 1.0,
+            "name": html.escape(label or "value"),
+        }
         legend = {"legend_label": label} if named and label else {}
         dash = DASHES.get(str(line.get_linestyle()))
         if dash is None:
@@ -230,7 +236,7 @@ def plain(text: str) -> str:
         >>> plain(r"simulation error $E_{sim}$ [-]"), plain(r"$\dot\varphi$ [rad/s]")
         ('simulation error E_sim [-]', 'φ̇ [rad/s]')
     """
-    text = text.replace("\n", " ")
+    text = re.sub(r"\\([(\[])", r"\1", text.replace("\n", " "))  # \( and \[ begin a formula in a browser
     if "$" not in text:
         return text
     greek = {"varphi": "φ", "phi": "φ", "omega": "ω", "tau": "τ", "sigma": "σ", "Delta": "Δ", "theta": "θ"}

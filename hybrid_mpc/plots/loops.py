@@ -129,7 +129,7 @@ def closed_loops(
         else np.zeros((len(t), 0))
     )
     heights = [1.6] * len(shown) + [1.1] * (len(tracked) + len(inputs) + around.shape[1])
-    figure, panels = new_column(heights, height=1.15, title=plain(title))
+    figure, panels = new_column(heights, height=1.15, title=title)
     errors = panels[len(shown) : len(shown) + len(tracked)]
     below = panels[len(shown) + len(tracked) :][: len(inputs)]
     for controller, loop in results.items():

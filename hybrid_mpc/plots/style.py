@@ -122,7 +122,7 @@ def axis_label(signal: Signal) -> str:
         >>> axis_label(Signal("torque", "N m"))
         'torque [N m]'
     """
-    return f"{_SYMBOLS.get(signal.name, plain(signal.name.replace('_', ' ')))} [{signal.unit}]"
+    return f"{_SYMBOLS.get(signal.name, plain(signal.name.replace('_', ' ')))} [{plain(signal.unit)}]"
 
 
 def ratio_unit(numerator: Signal, denominator: Signal) -> str:
@@ -174,7 +174,7 @@ def new_figure(
     for ax in axes.flat:
         dress(ax)
     if title:
-        figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
+        figure.suptitle(plain(title), fontsize=12, fontweight="bold", color=INK)
     return figure, axes
 
 

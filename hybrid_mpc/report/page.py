@@ -18,6 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
 from hybrid_mpc.plots.style import number
+from hybrid_mpc.rules import csv_cell
 
 Cell = str | float | int | bool | None
 Verdict = Literal["good", "bad", "plain"]
@@ -67,7 +68,8 @@ class Table:
             'model,x [rad]\nprior,0.1\n"a, b",\n'
         """
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([self.columns, *self.rows])
+        rows = [[csv_cell(c) if isinstance(c, str) else c for c in row] for row in (self.columns, *self.rows)]
+        csv.writer(text, lineterminator="\n").writerows(rows)
         return text.getvalue()
 
 

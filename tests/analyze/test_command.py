@@ -6,6 +6,7 @@ import shutil
 import sys
 from dataclasses import fields, replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from machines import dc_motor, thermal, two_tanks
@@ -38,7 +39,7 @@ from hybrid_mpc.job.analyze import (
     responses_of,
     state_range,
 )
-from hybrid_mpc.job.analyze_page import tables_of, write_analysis
+from hybrid_mpc.job.analyze_page import _draw_measured, tables_of, write_analysis
 from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
@@ -252,3 +253,23 @@ def test_a_working_speed_is_refused_where_nothing_moves():
         InputError, match=r"--speed: model two tanks: its states \(upper, lower\) are not positions"
     ):
         _speed(two_tanks(), None, 0.5)
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_model_that_diverges_is_left_out_of_the_responses(prior_alone, tmp_path, recorded):
+    model = prior_alone.models["prior"]
+    x, h, u, w, p = (
+        ca.MX.sym(name, n) for name, n in zip("xhuwp", (2, 0, 1, model.n_w, model.n_p), strict=True)
+    )
+    wild = replace(model, step=ca.Function("step", [x, h, u, w, p], [1e3 * x + 1.0, h]))
+    given = replace(prior_alone, models={"prior": model, "hybrid": wild})
+    if recorded:
+        drive = multisine(0.02 * np.arange(3000), 0.2, 0.1, 2.0, period=10.0)
+        out = run_model(model, [0.0, 0.0])(drive)
+        given = replace(given, plant=None, recordings=((drive, out, np.zeros(2)),))
+    found = responses_of(given)
+    assert set(found.models) == set(found.errors) == {"prior"}
+    assert set(found.left_out) == {"hybrid"}
+    assert "diverges" in found.left_out["hybrid"]
+    (_, figure, _), *_ = _draw_measured(given, found)
+    assert figure.axes

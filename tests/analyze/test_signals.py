@@ -91,6 +91,17 @@ def test_too_little_data_is_said():
         multisine_response(lambda u: u, 0.1, amplitude=1.0, band=(0.1, 1.0), periods=1)
 
 
+@pytest.mark.parametrize("last", [np.inf, np.nan, 1e200])
+def test_a_signal_that_diverges_is_refused(last):
+    u = np.random.default_rng(0).normal(size=2000)
+    y = np.append(u[:-1], last)
+    with pytest.raises(InputError, match="diverges, sample 1999"):
+        welch_response([(u, y)], 0.1, length=20.0)
+    driven = {"amplitude": 1.0, "band": (0.1, 1.0), "period": 10.0}
+    with pytest.raises(InputError, match="diverges"):
+        multisine_response(lambda u: np.append(u[:-1], last), 0.1, **driven)
+
+
 def test_interval_bounds_hold_and_are_tight_where_each_variable_appears_once():
     x = ca.SX.sym("x", 3)
     once = x[0] * x[1] - 2 * x[2], ca.tanh(x[0]) / (3 + x[1]), ca.fabs(x[0]) + x[2] ** 2, ca.sin(2 * x[1])

@@ -56,7 +56,7 @@ GOOD = {
         ({"terminal": np.eye(3)}, r"\(2, 2\)"),
         ({"terminal": -np.eye(2)}, "negative eigenvalue"),
         ({"blocks": (1, 2, 4)}, "sum to the horizon of 10"),
-        ({"blocks": (5, 5, 5)}, "15 periods"),
+        ({"blocks": (5, 5, 5)}, "sum to the horizon of 10"),
         ({"blocks": (10, 0)}, "at least 1"),
         ({"blocks": (2.5, 7.5)}, "whole numbers"),
         ({"blocks": ()}, "sum to the horizon"),

@@ -9,6 +9,7 @@ from online_models import linear_model, pendulum_model, random_linear
 
 from hybrid_mpc import OCP, CondensedController, InputError, SoftBound, Status
 from hybrid_mpc.control.problem import SoftRows
+from hybrid_mpc.control.sizes import Sizes
 
 DT = 0.1
 A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.5 * DT**2], [DT]])
@@ -109,7 +110,8 @@ def test_derivatives_of_expressions_are_those_of_finite_differences():
     e = ca.Function("e", [x, u], [ca.vertcat(x[0] * u[1], ca.sin(x[1]) + u[0] ** 2, x[0] * x[1])])
     bound = SoftBound(e, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
     ocp = OCP(3, [1.0, 1.0], [1.0] * 2, [0.0] * 2, [-9.0] * 2, [9.0] * 2, x_max=[np.inf, 0.5], soft=[bound])
-    rows, rng = SoftRows(ocp), np.random.default_rng(0)
+    model = linear_model(0.9 * np.eye(2), np.eye(2), np.eye(2))
+    rows, rng = SoftRows(ocp, model, Sizes(model, ocp)), np.random.default_rng(0)
     xs, us = rng.normal(size=(4, 2)), rng.normal(size=(3, 2))
     value, by_x, by_u = rows.linearize(xs, us)
     assert len(rows) == 3 + 9

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recording_bombs as bombs
+from patience import HANGS
 
 from hybrid_mpc import InputError
 from hybrid_mpc.data.recording import read_recording
@@ -28,7 +29,7 @@ def test_bombs_are_refused_in_little_memory_and_time(tmp_path):
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     done = subprocess.run(
         [sys.executable, "-m", "recording_bombs", str(tmp_path)],
-        capture_output=True, text=True, timeout=200, cwd=ROOT, env={**os.environ, "PYTHONPATH": path},
+        capture_output=True, text=True, timeout=HANGS, cwd=ROOT, env={**os.environ, "PYTHONPATH": path},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     told = {name: rest for name, *rest in map(json.loads, done.stdout.splitlines())}

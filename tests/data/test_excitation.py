@@ -189,9 +189,11 @@ def test_a_constant_input_is_refused_unless_another_run_moves_it():
     still = run(np.full(500, 0.2), name="monday#2")
     with pytest.raises(InputError, match=r"monday: the input torque is 0.2 throughout"):
         check_excitation([still], inputs=INPUT, outputs=OUTPUT)
-    tiny = run(1e-9 * np.random.default_rng(0).standard_normal(500))
+    rounded = run(0.3 + 1e-15 * np.random.default_rng(0).standard_normal(500))
     with pytest.raises(InputError, match="the input torque"):  # rounding is no excitation
-        check_excitation([tiny], inputs=INPUT)
+        check_excitation([rounded], inputs=INPUT)
+    for level, size in ((0.0, 1e-9), (1e6, 1.0), (1e6, 1e-3)):  # beside any level, in any unit
+        check_excitation([run(level + size * sine(0.5), level + size * np.c_[sine(0.5)])])
     with pytest.raises(InputError, match="input 2 is 0 throughout"):
         check_excitation([run(np.c_[sine(0.5), 0 * sine(0.5)])])
     assert check_excitation([still, run(sine(0.5))], inputs=INPUT, outputs=OUTPUT) == ()

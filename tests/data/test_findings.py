@@ -8,7 +8,8 @@ import pytest
 from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
-from hybrid_mpc.data.recording import read_recording
+from hybrid_mpc.data.findings import still_stretches
+from hybrid_mpc.data.recording import read_recording, unwrapped
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
@@ -211,3 +212,73 @@ def test_nothing_is_doubted_about_simulated_recordings(tmp_path, machine):
     prior = scenario.prior()
     files = scenario.make_data(tmp_path, 0, "quick")
     assert load_trajectories(files, prior, scenario.data).findings == ()
+
+
+def turned(angle):
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.1, 0.24, 0.3, 0.45])
+@pytest.mark.parametrize("lost", [0, 1, 2, 7])
+def test_turns_are_counted_over_missing_samples_at_any_speed(speed, lost):
+    """``speed`` turns a sample; ``lost`` samples in a row are missing now and then, at wraps, too."""
+    k = np.arange(600)
+    angle = 2 * np.pi * speed * k + 0.2 * np.sin(k / 40)
+    there = ~np.isin(k % 37, range(1, 1 + lost))
+    found = unwrapped(0.01 * k[there], turned(angle)[there], 2 * np.pi, 1.0)
+    np.testing.assert_allclose(found.angle - found.angle[0], angle[there] - angle[0], atol=1e-9)
+    assert not len(found.unclear)
+
+
+def test_where_the_number_of_turns_is_not_known_the_recording_is_cut(tmp_path):
+    """It reverses while a second of samples is missing, in which it may make several turns."""
+    k = np.arange(1200)
+    angle = np.where(k < 600, 0.5 * k, 300 - 0.5 * (k - 600))
+    angle[560:640] = np.nan
+    found = unwrapped(0.01 * k[np.isfinite(angle)], turned(angle)[np.isfinite(angle)], 2 * np.pi, 5.0)
+    assert found.unclear.tolist() == [560]
+    np.testing.assert_allclose(np.diff(found.angle)[:559], 0.5)
+    np.testing.assert_allclose(np.diff(found.angle)[560:], -0.5)
+
+
+def test_an_angle_that_is_not_periodic_may_step_by_half_a_turn():
+    t = 0.01 * np.arange(300)
+    slider = np.where(t < 1.5, -1.0, 2.5)  # 0.56 turns
+    assert not len(unwrapped(t, slider, 2 * np.pi, 1.0, periodic=False).jumps)
+
+
+def test_settled_answers_to_steps_are_not_frozen(tmp_path):
+    """A voltage behind a resistor and a capacitor: it settles to the digits of the file and starts at each step."""
+    t = 0.01 * np.arange(6000)
+    u = np.where((t // 1.0) % 2 == 0, 5.0, 0.0)
+    y = np.zeros(len(t))
+    for k in range(1, len(t)):
+        y[k] = u[k - 1] + (y[k - 1] - u[k - 1]) * np.exp(-0.01 / 0.08)
+    lag = {"inputs": (Signal("u", "V"),), "outputs": (Signal("y", "V"),), "states": ()}
+    assert findings(tmp_path, np.round(y, 4), t=t, tau=u, signals=lag) == ()
+
+
+def test_bursts_of_samples_are_not_frozen(tmp_path):
+    """Six samples in a millisecond, then a pause: an encoder does not move within a burst."""
+    t = (0.02 * np.arange(500)[:, None] + 1e-4 * np.arange(6)).ravel()
+    y = np.round(np.sin(3 * t) / 0.002) * 0.002
+    spec = replace(SPEC, dt=0.02, smoothing=0.2)
+    lag = {"inputs": (Signal("u", "V"),), "outputs": (Signal("y", "V"),), "states": ()}
+    file = write_csv(tmp_path / "run.csv", {"t": t, "tau": np.sin(7 * t), "phi": y})
+    found = read_recording(file, machine(**lag), spec)
+    still = still_stretches(found.t, found.y[:, 0], found.u, max_gap=0.05, patience=1.0, spreads=np.ones(1))
+    assert still == ()
+
+
+@pytest.mark.parametrize("code", [-9999.0, 9999.0, -999.9, 65535.0, 1e30])
+def test_a_code_for_missing_values_is_refused_by_name(tmp_path, code):
+    y = np.where(np.arange(len(T)) % 9 == 0, code, SWING)
+    with pytest.raises(InputError, match="phi"):
+        findings(tmp_path, y, signals={**SIGNALS, "outputs": (Signal("phi", "rad"),), "states": ()})
+
+
+def test_the_same_recording_twice_is_refused(tmp_path):
+    one = write_csv(tmp_path / "a.csv", {"t": T, "tau": TAU, "phi": SWING})
+    np.savez(tmp_path / "b.npz", t=T, tau=TAU, phi=SWING)
+    with pytest.raises(InputError, match=r"b.npz.*a.csv"):
+        load_trajectories([one, tmp_path / "b.npz"], machine(**SIGNALS), SPEC)

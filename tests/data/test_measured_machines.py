@@ -58,7 +58,7 @@ MACHINES = {
         "coupled_drives/prbs_1.csv",
         DataSpec("time_s", ("u_v",), ("speed",), dt=0.02, max_gap=0.03, smoothing=0.2, warm_up=0.2),
         inputs=(Signal("u", "V", -3, 3),),
-        outputs=(Signal("|speed|", "-", -0.1, 7),),
+        outputs=(Signal("speed", "-", -0.1, 7),),
         states=tuple(Signal(f"x{i}", "-") for i in range(3)),
         rows=500,
         period=0.02,

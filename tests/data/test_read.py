@@ -2,6 +2,7 @@
 
 import io
 import math
+import struct
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from scipy.io import savemat
 from scipy.sparse import csc_array
 
 from hybrid_mpc import InputError, Signal, Window, write_csv
+from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.mat_structure import check_structure, version
 from hybrid_mpc.data.recording import read_recording
 
@@ -194,7 +196,9 @@ def test_fields_of_structs(tmp_path):
     refused(path, "no column 'deep.*Not read are structs in structs", replace(SPEC, outputs=("deep",)))
     two = np.array([(1.0,), (2.0,)], dtype=[("phi", object)])
     savemat(path, {"time_s": T, "tau": T, "runs": two, "sparse": csc_array(np.eye(3))})
-    refused(path, "no column 'phi'.*Not read are arrays of structs and sparse matrices")
+    refused(
+        path, r"no column 'phi'.*Not read are arrays of structs \('runs'\) and sparse matrices \('sparse'\)"
+    )
 
 
 def test_no_such_format(tmp_path, vectors):
@@ -281,3 +285,101 @@ def test_damaged_vectors_are_an_input_error_or_what_was_written(tmp_path, vector
         np.testing.assert_array_equal(table.y[:, 0], np.sin(T))
         outcomes.add("read")
     assert "refused" in outcomes
+
+
+NUMBERS = [f"{0.1 * k:.1f},{k % 3},{k * k}" for k in range(30)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "match"),
+    [
+        (NUMBERS, "row 1 holds values, where the header is due"),
+        ([row.replace(",", ";").replace(".", ",") for row in NUMBERS], "row 1 holds values"),
+        ([f"2024-01-01 10:00:{k:02d},ON,2 V,{k}" for k in range(30)], "row 1 holds values"),
+        (["0.0,2"], "row 1 holds values"),
+        ([",0.5,1.5", *(f"{k},1,{k}" for k in range(30))], "row 1 holds values"),
+        ([row.replace(",", " ") for row in ["t,u,y", *NUMBERS]], "separated by blanks"),
+        ([row.replace(",", "   ") for row in ["t,u,y", *NUMBERS]], "separated by blanks"),
+        ([row.replace(",", "|") for row in ["t,u,y", *NUMBERS]], "separated by vertical bars"),
+        ([row.replace(",", " ") for row in NUMBERS], "separated by blanks(.|\n)*row 1 holds values"),
+        (
+            ["t [s, local],u [V, rms],y", *(row.replace(",", ";") for row in NUMBERS)],
+            "separated by semicolons",
+        ),
+        (["Logger 5", "Rate: 10 Hz", "", "t,u,y", *NUMBERS], "preamble stands before .* row 4"),
+        ([*(f"Key {k},{k}" for k in range(12)), "t,u,y", *NUMBERS], "preamble stands before .* row 13"),
+        (["Logger 5", "t,u,y", "s,V,m", *NUMBERS], "preamble stands before .* row 2"),
+        (
+            [
+                "LabVIEW Measurement\t",
+                "Writer_Version\t2",
+                "***End_of_Header***\t\t\t",
+                "\t",
+                "X_Value\tu\ty\tComment",
+            ]
+            + [f"{row},".replace(",", "\t") for row in NUMBERS],
+            "preamble stands before .* row 5",
+        ),
+        (["t,u,y", *(f"{row}," for row in NUMBERS)], "rows end with a separator .* 4 cells for 3 names"),
+        (["t,u,y,", *NUMBERS], r"the header \(row 1\) ends with a separator"),
+    ],
+)
+def test_a_first_row_that_is_no_header_is_refused_by_its_cause(tmp_path, rows, match):
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(rows))
+    refused(path, match)
+
+
+@pytest.mark.parametrize(
+    ("cell", "match"),
+    [
+        ("ON", "a word for a switch"), ("2 V", r"a number with a unit.*'name \[V\]'"),
+        ("5m/s", "a number with a unit"), ('"1,5"', "a decimal comma"), ('"1.200,5"', "a mark between thousands"),
+        ("1'200.5", "a mark between thousands"), ("2024-01-31 10:00:00", "a date or a time"),
+        ("31.01.2024", "a date or a time"), ("31-Jan-2024 10:00:00", "a date or a time"),
+        ("10:00:00.5", "a date or a time"), ("abc", "repair the value"), ("0x1f", "repair the value"),
+    ],
+)  # fmt: skip
+def test_a_cell_that_is_no_number_is_named_with_what_it_is(tmp_path, cell, match):
+    path = tmp_path / "run.csv"
+    rows = write_csv(path, GOOD).read_text().splitlines()
+    rows[30] = f"0.29,{cell},0.1"
+    path.write_text("\n".join(rows))
+    refused(path, f"row 31, column 'tau' is .* not a finite number.*{match}")
+    rows[30] = "0.29,0.1,0.1"
+    rows.insert(1, "s,N m,rad")
+    path.write_text("\n".join(rows))
+    refused(path, "row 2, column 'tau' is 'N m', not a finite number.*a row of units")
+
+
+@pytest.mark.parametrize("tail", ["Mean,1,2", "0.9,,", "", "# end", "0.9,1"])
+@pytest.mark.parametrize("note", [False, True])
+def test_a_header_stays_one_whatever_stands_below(tmp_path, tail, note):
+    """Names of many kinds over rows with text, an odd last row, or few rows: the columns are found."""
+    path = tmp_path / "run.csv"
+    rows = [f"{k},{0.5 * k},{k + 1}" + ",a long note" * note for k in range(30)]
+    for header in ("time_s,tau,phi", "1,tau [2 V],0 x", "phase 1,2024,3", '"a\n1",b,c', "x y z,2 x,nan"):
+        for body in ([*rows, tail], rows[:1], []):
+            path.write_text("\n".join([header + ",note" * note, *body]))
+            assert len(opened(path).header) == 3 + note
+
+
+def opaque(name):
+    """An object as MATLAB writes it in level 5: class 17, names and a reference of numbers."""
+
+    def element(kind, content):
+        return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+    numbers = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 2, 1)) + element(1, b"")
+    numbers += element(6, struct.pack("<II", 0xDD000000, 2))
+    texts = b"".join(element(1, text) for text in (name.encode(), b"MCOS", b"timeseries"))
+    return element(14, element(6, struct.pack("<II", 17, 0)) + texts + element(14, numbers))
+
+
+def test_vectors_beside_objects_are_read_and_the_objects_named(tmp_path):
+    path = tmp_path / "run.mat"
+    savemat(path, {"time_s": T, "tau": np.cos(T)})
+    path.write_bytes(path.read_bytes() + opaque("phi") + opaque("stamp"))
+    refused(path, r"no column 'phi'; it has 'time_s', 'tau'.*Not read are objects \(.*\) \('phi', 'stamp'\)")
+    table = read_recording(path, SIGNALS, replace(SPEC, inputs=("time_s",), time=0.01, outputs=("tau",)))
+    np.testing.assert_array_equal(table.y[:, 0], np.cos(T))

@@ -84,7 +84,7 @@ def test_what_cannot_be_split_is_refused(tmp_path):
 def test_runs_of_different_length_sampling_and_format(tmp_path):
     slow, fast = np.arange(0, 9, 0.01), np.arange(0, 4, 0.005)
     long = record(tmp_path / "long.csv", slow)
-    one = {"t": slow, "tau": np.sign(np.cos(7 * slow)), "phi": np.sin(slow), "more": slow}
+    one = {"t": slow, "tau": np.sign(np.cos(7 * slow)), "phi": np.sin(slow) + 1e-6, "more": slow}
     savemat(tmp_path / "matlab.mat", {"run": one})
     np.savez(tmp_path / "short.npz", t=0.005, tau=np.sign(np.cos(7 * fast)), phi=np.sin(fast))
     files = [long, tmp_path / "matlab.mat", tmp_path / "short.npz"]
@@ -93,8 +93,9 @@ def test_runs_of_different_length_sampling_and_format(tmp_path):
     csv, mat, short = data.whole
     assert (len(csv.t), len(mat.t), len(short.t)) == (449, 449, 199)
     for name in ("t", "u", "y", "x", "xdot"):
+        # 1e-6 of the angle makes it another recording
         # ten digits in CSV: 1e-10 times the gain of the second derivative, about 1e3 at 10 ms over 0.1 s
-        np.testing.assert_allclose(getattr(csv, name), getattr(mat, name), atol=1e-6)
+        np.testing.assert_allclose(getattr(csv, name), getattr(mat, name), atol=2e-6)
     np.testing.assert_allclose(short.x, np.c_[np.sin(short.t), np.cos(short.t)], atol=2e-5)
     assert [t.role for t in data.trajectories] == 3 * ["train", "valid", "test"]
     assert data.hash == load_trajectories(files[::-1], SIGNALS, SPEC).hash
@@ -111,8 +112,8 @@ def test_units_of_columns(tmp_path):
     np.testing.assert_allclose(got.y, plain.y, atol=1e-9)  # ten digits of CSV
     np.testing.assert_allclose(got.u, 0.5 * plain.u, atol=1e-12)
     for units, match in (
-        ({"phi": "Nm"}, "unit 'Nm' of column 'phi' is none for phi .rad.; there are: rad, deg"),
-        ({"tau": 0.0}, "factor 0.0 of column 'tau' to torque .N m. must be finite and not zero"),
+        ({"phi": "Nm"}, "'phi' is in 'Nm'"),
+        ({"tau": 0.0}, "'tau': 0.0"),
     ):
         with pytest.raises(InputError, match=match):
             load_trajectories([tmp_path / "run.csv"], SIGNALS, replace(SPEC, units=units))
@@ -184,7 +185,7 @@ def test_units_of_the_specification_are_those_of_a_header():
                     units={"heater": "W", "flow": "m^3/h"})  # fmt: skip
     check_unit(spec, "heater", Signal("heater", "kW"))
     check_unit(spec, "flow", Signal("flow", "l/min"))
-    with pytest.raises(InputError, match=r"unit 'W' of column 'heater' is none for heater \[K\]"):
+    with pytest.raises(InputError, match="'heater' is in 'W'"):
         check_unit(spec, "heater", Signal("heater", "K"))
 
 

@@ -18,10 +18,10 @@ from hybrid_mpc import (
     SwitchingFilter,
     with_input_delay,
 )  # fmt: skip
+from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.embedded import export
 from hybrid_mpc.embedded.generate import make_sources
 from hybrid_mpc.embedded.native import FLAGS, State, goal_of, load_library
-from hybrid_mpc.kit.assembly import disturbance_sizes
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 SOURCES = ("MPC", "PLAN", "FALLBACK", "SAFE", "HELD")
@@ -122,17 +122,10 @@ def filters_of(model, ocp):
     return SwitchingFilter(modes, ((0.97, 0.02, 0.01), (0.5, 0.49, 0.01), (0.45, 0.05, 0.5)))
 
 
-def write_unmeasured(folder, model, ocp, **options):
-    """The C of a controller whose README lacks its sizes: for these all of it would be compiled once more, with -O3."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(export, "footprint", lambda *given: None)
-        return export.write_controller(folder, model, ocp, **options)
-
-
 def write(folder, case, **options):
     """The C of a whole loop, of what ``Loop`` is made of."""
     controller = case.safe.controller
-    return write_unmeasured(
+    return export.write_controller(
         folder, controller.model, controller.ocp, estimator=case.estimator, fallback=case.safe.fallback,
         safe_input=case.safe.safe_input, monitor=case.monitor, guard=case.guard, **options,
     )  # fmt: skip

@@ -175,7 +175,7 @@ def replay(whole, case):
     preview = Previews(
         case.reference, case.weight, ocp, model.dt, np.inf, case.safe.controller.problem.standing()[0]
     )
-    size = case.safe.controller.problem.state_sizes
+    size = case.safe.controller.problem.sizes.states
     names = ENERGY if isinstance(case.monitor, EnergyMonitor) else RESIDUALS
     found, wanted = {name: [] for name in names}, {name: [] for name in names}
     largest_u = largest_x = 0.0

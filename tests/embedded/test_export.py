@@ -1,10 +1,14 @@
 """The folder of C: compiles without a warning, replays its vectors, survives rubbish; what has no C is refused."""
 
+import errno
+import json
 import re
 import shutil
 import subprocess
+import sys
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import embedded_parts as parts
@@ -14,10 +18,15 @@ import pytest
 from embedded_parts import needs_compiler
 
 import hybrid_mpc as hm
-from hybrid_mpc import OCP, CondensedController, InputError
+import nn_export.files
+from hybrid_mpc import OCP, Calibration, CondensedController, InputError, set_calibration
+from hybrid_mpc.embedded import export
 from hybrid_mpc.embedded.export import OTHERS, TOLERANCE
-from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, make_sources
-from hybrid_mpc.embedded.scalar import c_function
+from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, _config, make_sources
+from hybrid_mpc.embedded.scalar import c_function, comment
+from hybrid_mpc.embedded.watch import Watched
+from hybrid_mpc.errors import StorageError
+from hybrid_mpc.files import write_document
 from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 from hybrid_mpc.kit.assembly import make_controller
 
@@ -79,7 +88,7 @@ int main(int count, char **words) {
 
 def written(folder, name, **options):
     model, ocp = MACHINES[name]()
-    parts.write_unmeasured(
+    parts.export.write_controller(
         folder,
         model,
         ocp,
@@ -259,9 +268,14 @@ def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     kit, folder = hm.load(run), tmp_path / "controller"
     with pytest.raises(InputError, match="not empty"):
         hm.generate_controller(kit, run)
+    code, _, err = call("export", "c", run, "--out", folder)  # the run has learned nothing to alarm by
+    assert code == 2
+    assert "--no-monitor" in err
+    set_calibration(run, Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand"))
     code, out, err = call("export", "c", run, "--out", folder)
     assert code == 0, err
-    assert "README.md has the sizes" in out
+    assert "nothing of it was compiled or run" in out
+    assert "Not measured" in (folder / "README.md").read_text()
     assert subprocess.run(["make", "-s", "-C", folder, "CFLAGS=-O1", "test"], check=False).returncode == 0
     task = golf.tasks[0]
     loops = [
@@ -274,6 +288,124 @@ def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     # rounding that a loop of 30 periods on a well damped arm does not let grow
     np.testing.assert_allclose(loops[1].u, loops[0].u, atol=1e-7)
     assert set(loops[1].source) == {"MPC"}
+
+
+@needs_compiler
+def test_the_check_compiles_runs_and_measures(tmp_path, monkeypatch):
+    """Only where it is asked for; a test that fails leaves nothing behind."""
+    model, ocp = parts.delayed()
+    ran = []
+    run = subprocess.run
+    monkeypatch.setattr(
+        export.subprocess, "run", lambda words, **more: ran.append(words) or run(words, **more)
+    )
+    export.write_controller(tmp_path / "a", model, ocp)
+    assert not ran
+    export.write_controller(tmp_path / "a", model, ocp, check=True)
+    assert ran
+    assert re.search(r"flash: code and tables \| [\d,]+", (tmp_path / "a" / "README.md").read_text())
+    monkeypatch.setattr(export, "_vectors", lambda *given, own=export._vectors: own(*given).replace(
+        "vector_u[25][1] = {\n  {R(", "vector_u[25][1] = {\n  {R(9"))  # fmt: skip
+    with pytest.raises(InputError, match="otherwise than Python"):
+        export.write_controller(tmp_path / "b", model, ocp, check=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+HOSTILE = (
+    "phi **//\nint evil(void) { return 1; }\n/*", "x */ int a; /*", "x\\", "a??/", "%n%s", "../../x", "a\x00b",
+    "<script>", "$x$", "a`id`", "a;b", 'a"b', "a\u202eb", "", " ", ".hidden", "-rf", "x" * 200,
+)  # fmt: skip
+
+
+HARMLESS_UNITS = ("../../x", ".hidden", "-rf", "%n%s")
+"""No file is called after a unit, and none is a format."""
+PLACES = (
+    *((("model", role, 0), key) for role in ("states", "inputs", "outputs", "parameters") for key in ("name", "unit")),
+    (("model", "balances", 0), "name"), (("model", "balances", 0), "rate_unit"), (("models",), 0),
+    (("loop", "tasks"), 0),
+)  # fmt: skip
+
+
+def test_no_artifact_carries_code_in_a_name(tmp_path):
+    """Whatever it is the name of, and whoever wrote the folder: its hash is right."""
+    shipped = Path(__file__).parents[1] / "golden" / "golf_robot"
+    for file in ("model.json", "programs.json", "weights.safetensors"):
+        shutil.copy(shipped / file, tmp_path)
+    path = tmp_path / "model.json"
+    whole = path.read_text()
+    for place, key in PLACES:
+        for name in HOSTILE:
+            document = json.loads(whole)
+            del document["sha256"]
+            document["loop"]["tasks"] = ["hold"]
+            inner = document
+            for step in place:
+                inner = inner[step]
+            inner[key] = name
+            if "unit" in str(key) and name in HARMLESS_UNITS:
+                continue
+            write_document(path, document)
+            with pytest.raises(InputError):
+                hm.load(tmp_path)
+    path.write_text(whole)
+    hm.load(tmp_path)
+
+
+def test_c_comments_hold_nothing_but_text():
+    """What is no name comes into C through an expression's: neither closes the comment nor goes on in the next line."""
+    for name in HOSTILE:
+        text = comment(name)
+        assert not {"*", "/", "\\", "?", "\n", "\x00"} & set(text)
+        assert len(text) == len(name)
+    sizes, watched = {"NX": 1}, Watched({}, {}, "", "", {})
+    config = _config(sizes, False, [*HOSTILE, "level"], watched)
+    inside = config.split("/* Hard bounds by their place in given_way:\n")[1].split("*/")[0]
+    assert len(inside.splitlines()) == len([n for n in HOSTILE if n]) + 1
+    assert "level" in inside
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_full_disk_leaves_no_half_of_a_controller(tmp_path, monkeypatch, there):
+    model, ocp = parts.delayed()
+    place = tmp_path / "controller"
+    before = {}
+    if there:
+        export.write_controller(place, model, ocp)
+        (place / "main.c").write_text("int main(void) { return 0; }")
+        before = {p.name: p.read_bytes() for p in place.iterdir()}
+    write = nn_export.files.os.fsync
+    written = []
+
+    def full(handle):
+        written.append(handle)
+        if len(written) > 12:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(nn_export.files.os, "fsync", full)
+        with pytest.raises(StorageError, match="No space left"):
+            export.write_controller(place, model, ocp.changed(r=[2.0]))
+    assert {p.name: p.read_bytes() for p in place.iterdir()} == before if there else not place.exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["controller"] * there  # nothing hidden either
+    export.write_controller(place, model, ocp)  # the same place can be used again
+    assert (place / "hmpc_expressions.h").read_text().endswith("#endif\n")
+    assert (place / "main.c").exists() == there
+
+
+def test_a_limit_on_files_is_a_full_disk_too(tmp_path):
+    """A process of its own, whose files may have 4 KiB: the system itself cuts the writing off."""
+    code = (
+        "import resource, signal, sys\nfrom pathlib import Path\n"
+        "from hybrid_mpc.errors import StorageError\nfrom hybrid_mpc.files import replacing_folder, write_text\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nresource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "try:\n    with replacing_folder(Path(sys.argv[1])) as new:\n"
+        "        write_text(new / 'a', 'x')\n        write_text(new / 'b', 'x' * 5000)\n"
+        "except StorageError:\n    sys.exit(7)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "out"], check=False)
+    assert done.returncode == 7
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_a_compiler_python_solves(monkeypatch, tmp_path):

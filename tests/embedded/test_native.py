@@ -10,8 +10,8 @@ import pytest
 from embedded_parts import CLoop, goal, needs_compiler
 
 from hybrid_mpc import CondensedController, Limits, Loop, SafeController, TrueState
+from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.embedded.native import NativeController
-from hybrid_mpc.kit.assembly import disturbance_sizes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
 from golden_parts import frozen_estimates, machine, previews
@@ -61,7 +61,7 @@ def test_small_machines_with_everything(name):
     """Solves in a row from states that jump: bounds, soft bounds, blocks, delays, disturbances, limits, weights."""
     model, ocp = PROBLEMS[name]()
     python, native = CondensedController(model, ocp), NativeController(model, ocp, flags=parts.QUICK)
-    rng, size = np.random.default_rng(2), python.problem.state_sizes
+    rng, size = np.random.default_rng(2), python.problem.sizes.states
     seen = {"soft": 0, "limit": 0}
     x = model.x0 + 0.2 * size
     plan = python.initial(TrueState(model).start(np.concatenate([x, np.zeros(model.n_h)]), w=model.w))
@@ -105,7 +105,7 @@ def test_a_period_of_c_is_a_period_of_the_loop(name):
     python = SafeController(CondensedController(model, ocp), model, safe_input=safe_input)
     loop, rng = Loop(estimator, python), np.random.default_rng(1)
     c = CLoop(model, ocp, estimator, model, safe_input)
-    z, size = np.concatenate([model.x0, np.zeros(model.n_h)]), python.controller.problem.state_sizes
+    z, size = np.concatenate([model.x0, np.zeros(model.n_h)]), python.controller.problem.sizes.states
     target, w, u = model.x0 + 0.5 * size, model.w, python.controller.problem.u_rest
     target = python.controller.problem.standing()[0] + 2.0 if ocp.n_y else target
     sources = set()

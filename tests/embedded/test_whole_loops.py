@@ -189,10 +189,12 @@ def test_vectors_with_readings_and_no_warning(name, single, tmp_path):
     subprocess.run(words, cwd=tmp_path, check=True)
     assert subprocess.run([tmp_path / "test"], capture_output=True, check=False).returncode == 0
     text = (tmp_path / "hmpc_vectors.h").read_text()
-    changed = re.sub(
-        r"vector_reading_size(\[\d+\]) = \{[^}]*\}", r"vector_reading_size\1 = {R(1e-300)}", text
+    table = re.search(r"vector_reading\[.*?\] = (\{.*?\});", text, re.S)
+    last = re.findall(r"R\([^()]*\)", table[1])[-1]  # of the last period
+    changed = (
+        table[0][: table[0].rindex(last)] + f"{last} + R(1.0)" + table[0][table[0].rindex(last) + len(last) :]
     )
-    (tmp_path / "hmpc_vectors.h").write_text(changed.replace("1e-300", "1e-30") if single else changed)
+    (tmp_path / "hmpc_vectors.h").write_text(text.replace(table[0], changed))
     subprocess.run(words, cwd=tmp_path, check=True)
     assert subprocess.run([tmp_path / "test"], capture_output=True, check=False).returncode == 1
 

@@ -75,7 +75,12 @@ def test_windows_are_of_half_a_second_and_two_at_20_ms(runs):
     fit = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT)
     assert [row["stage"] for row in fit.stages] == ["nominal", *WINDOWS, "free runs of 2.98 s"]
     longer = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, length=1.5)
-    assert [row["stage"] for row in longer.stages] == ["nominal", "free runs of 0.5 s", "free runs of 1.5 s"]
+    assert [row["stage"] for row in longer.stages] == [
+        "nominal",
+        "free runs of 0.5 s",
+        "free runs of 1.5 s",
+        "whole recordings",
+    ]
     known = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, time_unit=0.8)
     assert [row["stage"] for row in known.stages] == [
         "nominal",

@@ -122,7 +122,7 @@ def test_what_is_known_makes_the_rest_surer(runs):
     def spread(kind):
         problem = problem_of(runs, known if kind == "known" else FirstStates(kind))
         point = problem.start(problem.own.scaled(TRUTH), np.tile(START, (RUNS, 1)), "all")
-        slopes, _, _ = problem._eliminated(point)
+        slopes, *_ = problem._eliminated(point)
         return np.diag(np.linalg.inv((slopes.swapaxes(1, 2) @ slopes).sum(axis=0)))
 
     # of the Cramer-Rao bounds: each thing known takes a column from the regression

@@ -354,9 +354,13 @@ class Idle(Pendulum):
 @pytest.mark.parametrize(("kind", "names"), [(Redundant, {"J", "J_2"}), (Idle, {"idle"})])
 def test_parameters_that_the_data_do_not_identify_are_named(noisy_runs, kind, names):
     found = fitted(kind, noisy_runs)
-    (line,) = (line for line in found.warnings if "cannot tell apart" in line)
-    told = set(line.split(": ")[1].split(", "))
-    assert told == names
+    (untold,) = found.unidentified
+    assert set(untold.parameters) == names
+    assert str(untold) in found.warnings
+    if kind is Redundant:  # the sum shows
+        assert not untold.product
+        np.testing.assert_allclose(untold.weights, 1.0, rtol=0.02)
+        assert untold.error < 0.01 * TRUTH["J"]
     inertia = found.values["J"] + found.values.get("J_2", 0.0)
     assert inertia == pytest.approx(TRUTH["J"], rel=0.01)  # what shows is found
 

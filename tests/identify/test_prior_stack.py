@@ -179,7 +179,7 @@ def test_the_exported_model_carries_the_values_and_the_fitted_priors_balance(dat
 def test_what_cannot_be_trained_along_is_refused(data, trained):
     with pytest.raises(InputError, match="rnn has no prior"):
         replace(SHORT, kind="rnn")
-    with pytest.raises(InputError, match="fixed, trained"):
+    with pytest.raises(InputError, match="prior_parameters"):
         replace(SHORT, prior_parameters="free")
     with pytest.raises(InputError, match="no free parameter"):
         TrainedParameters(PublishedPendulumPrior(), 2)

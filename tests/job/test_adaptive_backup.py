@@ -10,6 +10,7 @@ from online_models import pendulum_model
 
 from hybrid_mpc import (
     OCP,
+    DataSpec,
     InputError,
     Mode,
     Scenario,
@@ -23,8 +24,9 @@ from hybrid_mpc.loop.plant import ModelPlant
 
 CONTROL = OCP(20, q=(300.0, 1.0), r=(0.05,), r_delta=(0.05,), u_min=(-6.0,), u_max=(6.0,))
 CAUSES = {"mass": ("J", "mgl"), "friction": ("gamma",), "motor": ("gain of u",)}
+SPEC = DataSpec("t", ("u",), ("y",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.1)
 SCENARIO = Scenario(
-    "pendulum", "", "", prior=pendulum, data=None, control=CONTROL, sensor_sigma=(1e-4,), causes=CAUSES
+    "pendulum", "", "", prior=pendulum, data=SPEC, control=CONTROL, sensor_sigma=(1e-4,), causes=CAUSES
 )
 LATE = with_input_delay(pendulum(), 0.02)
 SIGMA_X = np.array([1e-5, 1e-3])

@@ -106,7 +106,7 @@ def test_what_begins_after_a_gap_is_no_run_of_full_length(machine, tmp_path):
     "given", [{"valid_every": 1}, {"valid_every": -3}, {"valid_every": 2, "cycle": ("train", "valid")}]
 )
 def test_a_bad_choice_of_validating_files_is_refused(given):
-    with pytest.raises(InputError, match="valid_every must be 2 or more"):
+    with pytest.raises(InputError, match="valid_every"):
         BenchmarkSpec({}, **given)
 
 
@@ -120,5 +120,5 @@ def test_figures_of_an_output_may_have_a_unit_of_their_own():
     ]
     with pytest.raises(InputError, match="no output in the units of the benchmark 'yy'; did you mean 'y'"):
         scored_signals(signals, BenchmarkSpec(units={"yy": ("mm", 1e3)}))
-    with pytest.raises(InputError, match="factors of units"):
+    with pytest.raises(InputError, match=r"units\.y"):
         BenchmarkSpec(units={"y": ("mm", 0.0)})

@@ -145,11 +145,11 @@ PLANTED = {
     ),
     "a column in a unit of something else": (
         lambda: replace(KETTLE, data=replace(KETTLE.data, outputs=("level [kg]", "warmth"))),
-        ["column 'level [kg]' is in kg, which is no unit of level [m]. Name the column of that signal, correct"],
+        ["'level [kg]' is in 'kg', which is another quantity for level [m]", "give the factor"],
     ),
     "a unit that nobody knows": (
-        lambda: replace(KETTLE, data=replace(KETTLE.data, units={"level": "inch"})),
-        ["unit 'inch' of column 'level' is none for level [m]", "Or give the factor to m as a number"],
+        lambda: replace(KETTLE, data=replace(KETTLE.data, units={"level": "furlong"})),
+        ["'level' is in 'furlong', which is not known for level [m]", "give the factor"],
     ),
     # balances
     "a balance with a wrong sign": (
@@ -329,7 +329,7 @@ def test_each_planted_error_is_told_with_its_remedy(name):
 
 
 def test_errors_in_different_places_are_told_in_one_pass():
-    """Eleven at once: no part hides what is wrong with another, as long as that other can be asked."""
+    """Ten at once: no part hides what is wrong with another, as long as that other can be asked."""
     wrong = replace(
         kettle(
             algebraic=(Signal("pressure", "Pa"),),
@@ -340,16 +340,15 @@ def test_errors_in_different_places_are_told_in_one_pass():
             output=lambda self, x, u, w, p: (x.level,),
             balances=lambda self, x, u, w, p: (x.level,),
         )(),
-        data=replace(KETTLE.data, inputs=("inflow",), units={"level": "inch"}, disturbances=()),
-        budgets={"quick": replace(BUDGET["quick"], networks=0)},
+        data=replace(KETTLE.data, inputs=("inflow",), units={"level": "furlong"}, disturbances=()),
         tasks=(replace(TASK, x0=(2.0, 0.0)),),
         control=OCP(10, (25,), (1,), (1,), (-5,), (5,)),
     )
     problems = told(wrong)
     for word in (
         "'algebraic'", "corrects names levl", "did you mean 'disturbances'?", "range of warmth", "(x, u, w, p, t)",
-        "output(x, u, w, p) must give 2", "tuple of Balance", "columns of inputs", "unit 'inch'",
-        "columns of disturbances", "networks must be", "task hold: x0", "control: q needs 2", "sensor_sigma needs 2",
+        "output(x, u, w, p) must give 2", "tuple of Balance", "columns of inputs", "is in 'furlong'",
+        "columns of disturbances", "task hold: x0", "control: q needs 2", "sensor_sigma needs 2",
     ):  # fmt: skip
         assert sum(word in problem for problem in problems) == 1, (word, problems)
 

@@ -10,12 +10,21 @@ import numpy as np
 import pytest
 from closed_loop_parts import loop_row
 
-from hybrid_mpc import InputError, RunSettings, Signal, load_scenario, set_process_noise
+from hybrid_mpc import (
+    InputError,
+    RunSettings,
+    Signal,
+    load,
+    load_scenario,
+    set_calibration,
+    set_process_noise,
+)
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.controllers import CONTROLLERS, ORACLES
-from hybrid_mpc.job.loops import limits_used
+from hybrid_mpc.job.loops import MODEL, LoopSpec, limits_used
 from hybrid_mpc.job.sequential import looks
-from hybrid_mpc.job.stages.compare import TIMED, _seeds, compare, parts_of
+from hybrid_mpc.job.stages import compare as stage
+from hybrid_mpc.job.stages.compare import TIMED, _seeds, compare, control_stage, parts_of, run_specs
 from hybrid_mpc.job.stages.results import gap_closed
 from hybrid_mpc.job.summary import by_task, interval, summaries
 from hybrid_mpc.job.tasks import tasks_of
@@ -229,3 +238,21 @@ def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, j
     other = compare(context)  # loops of another filter: none of those that are kept
     assert [r.controller for r in other] == [r.controller for r in rows]
     assert all(a.cost != b.cost for a, b in zip(other, rows, strict=True))
+
+
+def test_loops_leave_the_limits_in_the_artifact_and_do_not_depend_on_them(run_folder, tmp_path, monkeypatch):
+    out = shutil.copytree(run_folder, tmp_path / "run")
+    context = Context(RunSettings("golf_robot", budget="quick"), GOLF, out)
+    learned = load(out).calibration
+    assert learned is not None
+    spec = LoopSpec("golf_robot", MODEL, "track_sine", "hybrid_observer", duration=0.5)
+    monkeypatch.setattr(type(context), "read", lambda self, stage: None)
+    monkeypatch.setattr(stage, "compare", lambda context: run_specs("golf_robot", out / "model", [spec]))
+    found = []
+    for rest in ((0.3,), (0.02,)):
+        calibration = replace(learned, rest_speed=rest)
+        set_calibration(out / "model", calibration)
+        found.append(control_stage(context).rows[0])
+        assert load(out).calibration == calibration
+    assert found[0].largest_level > 0
+    assert found[0].largest_level == found[1].largest_level

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from hybrid_mpc import Bench, InputError, LoopSpec, OperatingPoint, load, load_scenario
 from hybrid_mpc.job.default_tasks import default_tasks
-from hybrid_mpc.job.loops import stand_in
+from hybrid_mpc.job.loops import DRAWN_PRIOR, drawn_prior, moves_otherwise, stand_in
 from hybrid_mpc.job.stages.results import read_results
 from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.model.riccati import hidden_fixed_point
@@ -198,3 +198,40 @@ def test_a_prior_that_does_not_rest_gets_no_default_tasks():
         InputError, match=r"upper, lower of the prior would not rest at .* give operating_point"
     ):
         default_tasks(scenario)
+
+
+def test_where_the_networks_correct_nothing_no_controller_meets_its_own_model(kit):
+    prior = kit.models["prior"]
+    null = {"prior": prior, "hybrid": replace(prior, name="hybrid")}
+    alike = replace(kit, models=null, members={"hybrid_1": replace(prior, name="hybrid_1")})
+    for name in ("prior_observer", "hybrid_observer"):
+        plant = stand_in(alike, name).model
+        assert plant.name == DRAWN_PRIOR
+        assert moves_otherwise(prior, plant)
+        assert np.array_equal(plant.p, stand_in(alike, name).model.p)
+    certain = {
+        name: replace(model, covariance=tuple((0.0,) * prior.n_p for _ in range(prior.n_p)))
+        for name, model in null.items()
+    }
+    for models in (certain, {name: replace(model, covariance=()) for name, model in certain.items()}):
+        for name in ("prior_observer", "hybrid_observer"):
+            with pytest.raises(InputError, match="correct nothing"):
+                stand_in(replace(alike, models=models), name)
+
+
+def test_drawn_parameters_scatter_as_their_covariance_says_and_keep_their_bounds(kit, monkeypatch):
+    prior = kit.models["prior"]
+    wide = tuple(replace(p, lower=-np.inf, upper=np.inf) for p in prior.parameters)
+    covariance = np.array(prior.covariance)
+    free = replace(prior, parameters=wide)
+    draws = []
+    generator = np.random.default_rng
+    for seed in range(400):
+        monkeypatch.setattr(np.random, "default_rng", lambda _, seed=seed: generator(seed))
+        draws.append(drawn_prior(free).p)
+        kept = drawn_prior(prior)
+        assert all(p.lower <= p.value <= p.upper for p in kept.parameters)
+    found, size = np.cov(np.array(draws).T), np.sqrt(np.diag(covariance))
+    scale = np.where(size > 0, size, 1.0)
+    # four deviations of a correlation of 400 draws
+    np.testing.assert_allclose(found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.3)

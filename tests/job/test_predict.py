@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from patience import HANGS
 
 from hybrid_mpc import InputError, load, load_trajectories, predict
 from hybrid_mpc.kit.artifact import read_description, write_description
@@ -152,6 +153,6 @@ def test_it_needs_no_torch(bare_tanks, model, tmp_path):
         "from hybrid_mpc.cli.main import main\nmain()"
     )
     words = ["predict", str(model), str(bare_tanks / "later.csv"), "--out", str(tmp_path / "o")]
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=HANGS)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "o" / "later.png").is_file()

@@ -8,12 +8,15 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from patience import HANGS
 
 from hybrid_mpc import InputError, load
 from hybrid_mpc.job.stages.results import read_results
+from hybrid_mpc.kit.artifact import BENCHMARK_NOTE, read_description, write_description
 
 
 def results(folder):
@@ -80,7 +83,7 @@ def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp
     out = tmp_path / "run"
     command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + HANGS
     while not list(out.glob("checkpoints/training/*/*.safetensors")):  # in the middle of the training
         assert process.poll() is None
         assert time.monotonic() < deadline
@@ -88,7 +91,7 @@ def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not (out / "results.json").exists()
-    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=HANGS)
     assert done.returncode == 0, done.stdout + done.stderr
     assert without_timing(out) == without_timing(finished)
     assert (out / "model" / "weights.safetensors").read_bytes() == (
@@ -111,7 +114,7 @@ def test_killed_several_times(finished, arguments, tmp_path):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     resume = ["--resume"] if (out / "run.json").is_file() else []
-    done = subprocess.run([*command, *resume], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([*command, *resume], capture_output=True, text=True, timeout=HANGS)
     assert done.returncode == 0, done.stdout + done.stderr
     assert without_timing(out) == without_timing(finished)
 
@@ -204,3 +207,27 @@ def test_the_main_job_says_what_its_guard_lacks(finished):
     assert "No detector could be learned" in page
     stored = load(finished / "model").calibration
     assert stored.detector is None
+
+
+def test_the_folder_alone_is_monitored(call, machine, finished, tmp_path):
+    """The machine of the folder is a user's own, so no name says where its scenario is."""
+    found = []
+    for extra in ((), ("--scenario", machine / "my_machine.py")):
+        out = tmp_path / f"out{len(extra)}"
+        code, told, error = call("monitor", finished, machine / "monday.csv", "--out", out, *extra)
+        assert code == 0, told + error
+        found.append(((out / "monitor.json").read_text(), (out / "monday.csv").read_text()))
+    assert found[0] == found[1]
+    bare = shutil.copytree(finished / "model", tmp_path / "model")
+    write_description(bare, replace(read_description(bare), predicting=None))
+    code, _, error = call("monitor", bare, machine / "monday.csv", "--out", tmp_path / "none")
+    assert code == 2
+    assert "--scenario" in error
+
+
+def test_a_benchmark_s_folder_is_told_from_an_artifact(tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / BENCHMARK_NOTE).write_text("{}")
+    for folder in (tmp_path, tmp_path / "model"):
+        with pytest.raises(InputError, match="hybrid-mpc benchmark"):
+            load(folder)

@@ -12,6 +12,7 @@ from hybrid_mpc.cli.run import comparison_lines
 from hybrid_mpc.job.sequential import SAME, Comparison, compare_costs, looks
 from hybrid_mpc.job.stages.compare import comparisons, decided
 from hybrid_mpc.job.stages.results import Control, ControlDetails, ControllerCosts
+from hybrid_mpc.job.summary import interval, summaries
 
 
 @pytest.mark.parametrize("most", range(1, 40))
@@ -139,3 +140,32 @@ def test_a_task_is_decided_where_the_harder_baseline_is():
     # nor does a baseline that diverges
     assert decided(cells(hybrid_observer=0.5 * noise, prior_observer=noise, prior=[math.inf] * 7), most=10)
     assert not decided(cells(hybrid_observer=[math.inf] * 7, prior_observer=noise, prior=noise), most=10)
+
+
+@pytest.mark.parametrize("most", [4, 10, 30])
+def test_mean_costs_of_all_looks_hold_together(most):
+    """Of every controller, the oracle's with fewer seeds too: loops may stop at whatever look."""
+    repetitions, few, rng = 600, max(2, most // 2), np.random.default_rng(most)
+    draws = 5.0 + rng.standard_normal((repetitions, most))
+    missed = dict.fromkeys(("hybrid_observer", "oracle"), 0)
+    for row in draws:
+        found = []
+        for n in looks(most):
+            costs = {"hybrid_observer": row[:n].tolist(), "oracle": row[: min(n, few)].tolist()}
+            rows = [row for own in cells(**costs).values() for row in own]
+            (task,) = summaries(rows, most).values()
+            found.append({name: task[name].cost for name in costs})
+        for name in missed:
+            missed[name] += any(abs(look[name].mean - 5.0) > look[name].ci95 for look in found)
+    # three standard deviations of a share of 5 %
+    for name, count in missed.items():
+        assert 0 < count / repetitions <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / repetitions), name
+
+
+def test_a_fixed_number_of_loops_has_ordinary_intervals():
+    costs = [1.0, 1.5, 0.7, 1.1, 0.9, 1.2]
+    rows = cells(hybrid_observer=costs)["hybrid_observer"]
+    half = {most: summaries(rows, most)[rows[0].task]["hybrid_observer"].cost.ci95 for most in (None, 6, 18)}
+    assert half[None] == half[6] == pytest.approx(interval(costs).ci95)
+    spread = np.std(costs, ddof=1) / math.sqrt(6)
+    assert half[18] == pytest.approx(student.ppf(1 - 0.05 / 6 / 2, 5) * spread)

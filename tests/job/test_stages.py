@@ -14,6 +14,7 @@ import pytest
 
 from hybrid_mpc import InputError, RunSettings, load, load_scenario
 from hybrid_mpc.job import run as job
+from hybrid_mpc.job import stage as stages
 from hybrid_mpc.job.context import Context, Progress
 from hybrid_mpc.job.run import NAMES, STAGES, _as_it_is, _end
 from hybrid_mpc.job.stage import (
@@ -136,6 +137,30 @@ def test_only_and_skip(own, call):
         assert (code, told in message.replace("\n", " ")) == (2, True)
 
 
+def test_only_control_after_an_edit_takes_the_edited_problem_and_keeps_the_monitor(own, call):
+    source, out, command = own
+    before = load(out / "model")
+    text = source.read_text()
+    source.write_text(text + "\nproblem = scenario.control.changed(q=[2.0 * q for q in scenario.control.q])\n"
+                      "scenario = dataclasses.replace(scenario, control=problem)\n")  # fmt: skip
+    code, said, message = call(*command, "--only", "control")
+    assert code == 0, said + message
+    after = load(out / "model")
+    np.testing.assert_allclose(after.control.q, 2.0 * np.array(before.control.q))
+    assert after.calibration == before.calibration
+    assert after.residuals == before.residuals
+    # limits of the input are the observer's too: with them a stage that control needs is out of date
+    source.write_text(source.read_text().replace("changed(", "changed(u_max=[0.5], ", 1))
+    kept = (out / "model" / "model.json").read_bytes()
+    code, _, message = call(*command, "--only", "control")
+    assert code == 2
+    assert "limits of the input has changed" in message
+    assert (out / "model" / "model.json").read_bytes() == kept
+    code, said, message = call(*command, "--only", "noise", "--only", "control")
+    assert code == 0, said + message
+    assert load(out / "model").control.u_max == (0.5,)
+
+
 def test_only_the_first_stages_of_a_new_run(own, call, tmp_path):
     """The fit alone is no error; what cannot run is refused before there is a folder."""
     _, _, command = own
@@ -206,6 +231,48 @@ def test_a_stage_is_computed_once_and_again_where_what_it_reads_has_changed(cont
     for _ in range(2):
         bring_up_to_date(Context(context.settings, context.scenario, context.out), unknown)
     assert calls == [0, 5, 0, 0]
+
+
+def test_another_program_computes_its_stages_again_and_says_why(context, monkeypatch):
+    stage, warned = one(lambda context: Sum(1.0, (), {})), []
+    bring_up_to_date(context, stage)
+    monkeypatch.setattr(stages, "program", lambda: "another")
+    fresh = Context(context.settings, context.scenario, context.out)
+    monkeypatch.setattr(fresh.progress, "warn", warned.append)
+    assert bring_up_to_date(fresh, stage) == ""
+    assert warned == ["stage sum runs again: the program has changed"]
+    again = Context(context.settings, context.scenario, context.out)
+    assert bring_up_to_date(again, stage) == "up to date"
+
+
+def test_the_program_is_its_sources_but_for_what_only_shows(tmp_path):
+    def of():
+        stages.program.cache_clear()
+        return stages.program(tmp_path / "own")
+
+    files = {
+        "a.py": 1,
+        "embedded/c/loop.c": 1,
+        "loop.h": 1,
+        "plots/style.py": 0,
+        "job/stages/report.py": 0,
+        "x.md": 0,
+    }
+    for name in files:
+        (tmp_path / "own" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "own" / name).write_text("1")
+    before = of()
+    for name, counts in files.items():
+        (tmp_path / "own" / name).write_text("2")
+        assert (of() != before) == bool(counts), name
+        before = of()
+    (tmp_path / "own" / "a.py").rename(tmp_path / "own" / "b.py")
+    assert of() != before
+    stages.program.cache_clear()
+    there = {path.relative_to(report.LIBRARY).as_posix() for path in report.LIBRARY.rglob("*")}
+    assert set(stages.LOOK) <= there
+    shown = {name for name in there if name.endswith(".py") and name.startswith(stages.LOOK)}
+    assert {name for name in shown if not name.startswith("cli/")} <= set(report.page_sources())
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from hybrid_mpc.loop.realtime import RealClock
 SAFE = 0.25
 LONG = 60.0
 """Seconds for which what blocks would block."""
+NAP = 0.05
 
 
 class LoggedRig(Rig):
@@ -42,7 +43,12 @@ class LoggedRig(Rig):
 
     def block(self):
         self.note("here")
-        time.sleep(LONG)
+        self.sleep()
+
+    def sleep(self):
+        """Sleep long, in naps: a signal in the instant before the call of a nap is seen after it."""
+        for _ in range(round(LONG / NAP)):
+            time.sleep(NAP)
 
     def at(self, count, function):
         """``function``, blocked in its call number ``count``."""
@@ -109,11 +115,12 @@ def in_actuate(machine):
 def final_wait(machine):
     class Clock(RealClock):
         def sleep_until(self, t):
-            if len(machine.u) == 4:
+            if machine.u:
                 machine.block()
             super().sleep_until(t)
 
-    make_runner(MODEL, SAFE_CONTROLLER, machine, Clock(), safe_input=[SAFE]).run(4 * DT)
+    # a single period: where a loaded machine passes some over, the number of a later one is not known
+    make_runner(MODEL, SAFE_CONTROLLER, machine, Clock(), safe_input=[SAFE]).run(DT)
 
 
 def swallowed(machine):
@@ -124,7 +131,7 @@ def swallowed(machine):
         try:
             if len(machine.y) == 5:
                 machine.note("here")
-                time.sleep(LONG)
+                machine.sleep()
         except BaseException:
             machine.note("swallowed")
         return ordinary()

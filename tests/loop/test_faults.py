@@ -64,11 +64,11 @@ def test_start_counts_and_end_does_not_in_spite_of_rounding():
         ((0.0, 1.0, "sensor_offset"), "measurement_offset"),
         ((1.0, 1.0, "input_gain"), "empty"),
         ((2.0, 1.0, "input_gain"), "empty"),
-        ((np.nan, 1.0, "input_gain"), "empty"),
+        ((np.nan, 1.0, "input_gain"), "start"),
         ((0.0, 1.0, "input_gain", np.nan), "finite"),
         ((0.0, 1.0, "input_gain", np.inf), "finite"),
         ((0.0, 1.0, "input_gain", 1.0, "", -1.0), "ramp"),
-        ((0.0, 1.0, "input_gain", 1.0, 1), "name of an output or input"),
+        ((0.0, 1.0, "input_gain", 1.0, 1), "channel"),
         ((0.0, 1.0, "inputs", 1.0), "plant_"),
     ],
 )

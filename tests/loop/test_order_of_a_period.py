@@ -266,7 +266,7 @@ def test_what_cannot_be_is_refused(model, safe):
         make_loop(model, safe).step([0.0])
     with pytest.raises(InputError, match="give monitor="):
         make_loop(model, safe, guard=Guard())
-    with pytest.raises(InputError, match=r"set-point of shape \(2,\)"):
+    with pytest.raises(InputError, match=r"the reference has shape"):
         make_loop(model, safe, reference=[0.0])
     with pytest.raises(InputError, match="sensor_delay: a whole number"):
         make_loop(model, safe, sensor_delay=0.5)
@@ -276,7 +276,7 @@ def test_what_cannot_be_is_refused(model, safe):
         make_loop(replace(model, dt=0.01), safe)
     loop = make_loop(model, safe)
     loop.start([0.0])
-    with pytest.raises(InputError, match="1 measured disturbances given"):
+    with pytest.raises(InputError, match="measured disturbances"):
         loop.step([0.0], [1.0])
     with pytest.raises(InputError, match="the measurement has shape"):
         loop.step([0.0, 1.0])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from closed_loop_parts import Rig, make_runner
+from patience import HANGS
 
 from hybrid_mpc import SafeEnd
 
@@ -42,11 +43,7 @@ class Child:
         eventually(lambda: text in self.log())
 
     def send(self, *names):
-        """Each once the process stands: asleep, stopped, or at its end, as where nothing stops a group of orphans.
-
-        Python looks for a signal before a call that blocks, not within it: one that comes between the look and the
-        system call waits for the end of the call (17 of 8000 signals sent at such an instant).
-        """
+        """Each once the process stands: asleep, stopped, or at its end, as where nothing stops a group of orphans."""
         for name in names:
             assert name == "SIGCONT" or not self.ended
             eventually(self._stands)
@@ -75,8 +72,8 @@ class Child:
 
 
 def eventually(true):
-    """Wait until something is true; what takes longer than ten seconds has failed on any machine."""
-    end = time.monotonic() + 10.0
+    """Wait until something is true."""
+    end = time.monotonic() + HANGS
     while not true():
         assert time.monotonic() < end
         time.sleep(0.005)
@@ -188,8 +185,30 @@ def test_no_instant_lets_a_signal_past_the_hand_over(start):
     assert child.log() == ["True"]
 
 
+@pytest.fixture
+def foreground():
+    """Handlers as of a program in the foreground: in the background SIGINT is ignored, under ``nohup`` SIGHUP."""
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)}
+    for number in before:
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+def test_a_signal_that_is_ignored_stays_so(foreground, number):
+    signal.signal(number, signal.SIG_IGN)
+    with SafeEnd(lambda: None) as end:
+        assert signal.getsignal(number) is signal.SIG_IGN
+        os.kill(os.getpid(), number)
+        assert not end.cause
+    assert signal.getsignal(number) is signal.SIG_IGN
+
+
 @pytest.mark.parametrize("error", [None, OSError])
-def test_handlers_are_those_of_before(model, safe, error):
+def test_handlers_are_those_of_before(model, safe, foreground, error):
     names = [s for s in signal.Signals if s not in (signal.SIGKILL, signal.SIGSTOP)]
     before, during = [signal.getsignal(s) for s in names], []
 
@@ -210,7 +229,7 @@ def test_handlers_are_those_of_before(model, safe, error):
     assert changed <= {"SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGXCPU", "SIGTSTP"}
 
 
-def test_a_handler_installed_during_the_run_stays():
+def test_a_handler_installed_during_the_run_stays(foreground):
     def later(number, frame):
         pass
 

@@ -145,3 +145,15 @@ def test_bad_input_is_refused(learned):
         Detector(0.02, ((1.0, 0.0),), (), 0.5, 4.0)
     with pytest.raises(InputError, match=r"no field 'drfit'; did you mean 'drift'"):
         record(Detector, {**plain(detector), "drfit": 1.0}, "calibration.json")
+
+
+def test_a_detector_that_cannot_alarm_on_what_it_reads_is_refused():
+    scales = (1.0, 0.0, 0.0, 0.0)
+    stored = plain(Detector(0.02, (scales,), scales, 0.5, 4.0, 3.0))
+    assert record(Detector, stored, "model.json").energy_threshold == 3.0
+    with pytest.raises(InputError, match="energy_threshold"):
+        record(Detector, {k: v for k, v in stored.items() if k != "energy_threshold"}, "model.json")
+    with pytest.raises(InputError, match="energy_threshold"):
+        Detector(0.02, (scales,), (), 0.5, 4.0, 3.0)
+    with pytest.raises(InputError, match="finite"):
+        Detector(0.02, (scales,), (), 0.5, np.inf)

@@ -139,6 +139,7 @@ def test_every_consumer_takes_the_stored_value():
         (1.0, 0, 0, 0),
         1.0,
         9.0,
+        9.0,
         rest_speed=(0.003,),
         false_alarms_per_hour=1.0,
         time_unit=2.0,

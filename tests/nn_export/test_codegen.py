@@ -1,7 +1,9 @@
 """C code: the same numbers, cached by content, safe with damaged files and many processes."""
 
+import errno
 import multiprocessing
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,7 +16,9 @@ import numpy as np
 import pytest
 from export_parts import traced_cell
 
+import nn_export.files
 from nn_export import build, codegen, compile_function, generate_c, unroll, with_jacobian
+from nn_export.c_names import refused_name
 from nn_export.errors import CompileError
 
 needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler on this machine")
@@ -310,3 +314,60 @@ def test_the_test_program_sees_a_difference(tmp_path):
         command = ["cc", "-o", str(tmp_path / "main"), str(files.source), str(files.test), "-lm"]
         subprocess.run(command, check=True, capture_output=True)
         assert subprocess.run([str(tmp_path / "main")], capture_output=True).returncode == status
+
+
+HEADERS = ("math", "stdio", "stdlib", "string")
+
+
+@pytest.mark.parametrize(
+    "name", ["double", "int", "main", "sin", "free", "class", "and", "read", "y0", "EOF", "k", "f_t"]
+)
+def test_names_that_mean_something_in_c_are_refused(tmp_path, name):
+    x = ca.MX.sym("x")
+    for write in (compile_function, generate_c):
+        with pytest.raises(CompileError, match=repr(name)):
+            write(ca.Function(name, [x], [x * x]), folder=tmp_path / "there")
+    assert not list(tmp_path.glob("there/*.c"))
+
+
+def test_names_of_machines_are_not_refused():
+    assert not [
+        n for n in ("step", "xdot", "output", "torque", "stress", "f", "K", "square") if refused_name(n)
+    ]
+
+
+@needs_compiler
+@pytest.mark.parametrize("given", [["-std=c11"], ["-std=gnu17", "-D_GNU_SOURCE"]])
+def test_no_function_of_this_machine_s_headers_is_missing(given):
+    """Whatever the generated code's headers declare here: of a library that is not glibc, too."""
+    source = "".join(f"#include <{name}.h>\n" for name in HEADERS)
+    text = subprocess.run(
+        ["cc", "-E", "-P", *given, "-"], input=source, capture_output=True, text=True, check=True
+    ).stdout
+    declared = set(re.findall(r"\b([A-Za-z]\w*)\s*\((?!\()", text))
+    assert len(declared) > 200
+    assert not [name for name in declared if not refused_name(name)]
+
+
+def test_names_of_arguments_carry_no_code(tmp_path):
+    """CasADi writes them into comments as they are."""
+    x = ca.MX.sym("x")
+    inner = ca.Function("inner", [x], [x * x], ["a*/b"], ["c"], {"never_inline": True})
+    for f in (inner, ca.Function("outer", [x], [inner(x)])):
+        for write in (compile_function, generate_c):
+            with pytest.raises(CompileError, match="inner"):
+                write(f, folder=tmp_path / "there")
+
+
+def test_a_full_disk_leaves_no_half_of_a_file(tmp_path, monkeypatch):
+    x = ca.MX.sym("x")
+
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(nn_export.files.os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            generate_c(ca.Function("f", [x], [x * x]), tmp_path)
+    assert not list(tmp_path.iterdir())
+    assert generate_c(ca.Function("f", [x], [x * x]), tmp_path).test.is_file()

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from patience import HANGS
 
 from nn_export.files import MAX_DEPTH, MAX_VALUES, parse_json, read_bytes, replacing, sweep, write_bytes
 
@@ -24,7 +25,7 @@ def refused(path, limit=1000):
     start = time.monotonic()
     with pytest.raises(OSError, match=r"\w") as caught:
         read_bytes(path, limit)
-    assert time.monotonic() - start < 10.0  # none of them waits; a busy machine may
+    assert time.monotonic() - start < HANGS  # none of them waits
     assert caught.value.filename == str(path)
     return caught.value.strerror
 
@@ -119,7 +120,9 @@ def test_json_with_traps_is_refused(content, reason):
     start = time.process_time()
     with pytest.raises(ValueError, match=reason) as caught:
         parse_json(content)
-    assert time.process_time() - start < 1.0  # a second: none of them takes long
+    assert (
+        time.process_time() - start < 10.0
+    )  # [s] of the processor; reading without limits takes minutes and all memory
     assert len(str(caught.value)) < 120  # a reason, not the content
 
 

@@ -9,8 +9,9 @@ import subprocess
 
 import numpy as np
 import pytest
+from patience import HANGS
 
-from hybrid_mpc.plots.interactive import MOST, over_time, thinned, write_interactive
+from hybrid_mpc.plots.interactive import MOST, over_time, plain, thinned, write_interactive
 from hybrid_mpc.plots.style import new_figure, save
 from hybrid_mpc.report.page import Report, Section, render
 
@@ -118,7 +119,7 @@ def test_a_browser_draws_it_without_an_error(drawn, tmp_path):
     done = subprocess.run(
         ["chromium", "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom",
          "--virtual-time-budget=8000", file.as_uri()],
-        capture_output=True, text=True, timeout=120,
+        capture_output=True, text=True, timeout=HANGS,
     )  # fmt: skip
     told = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     assert not [line for line in told if "rror" in line], told
@@ -139,3 +140,27 @@ def test_a_long_curve_keeps_its_peaks():
     assert len(short) == MOST
     assert np.all(np.diff(short) >= 0)
     assert short[np.nanargmax(kept)] == 31_415
+
+
+def test_a_label_is_no_html_and_no_formula(tmp_path):
+    """Tooltips are HTML that Bokeh fills in as it is; a recording's file name may be anything."""
+    figure, axes = new_figure(1, 1, title="costs $1 and $2")
+    axes[0, 0].plot([0.0, 1.0], [0.0, 1.0], label="<img src=x onerror=alert(1)>")
+    axes[0, 0].set_xlabel("time [s]")
+    axes[0, 0].set_ylabel(r"\(x\) [m]")
+    assert figure.get_suptitle() == r"costs \$1 and \$2"
+    save(figure, tmp_path / "a.png")  # a formula that is none would raise
+    held = json.loads(write_interactive(figure, tmp_path / "a.png").read_text())
+    names = [name for name in strings_of(held, "name") if "img" in name]
+    assert names == ["&lt;img src=x onerror=alert(1)&gt;"]
+    assert plain(r"\(x\) [m]") == "(x\\) [m]"
+
+
+def strings_of(value, key):
+    """All texts under a key, however deep."""
+    if isinstance(value, list):
+        return [found for one in value for found in strings_of(one, key)]
+    if not isinstance(value, dict):
+        return []
+    own = [value[key]] if isinstance(value.get(key), str) else []
+    return own + [found for one in value.values() for found in strings_of(one, key)]

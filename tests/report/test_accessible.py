@@ -17,6 +17,7 @@ from hybrid_mpc.report.page import Hint, KeyFigure, Report, Section, Table, rend
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report_example as example
+from patience import HANGS
 
 LEAST = 4.5
 """Contrast of text of ordinary size, WCAG 2.2, criterion 1.4.3, level AA."""
@@ -86,7 +87,7 @@ def test_all_text_stands_out_from_what_is_behind_it(text, tmp_path, dark):
     done = subprocess.run(
         ["chromium", "--headless=new", "--no-sandbox", "--disable-gpu", "--dump-dom", "--virtual-time-budget=4000",
          file.as_uri()],
-        capture_output=True, text=True, timeout=120,
+        capture_output=True, text=True, timeout=HANGS,
     )  # fmt: skip
     told = re.search(r'<pre id="answer">(.*?)</pre>', done.stdout, re.DOTALL)
     assert told, done.stderr[-2000:]

@@ -134,6 +134,7 @@ typedef struct {
   hmpc_real a[HMPC_NZ][HMPC_NT], half[HMPC_NZ], diagonal[HMPC_NZ], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];
   hmpc_real h[HMPC_NT][HMPC_NT], gram[HMPC_NT][HMPC_NT];
   hmpc_real bound[HMPC_TARGET_ROWS][HMPC_NT], end[HMPC_TARGET_ROWS], seen[HMPC_TARGET_ROWS][HMPC_NT], answer;
+  int straight; /* whether the last descent took whole steps alone */
 } hmpc_search;
 #endif
 

@@ -59,6 +59,13 @@ static void together(hmpc_state *s, const real *share) {
   if (HMPC_ND > 0) memcpy(s->d, z + HMPC_NZ, sizeof s->d);
 }
 
+/* Product of what two outputs show of the states, these in the squares of the sizes that distances count in. */
+static real shown(int i, int j) {
+  real sum = R(0.0);
+  for (int k = 0; k < HMPC_NX; ++k) sum += output_x[i][k] * start_weight[k] * output_x[j][k];
+  return sum;
+}
+
 /* Estimate at rest: the state nearest to the operating point's with these outputs. */
 void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
   real z[HMPC_LE] = {R(0.0)}, z_next[HMPC_LZ] = {R(0.0)};
@@ -72,9 +79,10 @@ void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
       real sum = error[i];
       for (int j = 0; j <= i; ++j) {
         const int both = hmpc_finite(y[i]) && hmpc_finite(y[j]);
-        real rest = both ? hmpc_dot(output_x[i], output_x[j], HMPC_NX) : i == j ? R(1.0) : R(0.0);
+        real rest = both ? shown(i, j) : i == j ? R(1.0) : R(0.0);
         for (int k = 0; k < j; ++k) rest -= l[i][k] * l[j][k];
-        l[i][j] = i == j ? hmpc_sqrt(rest) : rest / l[j][j];
+        /* an output of states that are known exactly moves none */
+        l[i][j] = i != j ? rest / l[j][j] : rest > R(0.0) ? hmpc_sqrt(rest) : R(INFINITY);
         if (j < i) sum -= l[i][j] * error[j];
       }
       error[i] = sum / l[i][i];
@@ -82,7 +90,7 @@ void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
     for (int i = HMPC_NY - 1; i >= 0; --i) {
       for (int j = i + 1; j < HMPC_NY; ++j) error[i] -= l[j][i] * error[j];
       error[i] /= l[i][i];
-      if (hmpc_finite(y[i])) hmpc_add(z, error[i], output_x[i], HMPC_NX);
+      for (int k = 0; k < HMPC_NX && hmpc_finite(y[i]); ++k) z[k] += error[i] * output_x[i][k] * start_weight[k];
     }
   }
   for (int i = 0; i < HMPC_DELAYED; ++i) z[HMPC_NX + i] = u_rest[i % HMPC_NU];
@@ -172,7 +180,7 @@ static int lost(const hmpc_filter *f, int mode) {
   int far = 0;
   for (int i = 0; i < HMPC_NE; ++i) {
     far |= !hmpc_finite(f->z[i]);
-    far |= !(f->p[i][i] <= lost_variance[mode]);
+    far |= !(f->p[i][i] <= lost_variance[mode][i]);
     sum += f->p[i][i];
   }
   return far || !hmpc_finite(sum);

@@ -85,16 +85,17 @@ static void settle(hmpc_state *s, const real *v, const real *goal, const real *w
   for (int round = 0; round < HMPC_TARGET_SETTLING; ++round) {
     hmpc_point *const at = &work->settled;
     real move[HMPC_NH], most = R(0.0), there[NT];
+    const real *const size = target_scale + HMPC_NX;
     for (int i = 0; i < HMPC_NH; ++i) {
-      move[i] = -at->rest[HMPC_NX + i];
+      move[i] = -at->rest[HMPC_NX + i] / size[i];
       most = hmpc_max(most, hmpc_abs(move[i]));
       for (int j = 0; j < HMPC_NH; ++j)
-        work->a[i][j] = at->slope[HMPC_NX + i][HMPC_NX + j] - (i == j ? R(1.0) : R(0.0));
+        work->a[i][j] = (at->slope[HMPC_NX + i][HMPC_NX + j] - (i == j ? R(1.0) : R(0.0))) * size[j] / size[i];
     }
     if (!hmpc_all_finite(at->rest, HMPC_NZ) || most < HMPC_TARGET_STEADY) break;
     if (!solve(work->a, move, HMPC_NH)) return;
     memcpy(there, at->v, sizeof there);
-    hmpc_add(there + HMPC_NX, R(1.0), move, HMPC_NH);
+    for (int i = 0; i < HMPC_NH; ++i) there[HMPC_NX + i] += size[i] * move[i];
     look(s, there, goal, w, at);
   }
   if (work->settled.merit < to->merit) *to = work->settled;
@@ -316,10 +317,11 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   int order[HMPC_NZ], tracked = 0, count = 0;
   for (int i = 0; i < HMPC_NZ; ++i) {
     for (int j = 0; j < HMPC_NZ; ++j)
-      work->a[i][j] = (at->slope[i][j] - (i == j ? R(1.0) : R(0.0))) * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) work->a[i][HMPC_NZ + j] = at->slope[i][HMPC_LZ + j] * target_scale[HMPC_NZ + j];
+      work->a[i][j] = (at->slope[i][j] - (i == j ? R(1.0) : R(0.0))) * target_scale[j] / target_heed[i];
+    for (int j = 0; j < HMPC_NU; ++j)
+      work->a[i][HMPC_NZ + j] = at->slope[i][HMPC_LZ + j] * target_scale[HMPC_NZ + j] / target_heed[i];
     if (!hmpc_all_finite(work->a[i], NT) || !hmpc_finite(at->rest[i])) return 0;
-    row[i] = -at->rest[i];
+    row[i] = -at->rest[i] / target_heed[i];
   }
   const int rank = factorize(work, order), m = NT - rank;
   shortest(work, rank, order, row, onto); /* to the steady states */
@@ -408,6 +410,7 @@ static real descend(hmpc_state *s, const real *v, const real *goal, const real *
   hmpc_point *const at = &work->at, *const after = &work->after;
   real step[NT], there[NT], lacks[HMPC_TARGET_ITERATIONS + 1], off = R(0.0);
   int done = 0;
+  work->straight = 1;
   look(s, v, goal, w, at);
   lacks[0] = at->lacks;
   for (int k = 1; k <= HMPC_TARGET_ITERATIONS; ++k) {
@@ -422,6 +425,7 @@ static real descend(hmpc_state *s, const real *v, const real *goal, const real *
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
       if (after->merit < at->merit) break;
+      if (!(size < HMPC_TARGET_NEAR)) work->straight = 0;
     }
     if (!(after->merit < at->merit)) { /* rounding is all that is left, or it gets nowhere */
       done = size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
@@ -443,13 +447,14 @@ static real descend(hmpc_state *s, const real *v, const real *goal, const real *
   return off;
 }
 
-/* Descents along set-points between the outputs at first, a point near rest, and y: a few, then more of them. Returns
-   whether they lead to a steady state. */
-static int approach(hmpc_state *s, const real *first, const real *y, const real *w, hmpc_steady *found) {
+/* Descents along set-points between the outputs at first, a point near rest, and y: least of them, then twice as many,
+   up to most. Returns whether they lead to a steady state. */
+static int approach(hmpc_state *s, const real *first, const real *y, const real *w, int least, int most,
+                    hmpc_steady *found) {
   real begun[HMPC_NY], towards[HMPC_NY], v[NT];
   look(s, first, y, w, &s->search.at);
   memcpy(begun, s->search.at.y, sizeof begun);
-  for (int parts = HMPC_TARGET_PARTS_LEAST; parts <= HMPC_TARGET_PARTS_MOST; parts *= 2) {
+  for (int parts = least; parts <= most; parts *= 2) {
     memcpy(v, first, sizeof v);
     found->steady = 1;
     for (int k = 1; k <= parts && found->steady; ++k) {
@@ -462,20 +467,35 @@ static int approach(hmpc_state *s, const real *first, const real *y, const real 
   return 0;
 }
 
-/* The steady state for outputs y, all finite where they are weighed: from a steady start, then, where wide or there is
-   no such start, at the operating point, beside it, and where the model's own run from there ends; at the operating
-   point, too, where it misses the set-point because outputs do not answer to inputs where it began. Where none leads to
-   one, set-points on the way are met first. Where none keeps the bounds of states and outputs, these are left out. */
+/* The steady state for outputs y, all finite where they are weighed: from a steady start by whole steps; else the one to
+   which set-points on the way from the operating point lead; then from the operating point, beside it, and where the
+   model's own run from there ends; at the operating point, too, where it misses the set-point because outputs do not
+   answer to inputs where it began. Where none leads to one, set-points on the way from the start are met first. Where
+   none keeps the bounds of states and outputs, these are left out. */
 void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
                        hmpc_steady *found) {
   hmpc_steady trial, other;
   real given[NT];
   const int known = start && start->steady;
+  int follows = wide;
   if (known) place(start, given);
+  found->steady = 0;
   for (int bounded = 1; bounded >= 0; --bounded) {
     const int beside = wide && bounded ? HMPC_TARGET_STARTS : (wide || !known);
     for (int k = known ? -1 : 0; k < beside; ++k) {
+      if (follows && k >= 0) {
+        follows = 0;
+        if (approach(s, target_starts[HMPC_TARGET_NEAREST], y, w, HMPC_TARGET_FOLLOWED, HMPC_TARGET_FOLLOWED, &trial)) {
+          *found = trial;
+          return;
+        }
+        if (found->steady) return;
+      }
       const real off = descend(s, k < 0 ? given : target_starts[k], y, w, bounded, &trial);
+      if (follows && !s->search.straight) {
+        *found = trial;
+        continue;
+      }
       if (k != 0 && trial.steady && !trial.reached && s->search.answer < target_flat[0]) {
         const real nearer = descend(s, target_starts[0], y, w, bounded, &other);
         if (other.steady && nearer < off) trial = other;
@@ -483,7 +503,8 @@ void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, co
       if (trial.steady || (bounded && k == (known ? -1 : 0))) *found = trial; /* the first answer if none is steady */
       if (trial.steady) return;
     }
-    if (wide && bounded && approach(s, known ? given : target_starts[HMPC_TARGET_NEAREST], y, w, &trial)) {
+    if (wide && bounded && approach(s, known ? given : target_starts[HMPC_TARGET_NEAREST], y, w, HMPC_TARGET_PARTS_LEAST,
+                                      HMPC_TARGET_PARTS_MOST, &trial)) {
       *found = trial;
       return;
     }

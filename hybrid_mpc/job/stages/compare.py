@@ -29,11 +29,11 @@ from hybrid_mpc.job.loops import (
     write_rows,
 )
 from hybrid_mpc.job.sequential import Comparison, compare_costs, hardest, looks
-from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, source_of
+from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, program, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.summary import by_task
 from hybrid_mpc.job.tasks import tasks_of
-from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description, write_description
+from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
@@ -126,11 +126,6 @@ def control_stage(context: Context) -> ControlResult | Absent:
     context.read(NOISE)
     if context.scenario.plant is None:
         return _only_timing(context)
-    folder = context.out / "model"
-    held = read_description(folder)
-    if held.calibration is not None:
-        # of a run before; these loops run without it, and the monitor's stage puts it back
-        write_description(folder, replace(held, calibration=None))
     rows = compare(context)
     return ControlResult(tuple(replace(row, arrays={}) for row in rows), "", arrays_of(rows))
 
@@ -217,15 +212,20 @@ def run_specs(
     specs: Sequence[LoopSpec],
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> list[LoopRow]:
-    """Rows of loops on a run's own model."""
-    bench = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns)
+    """Rows of loops on a run's own model.
+
+    Loops whose monitors alarm by nothing that was learned run as in a run's first pass, which has learned nothing yet.
+    """
+    learned = any(spec.monitor not in ("own", "none") for spec in specs)
+    bench = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns, learned)
     return list(run_loops(bench, specs, report))
 
 
 @lru_cache(maxsize=1)
-def _bench(scenario: str, folder: Path, changed: int) -> Bench:
-    """A bench with a run's model, as the folder was when it ``changed``."""
-    return Bench(load_scenario(scenario), {MODEL: load(folder)})
+def _bench(scenario: str, folder: Path, changed: int, learned: bool) -> Bench:
+    """A bench with a run's model, as the folder was when it ``changed``, with what its monitors have learned or not."""
+    kit = load(folder)
+    return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, calibration=None)})
 
 
 def run_or_read(
@@ -260,7 +260,7 @@ def run_or_read(
 
 
 def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
-    """Digest of all that decides what loops of a run compute: their specifications, machine, tasks and model."""
+    """Digest of all that decides what loops of a run compute: specifications, machine, tasks, model and program."""
     model = read_description(context.out / "model")
     rest = None if model.calibration is None else model.calibration.rest_speed
     of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
@@ -273,7 +273,8 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
     if any(value is UNKNOWN for value in (*contents, *read[1:])):
         return f"unknown {time.monotonic_ns()}"
     loops, estimators = [(spec.id, spec.keep) for spec in specs], replace(loop, control={})
-    return digest([loops, model.programs_sha256, estimators, of_monitor, read])
+    made_by = program(), context.versions
+    return digest([loops, model.programs_sha256, model.model, estimators, of_monitor, read, made_by])
 
 
 def task_content(task: Task, dt: float, loop: LoopSettings) -> object:

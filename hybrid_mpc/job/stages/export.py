@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 import nn_export
+from hybrid_mpc.data.scales import robust_spread
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import sha256
 from hybrid_mpc.identify.export import check_parity, trace_model
@@ -63,7 +67,11 @@ def export_stage(context: Context) -> ExportResult:
         **dict(zip(members, alone, strict=True)),
     }
     info = model_info(phy, dt, prior.fit.covariance(phy.parameters))
-    deployed = replace(info, input_delay=prior.fit.delay, time_unit=context.time_unit)
+    smoothed = context.smoothed("train")
+    deployed = replace(
+        info, input_delay=prior.fit.delay, time_unit=context.time_unit,
+        state_spread=_spread([t.x for t in smoothed]), output_spread=_spread([t.y for t in smoothed]),
+    )  # fmt: skip
     programs: dict[str, dict[str, nn_export.Program]] = {}
     parities = []
     for i, (name, step) in enumerate(steps.items()):
@@ -93,6 +101,14 @@ def export_stage(context: Context) -> ExportResult:
     )
 
 
+def _spread(recordings: Sequence[NDArray[np.float64]]) -> tuple[float, ...]:
+    """Spread of each column of recordings ``(n, m)``; 0 of one that moves by rounding alone."""
+    found = [
+        (robust_spread(c), float(np.nanmax(np.abs(c), initial=0.0))) for c in np.concatenate(recordings).T
+    ]
+    return tuple(spread if spread > 1e-9 * largest else 0.0 for spread, largest in found)
+
+
 def predicting(context: Context, phy: Prior) -> Predicting | None:
     """What predictions need beside the models."""
     fit, chosen = context.prior.fit, context.read(CHOICE)
@@ -118,6 +134,7 @@ def artifact_is_there(context: Context, found: ExportResult) -> str:
 def noise_stage(context: Context) -> NoiseResult | Absent:
     """Tune the estimators on training recordings, by maximum likelihood."""
     if context.scenario.control is None:
+        put_noise(context, NoiseResult({}))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     found = noise_of(context.scenario, context.kit, context.commanded("train"))
     result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()})

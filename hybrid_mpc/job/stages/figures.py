@@ -14,6 +14,7 @@ from hybrid_mpc.identify.evaluate import Scores, input_correlation
 from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loop_figures import curves_of, loop_figure
+from hybrid_mpc.job.loops import ON_MODEL
 from hybrid_mpc.job.monitor import thresholds_of
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.analyze import ANALYSIS
@@ -24,7 +25,7 @@ from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import PRIOR, TRAINING, trained_models
 from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
-from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, ON_MODEL, by_controller
+from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.job.stages.results import finite, step_times
 from hybrid_mpc.job.summary import summaries
 from hybrid_mpc.job.tasks import tasks_of
@@ -250,7 +251,7 @@ def _overview(context: Context) -> Any:
         return
     table = {
         task: {name: (_number(cell.cost.mean), _number(cell.cost.ci95)) for name, cell in cells.items()}
-        for task, cells in summaries(list(found.rows)).items()
+        for task, cells in summaries(list(found.rows), context.budget.seeds).items()
     }
     if any("oracle" in row for row in table.values()):
         text = "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."

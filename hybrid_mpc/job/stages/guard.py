@@ -486,7 +486,9 @@ def _recorded(
     Without either the readings are kept and nothing but a blind monitor alarms.
     """
     model = kit.models["hybrid"]
-    monitor = kit.monitor("hybrid", kind="energy" if detector is None else "guard", diagnose=True)
+    thresholds = kit.calibration is not None and kit.calibration.threshold_w is not None
+    kind = "guard" if detector is not None else "energy" if thresholds else "own"
+    monitor = kit.monitor("hybrid", kind=kind, diagnose=True)
     assert isinstance(monitor, EnergyMonitor)
     estimator = kit.observer("hybrid")
     tested = [r for r in context.dataset.whole if clean_windows(context, r, ("test",))]

@@ -19,8 +19,6 @@ from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import loop_settings
 
 Array = NDArray[np.float64]
-ON_MODEL = "on the model, not the machine"
-"""What stands wherever such a loop is shown."""
 
 
 @dataclass(frozen=True)

@@ -545,7 +545,7 @@ def _control(context: Context) -> Control:
         return Control(none, none, none, None, found.reason)
     assert not isinstance(found, Absent)
     rows = found.rows
-    table, means = by_task(list(rows)), summaries(list(rows))
+    table, means = by_task(list(rows)), summaries(list(rows), context.budget.seeds)
     costs = {name: _costs(controller, rows, means) for name, controller in REPORTED.items()}
     gaps = {task: Gap(*gap_closed(cells)) for task, cells in table.items()}
     defined = [gap.value for gap in gaps.values() if gap.value is not None]

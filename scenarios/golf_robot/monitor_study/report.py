@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -51,7 +52,8 @@ def write_monitor_report(out: Path, results: Mapping[str, Any], note: StudyNote)
     write_text(out / "table.md", "\n\n".join(f"{t.caption}\n\n{markdown(t)}" for t in tables) + "\n")
     report = Report(
         f"Study {note.study['name']}", note.title, note.description,
-        f"python -m scenarios.golf_robot.monitor_study run MODEL --out {out.name}", _head(results), sections,
+        f"python -m scenarios.golf_robot.monitor_study run MODEL --out {shlex.quote(out.name)}", _head(results),
+        sections,
         f"hybrid-mpc {note.versions['hybrid-mpc']}",
     )  # fmt: skip
     return write_report(out / "report.html", report)

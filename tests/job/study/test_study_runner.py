@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trivial_runs
+from patience import HANGS
 
 from hybrid_mpc import InputError, StudyResults, run_study
 from hybrid_mpc.files import read_document, write_document
@@ -142,7 +143,7 @@ def begun(folder, run="noted", runs=RUNS, **environment):
     )  # fmt: skip
 
 
-def wait_for(condition, process, most=120.0):
+def wait_for(condition, process, most=HANGS):
     end = time.monotonic() + most
     while not condition():
         assert time.monotonic() < end, "nothing happened"
@@ -177,7 +178,7 @@ def killed_and_resumed(tmp_path, kills, seed):
         assert not again & kept, "a finished run ran again"
         assert kept <= {row.id for row in rows(folder / "runs")}, "a finished run was lost"
     process = begun(folder, EXECUTED=str(executed))
-    told, error = process.communicate(timeout=300)
+    told, error = process.communicate(timeout=HANGS)
     assert "finished" in told, error
     ids = [row.id for row in rows(folder / "runs")]
     assert sorted(ids) == sorted(run.id for run in trivial_runs.study(RUNS).runs())
@@ -203,13 +204,13 @@ def test_ctrl_c_ends_the_workers_and_resumes(tmp_path):
     wait_for(lambda: count(tmp_path / "s") > 4, process)
     pids = {int(row.columns["timing_pid"]) for row in rows(tmp_path / "s" / "runs")}
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=HANGS)
     assert "KeyboardInterrupt" in error
     assert not any(alive(pid) for pid in pids)
     kept = values(tmp_path / "s")
     assert 4 < len(kept) < 60
     process = begun(tmp_path / "s", "slow", 60)
-    assert "finished" in process.communicate(timeout=300)[0]
+    assert "finished" in process.communicate(timeout=HANGS)[0]
     assert count(tmp_path / "s") == 60  # none ran twice
     assert kept.items() <= values(tmp_path / "s").items()
 
@@ -221,7 +222,7 @@ def test_workers_end_with_a_parent_that_was_killed(tmp_path):
     pids = {int(row.columns["timing_pid"]) for row in rows(tmp_path / "s" / "runs")}
     process.kill()
     process.communicate()
-    end = time.monotonic() + 60.0  # they look once a second
+    end = time.monotonic() + HANGS  # they look once a second
     while any(alive(pid) for pid in pids) and time.monotonic() < end:
         time.sleep(0.1)
     assert not any(alive(pid) for pid in pids)

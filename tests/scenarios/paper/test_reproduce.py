@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import HANGS
 
 from hybrid_mpc import InputError, PriorStep
 from scenarios.paper import run as run_module
@@ -116,7 +117,7 @@ def test_sindy_has_a_row_where_it_is_there(exact, tmp_path, monkeypatch):
 def test_on_the_command_line_with_two_processes(exact, finished, tmp_path):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "hybrid_mpc.cli", "reproduce", exact, "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANGS)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "MOPGRNN" in done.stdout
     found, expected = (table_of(read_results(f / "results.json")) for f in (out, finished))
