@@ -1,98 +1,95 @@
-"""The real-time iteration of the library against that of acados, on the same control problem; no estimator in it.
+"""Real-time iterations of acados and of hybrid-mpc's generated C on the same control problem, both driven from C.
 
-acados runs in processes of its own (``acados_worker.py``), since its libraries have the names of those in CasADi's
-wheel, and in an environment of its own, since its wheel brings a package ``casadi`` that would overwrite this one's:
+    python benchmarks/acados.py --acados PREFIX
 
-    python3.11 -m venv acados-env
-    acados-env/bin/pip install comma-deps-acados==0.2.2.post92
-    acados-env/bin/pip install --force-reinstall casadi==3.8.2
-    python benchmarks/acados.py --acados acados-env/bin/python --out acados.json
-    python benchmarks/acados.py --acados acados-env/bin/python --soft   # two soft bounds on states, active
+``PREFIX`` is an installation of acados with HPIPM and DAQP. It is built by (``X64_AUTOMATIC`` finds the processor):
 
-Without acados the library's rows are printed and the reason why the others are missing. The golf robot with a GRU of
-random weights, N = 50, |u| bounded. All solvers take one Gauss-Newton iteration a period along the states of one
-closed loop, each from its own last plan, shifted by a period; rounds by turns, one thread, wall clock or with ``--cpu``
-processor time. acados knows the input held before as one more state, and the cost as linear least squares; the script
-checks that its numbers cost what the library's problem does.
+    git clone --recurse-submodules https://github.com/acados/acados && mkdir acados/build && cd acados/build
+    cmake .. BUILD_OPTIONS
+    make install
 
-- ``plain``: the model as a graph of matrices with CasADi's own derivatives, as acados itself generates them;
-  ``structured``: with the exported model's Jacobians under the names that acados expects. Both are compiled for the
-  processor at hand, with ``-Ofast``, which takes up to a quarter off ``-O3`` for acados; ``native`` has ``-O3``.
-  acados' own libraries are those of its wheel, made for Haswell.
-- acados' QP solvers: full condensing with HPIPM and with qpOASES, partial condensing with HPIPM; the options of each
-  are the fastest of ``CANDIDATES`` on the structured model that answer as the library does. The plain model is timed
-  with the fastest of all three.
-- Of ``rti`` and ``native`` whole Python calls are timed, of ``native, C alone`` and acados the C functions:
-  what Python hands over and takes back is left out. ``for Haswell`` is ``native`` with the instructions of acados'
-  libraries.
-- ``QP``: acados' own time within its QP solver. This version condenses in the feedback; a later one, which
-  condenses before it, has a feedback between the two.
-- ``cost``: mean over the closed loop's states of what the plans cost when the library's model runs on their inputs;
-  ``KKT``: largest residual in the library's QP of answers from the same last plan, of the largest gradient;
-  ``input differs``: how far these are from those of ``rti``; ``answered``: the share of them with the status solved.
-  On random weights one step a period is far from convergence, and plans of their own part by and by.
+``PREFIX`` is then the checkout, whose version is printed. The problem: the golf robot with a GRU of random weights,
+N = 50, a bounded input; then the same with two soft bounds on states that act.
+
+- One closed loop is recorded. At each of its states every solver gets the same last plan, shifted by a period, and the
+  same measured state: each solves the same QP. A solver takes all states in order, the solvers take turns.
+- A C program (``acados_driver.c``) calls both, with one thread, and takes processor time. ``whole``: preparation,
+  feedback and what remains of the period; ``feedback``: from the measured state to the plan. Medians. What hands plans
+  and states to acados is not timed.
+- All C has the flags ``FLAGS``: the driver, hybrid-mpc's C and the model for acados. acados itself has those of its own
+  build.
+- acados: ``SQP_RTI`` with linear least squares; the held input is one more state. The model: the exported Jacobians, or
+  those that CasADi derives from the model as a graph of matrices. HPIPM with partial condensing to N2 stages and with
+  full condensing, DAQP with full condensing; of each the fastest of ``OPTIONS`` whose plans agree. qpOASES is left
+  out: with slacks, its plans were up to 0.33 Nm off with the status success.
+- ``differs``: largest difference of an input from the plan of the controller in Python, over all states. It must be
+  below ``AGREES`` for acados and below ``SAME`` for hybrid-mpc; else the row is no comparison and is left out of the
+  ratios, and if no variant of acados agrees, the script fails.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import subprocess
-import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from time import perf_counter, process_time
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from native import SOFT, bare, times
+from native import SOFT
 from numpy.typing import NDArray
 from parts import REFERENCE, SKIPPED, arguments, closed_loop, deployed, hybrid_step, problem, report
-from scipy.optimize import lsq_linear
 
 import nn_export
 from hybrid_mpc import OCP, CondensedController, Estimate, HybridModel, trace_model
-from hybrid_mpc.control.problem import Solution
-from hybrid_mpc.embedded.native import FLAGS, NativeController
+from hybrid_mpc.embedded.generate import make_sources, template
+from hybrid_mpc.embedded.native import one_file
 from hybrid_mpc.model.model import inlined
 
 Array = NDArray[np.float64]
-Clock = Callable[[], float]
-NAME = "golf"
-WORKER = Path(__file__).with_name("acados_worker.py")
-SAME = 1e-9
+Row = dict[str, Any]
+DRIVER = Path(__file__).with_name("acados_driver.c")
+FLAGS = ("-std=gnu11", "-O3", "-march=native")
+COST_TOLERANCE = 1e-9
 """Largest relative difference between what acados' numbers and the library's problem say that a plan costs."""
+SAME = 1e-9
+"""Largest difference [Nm] of plans of hybrid-mpc in C and in Python: one algorithm, rounded in another order."""
 AGREES = 1e-4
-"""Largest difference of the inputs [Nm] from ``rti`` with which options may be chosen: 0.01 % of the range."""
-COMPARED = 7
-"""Every so many states answers from the same last plan are compared."""
-SPEED = {"hpipm_mode": "SPEED"}
-CANDIDATES: dict[str, list[dict[str, Any]]] = {
-    "FULL_CONDENSING_HPIPM": [
-        {},
-        *(
-            {**SPEED, "qp_solver_cond_ric_alg": ric, "qp_solver_warm_start": warm}
-            for ric in (0, 1)
-            for warm in (0, 1)
-        ),
+"""Largest difference [Nm] of acados' plans: 0.01 % of the range, what a QP solver that stops at ``TOLERANCE`` is off."""
+TOLERANCE = 1e-6
+"""What residuals acados' QP solvers stop at: the default of its Python interface."""
+HORIZONS = (1, 2, 5, 10)
+OPTIONS: dict[str, list[str]] = {
+    **{
+        f"partial condensing HPIPM, N2 = {n2}": [
+            f"partial,{n2},{mode},{warm},{ric}"
+            for mode, warm, ric in product(("SPEED", "BALANCE"), (0, 1), (0, 1))
+        ]
+        for n2 in HORIZONS
+    },
+    "full condensing HPIPM": [
+        f"full,0,{mode},{warm},{ric}" for mode, warm, ric in product(("SPEED", "BALANCE"), (0, 1), (0, 1))
     ],
-    "FULL_CONDENSING_QPOASES": [{"qp_solver_warm_start": warm} for warm in (0, 1, 2)],
-    "PARTIAL_CONDENSING_HPIPM": [
-        {"qp_solver_cond_N": 5},  # its cond_ric_alg is 1, with which some answers are wrong
-        *(
-            {**mode, "qp_solver_cond_N": n, "qp_solver_cond_ric_alg": 0}
-            for mode in ({}, SPEED)
-            for n in (1, 5, 10)
-        ),
-    ],
+    "full condensing DAQP": [f"daqp,0,SPEED,{warm},{ric}" for warm, ric in product((0, 1, 2), (0, 1))],
 }
-HASWELL = tuple("-march=haswell" if flag == "-march=native" else flag for flag in FLAGS)
-ACADOS_FLAGS = ("-std=c99", "-Ofast", "-march=native")
-Measured = dict[str, Any]
+"""Of each variant what the driver takes: QP solver, N2, mode of HPIPM, warm start, whether a Riccati recursion condenses."""
+MODELS = {"exported": "exported Jacobians", "casadi": "CasADi's derivatives"}
+NATIVE = "hybrid-mpc, C alone"
+BUILD_OPTIONS = (
+    "-DACADOS_WITH_DAQP=ON -DACADOS_WITH_QPOASES=OFF -DACADOS_WITH_OPENMP=OFF -DBLASFEO_TARGET=X64_AUTOMATIC "
+    '-DHPIPM_TARGET=AVX -DCMAKE_BUILD_TYPE=Release -DCMAKE_C_FLAGS="-O3 -march=native" '
+)
+HOW = f"""Build acados (0.6.0 or later) once and name its installation:
+
+    git clone --recurse-submodules https://github.com/acados/acados && mkdir acados/build && cd acados/build
+    cmake .. {BUILD_OPTIONS}
+    make install
+    python benchmarks/acados.py --acados .../acados"""
+LIBRARIES = ("acados", "hpipm", "blasfeo", "daqp")
 
 
 @dataclass(frozen=True)
@@ -114,37 +111,39 @@ def made(z: int, n: int, *, soft: bool) -> Case:
     return Case(plain, model, ocp, CondensedController(model, ocp), closed_loop(model, ocp))
 
 
-def problem_data(case: Case) -> dict[str, Any]:
-    """The problem as acados takes it: linear least squares over ``(x, h, held input)`` and ``u``, one input."""
+def problem_data(case: Case) -> dict[str, Array]:
+    """The problem as acados takes it: linear least squares over ``(x, h, held input)`` and ``u``, one input.
+
+    Penalties of the last state (``_e``) have the period in them: acados multiplies those of the others by it.
+    """
     ocp, n_x, size = case.ocp, case.model.n_x, case.model.n_x + case.model.n_h + 1
     vx, vu = np.zeros((n_x + 2, size)), np.zeros((n_x + 2, 1))
     vx[:n_x, :n_x], vx[n_x + 1, -1], vu[n_x:] = np.eye(n_x), -1.0, 1.0
     linear, quadratic = ocp.penalties
     low, high = (np.full(n_x, np.inf) if v is None else v for v in (ocp.x_min, ocp.x_max))
     bounded = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
-    numbers = {
-        "vx": vx, "vu": vu, "w": 2 * np.diag([*ocp.q, *ocp.r, *ocp.r_delta]), "vx_e": np.eye(n_x, size),
-        "w_e": 2 * case.rti.problem.terminal, "y_ref": np.array([*REFERENCE[0], *case.model.u0, 0.0]),
-        "y_ref_e": REFERENCE[0], "u_min": ocp.u_min, "u_max": ocp.u_max, "bounded": bounded,
-        "x_min": low[bounded], "x_max": high[bounded],
-        "linear": linear[bounded], "quadratic": 2 * quadratic[bounded],
+    linear, quadratic = linear[bounded], 2 * quadratic[bounded]
+    return {
+        "reference": REFERENCE, "vx": vx, "vu": vu, "w": 2 * np.diag([*ocp.q, *ocp.r, *ocp.r_delta]),
+        "vx_e": np.eye(n_x, size), "w_e": 2 * case.rti.problem.terminal,
+        "y_ref": np.array([*REFERENCE[0], *case.model.u0, 0.0]), "y_ref_e": REFERENCE[0],
+        "u_min": ocp.u_min, "u_max": ocp.u_max, "bounded": bounded, "x_min": low[bounded], "x_max": high[bounded],
+        "linear": linear, "quadratic": quadratic,
+        "linear_e": case.model.dt * linear, "quadratic_e": case.model.dt * quadratic,
     }  # fmt: skip
-    return {"n": ocp.horizon, "dt": case.model.dt, "numbers": {k: v.tolist() for k, v in numbers.items()}}
 
 
-def cost_of_data(data: Mapping[str, Any], z: Array, u: Array, u_prev: Array) -> float:
+def cost_of_data(a: Mapping[str, Array], dt: float, z: Array, u: Array, u_prev: Array) -> float:
     """What a plan costs by the numbers that acados is handed."""
-    a, dt = {k: np.array(v) for k, v in data["numbers"].items()}, data["dt"]
     held = np.vstack([u_prev[None], u])
     state = np.hstack([z, held])
     stage = state[:-1] @ a["vx"].T + u @ a["vu"].T - a["y_ref"]
     end = a["vx_e"] @ state[-1] - a["y_ref_e"]
     total = 0.5 * dt * np.einsum("ki,ij,kj", stage, a["w"], stage) + 0.5 * end @ a["w_e"] @ end
-    if a["bounded"].size:
-        x = z[1:, a["bounded"].astype(int)]
-        s = np.maximum(0.0, np.maximum(x - a["x_max"], a["x_min"] - x))
-        total += dt * np.sum(s @ a["linear"] + 0.5 * s**2 @ a["quadratic"])
-    return float(total)
+    x = z[:, a["bounded"]]
+    s = np.maximum(0.0, np.maximum(x - a["x_max"], a["x_min"] - x))
+    total += dt * np.sum(s[1:-1] @ a["linear"] + 0.5 * s[1:-1] ** 2 @ a["quadratic"])
+    return float(total + s[-1] @ a["linear_e"] + 0.5 * s[-1] ** 2 @ a["quadratic_e"])
 
 
 def check_data(case: Case) -> None:
@@ -154,427 +153,286 @@ def check_data(case: Case) -> None:
         u = random.uniform(-0.5, 0.5, (case.ocp.horizon, 1))
         z = random.normal(size=(case.ocp.horizon + 1, case.model.n_x + case.model.n_h))
         own = owner.cost(z, u, np.array([0.1]), owner.target(REFERENCE))
-        other = cost_of_data(problem_data(case), z, u, np.array([0.1]))
-        if not abs(own - other) < SAME * own:
+        other = cost_of_data(problem_data(case), case.model.dt, z, u, np.array([0.1]))
+        if not abs(own - other) < COST_TOLERANCE * own:
             raise SystemExit(f"the library's problem costs {own}, the numbers for acados {other}")
 
 
-INNER, STEP, WITH_JACOBIAN = (
-    f"{NAME}_{what}" for what in ("inner", "dyn_disc_phi_fun", "dyn_disc_phi_fun_jac")
-)
-WRAPPER = """#include "INNER.c"
+EXPORTED_SLOPE = """#include "casadi.c"
 
-static const int shape_state[3] = {STATES, 1, 1}, shape_input[3] = {1, 1, 1}, shape_none[3] = {0, 0, 1};
-static const int shape_slopes[3] = {STATES + 1, STATES, 1};
-enum {Z = STATES - 1};
+static const int shape_state[3] = {NX + NH + 1, 1, 1}, shape_input[3] = {1, 1, 1};
+static const int shape_slopes[3] = {NX + NH + 2, NX + NH + 1, 1};
 
-int FUNCTION(const double** arg, double** res, int* iw, double* w, void* mem) {
+int exported_slope(const double** arg, double** res, int* iw, double* w, void* mem) {
+  enum { Z = NX + NH };
   double *a = w, *b = w + Z * Z, *rest = b + Z;
-  const double* given[3 + INNER_SZ_ARG] = {arg[0], arg[0] + N_X, arg[1]};
-  double* found[4 + INNER_SZ_RES] = {res[0], res[0] + N_X, a, b};
+  const double* given[3 + INNER_SZ_ARG] = {arg[0], arg[0] + NX, arg[1]};
+  double* found[4 + INNER_SZ_RES] = {res[0], res[0] + NX, a, b};
   (void)mem;
-  if (INNER(given, found, iw, rest, 0)) return 1;
+  if (inner(given, found, iw, rest, 0)) return 1;
   res[0][Z] = arg[1][0];
-  for (int i = 0; i < Z; i++) {  /* a column of the transposed Jacobian: by the input, the state, the held input */
-    double* column = res[1] + i * (STATES + 1);
+  for (int i = 0; i < Z; i++) { /* a column of the transposed Jacobian: by the input, the state, the held input */
+    double* column = res[1] + i * (Z + 2);
     column[0] = b[i];
     for (int j = 0; j < Z; j++) column[1 + j] = a[j * Z + i];
     column[1 + Z] = 0;
   }
-  for (int j = 0; j <= STATES; j++) res[1][Z * (STATES + 1) + j] = j == 0;
+  for (int j = 0; j < Z + 2; j++) res[1][Z * (Z + 2) + j] = j == 0;
   return 0;
 }
-
-int FUNCTION_work(int* sz_arg, int* sz_res, int* sz_iw, int* sz_w) {
-  *sz_arg = 3, *sz_res = 2, *sz_iw = INNER_SZ_IW, *sz_w = INNER_SZ_W + Z * Z + Z;
+int exported_slope_work(int* sz_arg, int* sz_res, int* sz_iw, int* sz_w) {
+  *sz_arg = 2, *sz_res = 2, *sz_iw = INNER_SZ_IW, *sz_w = INNER_SZ_W + (NX + NH) * (NX + NH + 1);
   return 0;
 }
-const int* FUNCTION_sparsity_in(int i) { return i == 0 ? shape_state : i == 1 ? shape_input : shape_none; }
-const int* FUNCTION_sparsity_out(int i) { return i == 0 ? shape_state : shape_slopes; }
-int FUNCTION_n_in(void) { return 3; }
-int FUNCTION_n_out(void) { return 2; }
+const int* exported_slope_sparsity_in(int i) { return i == 0 ? shape_state : shape_input; }
+const int* exported_slope_sparsity_out(int i) { return i == 0 ? shape_state : shape_slopes; }
+int exported_slope_n_in(void) { return 2; }
+int exported_slope_n_out(void) { return 2; }
 """
 """The exported Jacobians as acados wants them: transposed, by the input and then the states, the held one last."""
 
 
-def step_code(case: Case, *, structured: bool, folder: Path) -> list[Path]:
-    """C of the step over ``(x, h, held input)``, and with its Jacobian, named and shaped for acados."""
+def write_model(case: Case, folder: Path) -> None:
+    """``model.c``: the step over ``(x, h, held input)`` and its Jacobians, exported and CasADi's, as acados takes them.
+
+    A Jacobian is transposed: rows by the input and then the states. CasADi's is dense, since acados reads dense ones
+    faster.
+    """
     m = case.model
-    state, u, p = ca.MX.sym("state", m.n_x + m.n_h + 1), ca.MX.sym("u"), ca.MX.sym("p", 0)
+    state, u = ca.MX.sym("state", m.n_x + m.n_h + 1), ca.MX.sym("u")
     point = [ca.MX(v) for v in (state[: m.n_x], state[m.n_x : -1], u, m.w, m.p)]
-    following = ca.vertcat(*inlined(m.step if structured else case.plain, point), u)
-    files = [generated(ca.Function(STEP, [state, u, p], [following]), folder)]
-    if not structured:  # as acados itself generates it
-        slopes = ca.jacobian(following, ca.vertcat(u, state)).T
-        return [*files, generated(ca.Function(WITH_JACOBIAN, [state, u, p], [following, slopes]), folder)]
+    plain = ca.vertcat(*inlined(case.plain, point), u)
+    slopes = ca.densify(ca.jacobian(plain, ca.vertcat(u, state)).T)
     assert m.with_jacobian is not None
     x, h = ca.MX.sym("x", m.n_x), ca.MX.sym("h", m.n_h)
-    inner = ca.Function(INNER, [x, h, u], inlined(m.with_jacobian, [x, h, u, ca.MX(m.w), ca.MX(m.p)]))
-    generated(inner, folder)
-    text = WRAPPER
+    inner = ca.Function("inner", [x, h, u], inlined(m.with_jacobian, [x, h, u, ca.MX(m.w), ca.MX(m.p)]))
+    writer = ca.CodeGenerator("casadi", {"casadi_int": "int", "casadi_real": "double"})
+    writer.add(ca.Function("next_state", [state, u], [ca.vertcat(*inlined(m.step, point), u)]))
+    writer.add(ca.Function("casadi_slope", [state, u], [plain, slopes]))
+    writer.add(inner)
+    writer.generate(f"{folder}/")
+    text = f"enum {{ NX = {m.n_x}, NH = {m.n_h} }};\n{EXPORTED_SLOPE}"
     for name in ("arg", "res", "iw", "w"):
         text = text.replace(f"INNER_SZ_{name.upper()}", str(getattr(inner, f"sz_{name}")()))
-    for name, value in (
-        ("FUNCTION", WITH_JACOBIAN),
-        ("INNER", INNER),
-        ("STATES", state.numel()),
-        ("N_X", m.n_x),
-    ):
-        text = text.replace(name, str(value))
-    file = folder / f"{WITH_JACOBIAN}.c"
-    file.write_text(text)
-    return [*files, file]
+    (folder / "model.c").write_text(text)
 
 
-def generated(f: ca.Function, folder: Path) -> Path:
-    """The C file of a function."""
-    writer = ca.CodeGenerator(f.name(), {"casadi_int": "int", "casadi_real": "double"})
-    writer.add(f)
-    return Path(writer.generate(f"{folder}/"))
+def write_case(case: Case, folder: Path) -> None:
+    """``case.h`` with the problem's numbers (matrices column by column), ``records`` and hybrid-mpc's C."""
+    m, data = case.model, problem_data(case)
+    n_b = data["bounded"].size
+    lines = [
+        f"enum {{ N = {case.ocp.horizon}, NX = {m.n_x}, NH = {m.n_h}, BOUNDED = {n_b}, STEPS = {len(case.states)} }};"
+    ]
+    lines += [f"static const int bounded[] = {{{', '.join(str(v) for v in [*data['bounded'], 0])}}};"]
+    lines += [f"static const double dt = {m.dt!r};"]
+    for name, value in data.items():
+        if name != "bounded":
+            numbers = ", ".join(repr(float(v)) for v in np.append(np.ravel(value, order="F"), 0.0))
+            lines.append(f"static const double {name}[] = {{{numbers}}};")
+    (folder / "case.h").write_text("\n".join([*lines, ""]))
+    records(case).tofile(folder / "records")
+    sources = make_sources(m, case.ocp)
+    (folder / "native.c").write_text(one_file(sources.texts))
+    for name, text in {**sources.texts, "hmpc.h": template("hmpc.h")}.items():
+        if name.endswith(".h"):
+            (folder / name).write_text(text)
 
 
-def compiled(case: Case, folder: Path, *, structured: bool) -> list[str]:
-    """The paths of the compiled model."""
-    folder.mkdir(parents=True)
-    objects = []
-    for file in step_code(case, structured=structured, folder=folder):
-        objects.append(str(file.with_suffix(".o")))
-        subprocess.run(["cc", "-c", "-fPIC", *ACADOS_FLAGS, str(file), "-o", objects[-1]], check=True)
-    return objects
+def records(case: Case) -> Array:
+    """What the driver reads, a row a state: last plan's inputs and states, appended state, measured state, answer."""
+    rti, rows = case.rti, []
+    plan = rti.initial(case.states[0])
+    for e in case.states:
+        prepared = rti.prepare(plan)
+        answer = rti.finish(prepared, e, REFERENCE)
+        if not answer.status.ok:
+            raise SystemExit(f"the controller in Python does not solve its problem: {answer.status}")
+        z = np.hstack([plan.x, plan.h])
+        rows.append(np.concatenate([plan.u.ravel(), z.ravel(), prepared.z[-1], e.x, e.h, answer.u.ravel()]))
+        plan = answer
+    return np.array(rows)
 
 
-class WorkerError(Exception):
-    """What a worker says went wrong."""
-
-
-class Worker:
-    """An acados solver in a process of its own."""
-
-    def __init__(self, python: str, **given: Any) -> None:
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115 (the worker's, as long as it lives)
-        self._process = subprocess.Popen(
-            [python, "-P", str(WORKER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True,
-            env=own_environment(),
-        )  # fmt: skip
-        self.ask("make", **given)
-
-    def ask(self, what: str, **given: Any) -> dict[str, Any]:
-        """Its answer to a request."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps({"do": what, **given}) + "\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
-        answer = json.loads(line) if line else {"error": f"it ended with {self._process.wait()}"}
-        if "error" in answer:
-            self._log.seek(0)
-            tail = self._log.read().decode(errors="replace").strip().splitlines()[-3:]
-            self.close()
-            raise WorkerError(" ".join([answer["error"], *tail]))
-        return dict(answer)
-
-    def close(self) -> None:
-        """End it."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.close()
-        self._process.wait()
-        self._process.stdout.close()
-        self._log.close()
-
-
-def own_environment() -> dict[str, str]:
-    """The environment without the modules that this process sees."""
-    return {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-
-
-def why_not(python: str) -> str:
-    """Why acados cannot be used from an interpreter; empty if it can."""
-    command = [python, "-P", "-c", "import acados.acados_template"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, env=own_environment(), check=False)
-    except OSError as error:
-        return f"{python} does not start: {error.strerror}"
-    return (done.stderr.strip().splitlines() or ["it does not start"])[-1] if done.returncode else ""
+class DriverError(Exception):
+    """What the driver or the compiler says went wrong."""
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """A QP of the library with the plan it came from, and its answer."""
+class Driver:
+    """The C program of one case, with acados where an installation is named."""
 
-    hessian: Array
-    gradient: Array
-    soft: tuple[Array, Array] | None
-    u: Array
-    z: Array
-    plan: Solution
-    estimate: Estimate
-    answer: Array
+    folder: Path
+    prefix: Path | None
 
+    @staticmethod
+    def build(case: Case, folder: Path, prefix: Path | None, flags: Sequence[str] = FLAGS) -> Driver:
+        """Write the C of a case into the folder and compile it."""
+        write_case(case, folder)
+        command = ["cc", *flags, f"-I{folder}", str(DRIVER), str(folder / "native.c")]
+        if prefix is not None:
+            write_model(case, folder)
+            include = prefix / "include"
+            places = (include, include / "acados", include / "blasfeo/include", include / "hpipm/include")
+            command += ["-DWITH_ACADOS", "-DACADOS_WITH_DAQP", str(folder / "model.c"), *(f"-I{place}" for place in places)]
+            command += [
+                f"-L{prefix / 'lib'}",
+                f"-Wl,-rpath,{prefix / 'lib'}",
+                *(f"-l{name}" for name in LIBRARIES),
+            ]
+        told([*command, "-lm", "-o", str(folder / "driver")])
+        return Driver(folder, prefix)
 
-def recorded(case: Case) -> list[Recorded]:
-    """Some of the QPs of the closed loop, as ``rti`` has them."""
-    rti, found = case.rti, []
-    plan, handed = rti.initial(case.states[0]), []
-    original = rti.qp.solve
-
-    def watched(*given: Any, **more: Any) -> Any:
-        handed.append(given)
-        return original(*given, **more)
-
-    rti.qp.solve = watched  # type: ignore[method-assign]
-    for k, e in enumerate(case.states):
-        prepared = rti.prepare(plan)
-        answer = rti.finish(prepared, e, REFERENCE)
-        hessian, gradient, _, _, soft, *_ = handed[-1]
-        if k >= SKIPPED and k % COMPARED == 0:
-            soft = None if soft is None else (soft[0].copy(), soft[1].copy())
-            found.append(Recorded(
-                hessian.copy(), gradient.copy(), soft, prepared.u.copy(), prepared.z.copy(), plan, e, answer.u.copy()
-            ))  # fmt: skip
-        plan = answer
-    rti.qp.solve = original  # type: ignore[method-assign]
-    return found
-
-
-def residual(case: Case, at: Recorded, u: Array, tolerance: float = 1e-5) -> float:
-    """Largest residual of the QP's optimality at inputs ``u``.
-
-    A bound within the tolerance may have any multiplier of its sign, a soft one at most its penalty.
-    """
-    rows, dt = case.rti.problem.soft, case.model.dt
-    step = (u - at.u).ravel()
-    gradient = at.hessian @ step + at.gradient
-    eye, columns, most = np.eye(step.size), [], []
-    for side, near in ((-1.0, u.ravel() - case.ocp.u_min), (1.0, case.ocp.u_max - u.ravel())):
-        acting = np.flatnonzero(near < tolerance)
-        columns += list(side * eye[acting])
-        most += [np.inf] * acting.size
-    if at.soft is not None:
-        value, slope = at.soft[0] + at.soft[1] @ step, at.soft[1]
-        for side, excess in ((-1.0, rows.lower - value), (1.0, value - rows.upper)):
-            beyond = excess > tolerance
-            force = np.where(beyond, dt * (rows.linear + 2 * rows.quadratic * excess), 0.0)
-            gradient = gradient + side * force @ slope
-            touching = np.flatnonzero(np.abs(excess) <= tolerance)
-            columns += list(side * slope[touching])
-            most += list(dt * (rows.linear + 2 * rows.quadratic * tolerance)[touching])
-    if not columns:
-        return float(np.max(np.abs(gradient)))
-    found = lsq_linear(np.array(columns).T, -gradient, (0.0, np.array(most)), method="bvls")
-    return float(np.max(np.abs(found.fun)))
-
-
-def answers(case: Case, solver: Any, cases: Sequence[Recorded]) -> tuple[list[Array], list[bool]]:
-    """What a solver answers to QPs from the same last plans ``(N, 1)`` each, and whether it says it solved them."""
-    if not isinstance(solver, Worker):
-        plans = [solver.solve(at.plan, at.estimate, REFERENCE) for at in cases]
-        return [plan.u for plan in plans], [plan.status.ok for plan in plans]
-    given = []
-    for at in cases:
-        held = np.concatenate([at.plan.u[0], at.u.ravel()])  # known before a period, the first is now
-        x0 = np.concatenate([at.estimate.x, at.estimate.h, at.plan.u[0]])
-        z = np.hstack([at.z, held[: len(at.z), None]])
-        given.append({"u": at.u.ravel().tolist(), "z": z.tolist(), "x0": x0.tolist()})
-    found = solver.ask("replay", cases=given)
-    return [np.array(u)[:, None] for u in found["plans"]], found["ok"]
-
-
-def quality(case: Case, solver: Any, cases: Sequence[Recorded]) -> Measured:
-    """How right its answers are."""
-    found, ok = answers(case, solver, cases)
-    size = max(float(np.max(np.abs(at.gradient))) for at in cases)
-    both = list(zip(cases, found, strict=True))
-    return {
-        "answered": float(np.mean(ok)),
-        "KKT": max(residual(case, at, u) for at, u in both) / size,
-        "input differs": max(float(np.max(np.abs(u - at.answer))) for at, u in both),
-    }
-
-
-def one_round(case: Case, solver: Any, clock: Clock) -> Measured:
-    """Times [ms], solved steps and plans along the states."""
-    first = case.rti.initial(case.states[0])
-    if isinstance(solver, Worker):
-        held = np.full((case.ocp.horizon + 1, 1), first.u[0, 0])
-        z = np.hstack([first.x, first.h, held])
-        states = [np.concatenate([e.x, e.h]).tolist() for e in case.states]
-        found = solver.ask("round", u=first.u.ravel().tolist(), z=z.tolist(), states=states)
-        prepared, fed, inner = 1e3 * np.array(found["times"])[SKIPPED:].T
-        return {
-            "whole": prepared + fed,
-            "feedback": fed,
-            "QP": inner,
-            "ok": found["ok"],
-            "plans": found["plans"],
-        }
-    whole, feedback = times(solver, case.states, 1, clock)
-    plan, plans, ok = first, [], []
-    for e in case.states:
-        plan = solver.solve(plan, e, REFERENCE)
-        plans.append(plan.u.ravel().tolist())
-        ok.append(plan.status.ok)
-    return {"whole": whole, "feedback": feedback, "ok": ok, "plans": plans}
-
-
-def mean_cost(case: Case, plans: Sequence[Sequence[float]]) -> float:
-    """Mean of what the plans cost on the library's model."""
-    owner, held, costs = case.rti.problem, case.rti.initial(case.states[0]).u[0], []
-    target = owner.target(REFERENCE)
-    for e, inputs in zip(case.states, plans, strict=True):
-        u = np.clip(np.array(inputs)[:, None], case.ocp.u_min, case.ocp.u_max)
-        costs.append(owner.cost(owner.run(np.concatenate([e.x, e.h]), u), u, held, target))
-        held = u[0]
-    return float(np.mean(costs))
-
-
-class Acados:
-    """Makes acados' solvers of one case."""
-
-    def __init__(self, case: Case, python: str, folder: Path, *, cpu: bool) -> None:
-        self.case, self._python, self._cpu = case, python, cpu
-        self._data, self._folder, self._number = problem_data(case), folder, 0
-        self._objects = {
-            kind: compiled(case, folder / kind, structured=kind == "structured")
-            for kind in ("plain", "structured")
-        }
-
-    def solver(self, kind: str, qp: str, options: Mapping[str, Any]) -> Worker:
-        """A solver on the ``plain`` or the ``structured`` model.
+    def run(self, solvers: Sequence[str], rounds: int) -> list[Row]:
+        """Of each solver: times ``whole`` and ``feedback`` [ms], what plans differ by [Nm], the share of solved ones.
 
         Raises:
-            WorkerError: If acados cannot be made ready with these options.
+            DriverError: If the program fails.
         """
-        self._number += 1
-        return Worker(
-            self._python, **self._data, folder=str(self._folder / str(self._number)), cpu=self._cpu,
-            objects=self._objects[kind], compiler="cc", flags=ACADOS_FLAGS, options={"qp_solver": qp, **options},
-        )  # fmt: skip
+        environment = dict(os.environ)
+        if self.prefix is not None:  # acados' libraries do not say where those that they need lie
+            environment["LD_LIBRARY_PATH"] = f"{self.prefix / 'lib'}:{environment.get('LD_LIBRARY_PATH', '')}"
+        words = [str(self.folder / name) for name in ("driver", "records", "results")]
+        told([*words, str(rounds), *solvers], environment)
+        found = np.loadtxt(self.folder / "results")
+        rows = []
+        for index in range(len(solvers)):
+            own = found[found[:, 0] == index]
+            counted = own[own[:, 1] >= SKIPPED]
+            rows.append({
+                "whole": 1e3 * float(np.median(counted[:, 2:5].sum(axis=1))), "feedback": 1e3 * float(np.median(counted[:, 3])),
+                "differs": float(np.max(own[:, 5])), "solved": float(np.mean(own[:, 6] == 0)),
+            })  # fmt: skip
+        return rows
 
-    def best(self, qp: str, cases: Sequence[Recorded]) -> tuple[dict[str, Any] | None, list[Measured]]:
-        """The fastest options that answer as the library does, and what was found of all."""
-        tried: list[Measured] = []
-        for options in CANDIDATES[qp]:
-            row: Measured = {"qp": qp, "options": options}
+
+def told(command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+    """Run a program; its last words where it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode:
+        words = (done.stderr.strip() or done.stdout.strip()).splitlines()[-8:]
+        raise DriverError("\n".join([f"{command[0]} ends with code {done.returncode}", *words]))
+
+
+def version_of(prefix: Path) -> str:
+    """The version of an installation: ``git describe`` where it is a checkout, else the commit that its build wrote."""
+    top = subprocess.run(
+        ["git", "-C", str(prefix), "rev-parse", "--show-toplevel"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if top.returncode == 0 and Path(top.stdout.strip()).resolve() == prefix.resolve():
+        command = ["git", "-C", str(prefix), "describe", "--tags", "--always"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    commit = prefix / "lib" / "git_commit_hash"
+    return f"commit {commit.read_text().strip()}" if commit.is_file() else "unknown: no checkout"
+
+
+def lacks(prefix: Path) -> list[str]:
+    """What an installation of acados lacks."""
+    lib = prefix / "lib"
+    missing = (
+        []
+        if (prefix / "include/acados_c/ocp_nlp_interface.h").is_file()
+        else ["include/acados_c/ocp_nlp_interface.h"]
+    )
+    return missing + [f"lib/lib{name}" for name in LIBRARIES if not list(lib.glob(f"lib{name}.*"))]
+
+
+def agrees(row: Row) -> bool:
+    """Whether a variant of acados solved the same problem at every state."""
+    return row["differs"] < AGREES and row["solved"] == 1.0
+
+
+def chosen(driver: Driver) -> tuple[dict[str, str], list[Row]]:
+    """Of each variant the fastest options that agree, and what was tried; each in a process of its own."""
+    best, tried = {}, []
+    for variant, candidates in OPTIONS.items():
+        rows: list[Row] = []
+        for options in candidates:
             try:
-                worker = self.solver("structured", qp, options)
-                found = one_round(self.case, worker, perf_counter)
-                row |= quality(self.case, worker, cases) | {"solved": float(np.mean(found["ok"]))}
-                row["ms"] = float(np.median(found["whole"]))
-                worker.close()
-            except WorkerError as error:
-                row["error"] = str(error)
-            tried.append(row)
-        right = [r for r in tried if r.get("input differs", np.inf) < AGREES and r["solved"] == 1.0]
-        return (min(right, key=lambda r: float(r["ms"]))["options"] if right else None), tried
-
-
-def label(qp: str, options: Mapping[str, Any]) -> str:
-    """A QP solver with its options, for the table."""
-    kind = qp.replace("_CONDENSING_", " ").replace("FULL", "full").replace("PARTIAL", "partial")
-    return f"{kind}, cond_N {options['qp_solver_cond_N']}" if "qp_solver_cond_N" in options else kind
+                rows.append({"options": options, **driver.run([f"exported,{options}"], 1)[0]})
+            except DriverError as error:
+                tried.append({"options": options, "error": str(error)})
+        tried += rows
+        right = [row for row in rows if agrees(row)] or rows
+        if right:
+            best[variant] = min(right, key=lambda row: float(row["whole"]))["options"]
+    return best, tried
 
 
 def compared(
-    z: int, n: int, *, soft: bool, rounds: int, cpu: bool, acados: str | None
-) -> tuple[list[Measured], list[Measured]]:
-    """Rows of one size, and what was tried of acados' options; ``acados`` is the interpreter that has it."""
-    case, clock = made(z, n, soft=soft), process_time if cpu else perf_counter
+    z: int, n: int, *, soft: bool, rounds: int, prefix: Path, flags: Sequence[str]
+) -> tuple[list[Row], Row, list[Row]]:
+    """Rows of one size and set of bounds, the ratios, and what was tried of acados' options."""
+    case = made(z, n, soft=soft)
     check_data(case)
-    native = NativeController(case.model, case.ocp)
-    alone = {"native, C alone": native}
-    if platform.machine() == "x86_64":
-        alone["native, C alone, for Haswell"] = NativeController(case.model, case.ocp, flags=HASWELL)
-    solvers: dict[str, Any] = {"rti": case.rti, "native": native}
-    cases, tried, failed = recorded(case), [], []
     with tempfile.TemporaryDirectory() as folder:
-        if acados is not None:
-            maker, best = Acados(case, acados, Path(folder), cpu=cpu), {}
-            for qp in CANDIDATES:
-                best[qp], rows = maker.best(qp, cases)
-                tried += [{"z": z, **row} for row in rows]
-                if best[qp] is None:
-                    failed.append(f"acados, structured, {label(qp, {})}")
-            usable = [r for r in tried if r["options"] == best[r["qp"]]]
-            for row in usable:
-                solvers[f"acados, structured, {label(row['qp'], row['options'])}"] = maker.solver(
-                    "structured", row["qp"], row["options"]
-                )
-            if usable:
-                row = min(usable, key=lambda r: float(r["ms"]))
-                name = f"acados, plain, {label(row['qp'], row['options'])}"
-                solvers[name] = maker.solver("plain", row["qp"], row["options"])
-        found: dict[str, list[Measured]] = {name: [] for name in solvers}
-        inner: dict[str, list[tuple[Array, Array]]] = {name: [] for name in alone}
-        for _ in range(rounds):
-            for name, solver in solvers.items():
-                found[name].append(one_round(case, solver, clock))
-            for name, solver in alone.items():
-                inner[name].append(bare(solver, case.states, 1, clock))
-        rows = []
-        for name, solver in solvers.items():
-            kept = [k for k in ("whole", "feedback", "QP") if k in found[name][0]]
-            measured: dict[str, Array] = {k: np.concatenate([r[k] for r in found[name]]) for k in kept}
-            last = found[name][-1]
-            rest = {"solved": float(np.mean(last["ok"])), "cost": mean_cost(case, last["plans"])}
-            rest |= quality(case, solver, cases)
-            rows.append({"z": z, "solver": name, **statistics(measured), **rest})
-            if solver is native:
-                for kind, spent in inner.items():
-                    whole, feedback = (np.concatenate(v) for v in zip(*spent, strict=True))
-                    bare_row = statistics({"whole": whole, "feedback": feedback})
-                    rows.append({"z": z, "solver": kind, **bare_row, **rest})
-            if isinstance(solver, Worker):
-                solver.close()
-    empty = statistics({k: np.full(1, np.nan) for k in ("whole", "feedback", "QP")})
-    none = dict.fromkeys(("solved", "cost", "answered", "KKT", "input differs"), float("nan"))
-    return rows + [{"z": z, "solver": name, **empty, **none} for name in failed], tried
-
-
-def statistics(measured: Mapping[str, Array]) -> Measured:
-    """Medians and 99th percentiles."""
-    row: Measured = {}
+        driver = Driver.build(case, Path(folder), prefix, flags)
+        best, tried = chosen(driver)
+        names = {"native": NATIVE}
+        for (variant, options), (model, what) in product(best.items(), MODELS.items()):
+            names[f"{model},{options}"] = f"acados, {variant}, {what}"
+        found = driver.run(list(names), rounds)
+    case_is = {"z": z, "soft bounds": 2 if soft else 0}
+    rows = []
+    for (options, name), row in zip(names.items(), found, strict=True):
+        times = {"whole [ms]": row["whole"], "feedback [ms]": row["feedback"]}
+        right = row["differs"] < SAME if options == "native" else agrees(row)
+        rows.append({
+            **case_is, "solver": name, "options": options, **times, "differs [Nm]": row["differs"], "solved": row["solved"],
+            "agrees": "yes" if right else "no",
+        })  # fmt: skip
+    native, theirs = rows[0], [row for row in rows[1:] if row["agrees"] == "yes"]
+    if native["agrees"] != "yes":
+        raise SystemExit(f"hybrid-mpc's C and Python differ by {native['differs [Nm]']} Nm at z = {z}")
+    if not theirs:
+        raise SystemExit(f"no variant of acados solves the same problem at z = {z}: {rows[1:]}")
+    ratio = dict(case_is)
     for what in ("whole", "feedback"):
-        row |= {f"{what} [ms]": float(np.median(measured[what]))}
-        row |= {f"{what} p99": float(np.percentile(measured[what], 99))}
-    row["QP [ms]"] = float(np.median(measured["QP"])) if "QP" in measured else float("nan")
-    return row
+        fastest = min(theirs, key=lambda row: float(row[f"{what} [ms]"]))
+        ratio |= {
+            f"{what}: acados / hybrid-mpc": fastest[f"{what} [ms]"] / native[f"{what} [ms]"],
+            f"{what}: best": fastest["solver"],
+        }
+    return rows, ratio, [{**case_is, **row} for row in tried]
 
 
 def main() -> None:
     """Measure and print."""
     parser = arguments(__doc__)
-    parser.add_argument("--z", type=int, nargs="+", default=[16, 32, 64, 128], help="hidden units")
+    parser.add_argument(
+        "--acados", type=Path, help="installation of acados: the folder that has include and lib"
+    )
+    parser.add_argument("--z", type=int, nargs="+", default=[16, 32, 64, 128], help="sizes of the network")
     parser.add_argument("--n", type=int, default=50, help="horizon")
     parser.add_argument("--rounds", type=int, default=5, help="times that the solvers take turns")
-    parser.add_argument("--soft", action="store_true", help="two soft bounds on states")
-    parser.add_argument("--cpu", action="store_true", help="processor time instead of the wall clock's")
-    parser.add_argument("--acados", default=sys.executable, help="Python of the environment that has acados")
-    given = parser.parse_args()
-    reason = why_not(given.acados)
-    rows, tried = [], []
-    load = [round(v, 1) for v in os.getloadavg()]
-    for z in given.z:
-        acados = None if reason else given.acados
-        more, options = compared(
-            z, given.n, soft=given.soft, rounds=given.rounds, cpu=given.cpu, acados=acados
-        )
-        rows += more
-        tried += options
-    load += [round(v, 1) for v in os.getloadavg()]
-    flags = {"native": " ".join(FLAGS), "acados": " ".join(ACADOS_FLAGS)}
-    report(
-        rows,
-        given.out,
-        soft=given.soft,
-        cpu=given.cpu,
-        tried=tried,
-        flags=flags,
-        load=load,
-        without_acados=reason,
+    parser.add_argument(
+        "--flags", default=" ".join(FLAGS), help="of the compiler, for all C that is compiled here"
     )
-    if reason:
-        print(f"\nacados is left out: {reason}")
+    given = parser.parse_args()
+    if given.acados is None:
+        raise SystemExit(f"--acados is missing: the comparison needs acados. {HOW}")
+    missing = lacks(given.acados)
+    if missing:
+        raise SystemExit(f"--acados {given.acados}: no {', no '.join(missing)} in it. {HOW}")
+    version = version_of(given.acados)
+    print(f"acados {version}; compiler flags {given.flags}")
+    rows, ratios, tried = [], [], []
+    load = [round(v, 1) for v in os.getloadavg()]
+    for soft, z in product((False, True), given.z):
+        more, ratio, options = compared(
+            z,
+            given.n,
+            soft=soft,
+            rounds=given.rounds,
+            prefix=given.acados.resolve(),
+            flags=given.flags.split(),
+        )
+        rows, ratios, tried = rows + more, [*ratios, ratio], tried + options
+    load += [round(v, 1) for v in os.getloadavg()]
+    report([*rows, *ratios], given.out, acados=version, flags=given.flags, tried=tried, load=load)
 
 
 if __name__ == "__main__":
