@@ -5,7 +5,7 @@
 ``PREFIX`` is an installation of acados with HPIPM and DAQP. It is built by (``X64_AUTOMATIC`` finds the processor):
 
     git clone --recurse-submodules https://github.com/acados/acados && mkdir acados/build && cd acados/build
-    cmake .. BUILD_OPTIONS
+    cmake .. -DACADOS_WITH_DAQP=ON -DBLASFEO_TARGET=X64_AUTOMATIC -DHPIPM_TARGET=AVX -DCMAKE_C_FLAGS="-O3 -march=native"
     make install
 
 ``PREFIX`` is then the checkout, whose version is printed. The problem: the golf robot with a GRU of random weights,
@@ -22,9 +22,10 @@ N = 50, a bounded input; then the same with two soft bounds on states that act.
   those that CasADi derives from the model as a graph of matrices. HPIPM with partial condensing to N2 stages and with
   full condensing, DAQP with full condensing; of each the fastest of ``OPTIONS`` whose plans agree. qpOASES is left
   out: with slacks, its plans were up to 0.33 Nm off with the status success.
-- ``differs``: largest difference of an input from the plan of the controller in Python, over all states. It must be
-  below ``AGREES`` for acados and below ``SAME`` for hybrid-mpc; else the row is no comparison and is left out of the
-  ratios, and if no variant of acados agrees, the script fails.
+- ``differs``: largest difference of an input from the plan of the controller in Python, over all states. Below ``SAME``
+  for hybrid-mpc, else the script fails. Below ``AGREES`` for acados, else options are not chosen; a variant without
+  any is left out, and without variants the script fails.
+- Ratios take acados' fastest variant, for the whole period and for the feedback each.
 """
 
 from __future__ import annotations
@@ -58,35 +59,33 @@ COST_TOLERANCE = 1e-9
 """Largest relative difference between what acados' numbers and the library's problem say that a plan costs."""
 SAME = 1e-9
 """Largest difference [Nm] of plans of hybrid-mpc in C and in Python: one algorithm, rounded in another order."""
-AGREES = 1e-4
-"""Largest difference [Nm] of acados' plans: 0.01 % of the range, what a QP solver that stops at ``TOLERANCE`` is off."""
+AGREES = 1e-3
+"""Largest difference [Nm] of acados' plans, 0.1 % of the range. Its QP solvers stop at residuals of ``TOLERANCE``, that
+is 6e-4 Nm with soft bounds; options that solve another problem are 5e-3 Nm and more off."""
 TOLERANCE = 1e-6
-"""What residuals acados' QP solvers stop at: the default of its Python interface."""
+"""Residuals at which acados' QP solvers stop: the default of its Python interface."""
 HORIZONS = (1, 2, 5, 10)
+MODES = ("SPEED", "BALANCE")
 OPTIONS: dict[str, list[str]] = {
     **{
         f"partial condensing HPIPM, N2 = {n2}": [
-            f"partial,{n2},{mode},{warm},{ric}"
-            for mode, warm, ric in product(("SPEED", "BALANCE"), (0, 1), (0, 1))
+            f"partial,{n2},{mode},{warm},0" for mode, warm in product(MODES, (0, 2))
         ]
         for n2 in HORIZONS
     },
     "full condensing HPIPM": [
-        f"full,0,{mode},{warm},{ric}" for mode, warm, ric in product(("SPEED", "BALANCE"), (0, 1), (0, 1))
+        f"full,0,{mode},{warm},{ric}" for mode, warm, ric in product(MODES, (0, 2), (0, 1))
     ],
-    "full condensing DAQP": [f"daqp,0,SPEED,{warm},{ric}" for warm, ric in product((0, 1, 2), (0, 1))],
+    "full condensing DAQP": [f"daqp,0,SPEED,{warm},{ric}" for warm, ric in product((0, 1), (0, 1))],
 }
-"""Of each variant what the driver takes: QP solver, N2, mode of HPIPM, warm start, whether a Riccati recursion condenses."""
+"""What the driver takes of each variant: QP solver, N2, mode of HPIPM, warm start, 1: condensed by a Riccati recursion.
+Partial condensing by a Riccati recursion is not among them: its plans are up to 0.14 Nm off at z = 16."""
 MODELS = {"exported": "exported Jacobians", "casadi": "CasADi's derivatives"}
 NATIVE = "hybrid-mpc, C alone"
-BUILD_OPTIONS = (
-    "-DACADOS_WITH_DAQP=ON -DACADOS_WITH_QPOASES=OFF -DACADOS_WITH_OPENMP=OFF -DBLASFEO_TARGET=X64_AUTOMATIC "
-    '-DHPIPM_TARGET=AVX -DCMAKE_BUILD_TYPE=Release -DCMAKE_C_FLAGS="-O3 -march=native" '
-)
-HOW = f"""Build acados (0.6.0 or later) once and name its installation:
+HOW = """Build acados (0.6.0 or later) once and name its installation:
 
     git clone --recurse-submodules https://github.com/acados/acados && mkdir acados/build && cd acados/build
-    cmake .. {BUILD_OPTIONS}
+    cmake .. -DACADOS_WITH_DAQP=ON -DBLASFEO_TARGET=X64_AUTOMATIC -DHPIPM_TARGET=AVX -DCMAKE_C_FLAGS="-O3 -march=native"
     make install
     python benchmarks/acados.py --acados .../acados"""
 LIBRARIES = ("acados", "hpipm", "blasfeo", "daqp")
@@ -225,7 +224,7 @@ def write_case(case: Case, folder: Path) -> None:
         f"enum {{ N = {case.ocp.horizon}, NX = {m.n_x}, NH = {m.n_h}, BOUNDED = {n_b}, STEPS = {len(case.states)} }};"
     ]
     lines += [f"static const int bounded[] = {{{', '.join(str(v) for v in [*data['bounded'], 0])}}};"]
-    lines += [f"static const double dt = {m.dt!r};"]
+    lines += [f"static const double dt = {m.dt!r}, tolerance = {TOLERANCE!r};"]
     for name, value in data.items():
         if name != "bounded":
             numbers = ", ".join(repr(float(v)) for v in np.append(np.ravel(value, order="F"), 0.0))
@@ -274,7 +273,12 @@ class Driver:
             write_model(case, folder)
             include = prefix / "include"
             places = (include, include / "acados", include / "blasfeo/include", include / "hpipm/include")
-            command += ["-DWITH_ACADOS", "-DACADOS_WITH_DAQP", str(folder / "model.c"), *(f"-I{place}" for place in places)]
+            command += [
+                "-DWITH_ACADOS",
+                "-DACADOS_WITH_DAQP",
+                str(folder / "model.c"),
+                *(f"-I{place}" for place in places),
+            ]
             command += [
                 f"-L{prefix / 'lib'}",
                 f"-Wl,-rpath,{prefix / 'lib'}",
@@ -299,8 +303,9 @@ class Driver:
         for index in range(len(solvers)):
             own = found[found[:, 0] == index]
             counted = own[own[:, 1] >= SKIPPED]
+            whole, feedback = 1e3 * counted[:, 2:5].sum(axis=1), 1e3 * counted[:, 3]
             rows.append({
-                "whole": 1e3 * float(np.median(counted[:, 2:5].sum(axis=1))), "feedback": 1e3 * float(np.median(counted[:, 3])),
+                "whole": float(np.median(whole)), "feedback": float(np.median(feedback)),
                 "differs": float(np.max(own[:, 5])), "solved": float(np.mean(own[:, 6] == 0)),
             })  # fmt: skip
         return rows
@@ -342,23 +347,20 @@ def lacks(prefix: Path) -> list[str]:
 
 def agrees(row: Row) -> bool:
     """Whether a variant of acados solved the same problem at every state."""
-    return row["differs"] < AGREES and row["solved"] == 1.0
+    return bool(row["differs"] < AGREES and row["solved"] == 1.0)
 
 
-def chosen(driver: Driver) -> tuple[dict[str, str], list[Row]]:
-    """Of each variant the fastest options that agree, and what was tried; each in a process of its own."""
-    best, tried = {}, []
-    for variant, candidates in OPTIONS.items():
-        rows: list[Row] = []
-        for options in candidates:
-            try:
-                rows.append({"options": options, **driver.run([f"exported,{options}"], 1)[0]})
-            except DriverError as error:
-                tried.append({"options": options, "error": str(error)})
-        tried += rows
-        right = [row for row in rows if agrees(row)] or rows
-        if right:
-            best[variant] = min(right, key=lambda row: float(row["whole"]))["options"]
+def chosen(driver: Driver, n: int) -> tuple[dict[str, str], list[Row]]:
+    """Of each variant the fastest options whose plans agree, if any do, and what was measured of all."""
+    every = [(variant, options) for variant, candidates in OPTIONS.items() for options in candidates]
+    every = [(variant, options) for variant, options in every if int(options.split(",")[1]) <= n]
+    found = driver.run([f"exported,{options}" for _, options in every], 1)
+    tried = [
+        {"variant": v, "options": options, **row} for (v, options), row in zip(every, found, strict=True)
+    ]
+    best: dict[str, str] = {}
+    for row in sorted(filter(agrees, tried), key=lambda row: float(row["whole"])):
+        best.setdefault(row["variant"], row["options"])
     return best, tried
 
 
@@ -370,33 +372,29 @@ def compared(
     check_data(case)
     with tempfile.TemporaryDirectory() as folder:
         driver = Driver.build(case, Path(folder), prefix, flags)
-        best, tried = chosen(driver)
+        best, tried = chosen(driver, n)
         names = {"native": NATIVE}
         for (variant, options), (model, what) in product(best.items(), MODELS.items()):
             names[f"{model},{options}"] = f"acados, {variant}, {what}"
         found = driver.run(list(names), rounds)
-    case_is = {"z": z, "soft bounds": 2 if soft else 0}
-    rows = []
+    kind: Row = {"z": z, "soft bounds": 2 if soft else 0}
+    rows, right = [], []
     for (options, name), row in zip(names.items(), found, strict=True):
-        times = {"whole [ms]": row["whole"], "feedback [ms]": row["feedback"]}
-        right = row["differs"] < SAME if options == "native" else agrees(row)
-        rows.append({
-            **case_is, "solver": name, "options": options, **times, "differs [Nm]": row["differs"], "solved": row["solved"],
-            "agrees": "yes" if right else "no",
-        })  # fmt: skip
-    native, theirs = rows[0], [row for row in rows[1:] if row["agrees"] == "yes"]
-    if native["agrees"] != "yes":
-        raise SystemExit(f"hybrid-mpc's C and Python differ by {native['differs [Nm]']} Nm at z = {z}")
-    if not theirs:
-        raise SystemExit(f"no variant of acados solves the same problem at z = {z}: {rows[1:]}")
-    ratio = dict(case_is)
+        shown = {"whole [ms]": row["whole"], "feedback [ms]": row["feedback"], "differs [Nm]": row["differs"]}
+        rows.append({**kind, "solver": name, "options": options, **shown, "solved": row["solved"]})
+        if options != "native" and agrees(row):
+            right.append(rows[-1])
+    native = rows[0]
+    if not (native["differs [Nm]"] < SAME and native["solved"] == 1.0):
+        raise SystemExit(f"hybrid-mpc's C does not find the plan of the controller in Python: {native}")
+    if not right:
+        raise SystemExit(f"no variant of acados solves the same problem at z = {z}: {tried}")
+    ratio = dict(kind)
     for what in ("whole", "feedback"):
-        fastest = min(theirs, key=lambda row: float(row[f"{what} [ms]"]))
-        ratio |= {
-            f"{what}: acados / hybrid-mpc": fastest[f"{what} [ms]"] / native[f"{what} [ms]"],
-            f"{what}: best": fastest["solver"],
-        }
-    return rows, ratio, [{**case_is, **row} for row in tried]
+        fastest = min(right, key=lambda row: float(row[f"{what} [ms]"]))
+        ratio[f"{what}: acados / hybrid-mpc"] = fastest[f"{what} [ms]"] / native[f"{what} [ms]"]
+        ratio[f"{what}: fastest of acados"] = fastest["solver"].removeprefix("acados, ")
+    return rows, ratio, [{**kind, **row} for row in tried]
 
 
 def main() -> None:
@@ -407,7 +405,7 @@ def main() -> None:
     )
     parser.add_argument("--z", type=int, nargs="+", default=[16, 32, 64, 128], help="sizes of the network")
     parser.add_argument("--n", type=int, default=50, help="horizon")
-    parser.add_argument("--rounds", type=int, default=5, help="times that the solvers take turns")
+    parser.add_argument("--rounds", type=int, default=3, help="times that the solvers take turns")
     parser.add_argument(
         "--flags", default=" ".join(FLAGS), help="of the compiler, for all C that is compiled here"
     )
@@ -419,7 +417,9 @@ def main() -> None:
         raise SystemExit(f"--acados {given.acados}: no {', no '.join(missing)} in it. {HOW}")
     version = version_of(given.acados)
     print(f"acados {version}; compiler flags {given.flags}")
-    rows, ratios, tried = [], [], []
+    rows: list[Row] = []
+    ratios: list[Row] = []
+    tried: list[Row] = []
     load = [round(v, 1) for v in os.getloadavg()]
     for soft, z in product((False, True), given.z):
         more, ratio, options = compared(

@@ -4,8 +4,8 @@
      acados_driver RECORDS RESULTS ROUNDS SOLVER...
 
    RECORDS is a file of STEPS records (below). Each solver takes every record, in order, ROUNDS times, by turns. A solver
-   is "native" or MODEL,QP,N2,MODE,WARM,RIC,TOLERANCE: MODEL exported or casadi; QP partial, full or daqp; N2 the horizon of partial
-   condensing; MODE of HPIPM; WARM the warm start; RIC 1 condenses by a Riccati recursion; TOLERANCE of residuals.
+   is "native" or MODEL,QP,N2,MODE,WARM,RIC: MODEL exported or casadi; QP partial, full or daqp; N2 the horizon of partial
+   condensing; MODE of HPIPM; WARM the warm start; RIC 1 condenses by a Riccati recursion.
 
    Each solve writes a line of RESULTS: index of the solver, record, processor time [s] of the preparation, of the feedback and of
    what remains of the period, largest difference [input] from the plan in the record, status (0: solved).
@@ -224,8 +224,7 @@ static void set_option(acados *a, const char *name, const void *value) {
 static solver make_acados(const char *words) {
   char model[16], qp[16], mode[16];
   int n2, warm, ric;
-  double tolerance;
-  if (sscanf(words, "%15[a-z],%15[a-z],%d,%15[A-Z],%d,%d,%lf", model, qp, &n2, mode, &warm, &ric, &tolerance) != 7) fail(words);
+  if (sscanf(words, "%15[a-z],%15[a-z],%d,%15[A-Z],%d,%d", model, qp, &n2, mode, &warm, &ric) != 6) fail(words);
   const int partial = !strcmp(qp, "partial"), daqp = !strcmp(qp, "daqp");
   acados *const a = calloc(1, sizeof *a);
   ocp_nlp_plan_t *const plan = ocp_nlp_plan_create(N);
