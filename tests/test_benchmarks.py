@@ -1,7 +1,6 @@
 """The benchmarks run, and the routes that they time agree."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -67,36 +66,6 @@ def test_the_controller_in_c_solves_what_python_solves(tmp_path):
     assert [row["solver"] for row in found] == ["rti, Python", "native, -O3 -march=native", "native, -O3"]
     # the same QP in another order of operations
     assert max(row["input differs"] for row in found) < 1e-11
-
-
-def against_acados(out, words):
-    found = rows(out, "acados", f"--z 4 --n 6 --rounds 1 {words}")
-    return found, json.loads(out.read_text())
-
-
-@pytest.mark.full
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
-@pytest.mark.parametrize("bounds", ["", "--soft"])
-def test_without_acados_its_part_is_left_out_with_the_reason(bounds, tmp_path):
-    """The numbers for acados are checked too: the script refuses those that cost something else."""
-    found, whole = against_acados(tmp_path / "out.json", f"--acados {tmp_path / 'none'} {bounds}")
-    assert [row["solver"] for row in found][:3] == ["rti", "native", "native, C alone"]
-    assert not any(row["solver"].startswith("acados") for row in found)
-    assert whole["without_acados"].endswith("none does not start: No such file or directory")
-    assert max(row["KKT"] for row in found) < 1e-9
-    assert max(row["input differs"] for row in found) < 1e-11
-
-
-@pytest.mark.full
-@pytest.mark.skipif(
-    "ACADOS_PYTHON" not in os.environ, reason="ACADOS_PYTHON names no interpreter that has acados"
-)
-def test_acados_solves_what_the_library_solves(tmp_path):
-    found, _ = against_acados(tmp_path / "out.json", f"--acados {os.environ['ACADOS_PYTHON']}")
-    theirs = [row for row in found if row["solver"].startswith("acados")]
-    assert {row["solver"].split(", ")[1] for row in theirs} == {"plain", "structured"}
-    assert all(row["solved"] == 1.0 for row in theirs)
-    assert max(row["input differs"] for row in theirs) < 1e-4
 
 
 @pytest.mark.full
