@@ -3,15 +3,16 @@
 
      acados_driver RECORDS RESULTS ROUNDS SOLVER...
 
-   RECORDS is a file of STEPS records (below). Each solver takes every record, in order, ROUNDS times, by turns. A solver
-   is "native" or MODEL,QP,N2,MODE,WARM,RIC: MODEL exported or casadi; QP partial, full or daqp; N2 the horizon of partial
-   condensing; MODE of HPIPM; WARM the warm start; RIC 1 condenses by a Riccati recursion.
+   RECORDS is a file of STEPS records (below). Each solver takes every record, in order, ROUNDS times, by turns. A
+   solver is "native" or MODEL,QP,N2,MODE,WARM,RIC: MODEL exported or casadi; QP partial, full or daqp; N2 the horizon
+   of partial condensing; MODE of HPIPM; WARM the warm start; RIC 1 condenses by a Riccati recursion.
 
-   Each solve writes a line of RESULTS: index of the solver, record, processor time [s] of the preparation, of the feedback and of
-   what remains of the period, largest difference [input] from the plan in the record, status (0: solved).
+   Each solve writes a line of RESULTS: index of the solver, record, processor time [s] of the preparation, of the
+   feedback and of what remains of the period, largest difference of an input from the plan in the record, status (0:
+   solved).
 
-   Both linearize along the plan of the record, shifted by a period, and get the state of the record. Loading a plan is
-   not timed: acados has no shift of its own in this scheme. */
+   All solvers linearize along the plan of the record, shifted by a period, and get the state of the record. Handing
+   over plan and state is not timed: it takes acados some hundred calls, which a program would avoid. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -156,7 +157,8 @@ static void acados_inputs(void *self, double *u) {
 }
 
 static void set_dims(acados *a) {
-  int nx[N + 1], nu[N + 1], none[N + 1], ns[N + 1], one = 1, states = STATES, bounded = BOUNDED, costs = COSTS, end = NX;
+  int nx[N + 1], nu[N + 1], none[N + 1], ns[N + 1];
+  int one = 1, states = STATES, bounded = BOUNDED, costs = COSTS, end = NX;
   for (int k = 0; k <= N; k++) nx[k] = STATES, nu[k] = k < N, none[k] = 0, ns[k] = k > 0 ? BOUNDED : 0;
   ocp_nlp_dims_set_opt_vars(a->config, a->dims, "nx", nx);
   ocp_nlp_dims_set_opt_vars(a->config, a->dims, "nu", nu);
@@ -233,7 +235,10 @@ static solver make_acados(const char *words) {
       partial ? PARTIAL_CONDENSING_HPIPM : daqp ? FULL_CONDENSING_DAQP : FULL_CONDENSING_HPIPM;
   plan->relaxed_ocp_qp_solver_plan.qp_solver = plan->ocp_qp_solver_plan.qp_solver;
   for (int k = 0; k <= N; k++) plan->nlp_cost[k] = LINEAR_LS, plan->nlp_constraints[k] = BGH;
-  for (int k = 0; k < N; k++) plan->nlp_dynamics[k] = DISCRETE_MODEL, plan->sim_solver_plan[k].sim_solver = INVALID_SIM_SOLVER;
+  for (int k = 0; k < N; k++) {
+    plan->nlp_dynamics[k] = DISCRETE_MODEL;
+    plan->sim_solver_plan[k].sim_solver = INVALID_SIM_SOLVER;
+  }
   plan->regularization = NO_REGULARIZE;
   plan->globalization = FIXED_STEP;
   a->config = ocp_nlp_config_create(*plan);
@@ -299,7 +304,8 @@ int main(int count, char **words) {
   const int given = count - 4;
   if (given < 1 || given > 64) fail("acados_driver RECORDS RESULTS ROUNDS SOLVER...");
   FILE *const file = fopen(words[1], "rb"), *const results = fopen(words[2], "w");
-  if (!file || !results || fread(records, sizeof *records, STEPS, file) != STEPS) fail("no records, or no place for results");
+  if (!file || fread(records, sizeof *records, STEPS, file) != STEPS) fail("no records");
+  if (!results) fail("no place for results");
   fclose(file);
   for (int i = 0; i < given; i++)
     solvers[i] = strcmp(words[i + 4], "native") ? make_acados(words[i + 4]) : make_native();
