@@ -11,13 +11,33 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
-from hybrid_mpc.identify.evaluate import FreeRun, free_runs, stacked_free_runs
+from hybrid_mpc.identify.evaluate import (
+    FreeRun,
+    OutputErrors,
+    evaluation_trajectories,
+    free_runs,
+    measured_as,
+    output_errors,
+    score,
+    stacked_free_runs,
+)
 from hybrid_mpc.identify.fit import beyond_ranges, fit_prior, smoothed
+from hybrid_mpc.identify.linear import BASELINES
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
+from hybrid_mpc.identify.sound import (
+    BoundCost,
+    bound_costs,
+    constant_runs,
+    linear_runs,
+    problems,
+    reversed_signals,
+    structure_doubt,
+    trial_length,
+)
 from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.check import rests_no_more
@@ -77,6 +97,15 @@ class CutPart(CutInterval):
 
 
 @dataclass(frozen=True)
+class BaselineScores:
+    """Free-run errors of a simpler model and its orders, or why there is none."""
+
+    errors: OutputErrors | None = None
+    chosen: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class PriorResult:
     """The fitted prior, and the states that its equations smooth the recordings to.
 
@@ -84,12 +113,19 @@ class PriorResult:
         fit: Parameters with their standard errors, the inputs' delay, and what the smoother assumes.
         nominal: Parameters before the fit.
         units: Units of the parameters.
+        baselines: Errors on the test recordings of simpler models, by name: ``"constant"`` (the training mean) and
+            linear models of inputs and outputs.
+        bounds: Parameters at a bound, and what each bound costs.
+        in_doubt: Why the prior's structure is in doubt.
         arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
     """
 
     fit: PriorFit
     nominal: Mapping[str, float]
     units: Mapping[str, str]
+    baselines: Mapping[str, BaselineScores]
+    bounds: tuple[BoundCost, ...]
+    in_doubt: tuple[str, ...]
     arrays: Mapping[str, Array]
 
 
@@ -195,7 +231,12 @@ def what_prior_reads(context: Context) -> dict[str, object]:
 
 
 def prior_stage(context: Context) -> PriorResult:
-    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
+    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it.
+
+    Raises:
+        InputError: If the fit is impossible, or what it gives is of no use to later stages
+            (:func:`~hybrid_mpc.identify.sound.problems`).
+    """
     make, spec = context.scenario.prior, context.spec
     train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
     longest = spec.free_run or max(
@@ -207,16 +248,57 @@ def prior_stage(context: Context) -> PriorResult:
     )  # fmt: skip
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
     fitted = make(fit.values)
+    smoother = fit.smoother(fitted, spec.dt)
+    refuse([f"fit of the prior: {one}" for one in problems(smoother, fit, every)])
+    context.progress.update("free runs", 1, 1, "comparing with simpler models")
+    trial = trial_length(make, fit, every, spec.dt, longest, context.time_unit)
+    bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)
     told = *beyond_ranges(fitted, every), *rests_no_more(fitted, max(10 * spec.dt, spec.warm_up))
-    fit = replace(fit, warnings=(*fit.warnings, *told))
+    fit = replace(fit, warnings=(*fit.warnings, *(str(one) for one in bounds if one.costs), *told))
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
+    unseen = evaluation_trajectories(every[len(train) + len(valid) :], smoother, context.warm, spec.free_run)
+    baselines = _baselines(context, fitted, fit, unseen)
+    runs = free_runs(PriorStep(fitted, spec.dt, fit.substeps), fitted, unseen, context.warm)
+    error = score(runs, fitted, smoother.sizes.y).error
+    simpler = {name: one.errors.error for name, one in baselines.items() if one.errors is not None}
+    reversed_ = reversed_signals(make, fit, train, spec.dt, trial, context.time_unit)
+    in_doubt = tuple(one for one in (structure_doubt(error, simpler), *reversed_) if one)
+    for doubt in in_doubt:
+        context.progress.warn(f"the structure of the prior is in doubt: {doubt}")
     return PriorResult(
         fit,
         make().values,
         {p.name: p.unit for p in make().parameters},
+        baselines,
+        bounds,
+        in_doubt,
         {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )
+
+
+def _baselines(
+    context: Context, fitted: Prior, fit: PriorFit, unseen: Sequence[Trajectory]
+) -> dict[str, BaselineScores]:
+    """Free runs of simpler models over the test trajectories, from the same warm-up as the prior's."""
+    assert fit.sizes is not None
+    train, valid = context.trajectories("train"), context.trajectories("valid")
+    warm = context.warm + 1  # the prior starts from a state that knows this sample
+    found = {}
+    for name in ("constant", *BASELINES):
+        try:
+            y_hat, chosen = (
+                (constant_runs(train, unseen, warm), "")
+                if name == "constant"
+                else linear_runs(name, train, valid, unseen, context.spec.dt, warm)
+            )
+        except InputError as error:
+            found[name] = BaselineScores(reason=str(error))
+            continue
+        shown = [measured_as(fitted, own) for own in y_hat]
+        errors = output_errors(shown, [t.y[warm:] for t in unseen], fitted.outputs, fit.sizes.y)
+        found[name] = BaselineScores(errors, chosen)
+    return found
 
 
 def what_training_reads(context: Context) -> dict[str, object]:
