@@ -15,6 +15,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import (
     AT_BOUND,
+    GROWN,
     LENGTHS,
     POOR,
     WINDOWS,
@@ -23,7 +24,6 @@ from hybrid_mpc.identify.fit import (
     cut_outputs,
     with_states,
 )
-from hybrid_mpc.identify.linear import BASELINES
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import visited
 from hybrid_mpc.identify.smooth import Smoother, rough_smoother
@@ -112,6 +112,15 @@ def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) 
     return tuple(found)
 
 
+def growth_time(
+    make: Callable[..., Prior], fit: PriorFit, smoothed: Sequence[Trajectory], dt: float
+) -> float:
+    """Time [s] over which small errors grow tenfold where the recordings go; infinite where they do not grow."""
+    own = OutputFit(make, dt)
+    own.points = visited(smoothed)
+    return own.reach(own.scaled(fit.values)) * math.log(GROWN[0]) / math.log(GROWN[-1])
+
+
 def trial_length(
     make: Callable[..., Prior],
     fit: PriorFit,
@@ -120,11 +129,13 @@ def trial_length(
     longest: float | None,
     time_unit: float,
 ) -> float:
-    """Length [s] of the free runs of trial fits: two of the machine's seconds, less where small errors grow faster."""
-    own = OutputFit(make, dt)
-    own.points = visited(smoothed)
-    reach = min(own.reach(own.scaled(fit.values)), own.reach(own.nominal))
-    return max(2 * dt, min(LENGTHS[1] * time_unit, reach, math.inf if longest is None else longest))
+    """Length [s] of the free runs of trial fits: two of the machine's seconds, less where small errors grow faster.
+
+    There it is twice the time in which they grow tenfold: first states are free in a fit.
+    """
+    nominal = replace(fit, values=make().values)
+    reach = min(growth_time(make, one, smoothed, dt) for one in (fit, nominal))
+    return max(2 * dt, min(LENGTHS[1] * time_unit, 2 * reach, math.inf if longest is None else longest))
 
 
 def bound_costs(
@@ -245,23 +256,6 @@ def constant_runs(train: Sequence[Trajectory], test: Sequence[Trajectory], warm:
     """Outputs of the poorest model: the training outputs' means, in each test trajectory after its warm-up."""
     mean = np.nanmean(np.concatenate([t.y for t in train]), axis=0)
     return [np.tile(mean, (len(t.t) - warm, 1)) for t in test]
-
-
-def linear_runs(
-    name: str,
-    train: Sequence[Trajectory],
-    valid: Sequence[Trajectory],
-    test: Sequence[Trajectory],
-    dt: float,
-    warm: int,
-) -> tuple[list[Array], str]:
-    """Free runs of a linear model after the warm-up, and its orders.
-
-    Raises:
-        InputError: If the recordings are too short for any order, or no model of them is stable.
-    """
-    model = BASELINES[name](train, valid, dt, warm=warm)
-    return model.free_runs(test, warm), model.chosen.text
 
 
 def structure_doubt(error: float, baselines: Mapping[str, float]) -> str:

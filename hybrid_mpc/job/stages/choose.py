@@ -57,11 +57,11 @@ def choice_stage(context: Context) -> ChoiceResult:
     candidates = [name for name in models_of(phy) if name in CANDIDATES]
     settings = training_settings(context, "pgrnn")
     runs = unseen_runs(
-        settings, context.smoothed("train"), context.smoothed("valid"), smoother, spec.free_run
+        settings, context.smoothed("train"), context.smoothed("valid"), smoother, prior.longest_run
     )
     calibrating = list(runs)
     if all(own is not None for own, _ in runs):
-        validation = evaluation_trajectories(context.smoothed("valid"), smoother, warm, spec.free_run)
+        validation = evaluation_trajectories(context.smoothed("valid"), smoother, warm, prior.longest_run)
         calibrating.append((None, validation))
     n_left_out = sum(len(them) for _, them in runs)
 

@@ -74,14 +74,20 @@ class EvaluationResult:
 
 
 def evaluation_stage(context: Context) -> EvaluationResult:
-    """Free runs of every model over the test trajectories; the figures show them whole."""
+    """Free runs of every model over the test trajectories.
+
+    The figures show them whole, or their beginning where a machine that runs away is judged by short ones.
+    """
     prior, spec, chosen = context.prior, context.spec, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
     smoother = prior.fit.smoother(phy, spec.dt)
     whole = context.smoothed("test")
-    shown, test = (
-        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
+    longest = prior.longest_run
+    begins = slice(
+        0, None if spec.free_run or longest is None else context.warm + round(longest / spec.dt) + 1
     )
+    shown = evaluation_trajectories([t.part(begins) for t in whole], smoother, context.warm)
+    test = evaluation_trajectories(whole, smoother, context.warm, longest)
     scores: dict[str, ModelScores] = {}
     files: dict[str, dict[str, Scores]] = {}
     arrays: dict[str, Array] = {}
@@ -92,7 +98,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
         context.progress.update("models", i, len(models), name)
         share = chosen.choice.share(name)
         every = runs_of(context, name, phy, test, share=share)
-        drawn = every if spec.free_run is None else runs_of(context, name, phy, shown, share=share)
+        drawn = every if longest is None else runs_of(context, name, phy, shown, share=share)
         model, *networks = (score(runs, phy, spread) for runs in every)
         scores[name] = ModelScores(model, tuple(networks))
         files[name] = {f: score(part, phy, spread) for f, part in _by_file(every[0]).items()}
