@@ -147,12 +147,19 @@ class Smoother:
         held = np.repeat(np.clip(first, horizon.lower, horizon.upper), lengths, axis=0)
         return np.split(horizon.solve(stretches, [filtered, held]), begins[1:])
 
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Bounds of the states ``(n_x,)``: thrice their ranges; none of an angle that may turn through."""
+        low, high = (np.array([getattr(s, end) for s in self.prior.states]) for end in ("lower", "upper"))
+        beyond = np.where([s.periodic for s in self.prior.states], np.inf, high - low)
+        bounded = np.isfinite(beyond)
+        return np.where(bounded, low - beyond, -np.inf), np.where(bounded, high + beyond, np.inf)
+
     @cached_property
     def _horizon(self) -> Horizon:
-        states, sizes = self.prior.states, self.sizes
+        sizes = self.sizes
         rate = np.array([sizes.rate[i] for i in self.prior.corrected])
-        low, high = (np.array([getattr(s, end) for s in states]) for end in ("lower", "upper"))
-        beyond, unknown = high - low, np.full(len(rate), np.inf)
+        (low, high), unknown = self.bounds, np.full(len(rate), np.inf)
         seconds = self.dt * sizes.rate[0] / sizes.x[0]  # of the machine, in a period
         quiet = max(float(np.min(np.array(self.sigma) / np.array(sizes.y))), QUIETEST)
         exact = SLACK * quiet * math.sqrt(seconds) * np.array(sizes.x)
@@ -161,8 +168,7 @@ class Smoother:
             self.prior.equations, self.prior.corrected, self.prior.p, self.dt,
             self.substeps or required_substeps(self.prior, self.dt), self.fading, np.array(self.sigma),
             np.concatenate([exact, walk]), self._ignorance(np.array(self.walk)), np.concatenate([sizes.x, rate]),
-            np.concatenate([np.where(np.isfinite(beyond), low - beyond, -np.inf), -unknown]),
-            np.concatenate([np.where(np.isfinite(beyond), high + beyond, np.inf), unknown]),
+            np.concatenate([low, -unknown]), np.concatenate([high, unknown]),
         )  # fmt: skip
 
     def _ignorance(self, walk: Array) -> Array:

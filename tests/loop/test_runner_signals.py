@@ -136,7 +136,7 @@ TERM = -signal.SIGTERM
         ("slow_hand_over", "SIGTERM", "handing over", ["SIGHUP", "SIGHUP"], TERM, [SAFE]),
         ("slow_hand_over", "SIGINT", "handing over", ["SIGTERM"], TERM, [SAFE]),  # it still has its effect
         ("after_an_error", "SIGTERM", "here", [], TERM, [SAFE]),
-        ("ignored", "SIGHUP", "here", [], 0, [SAFE, "duration"]),
+        ("ignored", "SIGHUP", "here", ["SIGTERM"], TERM, [SAFE]),
         ("own_handler", "SIGTERM", "here", [], 0, [SAFE, "handler", "SIGTERM"]),
         ("suspended", "SIGTSTP", SAFE, ["SIGCONT"], 0, [SAFE, "SIGTSTP"]),  # safe before it stands still
         ("stopped_thread", "SIGTERM", "here", [], 0, [SAFE, "stop"]),

@@ -51,6 +51,12 @@ def _recordings(results: Results) -> Iterator[Hint]:
 
 
 def _prior(found: Identification) -> Iterator[Hint]:
+    for doubt in found.details.prior_parameters.in_doubt:
+        yield Hint(
+            "bad", f"The structure of the prior is in doubt: {doubt}.",
+            "Correct the prior first (docs/prior-fit.md#is-the-prior-sound): a state, a delay or an input that is "
+            "missing, or a sign. A network or an observer on top of it only hides the fault.",
+        )  # fmt: skip
     for warning in found.details.prior_parameters.warnings[:MOST]:
         yield Hint("plain", f"Fit of the prior: {warning}", "docs/prior-fit.md says what to do.")
     for label, fit in _by_output(found.fit_percent.get("phy")).items():
@@ -85,15 +91,17 @@ def _choice(found: Identification) -> Iterator[Hint]:
 
 
 def _linear(found: Identification) -> Iterator[Hint]:
-    """A linear model of inputs and outputs that has less error on unseen data than the recommended one."""
+    """A simpler model that has less error on unseen data than the recommended one, unless a doubt says so already."""
+    if found.details.prior_parameters.in_doubt:
+        return
     chosen = found.details.choice.recommended
     own = found.error.get(chosen)
     errors = {name: b.errors.error for name, b in found.details.baselines.items() if b.errors is not None}
     name = min(errors, key=lambda n: errors[n], default="")
     if name and isinstance(own, float) and errors[name] < own:
+        model = "a constant" if name == "constant" else f"the linear model {name}"
         yield Hint(
-            "bad", f"On unseen data the linear model {name} has an error of {errors[name]:.3g}, {name_of(chosen)} "
-            f"{own:.3g}.",
+            "bad", f"On unseen data {model} has an error of {errors[name]:.3g}, {name_of(chosen)} {own:.3g}.",
             "The prior lacks something that is linear: a state (a lag, a wall, a filter), a delay, or an input that "
             "the recordings have. Look at the residuals of its free runs.",
         )  # fmt: skip

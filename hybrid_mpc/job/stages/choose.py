@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -57,11 +57,11 @@ def choice_stage(context: Context) -> ChoiceResult:
     candidates = [name for name in models_of(phy) if name in CANDIDATES]
     settings = training_settings(context, "pgrnn")
     runs = unseen_runs(
-        settings, context.smoothed("train"), context.smoothed("valid"), smoother, spec.free_run
+        settings, context.smoothed("train"), context.smoothed("valid"), smoother, prior.longest_run
     )
     calibrating = list(runs)
     if all(own is not None for own, _ in runs):
-        validation = evaluation_trajectories(context.smoothed("valid"), smoother, warm, spec.free_run)
+        validation = evaluation_trajectories(context.smoothed("valid"), smoother, warm, prior.longest_run)
         calibrating.append((None, validation))
     n_left_out = sum(len(them) for _, them in runs)
 
@@ -86,6 +86,9 @@ def choice_stage(context: Context) -> ChoiceResult:
         {name: errors_of(name) for name in candidates}, deploy=context.settings.deploy, samples=samples,
         recordings=recordings, evidence=evidence, shrunk=errors_of,
     )  # fmt: skip
+    if found.recommended != "phy" and prior.in_doubt:  # networks must not hide a wrong structure
+        doubt = f"But the structure of the prior is in doubt: {prior.in_doubt[0]}."
+        found = replace(found, reason=f"{found.reason} {doubt}")
     bands: dict[str, Bands] = {}
     for name in candidates:
         every = list(zip(*scored(name, found.share(name)), strict=True))

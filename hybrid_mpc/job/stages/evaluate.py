@@ -9,25 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.bands import RunParts, coverage, interval_score
 from hybrid_mpc.identify.evaluate import (
     FreeRun,
-    OutputErrors,
     Scores,
     evaluation_trajectories,
-    measured_as,
-    output_errors,
     score,
 )
-from hybrid_mpc.identify.linear import BASELINES
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.choose import CHOICE, run_parts
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, models_of, runs_of
 from hybrid_mpc.kit.prediction import Bands
-from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[Any]
 DRAWN = ("t", "u", "x", "x_hat", "y", "y_hat", "balances", "balances_hat")
@@ -54,15 +47,6 @@ class BandScores:
 
 
 @dataclass(frozen=True)
-class BaselineScores:
-    """Free-run errors of a linear model and its orders, or why there is none."""
-
-    errors: OutputErrors | None = None
-    chosen: str = ""
-    reason: str = ""
-
-
-@dataclass(frozen=True)
 class ModelScores:
     """Errors of a model on unseen data, and of each of its networks alone, if it is the mean of several."""
 
@@ -79,7 +63,6 @@ class EvaluationResult:
         by_file: Errors by model and recording.
         runs: Names of the free runs.
         bands: What the bands around the free runs hold, by model.
-        baselines: Errors of linear models of inputs and outputs, by name.
         arrays: Signals of each run, ``"MODEL/RUN/SIGNAL"``.
     """
 
@@ -87,19 +70,24 @@ class EvaluationResult:
     by_file: Mapping[str, Mapping[str, Scores]]
     runs: tuple[str, ...]
     bands: Mapping[str, BandScores]
-    baselines: Mapping[str, BaselineScores]
     arrays: Mapping[str, Array]
 
 
 def evaluation_stage(context: Context) -> EvaluationResult:
-    """Free runs of every model over the test trajectories; the figures show them whole."""
+    """Free runs of every model over the test trajectories.
+
+    The figures show them whole, or their beginning where a machine that runs away is judged by short ones.
+    """
     prior, spec, chosen = context.prior, context.spec, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
     smoother = prior.fit.smoother(phy, spec.dt)
     whole = context.smoothed("test")
-    shown, test = (
-        evaluation_trajectories(whole, smoother, context.warm, length) for length in (None, spec.free_run)
+    longest = prior.longest_run
+    begins = slice(
+        0, None if spec.free_run or longest is None else context.warm + round(longest / spec.dt) + 1
     )
+    shown = evaluation_trajectories([t.part(begins) for t in whole], smoother, context.warm)
+    test = evaluation_trajectories(whole, smoother, context.warm, longest)
     scores: dict[str, ModelScores] = {}
     files: dict[str, dict[str, Scores]] = {}
     arrays: dict[str, Array] = {}
@@ -110,7 +98,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
         context.progress.update("models", i, len(models), name)
         share = chosen.choice.share(name)
         every = runs_of(context, name, phy, test, share=share)
-        drawn = every if spec.free_run is None else runs_of(context, name, phy, shown, share=share)
+        drawn = every if longest is None else runs_of(context, name, phy, shown, share=share)
         model, *networks = (score(runs, phy, spread) for runs in every)
         scores[name] = ModelScores(model, tuple(networks))
         files[name] = {f: score(part, phy, spread) for f, part in _by_file(every[0]).items()}
@@ -123,8 +111,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
             bands[name] = _band_scores(parts_of_runs, own, [s.label for s in phy.outputs])
             for run, parts in zip(drawn[0], run_parts(phy, prior.fit, drawn, spec.dt), strict=True):
                 arrays[f"{name}/{run.name}/band"] = own.half_width(parts.parts)
-    baselines = {name: _baseline(context, name, phy, test, spread) for name in BASELINES}
-    return EvaluationResult(scores, files, tuple(t.name for t in whole), bands, baselines, arrays)
+    return EvaluationResult(scores, files, tuple(t.name for t in whole), bands, arrays)
 
 
 def _band_scores(runs: Sequence[RunParts], bands: Bands, outputs: Sequence[str]) -> BandScores:
@@ -146,21 +133,6 @@ def _band_scores(runs: Sequence[RunParts], bands: Bands, outputs: Sequence[str])
         by_output([interval_score(run, bands) for run in runs]),
         by_output([interval_score(run, flat) for run in runs]),
     )
-
-
-def _baseline(
-    context: Context, name: str, phy: Prior, test: Sequence[Trajectory], spread: Sequence[float]
-) -> BaselineScores:
-    """Free runs of a linear model over the test trajectories, from the same warm-up as the others."""
-    train, valid = context.trajectories("train"), context.trajectories("valid")
-    warm = context.warm + 1  # the others start from a state that knows this sample
-    try:
-        model = BASELINES[name](train, valid, context.spec.dt, warm=warm)
-    except InputError as error:
-        return BaselineScores(reason=str(error))
-    y_hat = [measured_as(phy, own) for own in model.free_runs(test, warm)]
-    errors = output_errors(y_hat, [t.y[warm:] for t in test], phy.outputs, spread)
-    return BaselineScores(errors, model.chosen.text)
 
 
 def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:

@@ -9,15 +9,36 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from hybrid_mpc.data import scales
 from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
-from hybrid_mpc.identify.evaluate import FreeRun, free_runs, stacked_free_runs
+from hybrid_mpc.identify.evaluate import (
+    FreeRun,
+    OutputErrors,
+    evaluation_trajectories,
+    free_runs,
+    measured_as,
+    output_errors,
+    score,
+    stacked_free_runs,
+)
 from hybrid_mpc.identify.fit import beyond_ranges, fit_prior, smoothed
+from hybrid_mpc.identify.linear import BASELINES, LinearModel
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
+from hybrid_mpc.identify.sound import (
+    BoundCost,
+    bound_costs,
+    constant_runs,
+    growth_time,
+    problems,
+    reversed_signals,
+    structure_doubt,
+    trial_length,
+)
 from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.check import rests_no_more
@@ -77,6 +98,15 @@ class CutPart(CutInterval):
 
 
 @dataclass(frozen=True)
+class BaselineScores:
+    """Free-run errors of a simpler model and its orders, or why there is none."""
+
+    errors: OutputErrors | None = None
+    chosen: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class PriorResult:
     """The fitted prior, and the states that its equations smooth the recordings to.
 
@@ -84,12 +114,21 @@ class PriorResult:
         fit: Parameters with their standard errors, the inputs' delay, and what the smoother assumes.
         nominal: Parameters before the fit.
         units: Units of the parameters.
+        baselines: Errors on the test recordings of simpler models, by name: ``"constant"`` (the training mean) and
+            linear models of inputs and outputs.
+        bounds: Parameters at a bound, and what each bound costs.
+        in_doubt: Why the prior's structure is in doubt.
+        longest_run: Length [s] of the free runs that models are judged by; None: whole recordings.
         arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
     """
 
     fit: PriorFit
     nominal: Mapping[str, float]
     units: Mapping[str, str]
+    baselines: Mapping[str, BaselineScores]
+    bounds: tuple[BoundCost, ...]
+    in_doubt: tuple[str, ...]
+    longest_run: float | None
     arrays: Mapping[str, Array]
 
 
@@ -195,7 +234,12 @@ def what_prior_reads(context: Context) -> dict[str, object]:
 
 
 def prior_stage(context: Context) -> PriorResult:
-    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it."""
+    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it.
+
+    Raises:
+        InputError: If the fit is impossible, or what it gives is of no use to later stages
+            (:func:`~hybrid_mpc.identify.sound.problems`).
+    """
     make, spec = context.scenario.prior, context.spec
     train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
     longest = spec.free_run or max(
@@ -207,16 +251,95 @@ def prior_stage(context: Context) -> PriorResult:
     )  # fmt: skip
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
     fitted = make(fit.values)
+    smoother = fit.smoother(fitted, spec.dt)
+    refuse([f"fit of the prior: {one}" for one in problems(smoother, fit, every)])
+    context.progress.update("free runs", 1, 1, "comparing with simpler models")
+    trial = trial_length(make, fit, every, spec.dt, longest, context.time_unit)
+    bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)
     told = *beyond_ranges(fitted, every), *rests_no_more(fitted, max(10 * spec.dt, spec.warm_up))
-    fit = replace(fit, warnings=(*fit.warnings, *told))
+    fit = replace(fit, warnings=(*fit.warnings, *(str(one) for one in bounds if one.costs), *told))
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
+    unseen = every[len(train) + len(valid) :]
+    step = PriorStep(fitted, spec.dt, fit.substeps)
+    linear = _linear_models(context)
+
+    def judged(length: float | None) -> tuple[float, dict[str, BaselineScores]]:
+        """Errors of free runs of this length, of the fitted prior and of simpler models."""
+        runs = evaluation_trajectories(unseen, smoother, context.warm, length)
+        own = score(free_runs(step, fitted, runs, context.warm), fitted, smoother.sizes.y).error
+        return own, _baselines(context, linear, fitted, smoother.sizes.y, runs)
+
+    longest_run = spec.free_run
+    error, baselines = judged(longest_run)
+    told = ()
+    if longest_run is None and (shorter := growth_time(make, fit, every, spec.dt)) < (longest or 0.0):
+        constant = baselines["constant"].errors
+        if (
+            constant is not None and error > constant.error
+        ):  # whole runs say nothing of a machine that runs away
+            longest_run = max(shorter, 2 * spec.dt)
+            error, baselines = judged(longest_run)
+            told = (
+                f"small errors grow tenfold in {shorter:.2g} s, so long free runs say nothing of a model: models are "
+                "trained and judged by free runs of that length; free_run of the DataSpec sets another",
+            )
+            context.progress.warn(told[0])
+    fit = replace(fit, warnings=(*fit.warnings, *told))
+    # of a machine that runs away, recorded under its controller, inputs tell linear models what outputs will be
+    compared = baselines if not told else {"constant": baselines["constant"]}
+    simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
+    reversed_ = reversed_signals(make, fit, train, spec.dt, trial, context.time_unit)
+    in_doubt = tuple(one for one in (structure_doubt(error, simpler), *reversed_) if one)
+    for doubt in in_doubt:
+        context.progress.warn(f"the structure of the prior is in doubt: {doubt}")
     return PriorResult(
         fit,
         make().values,
         {p.name: p.unit for p in make().parameters},
+        baselines,
+        bounds,
+        in_doubt,
+        longest_run,
         {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )
+
+
+def _linear_models(context: Context) -> dict[str, LinearModel | str]:
+    """Linear models of inputs and outputs by name, or why there is none."""
+    train, valid = context.trajectories("train"), context.trajectories("valid")
+    found: dict[str, LinearModel | str] = {}
+    for name, fit_linear in BASELINES.items():
+        try:
+            found[name] = fit_linear(train, valid, context.spec.dt, warm=context.warm + 1)
+        except InputError as error:
+            found[name] = str(error)
+    return found
+
+
+def _baselines(
+    context: Context,
+    linear: Mapping[str, LinearModel | str],
+    fitted: Prior,
+    spread: Sequence[float],
+    runs: Sequence[Trajectory],
+) -> dict[str, BaselineScores]:
+    """Errors of simpler models over the same trajectories, from the same warm-up as the prior's."""
+    warm = context.warm + 1  # the prior starts from a state that knows this sample
+
+    def scored(y_hat: Sequence[Array], chosen: str) -> BaselineScores:
+        shown = [measured_as(fitted, own) for own in y_hat]
+        return BaselineScores(
+            output_errors(shown, [t.y[warm:] for t in runs], fitted.outputs, spread), chosen
+        )
+
+    found = {"constant": scored(constant_runs(context.trajectories("train"), runs, warm), "")}
+    for name, model in linear.items():
+        if isinstance(model, str):
+            found[name] = BaselineScores(reason=model)
+        else:
+            found[name] = scored(model.free_runs(runs, warm), model.chosen.text)
+    return found
 
 
 def what_training_reads(context: Context) -> dict[str, object]:
@@ -245,7 +368,7 @@ def training_stage(context: Context) -> TrainingResult:
         context.prior.fit.values,
         context.smoothed("train"),
         context.smoothed("valid"),
-        {kind: training_settings(context, kind) for kind in kinds_of(context.scenario.prior())},
+        {kind: _as_long_as_judged(context, kind) for kind in kinds_of(context.scenario.prior())},
         folder,
         device=context.settings.device,
         on_progress=context.progress.update,
@@ -360,6 +483,16 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
         parts=max(PARTS, b.networks),
     )
     return replace(settings, **context.settings.network())
+
+
+def _as_long_as_judged(context: Context, kind: str) -> TrainingSettings:
+    """The same, with free runs no longer than those by which a machine that runs away is judged."""
+    settings, longest = training_settings(context, kind), context.prior.longest_run
+    if context.spec.free_run is not None or longest is None:
+        return settings
+    most = scales.periods(longest, context.spec.dt, 2)
+    validation = settings.validation_horizon or most
+    return replace(settings, horizon=min(settings.horizon, most), validation_horizon=validation)
 
 
 @dataclass(frozen=True)

@@ -474,7 +474,8 @@ def _free_run_tables(context: Context, found: Identification) -> list[Table]:
         errors = own.errors or OutputErrors(math.inf, {}, {})
         error = finite(errors.error)
         rmse, fit = ([_by(by, label) for label in outputs] for by in (errors.rmse, errors.fit_percent))
-        rows.append((f"{name} (linear)", error, _percent(error, base), *rmse, *fit))
+        model = name if name == "constant" else f"{name} (linear)"
+        rows.append((model, error, _percent(error, base), *rmse, *fit))
     columns = ("model", "error [spreads]", "over the prior's", *(f"RMSE of {label}" for label in outputs),
                *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
     tables = [Table(columns, rows, "Free runs on unseen data: outputs.")]

@@ -25,10 +25,10 @@ from hybrid_mpc.job.stages.analyze import ANALYSIS, ModelAnalysis
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import BASELINES, CONTROL, REPORTED, comparisons
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecording, ObserverTest
-from hybrid_mpc.job.stages.evaluate import EVALUATION, BandScores, BaselineScores
+from hybrid_mpc.job.stages.evaluate import EVALUATION, BandScores
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
-from hybrid_mpc.job.stages.identify import DATA, MODELS, CutInterval
+from hybrid_mpc.job.stages.identify import DATA, MODELS, BaselineScores, CutInterval
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
@@ -67,13 +67,16 @@ class Data:
 
 @dataclass(frozen=True)
 class FittedPrior:
-    """Parameters of the fitted prior, their standard errors, those before the fit, warnings, and each stage's error."""
+    """Parameters of the fitted prior, their standard errors, those before the fit, warnings, each stage's error, and
+    why the prior's structure is in doubt.
+    """
 
     values: Mapping[str, float]
     standard_errors: Mapping[str, float]
     nominal: Mapping[str, float]
     warnings: tuple[str, ...]
     stages: tuple[Mapping[str, Any], ...]
+    in_doubt: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -481,7 +484,12 @@ def identification(context: Context) -> Identification:
     e_sim = {name: finite(scores.e_sim) for name, scores in model.items()}
     details = IdentificationDetails(
         FittedPrior(
-            prior.fit.values, prior.fit.standard_errors, prior.nominal, prior.fit.warnings, prior.fit.stages
+            prior.fit.values,
+            prior.fit.standard_errors,
+            prior.nominal,
+            prior.fit.warnings,
+            prior.fit.stages,
+            prior.in_doubt,
         ),
         {name: scores.networks for name, scores in found.scores.items()},
         {
@@ -503,7 +511,7 @@ def identification(context: Context) -> Identification:
             },
         ),
         found.bands,
-        found.baselines,
+        prior.baselines,
         network or None,
     )
     return Identification(

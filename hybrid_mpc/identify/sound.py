@@ -1,0 +1,283 @@
+"""Whether a fitted prior is sound: what stops a run, and what puts the prior's structure in doubt. No torch in here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data import scales
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.fit import (
+    AT_BOUND,
+    GROWN,
+    LENGTHS,
+    POOR,
+    WINDOWS,
+    OutputFit,
+    Shooting,
+    cut_outputs,
+    with_states,
+)
+from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.simulation import visited
+from hybrid_mpc.identify.smooth import Smoother, rough_smoother
+from hybrid_mpc.machine.prior import Prior
+
+Array = NDArray[np.float64]
+STUCK = 0.05
+"""Share of the samples that may lie at the bounds of the smoothed states: more are no outliers."""
+NEAR = 1e-3
+"""Distance from a bound, over the range, that counts as at the bound."""
+CLEARLY = 0.75
+"""Error of a linear model over the fitted prior's below which the prior lacks something: two models of the same
+structure, fitted to the same recordings, differ by less."""
+COSTLY = 0.95
+"""Error without a bound over the error with it below which the bound costs something."""
+REVERSED = 0.5
+"""Error with one signal counted the other way over the error as recorded below which its sign is in doubt."""
+ITERATIONS = 12
+"""Gauss-Newton steps of a trial fit at most; it shows the size of an error, no more."""
+
+
+@dataclass(frozen=True)
+class BoundCost:
+    """A parameter that the fit leaves at a bound, and what the bound costs.
+
+    Args:
+        parameter: Its name.
+        value: The bound [its unit].
+        free: Value that it would have without this bound [its unit].
+        ratio: Error of free runs without the bound over the error with it [-]; 1 where nothing is gained.
+
+    Example:
+        >>> print(BoundCost("k", 2.0, 2.6, 0.8))
+        k ends at its bound 2; with a wider one it is 2.6, and the error falls to 80 %
+    """
+
+    parameter: str
+    value: float
+    free: float
+    ratio: float
+
+    @property
+    def costs(self) -> bool:
+        """Whether the bound costs something."""
+        return self.ratio < COSTLY
+
+    def __str__(self) -> str:
+        ends = f"{self.parameter} ends at its bound {self.value:.4g}"
+        if not self.costs:
+            return f"{ends}: the error without it is the same to {100 * (1 - COSTLY):.0f} %"
+        return (
+            f"{ends}; with a wider one it is {self.free:.4g}, and the error falls to {100 * self.ratio:.0f} %"
+        )
+
+
+def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) -> tuple[str, ...]:
+    """What no later stage may be given: numbers that are not finite, and states that have run away.
+
+    Args:
+        smoother: Of the fitted prior (:meth:`~hybrid_mpc.identify.prior_result.PriorFit.smoother`).
+        fit: What the fit gave.
+        smoothed: All trajectories with the states that it smooths.
+    """
+    prior, found = smoother.prior, []
+    numbers = {
+        "value": fit.values, "standard error": fit.standard_errors,
+        "noise of sensor": dict(zip((s.name for s in prior.outputs), fit.sigma, strict=False)),
+        "process noise of state": dict(zip((prior.states[i].name for i in prior.corrected), fit.walk, strict=False)),
+    }  # fmt: skip
+    for what, values in numbers.items():
+        found += [f"{what} {name} is not finite ({v})" for name, v in values.items() if not math.isfinite(v)]
+    for i, (state, low, high) in enumerate(zip(prior.states, *smoother.bounds, strict=True)):
+        x = np.concatenate([t.x[:, i] for t in smoothed])
+        lost = ~np.isfinite(np.concatenate([t.xdot[:, i] for t in smoothed])) | ~np.isfinite(x)
+        if lost.any():
+            found.append(f"{state.label} or its rate is not finite in {lost.sum()} smoothed samples")
+            continue
+        near = NEAR * (high - low) if math.isfinite(high - low) else 0.0
+        away = float(np.mean((x <= low + near) | (x >= high - near)))
+        if away > STUCK:
+            found.append(
+                f"{state.label} lies at three times its range [{state.lower:g}, {state.upper:g}] or beyond in "
+                f"{away:.0%} of the smoothed samples ({x.min():.4g} to {x.max():.4g}): no sensor determines it, its "
+                "range is wrong, or an equation that contains it is"
+            )
+    return tuple(found)
+
+
+def growth_time(
+    make: Callable[..., Prior], fit: PriorFit, smoothed: Sequence[Trajectory], dt: float
+) -> float:
+    """Time [s] over which small errors grow tenfold where the recordings go; infinite where they do not grow."""
+    own = OutputFit(make, dt)
+    own.points = visited(smoothed)
+    return own.reach(own.scaled(fit.values)) * math.log(GROWN[0]) / math.log(GROWN[-1])
+
+
+def trial_length(
+    make: Callable[..., Prior],
+    fit: PriorFit,
+    smoothed: Sequence[Trajectory],
+    dt: float,
+    longest: float | None,
+    time_unit: float,
+) -> float:
+    """Length [s] of the free runs of trial fits: two of the machine's seconds, less where small errors grow faster.
+
+    There it is twice the time in which they grow tenfold: first states are free in a fit.
+    """
+    nominal = replace(fit, values=make().values)
+    reach = min(growth_time(make, one, smoothed, dt) for one in (fit, nominal))
+    return max(2 * dt, min(LENGTHS[1] * time_unit, 2 * reach, math.inf if longest is None else longest))
+
+
+def bound_costs(
+    make: Callable[..., Prior], fit: PriorFit, smoothed: Sequence[Trajectory], dt: float, length: float
+) -> tuple[BoundCost, ...]:
+    """What each bound costs at which the fit leaves a parameter.
+
+    The parameter's bound is moved by its whole range, all are fitted anew to windows of ``length`` [s], and errors of
+    free runs over these windows are compared.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        fit: What the fit gave.
+        smoothed: Training trajectories with smoothed states and the inputs that act.
+        dt: Model period [s].
+        length: Length [s] of the windows.
+    """
+    own = OutputFit(make, dt)
+    theta = own.scaled(fit.values)
+    span = own.upper - own.lower
+    low, high = theta - own.lower < AT_BOUND * span, own.upper - theta < AT_BOUND * span
+    found = []
+    for i in np.flatnonzero(low | high):
+        free = OutputFit(make, dt)
+        free.points = visited(smoothed)
+        free.lower[i] -= span[i] * low[i]
+        free.upper[i] += span[i] * high[i]
+        problem = _windows(free, smoothed, np.array(fit.smoother(make(fit.values), dt).sizes.x), length)
+        try:
+            solved = problem.solve(theta, ITERATIONS).theta
+            before, after = problem.explained([theta, solved])
+        except InputError:  # the equations hold no values beyond this bound, or are too stiff there
+            solved, before, after = theta, 1.0, 1.0
+        name, unit = own.names[i], own.unit[i]
+        found.append(
+            BoundCost(
+                name, float(theta[i] * unit), float(solved[i] * unit), after / before if before else 1.0
+            )
+        )
+    return tuple(found)
+
+
+def reversed_signals(
+    make: Callable[..., Prior],
+    fit: PriorFit,
+    recorded: Sequence[Trajectory],
+    dt: float,
+    length: float,
+    time_unit: float,
+) -> tuple[str, ...]:
+    """Inputs and outputs that fit far better when they are counted the other way.
+
+    A wrong sign of a sensor or an actuator is the most common error of a first prior, and no parameter can mend it. It
+    is looked for where the fitted prior leaves more than ``POOR`` of the outputs' spread: each signal whose range has
+    both signs is negated by itself, and the prior is fitted anew to free runs of ``length`` [s], as it is without.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        fit: What the fit gave.
+        recorded: Training trajectories as recorded.
+        dt: Model period [s].
+        length: Length [s] of the windows.
+        time_unit: The machine's second [s].
+    """
+    if not len(fit.stages) or min(row["validation_error"] for row in fit.stages) <= POOR:
+        return ()
+    prior, acting = make(), shifted(recorded, fit.delay)
+    # a fit with a wrong sign has no values to begin with: both begin at the nominal ones, or at the fitted
+    own = OutputFit(make, dt)
+    starts = [own.nominal, own.scaled(fit.values)]
+
+    def error_of(trajectories: Sequence[Trajectory]) -> float:
+        smoother = rough_smoother(prior, trajectories, dt, time_unit=time_unit)
+        known = with_states(trajectories, smoother, 0.0)
+        trial = OutputFit(make, dt)
+        trial.points = visited(known)
+        problem = _windows(trial, known, np.array(smoother.sizes.x), length)
+        try:
+            return min(problem.explained([problem.solve(one, ITERATIONS).theta for one in starts]))
+        except InputError:  # too stiff for the period with such values
+            return math.inf
+
+    before, found = error_of(acting), []
+    for key, signals in (("y", prior.outputs), ("u", prior.inputs)):
+        for j, signal in enumerate(signals):
+            if not signal.lower < 0.0 < signal.upper:
+                continue
+            after = error_of([_negated(t, key, j) for t in acting])
+            if after < REVERSED * before:
+                found.append(
+                    f"{signal.label} seems to be counted the other way: with its sign changed free runs of "
+                    f"{length:.3g} s leave {after:.2g} of the outputs' spread, as recorded {before:.2g}. Change its "
+                    "sign in the prior or in the data specification"
+                )
+    return tuple(found)
+
+
+def _negated(trajectory: Trajectory, key: str, j: int) -> Trajectory:
+    """The trajectory with one of its outputs (``"y"``) or inputs (``"u"``) counted the other way."""
+    values = np.array(getattr(trajectory, key))
+    values[:, j] = -values[:, j]
+    if key == "u":
+        return replace(trajectory, u=values)
+    censored = np.array(trajectory.censored)
+    censored[:, j] = -censored[:, j]
+    return replace(trajectory, y=values, censored=censored)
+
+
+def _windows(fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float) -> Shooting:
+    """Windows of ``length`` [s], or as long as the recordings hold."""
+    longest = max(len(t.t) for t in known) - 1
+    periods = min(scales.periods(length, fit.dt, 2), longest)
+    windows = cut_outputs(known, periods, 0, WINDOWS // 2, fit.prior.states)
+    return Shooting(fit, windows, sizes)
+
+
+def constant_runs(train: Sequence[Trajectory], test: Sequence[Trajectory], warm: int) -> list[Array]:
+    """Outputs of the poorest model: the training outputs' means, in each test trajectory after its warm-up."""
+    mean = np.nanmean(np.concatenate([t.y for t in train]), axis=0)
+    return [np.tile(mean, (len(t.t) - warm, 1)) for t in test]
+
+
+def structure_doubt(error: float, baselines: Mapping[str, float]) -> str:
+    """Why the structure of the fitted prior is in doubt; empty where nothing says so.
+
+    Args:
+        error: Its error of free runs on unseen recordings, over the outputs' spread.
+        baselines: That of simpler models on the same runs, by name: ``"constant"`` for the training mean, and linear
+            models of inputs and outputs.
+
+    Example:
+        >>> structure_doubt(0.35, {"constant": 1.1, "ARX": 0.3, "N4SID": 0.22})
+        'the linear model N4SID has an error of 0.22 on unseen recordings, the fitted prior 0.35'
+        >>> structure_doubt(0.35, {"constant": 1.1, "ARX": 0.3})
+        ''
+    """
+    if not baselines:
+        return ""
+    name = min(baselines, key=lambda one: baselines[one])
+    model = "a constant" if name == "constant" else f"the linear model {name}"
+    if name == "constant" and error < baselines[name]:
+        return ""
+    if name != "constant" and baselines[name] >= CLEARLY * error:
+        return ""
+    return f"{model} has an error of {baselines[name]:.3g} on unseen recordings, the fitted prior {error:.3g}"

@@ -1,0 +1,144 @@
+"""Gates behind the fit of the prior: what stops a run, and what puts the prior's structure in doubt."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from example_priors import Swing
+from simulated_pendulum import DT, TRUTH, Pendulum, record
+
+from hybrid_mpc import Parameter, Signal, fit_prior
+from hybrid_mpc.identify.fit import smoothed
+from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.sound import (
+    bound_costs,
+    constant_runs,
+    problems,
+    reversed_signals,
+    structure_doubt,
+    trial_length,
+)
+
+SECONDS = 1.0
+
+
+class Tight(Pendulum):
+    """Its stiffness may not be what it is."""
+
+    parameters = tuple(
+        Parameter("mgl", 0.7, "N m", 0.5, 0.8) if p.name == "mgl" else p for p in Swing.parameters
+    )
+
+
+class Ranged(Pendulum):
+    """Its angle and its speed have ranges; the angle turns through."""
+
+    states = (Signal("phi", "rad", -3.2, 3.2, periodic=True), Signal("phi_dot", "rad/s", -20.0, 20.0))
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rng = np.random.default_rng(1)
+    made = [record(seed) for seed in range(3)]
+    return [replace(t, y=t.y + 2e-3 * rng.standard_normal(t.y.shape)) for t in made]
+
+
+def fitted(make, runs):
+    *train, valid = runs
+    return fit_prior(make, train, [replace(valid, role="valid")], dt=DT, time_unit=SECONDS)
+
+
+@pytest.fixture(scope="module")
+def sound(runs):
+    return fitted(Pendulum, runs)
+
+
+@pytest.fixture(scope="module")
+def tight(runs):
+    return fitted(Tight, runs)
+
+
+def negated(runs, key):
+    return [replace(t, **{key: -getattr(t, key)}) for t in runs]
+
+
+def test_a_sound_fit_has_no_problem_and_no_doubt(runs, sound):
+    states = smoothed(Pendulum, sound, runs, DT)
+    assert problems(sound.smoother(Pendulum(sound.values), DT), sound, states) == ()
+    assert bound_costs(Pendulum, sound, states, DT, 2.0) == ()
+    assert reversed_signals(Pendulum, sound, runs, DT, 2.0, SECONDS) == ()
+
+
+def test_numbers_that_are_not_finite_are_problems(runs, sound):
+    states, smoother = smoothed(Pendulum, sound, runs, DT), sound.smoother(Pendulum(sound.values), DT)
+    cases = {
+        "mgl": replace(sound, values={**sound.values, "mgl": math.nan}),
+        "phi": replace(sound, sigma=(math.inf,)),
+    }
+    for name, fit in cases.items():
+        (found,) = problems(smoother, fit, states)
+        assert name in found
+    x = states[0].x.copy()
+    x[3, 1] = math.nan
+    (found,) = problems(smoother, sound, [replace(states[0], x=x)])
+    assert found.startswith("phi_dot ")
+
+
+def test_states_that_run_away_are_problems_and_single_samples_are_none(runs, sound):
+    smoother = sound.smoother(Ranged(sound.values), DT)
+    first, away = smoothed(Pendulum, sound, runs, DT)[0], smoother.bounds[1][1]
+    assert away == 60.0  # three times the range of 40, around its middle
+    assert math.isinf(smoother.bounds[1][0])  # an angle that turns through has no end
+    for share, n in ((0.02, 0), (0.2, 1)):
+        x = first.x.copy()
+        x[: round(share * len(x)), 1] = away
+        assert len(problems(smoother, sound, [replace(first, x=x)])) == n
+
+
+def test_the_cost_of_a_bound_is_that_of_a_fit_without_it(runs, tight, sound):
+    """The stiffness of 1.2 N m may be 0.8 at most: without this bound it is found, and little is left but noise."""
+    states = smoothed(Tight, tight, runs[:2], DT)
+    (found,) = bound_costs(Tight, tight, states, DT, 2.0)
+    assert (found.parameter, found.value) == ("mgl", pytest.approx(0.8))
+    # the range of 0.3 is added to it: 1.1 is the nearest that it may be
+    assert found.free == pytest.approx(1.1, rel=1e-3)
+    assert found.costs
+    assert found.ratio < 0.6
+
+
+@pytest.mark.parametrize("key", ["y", "u"])
+def test_a_signal_that_is_counted_the_other_way_is_found(runs, key):
+    """An angle with the wrong sign is one with an input of the wrong sign: an odd machine cannot tell them apart."""
+    wrong = negated(runs, key)
+    fit = fitted(Pendulum, wrong)
+    length = trial_length(Pendulum, fit, smoothed(Pendulum, fit, wrong, DT), DT, None, SECONDS)
+    found = reversed_signals(Pendulum, fit, wrong, DT, length, SECONDS)
+    assert [text.split()[0] for text in found] == ["phi", "torque"]
+
+
+def test_a_constant_runs_at_the_mean_of_the_training_outputs(runs):
+    (found,) = constant_runs(runs[:2], runs[2:], 10)
+    assert found.shape == (len(runs[2].t) - 10, 1)
+    assert (found == np.concatenate([runs[0].y, runs[1].y]).mean()).all()
+
+
+@pytest.mark.parametrize(
+    ("error", "baselines", "doubted"),
+    [
+        (0.2, {"constant": 1.0, "ARX": 0.19}, ""),
+        (0.2, {"constant": 1.0, "ARX": 0.1, "N4SID": 0.12}, "ARX"),
+        (1.2, {"constant": 1.1}, "constant"),
+        (1.2, {"constant": 1.1, "ARX": 1.15}, "constant"),
+        (math.inf, {"constant": 1.1, "ARX": 0.5}, "ARX"),
+        (0.5, {}, ""),
+    ],
+)
+def test_a_simpler_model_that_is_clearly_better_puts_the_structure_in_doubt(error, baselines, doubted):
+    found = structure_doubt(error, baselines)
+    assert bool(found) == bool(doubted)
+    assert doubted in found
+
+
+def test_a_fit_without_stages_is_not_asked_for_signs(runs):
+    assert reversed_signals(Pendulum, PriorFit(TRUTH, {}, (), ()), runs, DT, 2.0, SECONDS) == ()
