@@ -112,6 +112,25 @@ def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) 
     return tuple(found)
 
 
+def correlation_of_errors(errors: Sequence[Array]) -> Array:
+    """Correlation of one-step prediction errors with those of the sample before, by output ``(n_y,)``; zero is white.
+
+    Args:
+        errors: Errors of each trajectory ``(n, n_y)``, NaN where nothing was measured.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> white = rng.standard_normal((4000, 1))
+        >>> correlation_of_errors([white, white + np.roll(white, 1)]).round(1)
+        array([0.3])
+    """
+    products = np.concatenate([e[1:] * e[:-1] for e in errors])
+    squares = np.concatenate([np.square(e) for e in errors])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = np.nanmean(products, axis=0) / np.nanmean(squares, axis=0)
+    return np.asarray(np.nan_to_num(found))
+
+
 def growth_time(
     make: Callable[..., Prior], fit: PriorFit, smoothed: Sequence[Trajectory], dt: float
 ) -> float:
@@ -154,27 +173,30 @@ def bound_costs(
         length: Length [s] of the windows.
     """
     own = OutputFit(make, dt)
-    theta = own.scaled(fit.values)
-    span = own.upper - own.lower
+    own.points = visited(smoothed)
+    theta, span = own.scaled(fit.values), own.upper - own.lower
     low, high = theta - own.lower < AT_BOUND * span, own.upper - theta < AT_BOUND * span
-    found = []
+    if not (low | high).any():
+        return ()
+    sizes = np.array(fit.smoother(make(fit.values), dt).sizes.x)
+    problem, found = _windows(own, smoothed, sizes, length), []
+    bounded = problem.solve(theta, ITERATIONS).theta  # over these windows, as without the bound
+    (before,) = problem.explained([bounded])
     for i in np.flatnonzero(low | high):
         free = OutputFit(make, dt)
-        free.points = visited(smoothed)
+        free.points = own.points
         free.lower[i] -= span[i] * low[i]
         free.upper[i] += span[i] * high[i]
-        problem = _windows(free, smoothed, np.array(fit.smoother(make(fit.values), dt).sizes.x), length)
+        problem = _windows(free, smoothed, sizes, length)
         try:
-            solved = problem.solve(theta, ITERATIONS).theta
-            before, after = problem.explained([theta, solved])
+            solved = problem.solve(bounded, ITERATIONS).theta
+            (after,) = problem.explained([solved])
         except InputError:  # the equations hold no values beyond this bound, or are too stiff there
-            solved, before, after = theta, 1.0, 1.0
+            solved, after = bounded, before
+        outside = solved[i] < own.lower[i] or solved[i] > own.upper[i]
         name, unit = own.names[i], own.unit[i]
-        found.append(
-            BoundCost(
-                name, float(theta[i] * unit), float(solved[i] * unit), after / before if before else 1.0
-            )
-        )
+        ratio = after / before if before and outside else 1.0
+        found.append(BoundCost(name, float(theta[i] * unit), float(solved[i] * unit), ratio))
     return tuple(found)
 
 

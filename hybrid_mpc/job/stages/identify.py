@@ -14,6 +14,7 @@ from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
+from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.evaluate import (
     FreeRun,
     OutputErrors,
@@ -33,6 +34,7 @@ from hybrid_mpc.identify.sound import (
     BoundCost,
     bound_costs,
     constant_runs,
+    correlation_of_errors,
     growth_time,
     problems,
     reversed_signals,
@@ -118,6 +120,8 @@ class PriorResult:
             linear models of inputs and outputs.
         bounds: Parameters at a bound, and what each bound costs.
         in_doubt: Why the prior's structure is in doubt.
+        error_correlation: Correlation of the smoother's one-step errors with those of the sample before, by output;
+            zero is white.
         longest_run: Length [s] of the free runs that models are judged by; None: whole recordings.
         arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
     """
@@ -128,6 +132,7 @@ class PriorResult:
     baselines: Mapping[str, BaselineScores]
     bounds: tuple[BoundCost, ...]
     in_doubt: tuple[str, ...]
+    error_correlation: Mapping[str, float]
     longest_run: float | None
     arrays: Mapping[str, Array]
 
@@ -293,6 +298,8 @@ def prior_stage(context: Context) -> PriorResult:
     in_doubt = tuple(one for one in (structure_doubt(error, simpler), *reversed_) if one)
     for doubt in in_doubt:
         context.progress.warn(f"the structure of the prior is in doubt: {doubt}")
+    acting = shifted(train, fit.delay)
+    one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
     return PriorResult(
         fit,
         make().values,
@@ -300,6 +307,7 @@ def prior_stage(context: Context) -> PriorResult:
         baselines,
         bounds,
         in_doubt,
+        {s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)},
         longest_run,
         {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )

@@ -455,7 +455,11 @@ def _prior_table(context: Context) -> Table:
          prior.fit.standard_errors.get(p.name, "fixed"))
         for p in context.scenario.prior().parameters
     ]  # fmt: skip
-    caption = "Parameters of the prior. Standard errors suppose that the prior's structure is right."
+    colours = ", ".join(f"{label} {value:.2f}" for label, value in prior.error_correlation.items())
+    caption = (
+        "Parameters of the prior. Standard errors suppose that the prior's structure is right. Correlation of one-step "
+        f"errors with those of the sample before (0 is white): {colours}."
+    )
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
 
