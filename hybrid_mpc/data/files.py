@@ -659,7 +659,8 @@ class _Tail:
         """Whether the last cell is shorter than others, and its number ``column[-1]`` far from what is due."""
         if len(column) < STEADY + 1 or not np.isfinite(column[-1]):
             return False
-        steps = np.abs(np.diff(column))
+        with np.errstate(over="ignore"):  # what overflows is out of its range
+            steps = np.abs(np.diff(column))
         jumps = bool(steps[-1] > CUT * float(np.nanmax(steps[:-1], initial=0.0)))
         fewer = len(self._decimals) == 1 and _decimals(self.last) < max(self._decimals)
         return fewer or (jumps and len(self.last) < len(self._before))

@@ -479,11 +479,16 @@ def even(t: Array) -> Array:
         >>> bool(np.ptp(np.diff(single)) > 9e-4), bool(np.ptp(np.diff(even(single))) < 1e-9)
         (True, True)
     """
-    if len(t) < FEWEST or not (np.abs(t) < LARGER).all() or not (np.diff(t) > 0).all():
+    if len(t) < FEWEST or not (np.abs(t) < LARGER).all():
         return t
     steps = np.diff(t)
     usual = float(np.median(steps))
-    usual = float(steps[np.abs(steps - usual) <= 0.6 * usual].mean())
+    if not (steps > 0).all():
+        return t
+    like = steps[np.abs(steps - usual) <= 0.6 * usual]
+    if not len(like):
+        return t
+    usual = float(like.mean())
     if float(np.abs(steps - usual).max()) <= UNEVEN * usual:
         return t
     found, rounding = t.copy(), _rounding(t)
