@@ -834,6 +834,11 @@ def _vectors(
         for name in names:
             try:
                 array = lookup(name)
+                if time is not None and name == names[0] and array.dtype == np.float16 and array.size > 1:
+                    raise InputError(
+                        f"{path}: column {shown(name)} has half precision, three digits, which do not tell time stamps "
+                        "apart. Save it in double precision."
+                    )
                 left -= 8 * array.size
                 if left < 0:
                     raise InputError(

@@ -46,12 +46,16 @@ FAR_OFF = 3.0
 """Times the span and the size of all other values by which a code for missing ones is away from them."""
 _CODE = re.compile(
     r"999+(\.9+|\.25)?|9\.9+e\+\d\d+|9\.96921e\+36|32767|32768|65535|8388607|8388608|2147483647|2147483648|4294967295|"
-    r"1e\+[1-3]\d|3\.402823e\+38|3\.402823466e\+38"
+    r"1e\+[1-3]\d|3\.402(82|823|823466)e\+38"
 )
 _NEVER = re.compile(r"9999+(\.9+|\.25)?|999\.25|9\.9.*e\+\d\d+|[13].*e\+[2-9]\d")
 """Codes that are no position of a switch, where they are negative or larger than ``LARGER``."""
 LARGER = 1e15
 """No number of a machine that switches is larger."""
+OUTLYING = 10.0
+"""Spans of all other values by which a sample is away from them that is an outlier."""
+MOST_ODD = 5
+"""Most samples of a column that are outliers, and at most one of a hundred: more are a motion."""
 SEVERAL = 4
 """Most codes that one column is looked at for."""
 HOLE = 1.5
@@ -61,6 +65,8 @@ UNSURE = 0.4
 turn another number of turns would fit as well."""
 PARTS = (2, 3, 4, 6, 8)
 """Parts of a turn after which a sensor may begin anew: half turns of an arctangent, pole pairs."""
+BITS = (8, 10, 12, 14, 16, 20, 24, 32)
+"""Bits of counters that overflow."""
 LIKE = 0.03
 """Share by which a jump, the motion around it taken off, may differ from such a part."""
 FEWEST = 10
@@ -92,7 +98,7 @@ class Finding:
     concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
     """
 
-    kind: Literal["wrapped", "frozen", "clipped", "speed", "missing"]
+    kind: Literal["wrapped", "frozen", "clipped", "speed", "missing", "outlier"]
     file: str
     channel: str
     start: float
@@ -229,6 +235,8 @@ def read_recordings(
     missing: dict[str, list[str]] = {}
     for path in map(Path, paths):
         try:
+            if any("\ud800" <= c <= "\udfff" for c in path.name):
+                raise InputError(f"{str(path)!a}: the file's name is no text (UTF-8). Rename the file.")
             source = opened(path)
             names, lacking = _found(source, spec, there, missing)
             problems += lacking
@@ -419,6 +427,10 @@ def _recording(
                     cuts |= set(np.flatnonzero(there)[found_turns.unclear].tolist())
             elif found_parts := folded(t[there], values[there, j], turn, spec.max_gap):
                 findings.append(_folded(path.name, name, signal, t[there], values[there, j], *found_parts))
+        if clean and j >= first and (found_bits := _overflow(t[there], raw[there, j], spec.max_gap)):
+            findings.append(_overflowing(path.name, name, t[there], raw[there, j], *found_bits))
+        if clean and j and codes[j] is None and (odd := _outliers(values[:, j])) is not None:
+            findings.append(_outlying(path.name, name, signal, t, values[:, j], odd))
         if clean and j >= first and there.any() and not there.all():
             findings.append(_missing(path.name, name, t, there))
         if (code := codes[j]) is not None:
@@ -719,16 +731,31 @@ def folded(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, ND
     """Into how many parts of a turn an angle is folded that begins anew after one, and the samples before which it
     jumps; None where it is not.
 
-    It keeps within one part, and jumps by it against the motion before and after: a machine that steps goes with it.
-
     Example:
         >>> t = 0.01 * np.arange(400)
         >>> folded(t, (2 * t) % np.pi, 2 * np.pi, 0.05)
         (2, array([158, 315]))
     """
-    span, step = float(np.ptp(angle)), np.diff(angle)
-    if len(step) < 3 or not 0 < span <= SPAN * turn / 2:
-        return None
+    sizes, jumps = anew(t, angle, max_gap)
+    span = float(np.ptp(angle)) if len(jumps) else 0.0
+    for parts in PARTS:
+        if (
+            len(jumps)
+            and (np.abs(sizes - turn / parts) <= LIKE * turn / parts).all()
+            and span <= SPAN * turn / parts
+        ):
+            return parts, jumps
+    return None
+
+
+def anew(t: Array, x: Array, max_gap: float) -> tuple[Array, NDArray[np.intp]]:
+    """By how much a signal ``(m,)`` jumps from one end of its range to the other against its motion before and after,
+    that motion taken off, and the samples before which it does: there it begins anew. A machine that steps goes with
+    its motion.
+    """
+    step, none = np.diff(x), (np.zeros(0), np.zeros(0, dtype=np.intp))
+    if len(step) < 3 or not (span := float(np.ptp(x))) > 0:
+        return none
     near = ~gaps(t, max_gap)
     inner = np.flatnonzero(near[1:-1] & near[:-2] & near[2:] & (np.abs(step[1:-1]) > 0.5 * span)) + 1
     before, jump, after = step[inner - 1], step[inner], step[inner + 1]
@@ -738,14 +765,19 @@ def folded(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, ND
         & (np.maximum(np.abs(before), np.abs(after)) < NEARLY * np.abs(jump))
     )
     on &= np.abs(before - after) <= np.abs(before + after) / 2
-    top, low = np.maximum(angle[inner], angle[inner + 1]), np.minimum(angle[inner], angle[inner + 1])
-    on &= np.maximum(angle.max() - top, low - angle.min()) <= 0.75 * np.abs(before + after)  # from end to end
-    if not on.any():
+    top, low = np.maximum(x[inner], x[inner + 1]), np.minimum(x[inner], x[inner + 1])
+    on &= np.maximum(x.max() - top, low - x.min()) <= 0.75 * np.abs(before + after)  # from end to end
+    return np.abs(jump[on] - (before[on] + after[on]) / 2), inner[on] + 1
+
+
+def _overflow(t: Array, raw: Array, max_gap: float) -> tuple[int, NDArray[np.intp]] | None:
+    """The bits of a counter that overflows, and the samples before which it does; None where it does not."""
+    if not (raw == np.round(raw)).all():
         return None
-    part = np.abs(jump[on] - (before[on] + after[on]) / 2)
-    for parts in PARTS:
-        if (np.abs(part - turn / parts) <= LIKE * turn / parts).all() and span <= SPAN * turn / parts:
-            return parts, inner[on] + 1
+    sizes, jumps = anew(t, raw, max_gap)
+    for bits in BITS:
+        if len(jumps) and (np.abs(sizes - 2.0**bits) <= LIKE * 2.0**bits).all() and np.ptp(raw) < 2.0**bits:
+            return bits, jumps
     return None
 
 
@@ -761,6 +793,47 @@ def _folded(
         f"period={(_turn(signal) or 0.0) / parts:.6g})."
     )
     return Finding("wrapped", file, name, float(t[k]), count, message, refused=True)
+
+
+def _overflowing(file: str, name: str, t: Array, raw: Array, bits: int, jumps: NDArray[np.intp]) -> Finding:
+    """The finding of a counter that overflows."""
+    k, count = int(jumps[0]), len(jumps)
+    message = (
+        f"column {name!r} jumps {count} time{'s' * (count > 1)} by about {2**bits} against its motion (first from "
+        f"{raw[k - 1]:.10g} to {raw[k]:.10g} at {t[k]:.6g} s): a counter of {bits} bits that overflows. Record one "
+        f"that counts on, or unwrap it before: numpy.unwrap(..., period={2**bits})."
+    )
+    return Finding("wrapped", file, name, float(t[k]), count, message, refused=True)
+
+
+def _outliers(column: Array) -> NDArray[np.intp] | None:
+    """The few samples that are away from all others by ``OUTLYING`` times what these span; None without."""
+    known = np.abs(column) <= ABSURD
+    others, most = np.sort(column[known]), max(1, min(MOST_ODD, int(0.01 * known.sum())))
+    best = None
+    for low in range(most + 1):
+        for high in range(most + 1 - low):
+            rest = others[low : len(others) - high]
+            if not (low or high) or len(rest) < MIN_SCORED or not (span := float(np.ptp(rest))) > 0:
+                continue
+            if (not low or rest[0] - others[low - 1] > OUTLYING * span) and (
+                not high or others[len(others) - high] - rest[-1] > OUTLYING * span
+            ):
+                best = np.flatnonzero(known & ((column < rest[0]) | (column > rest[-1])))
+    return best
+
+
+def _outlying(
+    file: str, name: str, signal: Signal, t: Array, column: Array, odd: NDArray[np.intp]
+) -> Finding:
+    """The finding of samples that are far from all others."""
+    rest = np.delete(column, odd)
+    message = (
+        f"column {name!r} is {column[odd[0]]:.6g} {signal.unit} at {t[odd[0]]:.6g} s, far from all but {len(odd)} of "
+        f"{len(t)} samples, which are within {np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}. A code for a missing "
+        "value, or a lost digit? Leave these cells blank, or delete the rows."
+    )
+    return Finding("outlier", file, name, float(t[odd[0]]), len(odd), message)
 
 
 def _missing(file: str, name: str, t: Array, there: NDArray[np.bool_]) -> Finding:

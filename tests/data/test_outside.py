@@ -7,7 +7,7 @@ import pytest
 from machine_signals import machine
 from recording_bombs import GOOD, SPEC, T
 
-from hybrid_mpc import DataSpec, InputError, Signal
+from hybrid_mpc import DataSpec, InputError, Signal, load_trajectories, write_csv
 from hybrid_mpc.data.recording import even, folded, read_recording
 
 FREE = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
@@ -215,3 +215,50 @@ def test_steps_swings_and_impacts_are_not_folded():
         np.pi / 2 * np.abs(np.sin(3 * t)),
     ):
         assert folded(t, angle, 2 * np.pi, 0.05) is None
+
+
+@pytest.mark.parametrize("bits", [8, 16, 32])
+@pytest.mark.parametrize("low", [0, 0.5])
+def test_a_counter_that_overflows_is_refused(tmp_path, bits, low):
+    t = np.arange(0, 12, 0.01)
+    counts = np.round(2.0**bits * (0.4 * t + 0.2 * np.sin(t)))
+    numbers = (counts + low * 2**bits) % 2**bits - low * 2**bits
+    columns = {"time_s": t, "tau": np.cos(t), "phi": numbers}
+    lengths = machine((Signal("x", "m"),), (Signal("torque", "N m"),))
+    spec = replace(SPEC, units={"phi": 1e-6})
+    refused(tmp_path / "run.npz", columns, f"counter of {bits} bits", lengths, spec)
+    read(tmp_path / "run.npz", {**columns, "phi": counts}, lengths, spec)
+    steps = np.where(np.sin(t) > 0, 2.0**bits - 1, 0)
+    assert not read(tmp_path / "run.npz", {**columns, "phi": steps}, lengths, spec).findings
+
+
+@pytest.mark.parametrize("value", [-7777, 888888, 99, 1e9])
+@pytest.mark.parametrize("channel", ["phi", "tau"])
+def test_a_few_values_far_from_all_others_are_told(tmp_path, value, channel):
+    rows = np.arange(60)
+    numbers = np.where(np.isin(rows, [17]), value, GOOD[channel])
+    table = read(tmp_path / "run.npz", {**GOOD, channel: numbers})
+    (found,) = table.findings
+    assert (found.kind, found.channel, found.count, found.refused) == ("outlier", channel, 1, False)
+    assert found.start == T[17]
+    for sound in (np.where(rows > 50, 3.0, GOOD[channel]), np.where(rows == 17, 1.0, 0.0), np.exp(rows / 5)):
+        assert not read(tmp_path / "run.npz", {**GOOD, channel: sound}).findings
+
+
+def test_time_in_half_precision_is_refused(tmp_path):
+    refused(tmp_path / "run.npz", {**GOOD, "time_s": T.astype(np.float16)}, "half precision")
+    read(tmp_path / "run.npz", {**GOOD, "phi": np.sin(T).astype(np.float16)})
+
+
+def test_a_file_name_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "run\udcff.csv"
+    try:
+        write_csv(path, GOOD)
+    except (OSError, InputError):
+        pytest.skip("this file system has names of text alone")
+    with pytest.raises(InputError, match="no text"):
+        load_trajectories([path], FREE, SPEC)
+
+
+def test_a_column_without_a_number_is_refused_whatever_its_unit(tmp_path):
+    refused(tmp_path / "run.npz", {**GOOD, "phi": np.full(60, np.nan)}, "no number in any row")
