@@ -77,6 +77,19 @@ def named_extra(what: str = "") -> Iterator[None]:
         ) from missing
 
 
+def said_by(error: BaseException) -> str:
+    """What an error says, one of a user's own class, too, whose text may raise; empty if it says nothing.
+
+    Example:
+        >>> said_by(ValueError(" no level "))
+        'no level'
+    """
+    try:
+        return str(error).strip()
+    except Exception:  # the user's own code may raise anything
+        return ""
+
+
 @contextmanager
 def no_exit(what: str = "") -> Iterator[None]:
     """Within it, code that ends Python (``sys.exit``, ``SystemExit``) is an error with the code's file and line.
@@ -99,16 +112,23 @@ def no_exit(what: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except SystemExit as stop:
+    except BaseException as stop:
+        if not isinstance(stop, SystemExit | GeneratorExit) and type(stop) is not BaseException:
+            raise
         # without this block itself, and what Python is started with, where exit() stands
         passed = [frame for frame in traceback.extract_tb(stop.__traceback__) if frame.filename != __file__]
         frames = [frame for frame in passed if not frame.filename.startswith("<frozen")]
         place = f"{frames[-1].filename}:{frames[-1].lineno}: " if frames else ""
         of = f"{what}: " if what and not place.startswith(what) else ""
         raise InputError(
-            f"{of}{place}SystemExit({stop.code!r}) would end Python; take sys.exit or exit out, or put what a script "
+            f"{of}{place}{_ending(stop)} would end Python; take sys.exit or exit out, or put what a script "
             'does under if __name__ == "__main__":'
         ) from stop
+
+
+def _ending(stop: BaseException) -> str:
+    """What ends Python, as it was raised."""
+    return f"SystemExit({stop.code!r})" if isinstance(stop, SystemExit) else type(stop).__name__
 
 
 SHOWN = 20
