@@ -291,7 +291,11 @@ def load_scenario(name_or_path: str) -> Scenario:
         raise InputError(
             f"no scenario {name_or_path!r}; registered: {names}. Or give the path of a .py file."
         )
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except OSError as error:  # a name that is too long for the file system
+        raise InputError(f"no scenario file {path}: {error.strerror}") from error
+    if not there:
         raise InputError(f"no scenario file {path}")
     spec = importlib.util.spec_from_file_location(f"hybrid_mpc_user_{path.stem}", path)
     assert spec is not None

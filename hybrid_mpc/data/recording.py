@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -228,7 +227,9 @@ def read_recordings(
 
     They may differ in format, length and sampling, and in columns that ``spec`` does not name.
     """
-    refuse(_count_problems(spec, prior) or _column_problems(spec))
+    refuse(
+        _count_problems(spec, prior) or [*_column_problems(spec), *_stem_problems(spec, [*map(Path, paths)])]
+    )
     recordings: list[Recording] = []
     problems: list[str] = []
     there: dict[str, list[str]] = {}
@@ -320,7 +321,7 @@ def _column_problems(spec: DataSpec) -> list[str]:
                     f"data specification: column {name!r} is named in {' and '.join(sorted([role, *also]))}. A column "
                     "holds one signal: name it once."
                 )
-    known = {*spec.inputs, *spec.disturbances, *spec.outputs, *itertools.chain(*spec.inputs_of.values())}
+    known = spec.columns - set(time)
     for role, delays in [
         ("delays", spec.delays),
         *((f"delays_of {s!r}", d) for s, d in spec.delays_of.items()),
@@ -331,7 +332,36 @@ def _column_problems(spec: DataSpec) -> list[str]:
             for name in delays
             if name not in known
         ]
+    there = ", ".join(sorted(map(repr, spec.columns)))
+    problems += [
+        f"data specification: units names column {name!r}, which is none of {there}. Name a column as inputs, outputs, "
+        "disturbances and time do."
+        for name in spec.units
+        if name not in spec.columns
+    ]
     return list(dict.fromkeys(problems))
+
+
+def _stem_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
+    """Settings of single recordings that name a file by more than its stem, or by other letters: nobody would find
+    them. Of recordings that are not given there may be some.
+    """
+    stems = {path.stem for path in paths}
+    meant = {
+        **{path.name.casefold(): path.stem for path in paths},
+        **{stem.casefold(): stem for stem in stems},
+    }
+    return [
+        f"data specification: {setting} names the recording {name!r}, and the file's stem is "
+        f"{meant[name.strip().casefold()]!r}. Write it so."
+        for setting, names in (
+            ("windows", spec.windows),
+            ("inputs_of", spec.inputs_of),
+            ("delays_of", spec.delays_of),
+        )
+        for name in names
+        if name not in stems and name.strip().casefold() in meant
+    ]
 
 
 def _found(

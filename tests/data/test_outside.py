@@ -7,7 +7,7 @@ import pytest
 from machine_signals import machine
 from recording_bombs import GOOD, SPEC, T
 
-from hybrid_mpc import DataSpec, InputError, Signal, load_trajectories, write_csv
+from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.recording import even, folded, read_recording
 
 FREE = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
@@ -262,3 +262,23 @@ def test_a_file_name_that_is_no_text_is_refused(tmp_path):
 
 def test_a_column_without_a_number_is_refused_whatever_its_unit(tmp_path):
     refused(tmp_path / "run.npz", {**GOOD, "phi": np.full(60, np.nan)}, "no number in any row")
+
+
+@pytest.mark.parametrize(
+    ("setting", "match"),
+    [
+        ({"units": {"ph": "deg"}}, "units names column 'ph'"),
+        ({"units": {"phi [deg]": "deg"}}, "units names column"),
+        ({"windows": {"run.npz": (Window(0, 0.3, "train"),)}}, "windows names the recording 'run.npz'"),
+        ({"windows": {"Run": (Window(0, 0.3, "train"),)}}, "windows names the recording 'Run'"),
+        ({"inputs_of": {"run ": ("tau",)}}, "inputs_of names the recording 'run '"),
+        ({"delays_of": {"RUN.NPZ": {"phi": 0.1}}}, "delays_of names the recording 'RUN.NPZ'"),
+    ],
+)
+def test_settings_of_nothing_are_refused(tmp_path, setting, match):
+    refused(tmp_path / "run.npz", GOOD, match, spec=replace(SPEC, **setting))
+
+
+def test_settings_of_recordings_that_are_not_given_are_not(tmp_path):
+    spec = replace(SPEC, windows={"monday": (Window(0, 0.3, "train"),)}, delays_of={"tuesday": {"phi": 0.1}})
+    assert len(read(tmp_path / "run.npz", GOOD, spec=spec).t) == 60
