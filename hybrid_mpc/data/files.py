@@ -691,6 +691,25 @@ def _number(cell: str) -> float:
     return value if math.isfinite(value) and "_" not in cell else math.nan
 
 
+MOST_DECIMALS = 17
+"""Most digits after the point that are written: a float has no more."""
+
+
+def real_numbers(values: object, name: str) -> Array:
+    """Numbers as a float array.
+
+    Raises:
+        InputError: If they are none; ``name`` says what they are.
+    """
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind in "biufO":
+            return np.asarray(given, dtype=np.float64)
+    except Exception as error:  # whatever an object of anybody's raises where it is asked for its numbers
+        raise InputError(f"{name}: numbers are needed, got {type(values).__name__}") from error
+    raise InputError(f"{name}: numbers are needed, got {type(values).__name__} of {given.dtype}")
+
+
 def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int | None = None) -> Path:
     r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes; the path.
 
@@ -700,7 +719,8 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
         decimals: Digits after the point. Default: ten significant digits.
 
     Raises:
-        InputError: If the columns differ in length or are not one-dimensional.
+        InputError: If the columns differ in length or are not one-dimensional, or there is no such path or number of
+            decimals.
 
     Example:
         >>> import tempfile
@@ -708,8 +728,19 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
         ...     write_csv(Path(folder) / "a.csv", {"t": np.array([0.0, 0.1])}).read_text()
         't\n0\n0.1\n'
     """
+    if not isinstance(path, str | Path) or not Path(path).name:
+        raise InputError(f"write_csv: the path of a file is needed, got {path!r:.80}")
+    if not isinstance(columns, Mapping):
+        raise InputError(f"write_csv: columns by name are needed, got {type(columns).__name__}")
+    if decimals is not None and not (type(decimals) is int and 0 <= decimals <= MOST_DECIMALS):
+        raise InputError(
+            f"write_csv: decimals from 0 to {MOST_DECIMALS} are needed, got {type(decimals).__name__}"
+        )
     path = Path(path)
-    arrays = {name: np.asarray(column, dtype=float) for name, column in columns.items()}
+    arrays = {
+        name: real_numbers(column, f"write_csv: column {shown(str(name))}")
+        for name, column in columns.items()
+    }
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
         raise InputError(f"{path}: columns must be one-dimensional and of one length, got {shapes}")

@@ -176,6 +176,8 @@ def load_trajectories(
         >>> [(piece.name, piece.role, len(piece.t)) for piece in data.trajectories]
         [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
     """
+    if isinstance(paths, str | bytes | Path) or not all(isinstance(path, str | Path) for path in paths):
+        raise InputError(f"recordings: a list of paths is needed, got {paths!r:.80}")
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
