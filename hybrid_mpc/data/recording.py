@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
@@ -64,6 +65,8 @@ UNSURE = 0.4
 turn another number of turns would fit as well."""
 PARTS = (2, 3, 4, 6, 8)
 """Parts of a turn after which a sensor may begin anew: half turns of an arctangent, pole pairs."""
+ALIKE = 0.8
+"""How alike the names of two recordings are that are one, misspelt."""
 BITS = (8, 10, 12, 14, 16, 20, 24, 32)
 """Bits of counters that overflow."""
 LIKE = 0.03
@@ -97,7 +100,7 @@ class Finding:
     concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
     """
 
-    kind: Literal["wrapped", "frozen", "clipped", "speed", "missing", "outlier"]
+    kind: Literal["wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
     file: str
     channel: str
     start: float
@@ -364,6 +367,32 @@ def _stem_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
     ]
 
 
+def misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
+    """Settings of recordings that are not given, whose names are nearly those of recordings that are given and have no
+    such settings. Names that differ in their numbers alone are those of several recordings.
+    """
+    found = []
+    settings: dict[str, Mapping[str, object]] = {
+        "windows": spec.windows, "inputs_of": spec.inputs_of, "delays_of": spec.delays_of,
+    }  # fmt: skip
+    for setting, names in settings.items():
+        free = {path.stem: path.name for path in paths if path.stem not in names}
+        for name in names:
+            near = difflib.get_close_matches(name, free, n=1, cutoff=ALIKE)
+            if name in {path.stem for path in paths} or not near or _letters(name) == _letters(near[0]):
+                continue
+            message = (
+                f"{setting} of the DataSpec has {name!r}, which is not given, and nothing for {near[0]!r}: misspelt? "
+                "Settings of recordings go by the stem of the file."
+            )
+            found.append(Finding("settings", free[near[0]], "", 0.0, 1, message))
+    return found
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"\d+", "", name)
+
+
 def _found(
     source: Source, spec: DataSpec, there: dict[str, list[str]], missing: dict[str, list[str]]
 ) -> tuple[list[str], list[str]]:
@@ -446,6 +475,13 @@ def _recording(
             problems.append(
                 f"column {name!r} has no number in any row; {signal.name} was not measured. Record it, or leave this "
                 "recording out."
+            )
+        if clean and j >= split and there.any() and (censored[there, j - split] != 0).all():
+            lower, upper = signal.saturation or (-math.inf, math.inf)
+            problems.append(
+                f"column {name!r} is at an end of its sensor's range {lower:g} to {upper:g} {signal.unit} or beyond in "
+                f"all rows ({values[there, j].min():.6g} to {values[there, j].max():.6g}): nothing was measured. Check "
+                f"the unit and Signal.saturation of {signal.name}, or leave this recording out."
             )
         if clean and j >= first and turn is not None:
             found_turns = unwrapped(t[there], values[there, j], turn, spec.max_gap, periodic=signal.periodic)

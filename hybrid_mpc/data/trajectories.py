@@ -25,6 +25,7 @@ from hybrid_mpc.data.recording import (
     complete,
     empty,
     gaps,
+    misspelt,
     no_flags,
     read_recordings,
 )
@@ -200,6 +201,7 @@ def load_trajectories(
         motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
     speeds = states if n_x is None else ()
     findings = findings_of(recordings, motions, spec, outputs=outputs, states=speeds)
+    findings = (*findings, *misspelt(spec, [recording.path for recording in recordings]))
     paths_of = {recording.path.name: recording.path for recording in recordings}
     problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
     refuse(problems)

@@ -282,3 +282,21 @@ def test_settings_of_nothing_are_refused(tmp_path, setting, match):
 def test_settings_of_recordings_that_are_not_given_are_not(tmp_path):
     spec = replace(SPEC, windows={"monday": (Window(0, 0.3, "train"),)}, delays_of={"tuesday": {"phi": 0.1}})
     assert len(read(tmp_path / "run.npz", GOOD, spec=spec).t) == 60
+
+
+@pytest.mark.parametrize("ends", [(-8.0, -7.5), (7.0, 9.0), (-1e-3, -5e-4), (0.9, 1.1)])
+def test_a_sensor_that_is_always_at_an_end_of_its_range_measures_nothing(tmp_path, ends):
+    signals = machine((Signal("phi", "rad", saturation=ends),), (Signal("torque", "N m"),))
+    refused(tmp_path / "run.npz", GOOD, "phi.*nothing was measured", signals)
+    known = machine((Signal("phi", "rad", saturation=(0.1, 0.3)),), (Signal("torque", "N m"),))
+    assert {-1, 0, 1} == set(read(tmp_path / "run.npz", GOOD, known).censored.ravel())
+
+
+@pytest.mark.parametrize(
+    ("stem", "told"), [("mondya", 1), ("tuesday", 0), ("monday2", 0), ("monday", 0), ("monda", 1)]
+)
+def test_a_recording_whose_name_is_misspelt_in_the_settings_is_told(tmp_path, stem, told):
+    np.savez(tmp_path / "monday.npz", **{k: np.tile(v, 1) for k, v in GOOD.items()})
+    spec = replace(SPEC, windows={stem: (Window(0, 0.55, "train"),)})
+    found = load_trajectories([tmp_path / "monday.npz"], FREE, spec, needed=()).findings
+    assert [f.kind for f in found] == ["settings"] * told
