@@ -374,7 +374,7 @@ def _spline_ratio(w: Array) -> Array:
 
 def _check_cutoff(cutoff: float, dt: float, n: int) -> None:
     if not positive(cutoff):
-        raise InputError(f"cutoff: a frequency above 0 Hz is needed, got {cutoff!r:.80}")
+        raise InputError(f"cutoff: a positive frequency [Hz] is needed, got {cutoff!r:.80}")
     if not 0 < cutoff < 0.5 / dt:
         raise InputError(
             f"cutoff of {cutoff:g} Hz must be positive and below {0.5 / dt:g} Hz, half the sampling rate of "
