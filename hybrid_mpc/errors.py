@@ -92,7 +92,8 @@ def said_by(error: BaseException) -> str:
 
 @contextmanager
 def no_exit(what: str = "") -> Iterator[None]:
-    """Within it, code that ends Python (``sys.exit``, ``SystemExit``) is an error with the code's file and line.
+    """Within it, code that ends Python (``sys.exit``, ``SystemExit``, ``GeneratorExit``, ``BaseException`` itself) is
+    an error with the code's file and line.
 
     A scenario's file or one of its functions would end a job without a word, with exit code 0. Also a decorator of
     functions that call such code.
@@ -101,7 +102,7 @@ def no_exit(what: str = "") -> Iterator[None]:
         what: What runs there, for the message. Default: nothing is said.
 
     Raises:
-        InputError: If the code within raises ``SystemExit``.
+        InputError: If the code within raises one of these.
 
     Example:
         >>> with no_exit("my_machine.py"):

@@ -129,3 +129,23 @@ def test_a_terminal_without_a_character_gets_its_number(tmp_path):
     )
     assert ended.returncode == 0, ended.stderr
     assert r"Beh\xe4lter \u2264 3" in ended.stdout
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("prior=Tank", "prior=lambda: Tank()"),  # takes no values
+        ("# none", "# \udce4"),  # a comment of another encoding
+        ("# none", "# coding: nonsense"),
+    ],
+)
+def test_files_that_python_takes_half_are_told(call, tmp_path, old, new):
+    path = machine(tmp_path)
+    text = "# none\n" + path.read_text().replace(
+        "data=hm.DataSpec",
+        "control=hm.OCP(9, [1], [0.1], [0.1], [0], [0.1]), sensor_sigma=(1e-3,), data=hm.DataSpec",
+    )
+    path.write_bytes(text.replace(old, new, 1).encode("utf-8", "surrogateescape"))
+    status, told, error = call("check", path)
+    assert status == 2
+    assert "exits" in told + error
