@@ -77,9 +77,23 @@ def named_extra(what: str = "") -> Iterator[None]:
         ) from missing
 
 
+def said_by(error: BaseException) -> str:
+    """What an error says, one of a user's own class, too, whose text may raise; empty if it says nothing.
+
+    Example:
+        >>> said_by(ValueError(" no level "))
+        'no level'
+    """
+    try:
+        return str(error).strip()
+    except Exception:  # the user's own code may raise anything
+        return ""
+
+
 @contextmanager
 def no_exit(what: str = "") -> Iterator[None]:
-    """Within it, code that ends Python (``sys.exit``, ``SystemExit``) is an error with the code's file and line.
+    """Within it, code that ends Python (``sys.exit``, ``SystemExit``, ``GeneratorExit``, ``BaseException`` itself) is
+    an error with the code's file and line.
 
     A scenario's file or one of its functions would end a job without a word, with exit code 0. Also a decorator of
     functions that call such code.
@@ -88,7 +102,7 @@ def no_exit(what: str = "") -> Iterator[None]:
         what: What runs there, for the message. Default: nothing is said.
 
     Raises:
-        InputError: If the code within raises ``SystemExit``.
+        InputError: If the code within raises one of these.
 
     Example:
         >>> with no_exit("my_machine.py"):
@@ -99,16 +113,23 @@ def no_exit(what: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except SystemExit as stop:
+    except BaseException as stop:
+        if not isinstance(stop, SystemExit | GeneratorExit) and type(stop) is not BaseException:
+            raise
         # without this block itself, and what Python is started with, where exit() stands
         passed = [frame for frame in traceback.extract_tb(stop.__traceback__) if frame.filename != __file__]
         frames = [frame for frame in passed if not frame.filename.startswith("<frozen")]
         place = f"{frames[-1].filename}:{frames[-1].lineno}: " if frames else ""
         of = f"{what}: " if what and not place.startswith(what) else ""
         raise InputError(
-            f"{of}{place}SystemExit({stop.code!r}) would end Python; take sys.exit or exit out, or put what a script "
+            f"{of}{place}{_ending(stop)} would end Python; take sys.exit or exit out, or put what a script "
             'does under if __name__ == "__main__":'
         ) from stop
+
+
+def _ending(stop: BaseException) -> str:
+    """What ends Python, as it was raised."""
+    return f"SystemExit({stop.code!r})" if isinstance(stop, SystemExit) else type(stop).__name__
 
 
 SHOWN = 20

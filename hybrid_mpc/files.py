@@ -275,6 +275,14 @@ def cannot_write(path: Path, error: OSError) -> StorageError:
     return StorageError(f"cannot write {path}: {reason(error)}; {kept}")
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file that one may look at; a name that is too long for the file system names none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def _exists(path: Path) -> bool:
     try:
         return path.exists()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError, no_exit
+from hybrid_mpc.errors import InputError, no_exit, said_by
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.machine.specification import BenchmarkSpec, Count, CountOrNone, DataSpec
@@ -291,7 +291,11 @@ def load_scenario(name_or_path: str) -> Scenario:
         raise InputError(
             f"no scenario {name_or_path!r}; registered: {names}. Or give the path of a .py file."
         )
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except OSError as error:  # a name that is too long for the file system
+        raise InputError(f"no scenario file {path}: {error.strerror}") from error
+    if not there:
         raise InputError(f"no scenario file {path}")
     spec = importlib.util.spec_from_file_location(f"hybrid_mpc_user_{path.stem}", path)
     assert spec is not None
@@ -306,7 +310,9 @@ def load_scenario(name_or_path: str) -> Scenario:
             spec.loader.exec_module(module)
         except Exception as error:
             line = _line_in(error, path)
-            raise InputError(f"{path}{line}: {type(error).__name__}: {error}{_hint(error)}") from error
+            raise InputError(
+                f"{path}{line}: {type(error).__name__}: {said_by(error)}{_hint(error)}"
+            ) from error
     if not hasattr(module, "scenario"):
         raise InputError(f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)")
     return _checked(module.scenario, str(path))
@@ -321,7 +327,7 @@ def _checked(scenario: object, where: str) -> Scenario:
 
 def _hint(error: BaseException) -> str:
     """What helps where a field was given that its class does not have."""
-    found = re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(error))
+    found = re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", said_by(error))
     kinds = {
         kind.__name__: kind for kind in (Signal, Parameter, DataSpec, BenchmarkSpec, Task, Budget, Scenario)
     }

@@ -140,7 +140,7 @@ def test_the_solver_is_the_one_asked_for(run, solver, kind):
 @pytest.mark.parametrize("solver", ["rti", "sqp", "ipopt", "native"])
 def test_iterations_count_or_are_refused(run, solver):
     """None of the solvers ignores them: 0 is refused where they count, any number where they do not."""
-    with pytest.raises(hm.InputError, match="leave iterations out" if solver == "native" else "at least 1"):
+    with pytest.raises(hm.InputError, match="leave iterations out" if solver == "native" else "iterations"):
         hm.load(run).controller(solver=solver, iterations=0)
 
 
@@ -264,3 +264,21 @@ def test_a_state_of_other_parts_is_refused(run):
     with pytest.raises(hm.InputError, match=r"what Loop\.state was is needed, got NoneType"):
         mine.restore(None)
     assert mine.restore(mine.state) == mine.decision.u
+
+
+NO_NAME = [np.nan, 3, b"x", {}, [], object(), np.zeros(5), 10**400]
+
+
+def test_a_kit_refuses_what_is_no_name_no_flag_and_no_folder(run):
+    kit = hm.load(run)
+    for value in NO_NAME:
+        for call in (
+            lambda v=value: hm.load(v), lambda v=value: kit.problem(v), lambda v=value: kit.noise(v),
+            lambda v=value: kit.observer(v), lambda v=value: kit.observer(task=v), lambda v=value: kit.observer(load=v),
+            lambda v=value: kit.controller(v), lambda v=value: kit.controller(task=v),
+            lambda v=value: kit.controller(solver=v), lambda v=value: kit.monitor(v),
+            lambda v=value: kit.monitor(kind=v), lambda v=value: kit.monitor(diagnose=v),
+            lambda v=value: kit.guard(adapt=v), lambda v=value: kit.on(v),
+        ):  # fmt: skip
+            with pytest.raises(hm.InputError):
+                call()

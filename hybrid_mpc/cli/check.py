@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.rules import printable
 
 if TYPE_CHECKING:
     from hybrid_mpc.job.check import Preflight, Rest
@@ -63,7 +64,7 @@ def check(
         if texts:
             console.print(f"\n{len(texts)} {title}", style=style)
         for number, text in enumerate(texts, 1):
-            console.print(f"{number:3}. {text}", markup=False, soft_wrap=True)
+            console.print(printable(f"{number:3}. {text}"), markup=False, soft_wrap=True)
     if found.problems:
         raise typer.Exit(WRONG)
     console.print(
@@ -105,7 +106,7 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
 
 
 def _line(console: Console, name: str, text: str) -> None:
-    console.print(f"{name}: {text}", markup=False, soft_wrap=True)
+    console.print(printable(f"{name}: {text}"), markup=False, soft_wrap=True)
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from importlib.metadata import entry_points
@@ -133,6 +134,9 @@ def _root(
 
 def main() -> None:
     """Run the command line; bad input ends with a message and exit code 2, Ctrl-C with 130."""
+    for stream in (sys.stdout, sys.stderr):  # what a terminal's character set lacks is shown by number
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
         app()

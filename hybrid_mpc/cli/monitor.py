@@ -60,7 +60,7 @@ def monitor(
 
     Exit code 1 if a recording gave no valid reading.
     """
-    from hybrid_mpc.cli.progress import make_progress, print_summary
+    from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.files import check_folder
     from hybrid_mpc.job.monitor import learn as learn_job
     from hybrid_mpc.job.monitor import prepared, watch
@@ -80,7 +80,7 @@ def monitor(
         calibration=None if learn else calibration, residuals=residuals,
     )  # fmt: skip
     for finding in job.data.findings:
-        print(f"warning: {finding}")
+        say(f"warning: {finding}")
     if learn:
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)
@@ -89,7 +89,7 @@ def monitor(
             line = f"learned from {60 * found.hours:.1f} min: {found.method}"
         print_summary([line], out / "calibration.json", "detector" if job.energy else "limits")
         return
-    print(watching(job))
+    say(watching(job))
     with make_progress() as progress:
         result = watch(job, out, progress)
     print_summary(summary(result), out / "monitor.json")

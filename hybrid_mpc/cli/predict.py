@@ -31,7 +31,7 @@ def predict(
 
     The folder says how recordings are read; neither scenario nor checkpoints are needed.
     """
-    from hybrid_mpc.cli.progress import make_progress, print_summary
+    from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.files import check_folder
     from hybrid_mpc.job.predict import predict_recordings, read_recordings_of
     from hybrid_mpc.kit.artifact import load
@@ -40,7 +40,7 @@ def predict(
     loaded = load(kit)
     trajectories, doubts = read_recordings_of(loaded, recordings)
     for doubt in doubts:
-        print(f"warning: {doubt}")
+        say(f"warning: {doubt}")
     with make_progress() as progress:
         found = predict_recordings(loaded, trajectories, out, model, progress)
     print_summary(summary(found), out / "predict.json")

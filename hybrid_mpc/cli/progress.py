@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from hybrid_mpc.job.context import Progress
+from hybrid_mpc.rules import printable
 
 LINE_EVERY_S = 5.0
 """Plain output says something at most this often within a stage."""
@@ -53,7 +54,7 @@ class Bars(Progress):
     def warn(self, text: str) -> None:
         """A line above the bars."""
         self._bars.console.print(
-            f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True
+            printable(f"warning: {text}"), style="yellow", markup=False, highlight=False, soft_wrap=True
         )
 
     def finish(self, text: str) -> None:
@@ -80,22 +81,27 @@ class Lines(Progress):
     def start(self, title: str) -> None:
         """Note the stage."""
         self._stage = time.monotonic()
-        print(f"{title} ...", flush=True)
+        say(f"{title} ...")
 
     def update(self, key: str, done: int, total: int, text: str) -> None:
         """A line now and then."""
         now = time.monotonic()
         if now - self._last >= LINE_EVERY_S:
             self._last = now
-            print(f"  {key}: {done}/{total} {text}", flush=True)
+            say(f"  {key}: {done}/{total} {text}")
 
     def warn(self, text: str) -> None:
         """A line of its own."""
-        print(f"  warning: {text}", flush=True)
+        say(f"  warning: {text}")
 
     def finish(self, text: str) -> None:
         """How long the stage took."""
-        print(f"  {text or 'done'} after {time.monotonic() - self._stage:.1f} s", flush=True)
+        say(f"  {text or 'done'} after {time.monotonic() - self._stage:.1f} s")
+
+
+def say(text: str) -> None:
+    """Print a text of anybody's, a finding or the name of a file, so that it cannot change the terminal."""
+    print(printable(text), flush=True)
 
 
 def make_progress() -> Bars | Lines:
@@ -107,5 +113,5 @@ def make_progress() -> Bars | Lines:
 def print_summary(lines: Iterable[str], result: Path, name: str = "results") -> None:
     """Print what a command found, and where it wrote it."""
     for line in lines:
-        print(line)
-    print(f"{name}: {result.resolve()}")
+        say(line)
+    say(f"{name}: {result.resolve()}")

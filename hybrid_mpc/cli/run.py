@@ -69,7 +69,7 @@ def run(
     monitor, guard, analysis and report. With --resume a stage runs again only where something that it reads has
     changed. Exit code 1 if a stage after the export could not run; the report then says why.
     """
-    from hybrid_mpc.cli.progress import make_progress, print_summary
+    from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.job.run import failed_stages
     from hybrid_mpc.job.run import run as run_job
     from hybrid_mpc.job.settings import RunSettings
@@ -87,7 +87,7 @@ def run(
     print_summary(lines if results is None else summary(results), folder / "report.html", "report")
     if failed := failed_stages(folder):
         for stage, why in failed.items():
-            print(f"stage {stage} could not run: {why}")
+            say(f"stage {stage} could not run: {why}")
         raise typer.Exit(INCOMPLETE)
 
 

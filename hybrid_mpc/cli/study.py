@@ -161,6 +161,8 @@ def _plan(plan: Plan, workers: int) -> list[str]:
 
 
 def _tell(results: StudyResults) -> None:
+    from hybrid_mpc.cli.progress import say
+
     failed = results.failed
     if len(failed) < len(results.table):
         print(_text(results.summary()))
@@ -168,7 +170,7 @@ def _tell(results: StudyResults) -> None:
         print(
             f"failed: {row['model']}, {row['task']}, {row['controller']}, draw {row['draw']}, seed {row['seed']}:"
         )
-        print(row["error"].rstrip())
+        say(row["error"].rstrip())
     if len(failed):
         print(f"{len(failed)} of {len(results.table)} runs failed; the column 'error' has their tracebacks")
     print(f"results: {(results.folder / 'results.parquet').resolve()}")

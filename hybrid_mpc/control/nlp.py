@@ -14,6 +14,7 @@ from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Controller, Problem, Solution, Status, Target
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.limits import MOST_ITERATIONS, whole
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import stage_step
 
@@ -65,10 +66,9 @@ class IpoptController(Controller):
         iterations: int = 500,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        if not tolerance > 0 or iterations < 1:
-            raise InputError(
-                f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
-            )
+        if not (isinstance(tolerance, int | float) and tolerance > 0):
+            raise InputError(f"tolerance must be positive, got {tolerance!r:.80}")
+        iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         self.problem = Problem(model, ocp)
         self._bounds: dict[str, Array] = {}
         nlp = self._formulate()

@@ -511,7 +511,7 @@ def _whole(value: object) -> bool:
     return (
         isinstance(value, int | float | np.number)
         and not isinstance(value, bool | complex | np.complexfloating)
-        and bool(np.isfinite(value))
+        and (isinstance(value, int) or bool(np.isfinite(value)))
         and int(value) == value
     )
 

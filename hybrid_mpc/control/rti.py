@@ -14,8 +14,8 @@ from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP
 from hybrid_mpc.control.targets import Steady
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.limits import MOST_ITERATIONS, whole
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import Derivatives, stages
 
@@ -194,8 +194,7 @@ class CondensedController(SplitController):
     converges = False
 
     def __init__(self, model: HybridModel, ocp: OCP, *, iterations: int = 1, compiled: bool = False) -> None:
-        if iterations < 1:
-            raise InputError(f"iterations must be at least 1, got {iterations}")
+        iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         self.problem = Problem(model, ocp)
         self.iterations, self._n_x = iterations, ocp.n_x
         n, n_u = ocp.horizon, ocp.n_u

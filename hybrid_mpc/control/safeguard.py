@@ -15,6 +15,7 @@ from hybrid_mpc.control.problem import Controller, Solution, SplitController, St
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.limits import check_part, whole
 from hybrid_mpc.model.model import Expression, HybridModel
 from hybrid_mpc.model.riccati import dare, vector
 
@@ -94,8 +95,10 @@ class SafeController:
         first: Controller | None = None,
         safe_input: ArrayLike | None = None,
     ) -> None:
-        if max_age < 0:
-            raise InputError(f"max_age must not be negative, got {max_age}")
+        max_age = whole(max_age, "max_age [periods]", 0, 10**9)
+        check_part(controller, "controller", "a controller", "model", "ocp", "solve")
+        if not isinstance(fallback, HybridModel | None):
+            raise InputError(f"fallback: a model is needed, got {type(fallback).__name__}")
         ocp = controller.ocp
         self.controller, self.max_age, self.fallback = controller, max_age, fallback
         self.safe_input = None if safe_input is None else checked_safe_input(safe_input, ocp)

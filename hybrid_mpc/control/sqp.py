@@ -16,6 +16,7 @@ from hybrid_mpc.control.qp import Answer
 from hybrid_mpc.control.rti import CondensedController, Prepared, adjoint, condense_hessians
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.limits import MOST_ITERATIONS, whole
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import Derivatives
 
@@ -414,10 +415,9 @@ class SQPController(Controller):
         iterations: int = 100,
         compiled: bool = False,
     ) -> None:
-        if not tolerance > 0 or iterations < 1:
-            raise InputError(
-                f"tolerance must be positive and iterations at least 1, got {tolerance} and {iterations}"
-            )
+        if not (isinstance(tolerance, int | float) and tolerance > 0):
+            raise InputError(f"tolerance must be positive, got {tolerance!r:.80}")
+        iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         inner = CondensedController(model, ocp, compiled=compiled)
         self.problem, self._cost = inner.problem, ReducedCost(inner)
         self._tolerance, self._iterations = tolerance, iterations

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline, make_smoothing_spline
 from scipy.optimize import minimize_scalar
 from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
 
+from hybrid_mpc.data.files import real_numbers
 from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
@@ -105,15 +106,26 @@ def differentiate(y: Array, dt: float, method: Differentiator) -> Derivatives:
         >>> bool(np.abs(d.first - np.cos(t))[50:-50].max() < 1e-3)
         True
     """
-    y = np.asarray(y, dtype=float)
+    y = real_numbers(y, "differentiate: samples")
+    if not hasattr(method, "derivatives") or isinstance(method, type):
+        raise InputError(
+            f"differentiate: a method such as LocalPolynomial(0.2) is needed, got {method!r:.80}"
+        )
     if y.ndim not in (1, 2) or not y.size:
         raise InputError(f"differentiate: needs samples (n,) or (n, n_y), got an array of shape {y.shape}")
-    if not (math.isfinite(dt) and dt > 0):
+    if not positive(dt):
         raise InputError(f"differentiate: the period must be positive, got {dt} s")
     if not np.isfinite(y).all():
         row = int(np.argwhere(~np.isfinite(y))[0, 0])
         raise InputError(f"differentiate: sample {row} is not finite; cut the signal there or repair it")
     return method.derivatives(y, dt)
+
+
+def positive(value: object) -> bool:
+    """Whether something is a finite number above zero."""
+    if not isinstance(value, float | int | np.floating | np.integer) or isinstance(value, bool):
+        return False
+    return bool(0 < value < 1e300)
 
 
 def window_samples(length: float, dt: float, order: int = 4) -> int:
@@ -123,6 +135,8 @@ def window_samples(length: float, dt: float, order: int = 4) -> int:
         >>> window_samples(0.2, 0.02)
         11
     """
+    if not positive(length):
+        raise InputError(f"smoothing: a length above 0 s is needed, got {length!r:.80}")
     n = 2 * int(np.floor(length / (2 * dt) + 1e-6)) + 1
     if n <= order + 1:
         need = 2 * (order // 2 + 1) * dt
@@ -359,6 +373,8 @@ def _spline_ratio(w: Array) -> Array:
 
 
 def _check_cutoff(cutoff: float, dt: float, n: int) -> None:
+    if not positive(cutoff):
+        raise InputError(f"cutoff: a positive frequency [Hz] is needed, got {cutoff!r:.80}")
     if not 0 < cutoff < 0.5 / dt:
         raise InputError(
             f"cutoff of {cutoff:g} Hz must be positive and below {0.5 / dt:g} Hz, half the sampling rate of "

@@ -30,6 +30,7 @@ import nn_export.files
 from hybrid_mpc.data.mat_structure import check_structure, version
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_npz, write_text
+from hybrid_mpc.machine.units import Conversion, conversion, parsed
 from hybrid_mpc.records import LONGEST, shown
 
 Array = NDArray[np.float64]
@@ -70,6 +71,12 @@ OTHERS = {"|": "vertical bars", " ": "blanks"}
 ENGLISH, GERMAN = "on off true false yes no open closed high low", "ein aus an auf zu ja"
 SWITCH = frozenset(f"{ENGLISH} {GERMAN}".split())
 """Words for the two positions of a switch, in small letters."""
+SEEN = 1000
+"""Rows of columns that are not read which are looked at for the file's decimal mark."""
+CUT = 3.0
+"""Times the largest step of a column by which its last number must be off to be one that was cut in two."""
+_GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}(?:([.,])\d{3})(?:\1\d{3})*")
+_DECIMAL = re.compile(r"[+-]?\d+([.,])\d+(?:[eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[.,'’ \u00a0\u202f]\d{3})+(?:[.,]\d*)?")
 _DATE = re.compile(
     r"\d{1,4}([-/. ])(\d{1,2}|[a-z]{3,9})\.?\1\d{1,4}([T ,].*)?|\d{1,3}:\d{2}(:\d{2})?([.,]\d+)?(\s?[ap]m)?",
@@ -270,8 +277,9 @@ def _csv(path: Path) -> Source:
     def read(time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
         rows = _rows(path, content, separator)
         next(rows, None)
+        ended = content.endswith((b"\n", b"\r"))
         return _parsed(
-            path, rows, line, names, [*([] if time is None else [time]), *wanted], blanks, separator
+            path, rows, line, names, [*([] if time is None else [time]), *wanted], blanks, separator, ended
         )
 
     return Source(path, hashlib.sha256(content).hexdigest(), names, read)
@@ -463,8 +471,12 @@ def _parsed(
     wanted: Sequence[str],
     blanks: Collection[str],
     separator: str,
+    ended: bool,
 ) -> Columns:
-    """Numbers of the wanted columns; a row of another length than the header is an error of the whole file."""
+    """Numbers of the wanted columns; a row of another length than the header is an error of the whole file.
+
+    ``ended`` says whether the file ends with the end of a row.
+    """
     places = [names.index(name) for name in wanted]
     lax = [name in blanks for name in wanted]
     columns, numbers = [array("d") for _ in places], array("q")
@@ -472,26 +484,32 @@ def _parsed(
     first_bad = [(0, "")] * len(places)
     unequal, first_unequal = 0, (0, 0)
     words = 0  # the first row, if it holds no number at all
-    marks: dict[
-        str, tuple[int, str]
-    ] = {}  # decimal marks where they may be commas, and the first cell of each
+    marks = _Marks([names[place] for place in places], set(places))
+    units = _UnitsRow()
+    tail, last = _Tail(), [j for j, place in enumerate(places) if place == len(names) - 1]
+    before = header
     most = LARGEST // 8 // (len(places) + 1)
     for line, cells in rows:
         if len(cells) != len(names):
             first_unequal = first_unequal if unequal else (line, len(cells))
             unequal += 1
             continue
+        if line > before + 1:
+            _check_quotes(path, line, cells, separator)
+        before = line
         if len(numbers) == most:
             raise InputError(f"{path}: has more than {most} rows, more than are read. Split the recording.")
         if not numbers and not any(math.isfinite(_number(_pointed(cell, separator))) for cell in cells):
             words = line
+        if len(numbers) < 2:
+            units.look(line, cells, separator)
+        if separator != ",":
+            marks.look(len(numbers), line, cells, places)
         numbers.append(line)
+        if not ended and last:
+            tail.look(cells[-1])
         for j, place in enumerate(places):
             cell = cells[place]
-            if separator != ",":
-                for mark in ",.":
-                    if mark in cell:
-                        marks.setdefault(mark, (line, cell.strip()))
             value = _number(_pointed(cell, separator))
             columns[j].append(value)
             if value != value and not (lax[j] and cell.strip().lower() in BLANK):
@@ -510,21 +528,158 @@ def _parsed(
             what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
             such = f" ({count} such rows)" if count > 1 else ""
             remedy = ". Delete the row (longer gaps are cut out) or repair the value."
-            if line == words:
+            if line in (words, units.row):
+                said = name_and_unit(name)[1]
                 remedy = (
-                    ", as no cell of that row: a row of units? Delete it, and write the units behind the names, e.g. "
-                    "'time [s]'."
+                    f", and the header has {shown(said)}. Delete one of the two; which is right, nobody here knows."
+                    if said and conversion(said, cell) != Conversion(1.0)
+                    else ", as no cell of that row: a row of units? Delete it, and write the units behind the names, "
+                    "e.g. 'time [s]'."
                 )
             elif cause := _cause(cell):
                 remedy = f": {cause}."
             faults[name] = f"row {line}, column {shown(name)} {what}{such}{remedy}"
-    if len(marks) > 1:
-        (with_comma, comma), (with_point, point) = marks[","], marks["."]
-        faults[""] = (
-            f"numbers have commas and points: {shown(comma)} in row {with_comma}, {shown(point)} in row {with_point}. "
-            "Write the file with one decimal mark and nothing between thousands."
+    if units.row and not any(line == units.row for line, _ in first_bad):
+        faults["row of units"] = (
+            f"row {units.row} is a row of units ({shown(units.cell)})? Delete it, and write the units behind "
+            "the names, e.g. 'time [s]'."
         )
+    faults |= marks.faults()
+    for j in last[:1]:
+        if not ended and wanted[j] not in faults and tail.is_cut(np.array(columns[j])):
+            faults[wanted[j]] = (
+                f"row {numbers[-1]}, column {shown(wanted[j])} is {shown(tail.last)}, where the file ends without the "
+                "end of the row: the number seems to be cut in two. Delete that row, or record it whole."
+            )
     return Columns(np.column_stack([np.array(column) for column in columns]), "row", numbers, faults)
+
+
+class _Marks:
+    """Decimal marks of a file whose cells no comma separates: where points and commas stand, and what they may be.
+
+    A mark is decimal where a cell has it as no mark between thousands stands: ``0.5``, ``12.25``. Cells like ``1.250``
+    may be either.
+    """
+
+    def __init__(self, names: Sequence[str], read: set[int]) -> None:
+        self._names, self._read = names, read
+        self._first: dict[str, tuple[int, str]] = {}
+        self._decimal: set[str] = set()
+        self._grouped: dict[int, tuple[str, int, str]] = {}  # by column its first cell that may be either
+        self._small: set[int] = set()  # columns with whole numbers below 1000
+        self._not: set[int] = set()  # columns without marks between thousands
+
+    def look(self, k: int, line: int, cells: Sequence[str], places: Sequence[int]) -> None:
+        """See a row, the ``k``-th; of columns that are not read the first ones are enough."""
+        for j, place in enumerate(places):
+            cell = cells[place].strip()
+            for mark in ",.":
+                if mark in cell:
+                    self._first.setdefault(mark, (line, cell))
+                    if mark not in self._decimal and not _GROUPED.fullmatch(cell):
+                        self._decimal.add(mark)
+            if j in self._not:
+                continue
+            if found := _GROUPED.fullmatch(cell):
+                self._grouped.setdefault(j, (found[1], line, cell))
+            elif re.fullmatch(r"[+-]?\d{1,3}", cell):
+                self._small.add(j)
+            elif cell.casefold() not in BLANK:
+                self._not.add(j)
+        if k < SEEN:
+            for place, cell in enumerate(cells):
+                found = _DECIMAL.fullmatch(cell.strip())
+                if found and place not in self._read and not _GROUPED.fullmatch(cell.strip()):
+                    self._decimal.add(found[1])
+
+    def faults(self) -> dict[str, str]:
+        """What is wrong with them, by column; ``""`` is all columns."""
+        if len(self._first) > 1:
+            (with_comma, comma), (with_point, point) = self._first[","], self._first["."]
+            return {
+                "": f"numbers have commas and points: {shown(comma)} in row {with_comma}, {shown(point)} in row "
+                f"{with_point}. Write the file with one decimal mark and nothing between thousands."
+            }
+        return {
+            self._names[
+                j
+            ]: f"row {line}, column {shown(self._names[j])} is {shown(cell)}: a mark between thousands, or "
+            "decimals? Other cells of the column are whole numbers, or other columns have another decimal mark. Write "
+            "numbers with one decimal mark, as many decimals in all rows, and nothing between thousands."
+            for j, (mark, line, cell) in self._grouped.items()
+            if j not in self._not and mark not in self._decimal and (j in self._small or self._decimal)
+        }
+
+
+class _UnitsRow:
+    """Whether the first row of numbers is a row of units, of which some are written as numbers: ``s;1;1``."""
+
+    def __init__(self) -> None:
+        self.row, self.cell = 0, ""
+        self._words: dict[int, str] = {}
+        self._line = 0
+
+    def look(self, line: int, cells: Sequence[str], separator: str) -> None:
+        """See the first row of numbers, then the second."""
+        numbers = [math.isfinite(_number(_pointed(cell, separator))) for cell in cells]
+        if not self._line:
+            self._line = line
+            self._words = {
+                j: cell.strip()
+                for j, (cell, number) in enumerate(zip(cells, numbers, strict=True))
+                if not number and _is_unit(cell.strip())
+            }
+        elif found := next((cell for j, cell in self._words.items() if numbers[j]), ""):
+            self.row, self.cell = self._line, found
+
+
+def _is_unit(cell: str) -> bool:
+    """Whether a cell is the name of a unit, and no mark for a missing value."""
+    return (
+        cell.casefold() not in BLANK
+        and re.search(r"[^\W\d_]|[%°]", cell) is not None
+        and parsed(cell) is not None
+    )
+
+
+class _Tail:
+    """The last cell of a column, and what the cells before it look like."""
+
+    def __init__(self) -> None:
+        self.last, self._before = "", ""
+        self._decimals: set[int] = set()
+
+    def look(self, cell: str) -> None:
+        """See the next cell."""
+        if self.last:
+            self._decimals.add(_decimals(self.last))
+        self._before, self.last = self.last, cell.strip()
+
+    def is_cut(self, column: Array) -> bool:
+        """Whether the last cell is shorter than others, and its number ``column[-1]`` far from what is due."""
+        if len(column) < STEADY + 1 or not np.isfinite(column[-1]):
+            return False
+        with np.errstate(over="ignore"):  # what overflows is out of its range
+            steps = np.abs(np.diff(column))
+        jumps = bool(steps[-1] > CUT * float(np.nanmax(steps[:-1], initial=0.0)))
+        fewer = len(self._decimals) == 1 and _decimals(self.last) < max(self._decimals)
+        return fewer or (jumps and len(self.last) < len(self._before))
+
+
+def _decimals(cell: str) -> int:
+    """Characters behind a number's decimal mark."""
+    return len(re.split("[.,]", cell)[-1]) if re.search("[.,]", cell) else 0
+
+
+def _check_quotes(path: Path, line: int, cells: Sequence[str], separator: str) -> None:
+    """Refuse a row of which a cell holds whole rows: a quotation mark that was opened and never closed."""
+    for cell in cells:
+        inner = re.split(r"[\r\n]+", cell)[1:]
+        if any(one.count(separator) >= len(cells) - 1 for one in inner):
+            raise InputError(
+                f"{path}: row {line}: a quotation mark that stands before it is not closed, and the rows between are "
+                "one cell. Delete the mark, or double it within a text."
+            )
 
 
 def _number(cell: str) -> float:
@@ -536,6 +691,25 @@ def _number(cell: str) -> float:
     return value if math.isfinite(value) and "_" not in cell else math.nan
 
 
+MOST_DECIMALS = 17
+"""Most digits after the point that are written: a float has no more."""
+
+
+def real_numbers(values: object, name: str) -> Array:
+    """Numbers as a float array.
+
+    Raises:
+        InputError: If they are none; ``name`` says what they are.
+    """
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind in "biufO":
+            return np.asarray(given, dtype=np.float64)
+    except Exception as error:  # whatever an object of anybody's raises where it is asked for its numbers
+        raise InputError(f"{name}: numbers are needed, got {type(values).__name__}") from error
+    raise InputError(f"{name}: numbers are needed, got {type(values).__name__} of {given.dtype}")
+
+
 def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int | None = None) -> Path:
     r"""Write columns of equal length as CSV: all of it or nothing, the same data as the same bytes; the path.
 
@@ -545,7 +719,8 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
         decimals: Digits after the point. Default: ten significant digits.
 
     Raises:
-        InputError: If the columns differ in length or are not one-dimensional.
+        InputError: If the columns differ in length or are not one-dimensional, or there is no such path or number of
+            decimals.
 
     Example:
         >>> import tempfile
@@ -553,8 +728,19 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
         ...     write_csv(Path(folder) / "a.csv", {"t": np.array([0.0, 0.1])}).read_text()
         't\n0\n0.1\n'
     """
+    if not isinstance(path, str | Path) or not Path(path).name:
+        raise InputError(f"write_csv: the path of a file is needed, got {path!r:.80}")
+    if not isinstance(columns, Mapping):
+        raise InputError(f"write_csv: columns by name are needed, got {type(columns).__name__}")
+    if decimals is not None and not (type(decimals) is int and 0 <= decimals <= MOST_DECIMALS):
+        raise InputError(
+            f"write_csv: decimals from 0 to {MOST_DECIMALS} are needed, got {type(decimals).__name__}"
+        )
     path = Path(path)
-    arrays = {name: np.asarray(column, dtype=float) for name, column in columns.items()}
+    arrays = {
+        name: real_numbers(column, f"write_csv: column {shown(str(name))}")
+        for name, column in columns.items()
+    }
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
         raise InputError(f"{path}: columns must be one-dimensional and of one length, got {shapes}")
@@ -679,6 +865,11 @@ def _vectors(
         for name in names:
             try:
                 array = lookup(name)
+                if time is not None and name == names[0] and array.dtype == np.float16 and array.size > 1:
+                    raise InputError(
+                        f"{path}: column {shown(name)} has half precision, three digits, which do not tell time stamps "
+                        "apart. Save it in double precision."
+                    )
                 left -= 8 * array.size
                 if left < 0:
                     raise InputError(

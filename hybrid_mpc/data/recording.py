@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-import itertools
+import difflib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
@@ -44,12 +44,41 @@ DIGITS = 1e-9
 """Share by which equal numbers differ in files of other formats: ten digits."""
 FAR_OFF = 3.0
 """Times the span and the size of all other values by which a code for missing ones is away from them."""
-_CODE = re.compile(r"999+(\.9+)?|32767|32768|65535|2147483647|2147483648|1e\+?\d\d+")
+_CODE = re.compile(
+    r"999+(\.9+|\.25)?|9\.9+e\+\d\d+|9\.96921e\+36|32767|32768|65535|8388607|8388608|2147483647|2147483648|4294967295|"
+    r"1e\+[1-3]\d|3\.402(82|823|823466)e\+38"
+)
+_NEVER = re.compile(r"9999+(\.9+|\.25)?|999\.25|9\.9.*e\+\d\d+|[13].*e\+[2-9]\d")
+"""Codes that are no position of a switch, where they are negative or larger than ``LARGER``."""
+LARGER = 1e15
+"""No number of a machine that switches is larger."""
+OUTLYING = 10.0
+"""Spans of all other values by which a sample is away from them that is an outlier."""
+MOST_ODD = 5
+"""Most samples of a column that are outliers, and at most one of a hundred: more are a motion."""
+SEVERAL = 4
+"""Most codes that one column is looked at for."""
 HOLE = 1.5
 """Usual distances of the time stamps from which on samples are missing between two."""
 UNSURE = 0.4
 """Share of a turn by which the way over missing samples may differ from that at the speeds before and after: at half a
 turn another number of turns would fit as well."""
+PARTS = (2, 3, 4, 6, 8)
+"""Parts of a turn after which a sensor may begin anew: half turns of an arctangent, pole pairs."""
+ALIKE = 0.8
+"""How alike the names of two recordings are that are one, misspelt."""
+BITS = (8, 10, 12, 14, 16, 20, 24, 32)
+"""Bits of counters that overflow."""
+LIKE = 0.03
+"""Share by which a jump, the motion around it taken off, may differ from such a part."""
+FEWEST = 10
+"""Fewest time stamps that show whether they are even."""
+UNEVEN = 1e-3
+"""Share of a step from which on a step is another one."""
+PAUSE = 20.0
+"""Usual steps without a sample that are a pause."""
+SLACK = 0.05
+"""What a grid that is fitted to rounded stamps may be off beyond their rounding, in roundings."""
 SPAN = 1.05
 """Turns that a wrapped angle spans at most: one, and some noise. An angle that counts on and turns fast spans more."""
 MIN_SCORED = 10
@@ -71,7 +100,7 @@ class Finding:
     concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
     """
 
-    kind: Literal["wrapped", "frozen", "clipped", "speed", "missing"]
+    kind: Literal["wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
     file: str
     channel: str
     start: float
@@ -201,13 +230,17 @@ def read_recordings(
 
     They may differ in format, length and sampling, and in columns that ``spec`` does not name.
     """
-    refuse(_count_problems(spec, prior) or _column_problems(spec))
+    refuse(
+        _count_problems(spec, prior) or [*_column_problems(spec), *_stem_problems(spec, [*map(Path, paths)])]
+    )
     recordings: list[Recording] = []
     problems: list[str] = []
     there: dict[str, list[str]] = {}
     missing: dict[str, list[str]] = {}
     for path in map(Path, paths):
         try:
+            if any("\ud800" <= c <= "\udfff" for c in path.name):
+                raise InputError(f"{str(path)!a}: the file's name is no text (UTF-8). Rename the file.")
             source = opened(path)
             names, lacking = _found(source, spec, there, missing)
             problems += lacking
@@ -291,7 +324,7 @@ def _column_problems(spec: DataSpec) -> list[str]:
                     f"data specification: column {name!r} is named in {' and '.join(sorted([role, *also]))}. A column "
                     "holds one signal: name it once."
                 )
-    known = {*spec.inputs, *spec.disturbances, *spec.outputs, *itertools.chain(*spec.inputs_of.values())}
+    known = spec.columns - set(time)
     for role, delays in [
         ("delays", spec.delays),
         *((f"delays_of {s!r}", d) for s, d in spec.delays_of.items()),
@@ -302,7 +335,62 @@ def _column_problems(spec: DataSpec) -> list[str]:
             for name in delays
             if name not in known
         ]
+    there = ", ".join(sorted(map(repr, spec.columns)))
+    problems += [
+        f"data specification: units names column {name!r}, which is none of {there}. Name a column as inputs, outputs, "
+        "disturbances and time do."
+        for name in spec.units
+        if name not in spec.columns
+    ]
     return list(dict.fromkeys(problems))
+
+
+def _stem_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
+    """Settings of single recordings that name a file by more than its stem, or by other letters: nobody would find
+    them. Of recordings that are not given there may be some.
+    """
+    stems = {path.stem for path in paths}
+    meant = {
+        **{path.name.casefold(): path.stem for path in paths},
+        **{stem.casefold(): stem for stem in stems},
+    }
+    return [
+        f"data specification: {setting} names the recording {name!r}, and the file's stem is "
+        f"{meant[name.strip().casefold()]!r}. Write it so."
+        for setting, names in (
+            ("windows", spec.windows),
+            ("inputs_of", spec.inputs_of),
+            ("delays_of", spec.delays_of),
+        )
+        for name in names
+        if name not in stems and name.strip().casefold() in meant
+    ]
+
+
+def misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
+    """Settings of recordings that are not given, whose names are nearly those of recordings that are given and have no
+    such settings. Names that differ in their numbers alone are those of several recordings.
+    """
+    found = []
+    settings: dict[str, Mapping[str, object]] = {
+        "windows": spec.windows, "inputs_of": spec.inputs_of, "delays_of": spec.delays_of,
+    }  # fmt: skip
+    for setting, names in settings.items():
+        free = {path.stem: path.name for path in paths if path.stem not in names}
+        for name in names:
+            near = difflib.get_close_matches(name, free, n=1, cutoff=ALIKE)
+            if name in {path.stem for path in paths} or not near or _letters(name) == _letters(near[0]):
+                continue
+            message = (
+                f"{setting} of the DataSpec has {name!r}, which is not given, and nothing for {near[0]!r}: misspelt? "
+                "Settings of recordings go by the stem of the file."
+            )
+            found.append(Finding("settings", free[near[0]], "", 0.0, 1, message))
+    return found
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"\d+", "", name)
 
 
 def _found(
@@ -356,11 +444,17 @@ def _recording(
         blanks = set(found[1 + len(inputs) :]) - set(found[: 1 + len(inputs)])
         columns = source.read(None, found[1:], blanks)
         values = np.column_stack([spec.time * np.arange(len(columns.values)), columns.values])
+    values[:, 0] = even(values[:, 0])
     first, split = 1 + len(inputs), 1 + len(inputs) + len(disturbances)
     problems = list(columns.problems)
     findings: list[Finding] = []
     unclear: set[int] = set()  # columns whose unit is none of their signal's
     cuts: set[int] = set()
+    raw = values.copy()
+    codes = [
+        None,
+        *(_code(column) for column in values.T[1:]),
+    ]  # as the file has them, before units are converted
     with np.errstate(over="ignore"):  # what overflows is out of its range
         for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
             to, problem = _converted(spec, name, found[j], signal)
@@ -382,6 +476,13 @@ def _recording(
                 f"column {name!r} has no number in any row; {signal.name} was not measured. Record it, or leave this "
                 "recording out."
             )
+        if clean and j >= split and there.any() and (censored[there, j - split] != 0).all():
+            lower, upper = signal.saturation or (-math.inf, math.inf)
+            problems.append(
+                f"column {name!r} is at an end of its sensor's range {lower:g} to {upper:g} {signal.unit} or beyond in "
+                f"all rows ({values[there, j].min():.6g} to {values[there, j].max():.6g}): nothing was measured. Check "
+                f"the unit and Signal.saturation of {signal.name}, or leave this recording out."
+            )
         if clean and j >= first and turn is not None:
             found_turns = unwrapped(t[there], values[there, j], turn, spec.max_gap, periodic=signal.periodic)
             if len(jumps := found_turns.jumps):
@@ -390,12 +491,20 @@ def _recording(
                     values[there, j] = found_turns.angle
                     note = f", with {len(jumps)} jumps of a full turn taken out"
                     cuts |= set(np.flatnonzero(there)[found_turns.unclear].tolist())
+            elif found_parts := folded(t[there], values[there, j], turn, spec.max_gap):
+                findings.append(_folded(path.name, name, signal, t[there], values[there, j], *found_parts))
+        if clean and j >= first and (found_bits := _overflow(t[there], raw[there, j], spec.max_gap)):
+            findings.append(_overflowing(path.name, name, t[there], raw[there, j], *found_bits))
+        if clean and j and codes[j] is None and (odd := _outliers(values[:, j])) is not None:
+            findings.append(_outlying(path.name, name, signal, t, values[:, j], odd))
         if clean and j >= first and there.any() and not there.all():
             findings.append(_missing(path.name, name, t, there))
-        if j and (code := _code(values[:, j])) is not None:
+        if (code := codes[j]) is not None:
+            rows = np.flatnonzero(raw[:, j] == code)
             problems.append(
-                f"column {name!r}: {code:.10g} in {int((values[:, j] == code).sum())} of {len(t)} rows, far from all "
-                "other values: a code for missing ones? Leave these cells blank; inputs are needed in every row."
+                f"{columns.place(int(rows[0]))}, column {name!r}: {code:.10g}, in {len(rows)} of {len(t)} rows, is far "
+                "from all other values: a code for missing ones? Leave these cells blank; inputs are needed in every "
+                "row."
             )
         elif j not in unclear:
             problems += _range_problems(signal, name, values[:, j], columns, note)
@@ -434,6 +543,58 @@ def censored_of(y: Array, outputs: Sequence[Signal]) -> Flags:
 def gaps(t: Array, max_gap: float) -> NDArray[np.bool_]:
     """Which of the steps ``(m - 1,)`` between time stamps ``(m,)`` are longer than ``max_gap`` [s]."""
     return np.asarray(np.diff(t) > max_gap * (1 + 1e-6))
+
+
+def even(t: Array) -> Array:
+    """Time stamps ``(m,)`` whose steps are uneven by rounding alone, made even; all others as they are.
+
+    Stamps are rounded to single precision, or to so many decimals. Where a grid of equal steps, with samples missing
+    here and there, is nowhere further from them than that rounding, it is what was sampled. Stretches with a pause
+    between them have grids of their own.
+
+    Example:
+        >>> single = (1e4 + 0.01 * np.arange(1000)).astype(np.float32).astype(float)
+        >>> bool(np.ptp(np.diff(single)) > 9e-4), bool(np.ptp(np.diff(even(single))) < 1e-9)
+        (True, True)
+    """
+    if len(t) < FEWEST or not (np.abs(t) < LARGER).all():
+        return t
+    steps = np.diff(t)
+    usual = float(np.median(steps))
+    if not (steps > 0).all():
+        return t
+    like = steps[np.abs(steps - usual) <= 0.6 * usual]
+    if not len(like):
+        return t
+    usual = float(like.mean())
+    if float(np.abs(steps - usual).max()) <= UNEVEN * usual:
+        return t
+    found, rounding = t.copy(), _rounding(t)
+    for rows in np.split(np.arange(len(t)), np.flatnonzero(steps > PAUSE * usual) + 1):
+        if len(rows) < FEWEST:
+            continue
+        own = t[rows] - t[rows[0]]
+        mean = own[-1] / max(1.0, float(np.round(np.diff(own) / usual).sum()))
+        count = np.r_[0.0, np.cumsum(np.round(np.diff(own) / mean))]
+        slope = float(np.cov(count, own)[0, 1] / np.var(count, ddof=1)) if np.ptp(count) > 0 else 0.0
+        grid = own.mean() + slope * (count - count.mean())
+        off = np.abs(grid - own)
+        fits = (np.diff(count) > 0).all() and (off <= rounding[rows] * (0.5 + SLACK)).all()
+        if fits and off.max() > UNEVEN * slope:
+            found[rows] = t[rows[0]] + grid
+    return found
+
+
+def _rounding(t: Array) -> Array:
+    """What time stamps ``(m,)`` are rounded to, for each."""
+    found, single, size = np.zeros(len(t)), t.astype(np.float32), float(np.abs(t).max())
+    if (single == t).all() or all(float(str(a)) == b for a, b in zip(single, t.tolist(), strict=True)):
+        found = np.spacing(np.abs(single)).astype(np.float64)
+    for decimals in range(10):
+        unit = 10.0**-decimals
+        if (np.abs(t - np.round(t, decimals)) <= 1e-4 * unit + 4 * np.spacing(size)).all():
+            return np.maximum(found, unit)
+    return found
 
 
 def _stamps(spec: DataSpec) -> str:
@@ -489,19 +650,35 @@ def _range_problems(signal: Signal, name: str, column: Array, columns: Columns, 
 
 
 def _code(column: Array) -> float | None:
-    """A number that logging programs write for a missing value, where a column has it again and again, far from all
-    others; None without.
+    """A number that logging programs write for a missing value, as the file has it, where a column has it, be it once,
+    far from all others; None without.
+
+    It is far where it is ``FAR_OFF`` spans of the others away, and as many of their sizes, or negative where all others
+    are positive.
     """
-    known = column[np.isfinite(column)]
-    for code in (known.min(initial=math.inf), known.max(initial=-math.inf)):
-        others = known[known != code]
-        if 2 <= len(known) - len(others) < len(known) and _CODE.fullmatch(f"{abs(code):.10g}"):
-            away = float(np.abs(others - code).min())
-            if not np.ptp(others) > 0:  # what switches between two values
-                continue
-            if away > FAR_OFF * float(np.ptp(others)) and away > FAR_OFF * float(np.abs(others).max()):
-                return float(code)
+    others, found = column[np.abs(column) <= ABSURD], list[float]()
+    while len(others) and len(found) < SEVERAL:
+        ends = (float(others.min()), float(others.max()))
+        code = next((end for end in ends if _spelled(_CODE, end)), None)
+        if code is None:
+            break
+        found.append(code)
+        others = others[others != code]
+    if not len(others):
+        return None
+    span, size = float(np.ptp(others)), float(np.abs(others).max())
+    for code in found:
+        away = float(np.abs(others - code).min())
+        far = away > FAR_OFF * size or code < 0 <= float(others.min())
+        switch = span == 0 and not (_spelled(_NEVER, code) and (code < 0 or code > LARGER))
+        if far and away > FAR_OFF * span and not switch:
+            return code
     return None
+
+
+def _spelled(pattern: re.Pattern[str], value: float) -> bool:
+    """Whether a number, or the one of single precision that it was, is written so, whatever its sign."""
+    return any(pattern.fullmatch(f"{abs(value):.{digits}g}") for digits in (10, 7))
 
 
 # Units
@@ -614,6 +791,115 @@ def unwrapped(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: 
             unclear.append(int(k) + 1)
     counted = angle + turn * np.concatenate([[0.0], np.cumsum(turns)])
     return Unwrapped(counted, np.flatnonzero(turns) + 1, np.array(unclear, dtype=np.intp))
+
+
+def folded(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, NDArray[np.intp]] | None:
+    """Into how many parts of a turn an angle is folded that begins anew after one, and the samples before which it
+    jumps; None where it is not.
+
+    Example:
+        >>> t = 0.01 * np.arange(400)
+        >>> folded(t, (2 * t) % np.pi, 2 * np.pi, 0.05)
+        (2, array([158, 315]))
+    """
+    sizes, jumps = anew(t, angle, max_gap)
+    span = float(np.ptp(angle)) if len(jumps) else 0.0
+    for parts in PARTS:
+        if (
+            len(jumps)
+            and (np.abs(sizes - turn / parts) <= LIKE * turn / parts).all()
+            and span <= SPAN * turn / parts
+        ):
+            return parts, jumps
+    return None
+
+
+def anew(t: Array, x: Array, max_gap: float) -> tuple[Array, NDArray[np.intp]]:
+    """By how much a signal ``(m,)`` jumps from one end of its range to the other against its motion before and after,
+    that motion taken off, and the samples before which it does: there it begins anew. A machine that steps goes with
+    its motion.
+    """
+    step, none = np.diff(x), (np.zeros(0), np.zeros(0, dtype=np.intp))
+    if len(step) < 3 or not (span := float(np.ptp(x))) > 0:
+        return none
+    near = ~gaps(t, max_gap)
+    inner = np.flatnonzero(near[1:-1] & near[:-2] & near[2:] & (np.abs(step[1:-1]) > 0.5 * span)) + 1
+    before, jump, after = step[inner - 1], step[inner], step[inner + 1]
+    on = (
+        (before * jump < 0)
+        & (after * jump < 0)
+        & (np.maximum(np.abs(before), np.abs(after)) < NEARLY * np.abs(jump))
+    )
+    on &= np.abs(before - after) <= np.abs(before + after) / 2
+    top, low = np.maximum(x[inner], x[inner + 1]), np.minimum(x[inner], x[inner + 1])
+    on &= np.maximum(x.max() - top, low - x.min()) <= 0.75 * np.abs(before + after)  # from end to end
+    return np.abs(jump[on] - (before[on] + after[on]) / 2), inner[on] + 1
+
+
+def _overflow(t: Array, raw: Array, max_gap: float) -> tuple[int, NDArray[np.intp]] | None:
+    """The bits of a counter that overflows, and the samples before which it does; None where it does not."""
+    if not (raw == np.round(raw)).all():
+        return None
+    sizes, jumps = anew(t, raw, max_gap)
+    for bits in BITS:
+        if len(jumps) and (np.abs(sizes - 2.0**bits) <= LIKE * 2.0**bits).all() and np.ptp(raw) < 2.0**bits:
+            return bits, jumps
+    return None
+
+
+def _folded(
+    file: str, name: str, signal: Signal, t: Array, raw: Array, parts: int, jumps: NDArray[np.intp]
+) -> Finding:
+    """The finding of an angle as it was recorded ``raw`` ``(m,)`` that begins anew after a part of a turn."""
+    k, count = int(jumps[0]), len(jumps)
+    message = (
+        f"column {name!r} jumps {count} time{'s' * (count > 1)} by about 1/{parts} of a turn against its motion "
+        f"(first from {raw[k - 1]:.4g} to {raw[k]:.4g} {signal.unit} at {t[k]:.6g} s): an angle that begins anew after "
+        f"each 1/{parts} of a turn, or a wrong unit. Record one that counts on, or unwrap it before: numpy.unwrap(..., "
+        f"period={(_turn(signal) or 0.0) / parts:.6g})."
+    )
+    return Finding("wrapped", file, name, float(t[k]), count, message, refused=True)
+
+
+def _overflowing(file: str, name: str, t: Array, raw: Array, bits: int, jumps: NDArray[np.intp]) -> Finding:
+    """The finding of a counter that overflows."""
+    k, count = int(jumps[0]), len(jumps)
+    message = (
+        f"column {name!r} jumps {count} time{'s' * (count > 1)} by about {2**bits} against its motion (first from "
+        f"{raw[k - 1]:.10g} to {raw[k]:.10g} at {t[k]:.6g} s): a counter of {bits} bits that overflows. Record one "
+        f"that counts on, or unwrap it before: numpy.unwrap(..., period={2**bits})."
+    )
+    return Finding("wrapped", file, name, float(t[k]), count, message, refused=True)
+
+
+def _outliers(column: Array) -> NDArray[np.intp] | None:
+    """The few samples that are away from all others by ``OUTLYING`` times what these span; None without."""
+    known = np.abs(column) <= ABSURD
+    others, most = np.sort(column[known]), max(1, min(MOST_ODD, int(0.01 * known.sum())))
+    best = None
+    for low in range(most + 1):
+        for high in range(most + 1 - low):
+            rest = others[low : len(others) - high]
+            if not (low or high) or len(rest) < MIN_SCORED or not (span := float(np.ptp(rest))) > 0:
+                continue
+            if (not low or rest[0] - others[low - 1] > OUTLYING * span) and (
+                not high or others[len(others) - high] - rest[-1] > OUTLYING * span
+            ):
+                best = np.flatnonzero(known & ((column < rest[0]) | (column > rest[-1])))
+    return best
+
+
+def _outlying(
+    file: str, name: str, signal: Signal, t: Array, column: Array, odd: NDArray[np.intp]
+) -> Finding:
+    """The finding of samples that are far from all others."""
+    rest = np.delete(column, odd)
+    message = (
+        f"column {name!r} is {column[odd[0]]:.6g} {signal.unit} at {t[odd[0]]:.6g} s, far from all but {len(odd)} of "
+        f"{len(t)} samples, which are within {np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}. A code for a missing "
+        "value, or a lost digit? Leave these cells blank, or delete the rows."
+    )
+    return Finding("outlier", file, name, float(t[odd[0]]), len(odd), message)
 
 
 def _missing(file: str, name: str, t: Array, there: NDArray[np.bool_]) -> Finding:

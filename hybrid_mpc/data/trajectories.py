@@ -25,6 +25,7 @@ from hybrid_mpc.data.recording import (
     complete,
     empty,
     gaps,
+    misspelt,
     no_flags,
     read_recordings,
 )
@@ -176,6 +177,8 @@ def load_trajectories(
         >>> [(piece.name, piece.role, len(piece.t)) for piece in data.trajectories]
         [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
     """
+    if isinstance(paths, str | bytes | Path) or not all(isinstance(path, str | Path) for path in paths):
+        raise InputError(f"recordings: a list of paths is needed, got {paths!r:.80}")
     if not paths:
         raise InputError("no recordings given; name at least one file with --data")
     _check_windows(spec)
@@ -198,6 +201,7 @@ def load_trajectories(
         motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
     speeds = states if n_x is None else ()
     findings = findings_of(recordings, motions, spec, outputs=outputs, states=speeds)
+    findings = (*findings, *misspelt(spec, [recording.path for recording in recordings]))
     paths_of = {recording.path.name: recording.path for recording in recordings}
     problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
     refuse(problems)

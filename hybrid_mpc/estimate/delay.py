@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, Estimator, TrueState
-from hybrid_mpc.model.limits import sampled
+from hybrid_mpc.model.limits import sampled, whole
 
 Array = NDArray[np.float64]
 
@@ -107,11 +107,13 @@ def _given(w: ArrayLike | None) -> dict[str, Array]:
     return {} if w is None else {"w": sampled(w, (None,), "w")}
 
 
+MOST_PERIODS = 10**6
+"""Most periods of a delay: each is remembered."""
+
+
 def whole_periods(delay: float, name: str) -> int:
     """A delay in periods, whole and not negative."""
-    if int(delay) != delay or delay < 0:
-        raise InputError(f"{name}: a whole number of periods needed, not negative; got {delay}")
-    return int(delay)
+    return whole(delay, f"{name} [periods]", 0, MOST_PERIODS)
 
 
 def filtered(estimate: Estimate) -> Estimate:

@@ -220,6 +220,7 @@ class ExtendedKalmanFilter:
         size = self.nearness
         return min(fitting, key=lambda x: float(np.sum(((x - x0) / np.where(size > 0, size, 1.0)) ** 2)))
 
+    @np.errstate(over="ignore", invalid="ignore")  # no value of a sensor warns
     def _newton(self, x: Array, y: Array, u: Array, w: Array) -> tuple[Array, float, bool]:
         """A state whose output is ``y`` by Newton's method, the squared error in deviations of the sensors, and whether
         no step had to be shortened. One step if the outputs are linear in the state.

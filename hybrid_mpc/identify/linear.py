@@ -11,6 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from hybrid_mpc.data.differentiate import positive
 from hybrid_mpc.data.excitation import is_constant
 from hybrid_mpc.errors import InputError, named_extra, refuse
 from hybrid_mpc.model.riccati import dare
@@ -432,8 +433,8 @@ def _signals(recording: Measured) -> tuple[Array, Array]:
 def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, warm: int) -> _Data:
     """The training data, scaled; everything that can be said against the input before computing is said."""
     problems = []
-    if not (math.isfinite(dt) and dt > 0):
-        problems.append(f"dt is {dt}; a period above 0 s is needed")
+    if not positive(dt):
+        problems.append(f"dt is {dt!r:.80}; a period above 0 s is needed")
     if isinstance(warm, bool) or not isinstance(warm, int | np.integer) or warm < 1:
         problems.append(f"warm is {warm}; a whole number of samples is needed, at least 1")
     for role, recordings in (("training", train), ("validation", valid)):

@@ -151,7 +151,7 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
 def _checked(kit: Kit, trajectory: Trajectory, model: str) -> tuple[str, Predicting]:
     """Name of the model, and what predictions need."""
     name = model or kit.recommended
-    if name not in kit.models:
+    if not isinstance(name, str) or name not in kit.models:
         raise InputError(f"no model {name!r}; there are: {', '.join(kit.models)}")
     if kit.predicting is None or "prior" not in kit.models:
         raise InputError(

@@ -151,11 +151,12 @@ def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
     """Those of a scenario without plant and tasks; that there can be none is told, and stops nothing."""
     if scenario.plant is not None or scenario.control is None or scenario.tasks:
         return ()
-    try:
-        return default_tasks(scenario)
-    except InputError as none:
-        report.warn(f"tasks: none are declared, and no loop will run: {str(none).partition(': ')[2]}")
-        return ()
+    with report.part("default tasks"):
+        try:
+            return default_tasks(scenario)
+        except InputError as none:
+            report.warn(f"tasks: none are declared, and no loop will run: {str(none).partition(': ')[2]}")
+    return ()
 
 
 def _sizes(signals: tuple[Signal, ...], at: Array) -> Array:

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.errors import InputError, named_extra, no_exit
+from hybrid_mpc.errors import InputError, named_extra, no_exit, said_by
 from hybrid_mpc.identify.simulation import rest_of
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import POINT, BalanceEquations, OperatingPoint, Prior, column
@@ -89,7 +89,7 @@ class Report:
         except ExportError as error:  # of several lines, each with an operator
             self.add(f"{what}: {error}")
         except Exception as error:  # the user's own code may raise anything, and this is where it is reported
-            said = (str(error).strip() or "no message").splitlines()[0]
+            said = (said_by(error) or "no message").splitlines()[0]
             self.add(f"{what} raised {type(error).__name__}: {said}{_place(error)}{_hint(error)}")
 
     @contextmanager
@@ -592,7 +592,7 @@ def _check_balance(prior: Prior, balance: BalanceEquations, points: Points, rate
 
 def _hint(error: BaseException) -> str:
     """What helps against Python's own words."""
-    text = str(error)
+    text = said_by(error)
     if IF in text:
         return "; write ca.if_else(condition, one, other) instead of if"
     return NO_NUMBERS if any(word in text for word in NUMBER) else ""

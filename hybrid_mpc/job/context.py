@@ -74,11 +74,24 @@ class Context:
 
     @property
     def spec(self) -> DataSpec:
-        """The scenario's data specification with the user's columns, which hold for every file."""
-        s, spec = self.settings, self.scenario.data
+        """The scenario's data specification with the user's columns, which hold for every file; units and delays of
+        columns in whose place others are read are left out.
+        """
+        s, own = self.settings, self.scenario.data
+        spec = own
         if s.inputs:
             spec = replace(spec, inputs=s.inputs, inputs_of={})
-        return replace(spec, time=s.time or spec.time, outputs=s.outputs or spec.outputs)
+        spec = replace(spec, time=s.time or spec.time, outputs=s.outputs or spec.outputs)
+        gone = own.columns - spec.columns
+        return replace(
+            spec,
+            units={name: unit for name, unit in spec.units.items() if name not in gone},
+            delays={name: delay for name, delay in spec.delays.items() if name not in gone},
+            delays_of={
+                stem: {name: delay for name, delay in delays.items() if name not in gone}
+                for stem, delays in spec.delays_of.items()
+            },
+        )
 
     @property
     def warm(self) -> int:

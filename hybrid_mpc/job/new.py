@@ -226,6 +226,9 @@ def write_scenario(
 def left_to_decide(path: Path) -> list[str]:
     r"""Lines of a scenario's file whose comment begins with the mark, with their numbers; texts do not count.
 
+    Raises:
+        InputError: If the file is no text of Python.
+
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -235,10 +238,13 @@ def left_to_decide(path: Path) -> list[str]:
         ['line 2: is it?']
     """
     found, mark = [], f"# {MARK}"
-    with path.open("rb") as file:
-        for token in tokenize.tokenize(file.readline):
-            if token.type == tokenize.COMMENT and token.string.startswith(mark):
-                found.append(f"line {token.start[0]}: {token.string.removeprefix(mark).lstrip(': ')}")
+    try:
+        with path.open("rb") as file:
+            for token in tokenize.tokenize(file.readline):
+                if token.type == tokenize.COMMENT and token.string.startswith(mark):
+                    found.append(f"line {token.start[0]}: {token.string.removeprefix(mark).lstrip(': ')}")
+    except (SyntaxError, UnicodeDecodeError, tokenize.TokenError) as error:
+        raise InputError(f"{path}: cannot be read as Python ({error}). Save it as UTF-8 text.") from error
     return found
 
 

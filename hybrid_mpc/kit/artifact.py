@@ -19,7 +19,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
-from hybrid_mpc.files import read_document, read_object, sha256, write_document
+from hybrid_mpc.files import is_file, read_document, read_object, reason, sha256, write_document
 from hybrid_mpc.kit.assembly import (
     energy_is_watched,
     make_adaptive_guard,
@@ -34,7 +34,7 @@ from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
-from hybrid_mpc.model.limits import numbers
+from hybrid_mpc.model.limits import check_flag, numbers
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
@@ -380,16 +380,21 @@ def artifact_folder(folder: Path) -> Path:
     one.
     """
     for place in (folder, folder / "model"):
-        if (place / FILE).is_file():
+        if is_file(place / FILE):
             return place
     for place in (folder, folder / "model"):
-        if (place / BENCHMARK_NOTE).is_file():
+        if is_file(place / BENCHMARK_NOTE):
             raise InputError(
                 f"{folder} is the folder of a benchmark: its model ({place / BENCHMARK_NOTE}) predicts and has no "
                 f"controller. Evaluate it with: hybrid-mpc benchmark SCENARIO --model {folder} --test FILE. For loops "
                 "make an artifact of the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER"
             )
-    state = "holds no model.json" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
+    try:
+        state = (
+            "holds no model.json" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
+        )
+    except OSError as error:
+        state = f"cannot be looked into ({reason(error)})"
     raise InputError(
         f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
     )
@@ -466,6 +471,8 @@ def load(folder: str | Path) -> Kit:
     Example:
         ``kit = hm.load("runs/mine")``
     """
+    if not isinstance(folder, str | Path):
+        raise InputError(f"load: the path of a folder is needed, got {type(folder).__name__}")
     folder = artifact_folder(Path(folder))
     found = read_description(folder)
     if sha256(folder / PROGRAMS) != found.programs_sha256:
@@ -486,6 +493,13 @@ def load(folder: str | Path) -> Kit:
         found.recommended or ("hybrid" if "hybrid" in models else found.models[0]), found.residuals,
         members, found.predicting,
     )  # fmt: skip
+
+
+def _named(name: object, what: str) -> str:
+    """A name as somebody gives it; InputError if it is no text."""
+    if not isinstance(name, str):
+        raise InputError(f"{what}: a name is needed, got {type(name).__name__}")
+    return name
 
 
 def _disturbed(
@@ -581,10 +595,16 @@ class Kit:
 
     def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
         """The kit with other process noise, by estimator (see :meth:`noise`)."""
+        if not isinstance(noise, Mapping):
+            raise InputError(
+                f"noise: numbers by the name of an estimator are needed, got {type(noise).__name__}"
+            )
         return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
 
     def on(self, scenario: Scenario) -> Kit:
         """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now."""
+        if not isinstance(scenario, Scenario):
+            raise InputError(f"on: a Scenario is needed, got {type(scenario).__name__}")
         models = _disturbed(self.models, scenario.disturbance_model)
         return replace(self, models=models, loop=loop_settings(scenario, self.loop.process_noise))
 
@@ -595,7 +615,7 @@ class Kit:
         Raises:
             InputError: If there is no such task, or no control problem.
         """
-        if task:
+        if _named(task, "task"):
             known(task, sorted({*self.loop.tasks, *self.loop.control} - {""}), "task")
         found = self.loop.control.get(task, self.control)
         if found is None:
@@ -614,7 +634,7 @@ class Kit:
         Raises:
             InputError: If the folder holds none for it, or it is of another size.
         """
-        if estimator not in self.loop.process_noise:
+        if _named(estimator, "estimator") not in self.loop.process_noise:
             raise InputError(
                 f"{self._whose} was saved without process noise for {estimator}; run the scenario again (its stage "
                 "control estimates it)"
@@ -645,7 +665,8 @@ class Kit:
         Raises:
             InputError: If there is no such model or task, no control problem, or no noise for this estimator.
         """
-        model = model or self.recommended
+        check_flag(load, "load")
+        model = _named(model, "model") or self.recommended
         found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
         return make_estimator(found, self, noise, self.problem(task), observer=load)
 
@@ -691,11 +712,12 @@ class Kit:
             InputError: If there is no such model, task or kind, nothing was learned by which the monitor could alarm
                 (all kinds but ``"own"`` and ``"readings"``), or the energy of a model is asked for that has none.
         """
+        check_flag(diagnose, "diagnose")
         watched, learned = self._model(model), self.calibration
         energy = energy_is_watched(watched)
         detects = learned is not None and learned.detector is not None and self.control is not None
         default = ("guard" if detects else "energy") if energy else "residuals"
-        kind = known(kind or default, WATCHES, "kind of monitor")
+        kind = known(_named(kind, "kind of monitor") or default, WATCHES, "kind of monitor")
         if kind == "residuals" or (kind in ("guard", "own") and not energy):
             limits = self.residuals.get(model or self.recommended)
             if kind != "own" and limits is None:
@@ -736,6 +758,7 @@ class Kit:
         Example:
             ``simulate(..., monitor=kit.monitor(), guard=kit.guard())``
         """
+        check_flag(adapt, "adapt")
         hybrid = self._model("hybrid")
         if not adapt:
             return make_resting_guard(hybrid)
@@ -747,4 +770,4 @@ class Kit:
         return f"the model of scenario {self.name or '(unnamed)'}"
 
     def _model(self, name: str) -> HybridModel:
-        return self.models[known(name or self.recommended, self.models, "model")]
+        return self.models[known(_named(name, "model") or self.recommended, self.models, "model")]

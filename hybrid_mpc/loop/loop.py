@@ -32,12 +32,14 @@ from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
 from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held
-from hybrid_mpc.model.limits import sampled
+from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 TIMED = ("estimate", "solve", "monitor", "prepare")
 """What of a period is timed: between the sample and the input, and after it."""
+MOST_SKIPPED = 10**12
+"""Most periods that are skipped at a time: the time [s] must stay a number."""
 LONG = 250
 """Skipped periods after which the estimate starts anew: a filter knows little after as many without a sample."""
 
@@ -175,6 +177,14 @@ class Loop:
         sensor_delay: int = 0,
         now: Callable[[], float] = perf_counter,
     ) -> None:
+        check_part(estimator, "estimator", "a filter", "model", "start", "update")
+        check_function(now, "now")
+        if not isinstance(controller, SafeController):
+            check_part(controller, "controller", "a controller", "model", "ocp", "solve")
+        if monitor is not None:
+            check_part(monitor, "monitor", "a monitor", "initial", "update")
+        if not isinstance(guard, Guard | None):
+            raise InputError(f"guard: a Guard is needed, got {type(guard).__name__}")
         safe = controller if isinstance(controller, SafeController) else SafeController(controller)
         self.model, self.ocp = estimator.model, safe.controller.ocp
         _check_models(self.model, safe.controller.model)
@@ -213,6 +223,8 @@ class Loop:
         Arguments are those of :meth:`step`; ``applied`` is the input that has acted until now, by default that of the
         operating point. Returned is the input ``(n_u,)`` to hold from now on.
         """
+        if in_time is not None:
+            check_function(in_time, "in_time")
         sample, measured = self._sample(y), self._disturbed(w)
         x_ref, factors = self._preview(0, reference)
         estimate = self._estimator.start(self._seen(sample, truth), 0.0, **self._now_measured(measured))
@@ -252,6 +264,8 @@ class Loop:
         Raises:
             InputError: If a shape does not fit. No number raises.
         """
+        if in_time is not None:
+            check_function(in_time, "in_time")
         self.finish()
         sample, measured, state = self._sample(y), self._disturbed(w), self.state
         previous, inputs = state.decision, state.inputs
@@ -333,8 +347,7 @@ class Loop:
 
         The estimator is led through them without a sample; after 250 it starts anew at the next one.
         """
-        if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 0:
-            raise InputError(f"skip: a number of periods needed, got {n!r}")
+        n = whole(n, "skip [periods]", 0, MOST_SKIPPED)
         self.finish()
         state, missing = self.state, np.full(self.model.n_y, np.nan)
         estimate, guard, u = state.estimate, state.guard, state.decision.u
@@ -384,8 +397,8 @@ class Loop:
 
     @mode.setter
     def mode(self, mode: Literal["automatic", "manual"]) -> None:
-        if mode not in ("automatic", "manual"):
-            raise InputError(f"mode: 'automatic' or 'manual' needed, got {mode!r}")
+        if not isinstance(mode, str) or mode not in ("automatic", "manual"):
+            raise InputError(f"mode: 'automatic' or 'manual' needed, got {mode!r:.80}")
         self._state = replace(self.state, mode=mode)
 
     @property

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.limits import sampled
+from hybrid_mpc.model.limits import check_function, floats, sampled
 
 Array = NDArray[np.float64]
 Preview = Callable[[Array], Array]
@@ -27,7 +27,10 @@ class Previews:
         self, reference: Preview | ArrayLike | None, weight: Preview | None, ocp: OCP, dt: float, end: float,
         standing: Array,
     ) -> None:  # fmt: skip
-        self._reference, self._weight, self._end = _function_of(reference, standing), weight, end
+        if weight is not None:
+            check_function(weight, "weight")
+        self._reference, self._weight = _function_of(reference, standing), weight
+        self._end = float(sampled(end, (), "end"))
         self._n_x, self._columns = ocp.n_x, ocp.columns
         self._ahead: Array = np.arange(ocp.horizon + 1 if ocp.preview else 1, dtype=np.float64) * dt
 
@@ -39,13 +42,17 @@ class Previews:
         return x_ref, weight
 
     def _over(self, preview: Preview, times: Array, name: str, columns: int) -> Array:
-        values = np.array(preview(times), dtype=np.float64)
+        values = floats(preview(times), f"what {name} returns")
         if values.shape != (times.size, columns):
             raise InputError(f"{name} returns {values.shape}, needed: {(times.size, columns)}")
         beyond = (times > self._end + 1e-9) & ~np.all(np.isfinite(values), axis=1)
         if beyond.any():
             last = int(np.argmax(beyond)) - 1
-            ended = values[last] if last >= 0 else np.asarray(preview(np.array([self._end])), float)[0]
+            ended = (
+                values[last]
+                if last >= 0
+                else floats(preview(np.array([self._end])), f"what {name} returns")[0]
+            )
             values[beyond] = ended
         return values
 
@@ -66,6 +73,8 @@ class Forecast:
     def __init__(self, w: Preview | None, ocp: OCP, n_w: int, dt: float) -> None:
         if w is not None and not n_w:
             raise InputError("w: a forecast of measured disturbances given, the model has none")
+        if w is not None:
+            check_function(w, "w")
         self._w = w if ocp.preview_w else None
         self._n_w, self._ahead = n_w, np.arange(ocp.horizon, dtype=np.float64) * dt
 

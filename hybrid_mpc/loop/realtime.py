@@ -26,7 +26,7 @@ from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import Loop, Monitor, Reading
 from hybrid_mpc.loop.preview import Preview
-from hybrid_mpc.model.limits import sampled
+from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
 
 Array = NDArray[np.float64]
 TIMED = ("measure", "estimate", "solve", "actuate", "monitor", "prepare")
@@ -48,6 +48,10 @@ EARLY = 1e-3
 """Share of a period by which a wait may end early: rounding, and what no controller notices."""
 WAKES = 10
 """Waits for one instant that may end early, one after the other: a sleep that something woke is slept again."""
+
+
+MOST_KEPT = 10**9
+"""Most periods whose rows a report keeps."""
 
 
 class Runner:
@@ -123,15 +127,26 @@ class Runner:
         keep: int = 100_000,
         guard: Guard | None = None,
     ) -> None:
+        check_part(estimator, "Runner: estimator", "a filter", "model", "start", "update")
+        optional: dict[str, object] = {"measure_w": measure_w, "on_step": on_step}
+        given = {name: function for name, function in optional.items() if function is not None}
+        for name, function in {"measure": measure, "actuate": actuate, **given}.items():
+            check_function(function, f"Runner: {name}")
+        if clock is not None:
+            check_part(clock, "Runner: clock", "a clock", "now", "sleep_until")
         if sees_truth(estimator):
             raise InputError("Runner: a machine does not give its true state; give a filter, not TrueState")
         dt = estimator.model.dt
-        due = dt if deadline is None else float(deadline)
+        due = dt if deadline is None else float(sampled(deadline, (), "Runner: deadline"))
         if not 0 < due <= dt * (1 + 1e-9):
             raise InputError(f"Runner: deadline must lie within the period of {dt} s, got {deadline} s")
-        if keep < 1:
-            raise InputError(f"Runner: keep must be 1 or more periods, got {keep}")
-        self._clock, self._dt, self._deadline, self._keep = clock or RealClock(), dt, due, keep
+        keep = whole(keep, "Runner: keep [periods]", 1, MOST_KEPT)
+        self._clock, self._dt, self._deadline, self._keep = (
+            RealClock() if clock is None else clock,
+            dt,
+            due,
+            keep,
+        )
         self._measure, self._actuate, self._on_step = measure, actuate, on_step
         self._measure_w = measure_w
         self._loop = partial(
@@ -164,6 +179,8 @@ class Runner:
                 another shape, or the clock is none. What a callback raises is raised on, after the safe input.
             SafeInputError: If the actuator did not take the safe input.
         """
+        if stop is not None:
+            check_function(stop, "Runner: stop")
         n = self._periods(duration, stop)
         clock = CheckedClock(self._clock, self._dt)
         loop = self._loop(end=math.inf if n is None else n * self._dt, now=clock.now)
@@ -175,7 +192,7 @@ class Runner:
             run.begin()
             while n is None or run.k < n:
                 end.check()
-                if stop is not None and stop():
+                if stop is not None and _stops(stop()):
                     ended = "stop"
                     break
                 run.period()
@@ -187,12 +204,22 @@ class Runner:
             if stop is None:
                 raise InputError("Runner: give a duration [s], or a function stop() that ends the run")
             return None
-        dt = self._dt
+        dt, duration = self._dt, float(sampled(duration, (), "Runner: duration"))
         if not (math.isfinite(duration) and round(duration / dt) >= 1):
             raise InputError(
                 f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed"
             )
         return round(duration / dt)
+
+
+def _stops(answer: object) -> bool:
+    """What ``stop()`` has answered."""
+    try:
+        return bool(answer)
+    except ValueError as error:  # several numbers
+        raise InputError(
+            f"Runner: stop() must return True or False, it returns {type(answer).__name__}"
+        ) from error
 
 
 class _Run:
@@ -558,7 +585,7 @@ class CheckedClock:
 
     def now(self) -> float:
         """Time [s], finite and never before the last one."""
-        t = float(self._clock.now())
+        t = float(sampled(self._clock.now(), (), "clock: what now() returns"))
         if not math.isfinite(t):
             raise InputError(f"clock: now() gives {t}; a finite time [s] needed")
         if t < self._last:

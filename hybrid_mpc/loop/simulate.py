@@ -16,13 +16,14 @@ from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.safeguard import Decision, SafeController
 from hybrid_mpc.control.targets import Steady
 from hybrid_mpc.errors import InputError, named_extra
+from hybrid_mpc.estimate.delay import whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
 from hybrid_mpc.loop.plant import Plant, SimulatedMachine
 from hybrid_mpc.loop.preview import Preview, Previews
-from hybrid_mpc.model.limits import sampled
+from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import vector
 
@@ -44,6 +45,10 @@ class Step:
     estimate: Estimate
     decision: Decision
     reading: Reading | None
+
+
+MOST_PERIODS = 10**9
+"""Most periods of one simulation: each has a row in the result."""
 
 
 def simulate(
@@ -115,6 +120,21 @@ def simulate(
         result = simulate(plant, ekf, controller, task.reference, weight=task.weight, dt=0.02,
                           duration=task.duration, x0=task.x0, seed=0)
     """
+    dt, duration = (float(sampled(value, (), name)) for value, name in ((dt, "dt"), (duration, "duration")))
+    check_part(plant, "plant", "a plant", "reset", "step", "measure", "truth", "hidden")
+    check_part(estimator, "estimator", "a filter", "model", "start", "update")
+    for function, name in ((on_step, "on_step"), (late, "late")):
+        if function is not None:
+            check_function(function, name)
+    if not isinstance(stage_cost, OCP | None):
+        raise InputError(f"stage_cost: an OCP is needed, got {type(stage_cost).__name__}")
+    if isinstance(faults, str | bytes) or not all(isinstance(fault, Fault) for fault in _listed(faults)):
+        raise InputError(f"faults: a list of Faults is needed, got {type(faults).__name__}")
+    seed = whole(seed, "seed", 0, 2**63 - 1)
+    sensor_delay, input_delay = (
+        whole_periods(sensor_delay, "sensor_delay"),
+        whole_periods(input_delay, "input_delay"),
+    )
     loop = Loop(
         estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
         w=_disturbances(w, estimator.model), end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
@@ -158,6 +178,11 @@ def simulate(
             on_step(step)
         machine.advance(t, now_w if model.n_w else None)
     return _result(rows, dt, loop.switches)
+
+
+def _listed(faults: object) -> Sequence[object]:
+    """What stands in a list; itself alone where it is none."""
+    return faults if isinstance(faults, list | tuple) else (faults,)
 
 
 def _disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview | None:
@@ -278,6 +303,8 @@ def _end(dt: float, duration: float, period: float) -> float:
         raise InputError(f"dt and duration must be finite and dt positive; got {dt} s and {duration} s")
     if not abs(dt - period) <= 1e-9 * period:
         raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
+    if duration / dt > MOST_PERIODS:
+        raise InputError(f"duration {duration:g} s: at most {MOST_PERIODS:g} periods of {dt} s are simulated")
     if round(duration / dt) < 1:
         raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
     return round(duration / dt) * dt

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Annotated, Literal
 
 from hybrid_mpc.records import Fields
@@ -109,6 +110,12 @@ class DataSpec:
     disturbances: tuple[Column, ...] = ()
     delays: Mapping[Column, Shift] = field(default_factory=dict)
     delays_of: Mapping[str, Mapping[Column, Shift]] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> frozenset[str]:
+        """All columns that are read, of any file."""
+        time = (self.time,) if isinstance(self.time, str) else ()
+        return frozenset(chain(time, self.inputs, self.disturbances, self.outputs, *self.inputs_of.values()))
 
     def inputs_in(self, stem: str) -> tuple[str, ...]:
         """Input columns of the recording of this file stem."""

@@ -14,6 +14,10 @@ from hybrid_mpc.rules import LARGEST
 Array = NDArray[np.float64]
 
 
+MOST_ITERATIONS = 10**6
+"""Most iterations of a solver."""
+
+
 def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, Array]:
     """Checked limits ``(n_u,)`` of the inputs; ``-inf`` and ``inf`` for none."""
     lower, upper = (numbers(v, name, most=LARGEST) for v, name in ((u_min, "u_min"), (u_max, "u_max")))
@@ -35,8 +39,8 @@ def numbers(values: ArrayLike, name: str, *, most: float = np.inf) -> Array:
     try:
         given = np.array(values)
         array = np.array(values, dtype=float).ravel() if given.dtype.kind in "iufO" else None
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{name}: numbers needed, got {values!r:.80}") from error
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(f"{name}: numbers needed, got {type(values).__name__} {values!r:.80}") from error
     if array is None or _not_numbers(values):
         raise InputError(f"{name}: numbers needed, got {values!r:.80}")
     if np.any(np.isfinite(array) & (np.abs(array) > most)):
@@ -67,7 +71,7 @@ def sampled(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Arra
         (array([ 1., nan]), array(inf))
     """
     plain = type(values) is np.ndarray and values.dtype == np.float64  # a loop's every period
-    array = np.array(values) if plain else _floats(values, name)
+    array = np.array(values) if plain else floats(values, name)
     if array.ndim < len(shape) and shape[: len(shape) - array.ndim] in ((1,), (None,), (1, 1), (None, 1)):
         array = array.reshape((1,) * (len(shape) - array.ndim) + array.shape)
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
@@ -76,7 +80,7 @@ def sampled(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Arra
     return array
 
 
-def _floats(values: ArrayLike, name: str) -> Array:
+def floats(values: ArrayLike, name: str) -> Array:
     """Real numbers of any kind as a float array."""
     try:
         if isinstance(values, np.ma.MaskedArray):
@@ -112,3 +116,72 @@ def share_used(values: ArrayLike, lower: ArrayLike, upper: ArrayLike, rest: Arra
             beyond = np.where(way > 0, 1.0 + way / np.where(np.isfinite(span), span, 0.0), 0.0)
             shares.append(np.where(room > 0, way / room, beyond))
     return float(np.max(shares))
+
+
+def check_part(value: object, name: str, what: str, *needed: str) -> None:
+    """Refuse what is no part of a loop: it lacks an attribute that it needs.
+
+    Raises:
+        InputError: Naming the argument and what is needed.
+
+    Example:
+        >>> check_part(3.0, "monitor", "a monitor", "update")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: monitor: a monitor is needed, got float, which has no 'update'
+    """
+    lacking = [attribute for attribute in needed if not hasattr(value, attribute)]
+    if lacking or isinstance(value, type):
+        raise InputError(
+            f"{name}: {what} is needed, got {value.__name__ if isinstance(value, type) else type(value).__name__}"
+            + (f", which has no {lacking[0]!r}" if lacking else ", a class")
+        )
+
+
+def check_function(value: object, name: str) -> None:
+    """Refuse what cannot be called.
+
+    Raises:
+        InputError: Naming the argument.
+    """
+    if not callable(value):
+        raise InputError(f"{name}: a function is needed, got {type(value).__name__}")
+
+
+def check_flag(value: object, name: str) -> None:
+    """Refuse what is neither True nor False.
+
+    Raises:
+        InputError: Naming the argument.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name}: True or False is needed, got {type(value).__name__}")
+
+
+def whole(value: object, name: str, least: int, most: int) -> int:
+    """A whole number from ``least`` to ``most``, a float of that value, too.
+
+    Raises:
+        InputError: If it is another one, or none.
+
+    Example:
+        >>> whole(3.0, "skip", 0, 10)
+        3
+    """
+    kind = isinstance(value, int | float | np.integer | np.floating) and not isinstance(
+        value, bool | np.bool_
+    )
+    if not kind or not least <= value <= most or value != int(value):  # type: ignore[operator, call-overload]
+        raise InputError(f"{name}: a whole number from {least} to {most:g} is needed, got {_shortly(value)}")
+    return int(value)  # type: ignore[call-overload]
+
+
+def _shortly(value: object) -> str:
+    huge = isinstance(value, int) and abs(value) > LARGEST
+    return (
+        "one that is larger"
+        if huge
+        else f"{value!r:.80}"
+        if isinstance(value, int | float)
+        else type(value).__name__
+    )

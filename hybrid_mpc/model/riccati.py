@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.limits import numbers
+from hybrid_mpc.model.limits import floats, numbers
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -49,7 +49,8 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
         >>> round(float(p[0, 0]), 6), round(float(k[0, 0]), 6)
         (1.618034, 0.618034)
     """
-    a, b, q, r = (np.atleast_2d(np.asarray(m, dtype=float)) for m in (a, b, q, r))
+    given = {"A": a, "B": b, "Q": q, "R": r}
+    a, b, q, r = (np.atleast_2d(floats(m, f"Riccati equation: {name}")) for name, m in given.items())
     hint = "check the pair (A, B), give every undamped state a positive q and every input a positive r"
     if not all(np.all(np.isfinite(m)) for m in (a, b, q, r)):
         raise InputError("Riccati equation: A, B, Q or R holds a NaN or an infinite value")
@@ -68,7 +69,7 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
         raise InputError(f"the Riccati equation has no stabilising solution ({error}); {hint}") from error
     if not radius < 1.0:
         raise InputError(f"not stabilisable: spectral radius {radius:.6f} in closed loop; {hint}")
-    return p, k
+    return p, np.asarray(k, dtype=np.float64)
 
 
 def _doubled(a: Array, b: Array, q: Array, r: Array) -> Array:

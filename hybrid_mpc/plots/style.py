@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -302,7 +303,10 @@ def save(figure: Figure, path: str | Path) -> Path:
     if path.suffix != ".png":
         raise InputError(f"figure {path}: figures are written as PNG; end the name in .png")
     drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
+    with warnings.catch_warnings():
+        # names of anybody's may have characters that the font lacks; the warning would print them as they are
+        warnings.filterwarnings("ignore", "Glyph .* missing from")
+        figure.savefig(drawn, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
     picture = Image.open(drawn).convert("RGB").quantize(IN_PALETTE, dither=Image.Dither.NONE)
     with replacing(path) as file:
         picture.save(file, format="png")

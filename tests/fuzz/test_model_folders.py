@@ -9,7 +9,8 @@ import shutil
 import numpy as np
 import pytest
 
-from hybrid_mpc import Calibration, Detector, set_calibration, set_process_noise
+import hybrid_mpc as hm
+from hybrid_mpc import Calibration, Detector, InputError, set_calibration, set_process_noise
 from hybrid_mpc.files import HASH, digest
 from tests.fuzz.forked import cheap, command, refused
 
@@ -189,3 +190,11 @@ def test_a_good_folder_passes(folder, tmp_path):
     refused(ended, "an unknown task")
     assert "no task 'none'" in ended.told
     cheap(ended, "")
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "\udcff", ""])
+def test_names_that_are_no_folder(name, tmp_path):
+    with pytest.raises(InputError):
+        hm.load(tmp_path / "x" / name)
+    with pytest.raises(InputError):
+        hm.load_scenario(f"{name}.py")

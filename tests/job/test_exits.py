@@ -1,5 +1,7 @@
 """Code of a user that ends Python is an error with its place, wherever it runs; it never ends a job without a word."""
 
+import os
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -93,3 +95,57 @@ def test_other_ends_pass():
         raise KeyboardInterrupt
     with pytest.raises(ZeroDivisionError), no_exit("x"):
         _ = 1 / 0
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "raise BaseException('b')",
+        "raise GeneratorExit",
+        "raise hm.Mute",
+        r"raise ValueError('\x1b[2J\u202e\udcff')",
+    ],
+)
+@pytest.mark.parametrize("where", ["top", "asked"])
+def test_whatever_is_raised_is_told_and_moves_no_cursor(call, tmp_path, where, code):
+    code = code.replace("hm.Mute", "type('Mute', (Exception,), {'__str__': lambda self: 1 / 0})")
+    status, told, error = call("check", machine(tmp_path, **{where: code}))
+    assert status == 2
+    said = told + error
+    assert "exits.py" in said
+    assert "Traceback" not in said
+    assert not {"\x1b", "\u202e", "\udcff"} & set(said)
+
+
+def test_a_terminal_without_a_character_gets_its_number(tmp_path):
+    path = machine(tmp_path)
+    path.write_text(path.read_text().replace('title=""', 'title="Behälter ≤ 3"'))
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    ended = subprocess.run(
+        [sys.executable, "-m", "hybrid_mpc.cli", "check", path],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert r"Beh\xe4lter \u2264 3" in ended.stdout
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("prior=Tank", "prior=lambda: Tank()"),  # takes no values
+        ("# none", "# \udce4"),  # a comment of another encoding
+        ("# none", "# coding: nonsense"),
+    ],
+)
+def test_files_that_python_takes_half_are_told(call, tmp_path, old, new):
+    path = machine(tmp_path)
+    text = "# none\n" + path.read_text().replace(
+        "data=hm.DataSpec",
+        "control=hm.OCP(9, [1], [0.1], [0.1], [0], [0.1]), sensor_sigma=(1e-3,), data=hm.DataSpec",
+    )
+    path.write_bytes(text.replace(old, new, 1).encode("utf-8", "surrogateescape"))
+    status, told, error = call("check", path)
+    assert status == 2
+    assert "exits" in told + error

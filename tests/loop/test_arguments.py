@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from online_models import make_filter, pendulum_model
 
-from hybrid_mpc import OCP, CondensedController, Loop
+from hybrid_mpc import OCP, CondensedController, IpoptController, Loop, Runner, SQPController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.limits import sampled
 
@@ -103,3 +103,124 @@ def test_numbers_of_any_kind_become_floats():
     assert np.isnan(masked[1])
     given = np.zeros(2)
     assert sampled(given, (2,), "y") is not given
+
+
+NONE_OF_A_LOOP = [
+    np.nan,
+    3,
+    "abc",
+    b"1",
+    {},
+    [1.0],
+    object(),
+    Raises(),
+    int,
+    np.zeros(2),
+    lambda: 1.0,
+    10**400,
+]
+PARTS = ("estimator", "controller", "monitor", "guard")
+FUNCTIONS = ("weight", "now", "measure", "actuate", "measure_w", "on_step", "late")
+PERIODS = [2.5, -1, True, "3", None, 1 + 0j, np.nan, np.inf, [1], 10**400, np.ma.masked, Raises()]
+
+
+def parts():
+    model = pendulum_model(z=2)
+    ocp = OCP(10, [1.0, 0.1], [0.1], [0.01], [-1.0], [1.0])
+    return {"estimator": make_filter(model), "controller": CondensedController(model, ocp)}
+
+
+def loop_of(**given):
+    return Loop(**{**parts(), **given})
+
+
+def runner_of(**given):
+    drives = {
+        "measure": lambda: [0.1],
+        "actuate": lambda u: None,
+        "reference": lambda t: np.zeros((len(t), 2)),
+    }
+    return Runner(**{**parts(), **drives, "safe_input": [0.0], **given})
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("make", [loop_of, runner_of])
+def test_what_is_no_part_of_a_loop_is_refused_when_it_is_made(make, part):
+    for value in NONE_OF_A_LOOP:
+        with pytest.raises(InputError):
+            make(**{part: value})
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (loop_of, "weight"),
+        (loop_of, "now"),
+        *((runner_of, name) for name in FUNCTIONS[2:6]),
+        (runner_of, "clock"),
+    ],
+)
+def test_what_cannot_be_called_is_refused_before_the_machine_moves(make, name):
+    for value in [np.nan, 3, "abc", {}, [1.0], object(), np.zeros(5)]:
+        with pytest.raises(InputError):
+            make(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["input_delay", "sensor_delay"])
+@pytest.mark.parametrize("make", [loop_of, runner_of])
+def test_delays_are_whole_periods(make, name):
+    for value in PERIODS:
+        with pytest.raises(InputError):
+            make(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["deadline", "keep"])
+def test_a_runners_numbers_are_numbers(name):
+    for value in ["abc", -1, 0, np.nan, 1 + 0j, [1.0, 2.0], 10**400, Raises(), np.zeros(5)]:
+        with pytest.raises(InputError):
+            runner_of(**{name: value})
+
+
+@pytest.mark.parametrize("duration", ["abc", np.nan, np.inf, -1, 1 + 0j, [1.0, 2.0], Raises(), 10**400])
+def test_durations_are_numbers(duration):
+    with pytest.raises(InputError):
+        runner_of().run(duration)
+
+
+@pytest.mark.parametrize("given", ["abc", None, 1 + 0j, Raises(), [1.0, 2.0]])
+def test_what_a_callback_of_a_runner_gives_is_refused_and_the_input_is_safe(given):
+    class Clock:
+        t, asked = 0.0, 0
+
+        def now(self):
+            self.asked += 1
+            return self.t if self.asked < 9 or broken != "clock" else given
+
+        def sleep_until(self, t):
+            self.t = max(self.t, t)
+
+    for broken in ("clock", "reference"):
+        taken = []
+        reference = (lambda t: given) if broken == "reference" else (lambda t: np.zeros((len(t), 2)))
+        runner = runner_of(
+            actuate=lambda u, to=taken: to.append(u[0]), reference=reference, clock=Clock(), safe_input=[0.5]
+        )
+        with pytest.raises(InputError):
+            runner.run(1.0)
+        assert taken == [] or taken[-1] == 0.5
+
+
+def test_a_skip_beyond_all_time_is_refused_and_the_loop_goes_on(loop):
+    for n in (10**400, 10**300, np.inf):
+        with pytest.raises(InputError):
+            loop.skip(n)
+    loop.skip(np.int64(3))
+    assert np.isfinite(loop.step([0.1])).all()
+
+
+@pytest.mark.parametrize("iterations", [0, -1, 2.5, "3", np.nan, True, 10**400, np.zeros(2)])
+@pytest.mark.parametrize("solver", [CondensedController, SQPController, IpoptController])
+def test_iterations_are_a_whole_number(solver, iterations):
+    controller = parts()["controller"]
+    with pytest.raises(InputError):
+        solver(controller.model, controller.ocp, iterations=iterations)

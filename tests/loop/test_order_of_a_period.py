@@ -231,7 +231,7 @@ def test_skipped_periods_are_periods_without_a_sample(model, safe):
     loop.skip(1000)  # so long that nothing is known any more
     loop.step(y)
     np.testing.assert_allclose(loop.estimate.x, [y[0], 0.0], atol=1e-12)
-    with pytest.raises(InputError, match="number of periods"):
+    with pytest.raises(InputError, match="skip"):
         loop.skip(-1)
 
 
@@ -268,7 +268,7 @@ def test_what_cannot_be_is_refused(model, safe):
         make_loop(model, safe, guard=Guard())
     with pytest.raises(InputError, match=r"the reference has shape"):
         make_loop(model, safe, reference=[0.0])
-    with pytest.raises(InputError, match="sensor_delay: a whole number"):
+    with pytest.raises(InputError, match="sensor_delay"):
         make_loop(model, safe, sensor_delay=0.5)
     with pytest.raises(InputError, match="give both the same model"):
         make_loop(pendulum_model(), safe)
