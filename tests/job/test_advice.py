@@ -95,6 +95,24 @@ def test_each_finding_is_told_with_what_to_do(results):
     )
 
 
+def test_doubt_about_the_prior_comes_first_and_is_told_once(results):
+    found = results.identification
+    prior = replace(
+        found.details.prior_parameters, in_doubt=("ARX has an error of 0.02, the fitted prior 0.1",)
+    )
+    arx = found.details.baselines["ARX"]
+    assert arx.errors is not None
+    better = {"ARX": replace(arx, errors=replace(arx.errors, error=0.02))}
+    warned = replace(results, data=replace(
+        results.data, details=replace(results.data.details, warnings=("monday.csv is nearly constant",))
+    ))  # fmt: skip
+    for start, others in ((results, []), (warned, ["Recordings: monday.csv is nearly constant"])):
+        said = bad(changed(start, prior_parameters=prior, baselines=better))
+        assert said == [
+            "The structure of the prior is in doubt: ARX has an error of 0.02, the fitted prior 0.1.", *others
+        ]  # fmt: skip
+
+
 def test_an_error_that_is_the_sensor_s_noise_is_told(results):
     found = results.identification
     (error,) = found.rmse[found.details.choice.recommended].values()

@@ -29,8 +29,8 @@ def advice(results: Results) -> list[Hint]:
     """
     own = results.identification
     found = [
-        *_recordings(results), *_prior(own), *_choice(own), *_linear(own), *_floor(own), *_bands(own), *_loops(results),
-        *_watching(results),
+        *_doubt(own), *_recordings(results), *_prior(own), *_choice(own), *_linear(own), *_floor(own), *_bands(own),
+        *_loops(results), *_watching(results),
     ]  # fmt: skip
     if not any(hint.verdict == "bad" for hint in found):
         found.append(
@@ -50,13 +50,16 @@ def _recordings(results: Results) -> Iterator[Hint]:
         )
 
 
-def _prior(found: Identification) -> Iterator[Hint]:
+def _doubt(found: Identification) -> Iterator[Hint]:
     for doubt in found.details.prior_parameters.in_doubt:
         yield Hint(
             "bad", f"The structure of the prior is in doubt: {doubt}.",
             "Correct the prior first (docs/prior-fit.md#is-the-prior-sound): a state, a delay or an input that is "
             "missing, or a sign. A network or an observer on top of it only hides the fault.",
         )  # fmt: skip
+
+
+def _prior(found: Identification) -> Iterator[Hint]:
     for warning in found.details.prior_parameters.warnings[:MOST]:
         yield Hint("plain", f"Fit of the prior: {warning}", "docs/prior-fit.md says what to do.")
     for label, fit in _by_output(found.fit_percent.get("phy")).items():
