@@ -122,7 +122,10 @@ class Runs:
         """First states that explain windows best for ``p`` ``(n_p,)``, and the errors: Levenberg and Marquardt."""
         n, n_x = x.shape
         every, damping, x = np.tile(p, (n, 1)), np.full(n, 1e-2), x.copy()
-        many, guess = windows.__class__(*(np.concatenate([v] * (n_x + 1)) for v in _parts(windows))), windows.x
+        many, guess = (
+            windows.__class__(*(np.concatenate([v] * (n_x + 1)) for v in _parts(windows))),
+            windows.x,
+        )
         error = self.errors(every, x, windows)
         cost = np.square(error).sum(1) + np.square(HELD * (x - guess) / self.sizes).sum(1)
         for _ in range(STEPS):
@@ -156,7 +159,10 @@ class Runs:
         shown = self.prior.equations.output(x, u, w, p)
         period = ca.Function("period", [x, u, w, p], [after, shown])
         run = period.mapaccum("run", steps)
-        first, *held = (ca.MX.sym(key, v.numel(), 1 if key == "x" else steps) for key, v in zip(names, (x, u, w, p), strict=True))
+        first, *held = (
+            ca.MX.sym(key, v.numel(), 1 if key == "x" else steps)
+            for key, v in zip(names, (x, u, w, p), strict=True)
+        )
         return ca.Function("runs", [first, *held], [run(first, *held)[1]]).map(n)
 
 
@@ -265,5 +271,7 @@ def _solved(
     inner = np.concatenate([bounds[0] / unit, np.full(n * n_x, -np.inf)])
     outer = np.concatenate([bounds[1] / unit, np.full(n * n_x, np.inf)])
     z = np.clip(z, inner + 1e-9, outer - 1e-9)
-    found = least_squares(residuals, z, slopes, (inner, outer), x_scale="jac", max_nfev=30, ftol=1e-7, xtol=1e-9)
+    found = least_squares(
+        residuals, z, slopes, (inner, outer), x_scale="jac", max_nfev=30, ftol=1e-7, xtol=1e-9
+    )
     return split(found.x)
