@@ -71,12 +71,18 @@ DISTINCT, FACTOR = 0.1, 3.0
 differ in one of them at least."""
 GROWN = 10.0, 100.0
 """Growth of a small error over the two shortest windows of a machine that runs away."""
+AWAY = 10.0
+"""Time in which small errors grow a hundredfold, over the longest windows, up to which each length's fit smooths the
+recordings anew: there the nominal prior's states are no start for longer windows."""
 WHOLE = 1.2
 """Ratio of the longest recording to the windows before from which on whole recordings are fitted, where it pays."""
 LONGEST = 20_000
 """Periods of a whole recording at most: longer ones are cut."""
 QUIET = 3.0
 """Ratio of what is left to the sensors' noise up to which windows grow on beyond that."""
+LOOSELY = 1e-2
+"""Weight of a first state's distance from its guess, over its size, beside errors that are counted in spreads: a guess
+by the nominal prior is far off where that is, and errors are a small share of the spread once first states fit."""
 ROUNDING = 1e-12
 """Share that is added to the diagonal of the normal equations: first states that act alike stay solvable."""
 STEEP = 1e5
@@ -644,7 +650,8 @@ class _Point:
 
     ``error`` ``(n, (T + 1) n_y)`` is zero where nothing counts, ``slopes`` ``(n, (T + 1) n_y, columns)`` are by
     ``theta`` (or not) and by ``x`` in its sizes. ``scale`` ``(n_y,)`` is what an error of each output is counted in.
-    Errors beyond ``far`` scales are no measurements: they cost the same wherever they are.
+    Errors beyond ``far`` scales are no measurements: they cost the same wherever they are. ``held`` is the weight of
+    what first states move from their guess, in their sizes, beside errors in scales.
     """
 
     theta: Array
@@ -653,6 +660,7 @@ class _Point:
     scale: Array
     error: Array
     slopes: Array
+    held: float
     far: float = math.inf
 
     @property
@@ -730,7 +738,7 @@ class Shooting:
         if len(theta):
             point = self._descend(point, min(iterations, FIRST))
             for k in range(SCALINGS):
-                rescaled = replace(point, scale=self._left(point.error))
+                rescaled = replace(point, scale=self._left(point.error), held=1.0)
                 if k and (rescaled.scale > SETTLED * point.scale).all():
                     break
                 point = self._descend(rescaled, iterations)
@@ -745,7 +753,7 @@ class Shooting:
     def shift(self, theta: Array, substeps: int) -> Array:
         """How far a Gauss-Newton step moves ``theta`` where the outputs are those of so many sub-steps a period."""
         point = self.start(theta, self.first_states(theta), "all")
-        point = replace(point, scale=self._left(point.error))
+        point = replace(point, scale=self._left(point.error), held=1.0)
         finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
         moved = [
             self._step(self._behind(p) if self.windows.warm else self._normal(p), 0.0, theta)[0]
@@ -757,7 +765,7 @@ class Shooting:
         """Errors at ``theta`` from ``x``, each output's over its spread."""
         nothing = np.zeros(0)
         substeps = max(self.own.substeps(one) for one in np.atleast_2d(theta))
-        empty = _Point(theta, x, substeps, self.spread, nothing, nothing)
+        empty = _Point(theta, x, substeps, self.spread, nothing, nothing, LOOSELY**2)
         return self._at(empty, theta, x, slopes)
 
     def _at(self, before: _Point, theta: Array, x: Array, slopes: Slopes) -> _Point:
@@ -798,8 +806,8 @@ class Shooting:
         return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
 
     def _moved(self, point: _Point) -> Array:
-        """What first states moved from their guess, in their sizes."""
-        return np.asarray((point.x - self.windows.x) / self.sizes)
+        """What first states moved from their guess, in their sizes, by the root of its weight."""
+        return np.asarray(math.sqrt(point.held) * (point.x - self.windows.x) / self.sizes)
 
     def _grouped(self, values: Array) -> Array:
         """Sums over the windows of each group."""
@@ -837,6 +845,12 @@ class Shooting:
                 break
         return point
 
+    def _followed(self, point: _Point, theta: Array, x: Array) -> Array:
+        """First states ``(n, n_x)`` that suit another ``theta``: from ``x``, or from where they were, in each window."""
+        moved, still = (self._at(point, theta, one, "x") for one in (x, point.x))
+        better = self._costs(still) < self._costs(moved)
+        return self._states(moved.where(better[self.windows.group], still)).x
+
     def _descend(self, point: _Point, iterations: int) -> _Point:
         """Steps of Levenberg and Marquardt, of ``theta`` with the first states."""
         damping, cost, n = DAMPING, self._cost(point), len(point.x)
@@ -852,6 +866,9 @@ class Shooting:
                     x = self._states(self._at(point, theta, x, "x")).x
                 trial = self._at(point, theta, x, "all")
                 new = self._cost(trial)
+                if not new < cost and not self.windows.warm:  # first states may not have followed
+                    trial = self._at(point, theta, self._followed(point, theta, x), "all")
+                    new = self._cost(trial)
                 better = new < cost
                 damping *= 0.2 if better else 5.0
                 if last:
@@ -876,9 +893,10 @@ class Shooting:
         every = rows.swapaxes(1, 2) @ rows
         t, x = slice(0, -1 - n_x), slice(-1 - n_x, -1)
         moved, n = self._moved(point) / self.members[:, None], rows.shape[-1] - 1 - n_x
+        moved = math.sqrt(point.held) * moved
         pull, from_nominal = self._pull(point, n)
         return (
-            _regular(self._grouped(every[:, x, x])), self._grouped(every[:, x, t]),
+            _regular(self._grouped(every[:, x, x]), point.held), self._grouped(every[:, x, t]),
             every[:, t, t].sum(axis=0) + pull, self._grouped(every[:, x, -1] + moved),
             every[:, t, -1].sum(axis=0) + from_nominal,
         )  # fmt: skip
@@ -897,14 +915,14 @@ class Shooting:
         rows, n_x = self._weighted(point), point.x.shape[1]
         b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
         at = (a * self.tell[:, None]).swapaxes(1, 2)
-        xx = _regular(self._grouped(at @ a))
+        xx = _regular(self._grouped(at @ a), point.held)
         follow = np.linalg.solve(xx, self._grouped(at @ np.concatenate([b, error], axis=-1)))
         left = np.concatenate([b, error], axis=-1) - a @ follow[self.windows.group]
         left *= self.count[:, None]
         taken = (
             0.0
             if self.windows.warm
-            else float(np.trace(np.eye(n_x) - np.linalg.inv(xx), axis1=1, axis2=2).sum())
+            else float(np.trace(np.eye(n_x) - point.held * np.linalg.inv(xx), axis1=1, axis2=2).sum())
         )
         return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64), taken
 
@@ -986,10 +1004,10 @@ class Shooting:
         return bounded, tuple({one.parameters: one for one in found}.values())
 
 
-def _regular(xx: Array) -> Array:
+def _regular(xx: Array, held: float) -> Array:
     """Normal matrices of first states ``(n, n_x, n_x)`` with what holds these at their guess."""
     eye = np.eye(xx.shape[-1])
-    return np.asarray(xx * (1.0 + ROUNDING * eye) + eye)
+    return np.asarray(xx * (1.0 + ROUNDING * eye) + held * eye)
 
 
 def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Array) -> Combination:
@@ -1135,12 +1153,20 @@ def fit_prior(
             solved = [solved[k] for k in np.argsort(errors, kind="stable")]
             found.append((name, solved))
             followed = [one.theta for one in solved]
+            if fit.reach(followed[0]) < AWAY * lengths[-1] * dt:
+                again = rough_smoother(make(fit.values(followed[0])), shifted(train, fit.delay(followed[0])), dt, time_unit=unit)
+                again = replace(again, substeps=fit.substeps(followed[0]))
+                every = with_states([*train, *valid], again, fit.delay(followed[0]))
+                guesses = every[: len(train)], every[len(train) :]
         whole = _longest(guesses[0]) - fit.lead - 1
         more = whole > WHOLE * periods and 0.8 * min(whole, LONGEST) * dt < fit.reach(followed[0])
         if more and _quiet(problem, followed[0], noise):  # each window spends some numbers on its first state
             on_progress(total - 1, total, "whole recordings")
-            problem, scoring = problem_of(guesses[0], None), parts_of(None)
-            found.append(("whole recordings", [problem.solve(followed[0])]))
+            longer = problem_of(guesses[0], None)
+            solution = longer.solve(followed[0])
+            if _quiet(longer, solution.theta, noise):
+                problem, scoring = longer, parts_of(None)
+                found.append(("whole recordings", [solution]))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ()))]
     for name, solved in found:  # of each length what is best over the longest windows
         errors = _errors_of([one.theta for one in solved], scoring)
