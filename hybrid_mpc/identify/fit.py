@@ -112,6 +112,8 @@ LARGEST = 1e3
 """Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
 COMPARED = 10
 """Steps at most of the first states alone, where candidates are compared."""
+FOLLOWING = 4
+"""Steps at most of the first states after ``theta``, where it would be rejected without."""
 ALIKE = 1e-3
 """They end when none takes off more than this share of a candidate's cost."""
 DAMPING, WORST = 1e-3, 1e9
@@ -826,11 +828,11 @@ class Shooting:
         robust = np.maximum(robust, 0.1 * whole)  # where most samples are met exactly, the rest is no outlier
         return np.maximum(robust, 1e-9 * self.spread)
 
-    def _states(self, point: _Point) -> _Point:
+    def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
         """First states at a ``theta``, each window by itself: with a damping of its own, until all have settled."""
         cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
         damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
-        for _ in range(COMPARED):
+        for _ in range(steps):
             xx, _, _, gx, _ = self._normal(point)
             moved = -np.linalg.solve(xx * (1 + damping * eye), gx[..., None])[..., 0]
             trial = self._at(point, point.theta, point.x + moved[group] * self.sizes, "x")
@@ -845,17 +847,18 @@ class Shooting:
                 break
         return point
 
-    def _followed(self, point: _Point, theta: Array, x: Array) -> Array:
-        """First states ``(n, n_x)`` that suit another ``theta``: from ``x``, or from where they were, in each window."""
-        moved, still = (self._at(point, theta, one, "x") for one in (x, point.x))
+    def _followed(self, point: _Point, trial: _Point) -> _Point:
+        """Another ``theta`` with first states that suit it: from the trial's, or from where they were, in each window."""
+        moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
+        still = self._at(point, trial.theta, point.x, "x")
         better = self._costs(still) < self._costs(moved)
-        return self._states(moved.where(better[self.windows.group], still)).x
+        return self._states(moved.where(better[self.windows.group], still), FOLLOWING)
 
     def _descend(self, point: _Point, iterations: int) -> _Point:
         """Steps of Levenberg and Marquardt, of ``theta`` with the first states."""
         damping, cost, n = DAMPING, self._cost(point), len(point.x)
         for _ in range(iterations):
-            better = False
+            better = followed = False
             normal = self._behind(point) if self.windows.warm else self._normal(point)
             while not better and damping < WORST:
                 step, moved, promised = self._step(normal, damping, point.theta)
@@ -866,9 +869,12 @@ class Shooting:
                     x = self._states(self._at(point, theta, x, "x")).x
                 trial = self._at(point, theta, x, "all")
                 new = self._cost(trial)
-                if not new < cost and not self.windows.warm:  # first states may not have followed
-                    trial = self._at(point, theta, self._followed(point, theta, x), "all")
-                    new = self._cost(trial)
+                if not (new < cost or last or followed or self.windows.warm):  # first states may not have followed
+                    followed = True
+                    own = self._followed(point, trial)
+                    if self._cost(own) < cost:
+                        trial = self._at(point, theta, own.x, "all")
+                        new = self._cost(trial)
                 better = new < cost
                 damping *= 0.2 if better else 5.0
                 if last:
