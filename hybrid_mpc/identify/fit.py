@@ -46,6 +46,9 @@ Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
 """Lengths of the windows [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
 ones have one optimum, long ones are what counts."""
+FARTHEST = 2.0
+"""Length of the longest windows at most, over the time in which small errors grow a hundredfold: first states would be
+lost in rounding, and no digit of them would be found."""
 APART = 4.0
 """Ratio of one length to the next at most."""
 SLOWEST = 3.0
@@ -121,6 +124,9 @@ DAMPING, WORST = 1e-3, 1e9
 CONVERGED = 0.01
 """A step that takes off less than this share of a window's mean cost is the last of a fit: what would come after it is
 far less than a standard error."""
+SETTLING, DIGITS, SAME = 12, 1e-9, 1e-9
+"""Steps at most at the end of a fit, which end where none moves a parameter by more than this share of its half range;
+and the share by which rounding may raise the cost there."""
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
 BEYOND = 0.05
@@ -748,6 +754,27 @@ class Shooting:
                 point = self._descend(replace(point, far=GROSS), iterations)
         return Fitted(point.theta, *self._covariance(point))
 
+    def settled(self, theta: Array) -> Fitted:
+        """The same fit from near its end on, to the last digits: neither start nor rounding is left in it."""
+        point = self.start(theta, self.first_states(theta), "all")
+        point = self._descend(replace(point, scale=self._left(point.error), held=1.0), FIRST)
+        for _ in range(SETTLING):
+            point = replace(point, scale=self._left(point.error))
+            normal = self._behind(point) if self.windows.warm else self._normal(point)
+            step, moved, _ = self._step(normal, 0.0, point.theta)
+            theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
+            x = point.x + moved[self.windows.group] * self.sizes
+            if self.windows.warm:
+                x = self._states(self._at(point, theta, x, "x")).x
+            trial, cost = self._at(point, theta, x, "all"), self._cost(point)
+            if not self._cost(trial) <= cost * (1 + SAME):
+                break
+            small = (np.abs(theta - point.theta) <= DIGITS * self.own.half).all()
+            point = trial
+            if small:
+                break
+        return Fitted(point.theta, *self._covariance(point))
+
     def forget(self) -> None:
         """Forget the first states that were found with other integration steps."""
         self._known.clear()
@@ -1138,7 +1165,7 @@ def fit_prior(
         return [problem_of(part, periods) for part in guesses if _longest(part) > (periods or 2) + fit.lead]
 
     periods, scoring = lengths[-1], parts_of(lengths[-1])
-    found: list[tuple[str, list[Fitted]]] = []
+    found: list[tuple[str, list[Fitted], Shooting]] = []
     if len(fit.nominal):
         on_progress(1, total, "several starts")
         far = max(p for p in lengths if p == lengths[0] or 0.8 * p * dt <= fit.reach(fit.nominal))
@@ -1146,18 +1173,22 @@ def fit_prior(
         begun = _starts(fit, short, long, start)
         followed, problem = begun, short
         for i, own in enumerate(lengths):
-            if i and 0.8 * own * dt > fit.reach(followed[0]) and not _quiet(problem, followed[0], noise):
+            beyond = i > 0 and 0.8 * own * dt > fit.reach(followed[0])
+            if beyond and not _quiet(problem, followed[0], noise):
                 break
-            name, periods, problem = f"free runs of {own * dt:.3g} s", own, problem_of(guesses[0], own)
+            name, longer = f"free runs of {own * dt:.3g} s", problem_of(guesses[0], own)
             on_progress(2 + i, total, name)
             every_start = [fit.nominal, *begun, *followed]  # short windows may have led astray
-            solved = [problem.solve(one) for one in _promising(fit, problem, every_start)]
+            solved = [longer.solve(one) for one in _promising(fit, longer, every_start)]
+            if beyond and not any(_quiet(longer, one.theta, noise) for one in solved):
+                break  # first states that explain so long windows were not found
+            periods, problem = own, longer
             if own == lengths[-1]:
                 solved += _further(fit, problem, solved)
             scoring = parts_of(own) or [problem]
             errors = _errors_of([one.theta for one in solved], scoring)
             solved = [solved[k] for k in np.argsort(errors, kind="stable")]
-            found.append((name, solved))
+            found.append((name, solved, problem))
             followed = [one.theta for one in solved]
             if fit.reach(followed[0]) < AWAY * lengths[-1] * dt:
                 again = rough_smoother(make(fit.values(followed[0])), shifted(train, fit.delay(followed[0])), dt, time_unit=unit)
@@ -1172,9 +1203,10 @@ def fit_prior(
             solution = longer.solve(followed[0])
             if _quiet(longer, solution.theta, noise):
                 problem, scoring = longer, parts_of(None)
-                found.append(("whole recordings", [solution]))
+                found.append(("whole recordings", [solution], longer))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ()))]
-    for name, solved in found:  # of each length what is best over the longest windows
+    problems = {}
+    for name, solved, problems[name] in found:  # of each length what is best over the longest windows
         errors = _errors_of([one.theta for one in solved], scoring)
         candidates.append((name, solved[int(np.argmin(errors))]))
     scores = _errors_of([c.theta for _, c in candidates], scoring)
@@ -1188,9 +1220,10 @@ def fit_prior(
         fitted, substeps = make(fit.values(found.theta)), fit.substeps(found.theta)
         return fit_smoother(fitted, acting, dt, time_unit=unit, substeps=substeps)
 
-    chosen = candidates[winner([name for name, _ in candidates], scores)][1]
+    name, chosen = candidates[winner([name for name, _ in candidates], scores)]
     if len(chosen.covariance):
-        chosen = _with_enough_substeps(fit, problem, chosen)
+        chosen = _with_enough_substeps(fit, problems[name], chosen)
+        chosen = problems[name].settled(chosen.theta)
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
     answered = feedback(acting, smoother.prediction_errors(acting, smoother.prior.p[None])[1])
@@ -1349,7 +1382,7 @@ def _lengths(
         wanted.append(wanted[-1] * APART)
     wanted.append(length)
     grown = [reach * math.log(own) / math.log(GROWN[-1]) for own in GROWN]
-    slow = [own for own in wanted if own > 1.5 * grown[-1]]
+    slow = sorted({min(own, FARTHEST * grown[-1]) for own in wanted if own > 1.5 * grown[-1]})
     if slow:
         wanted = [*grown, *slow]
     fitting = [p for p in (scales.periods(own, dt, 2) for own in wanted) if p <= longest]
