@@ -218,7 +218,7 @@ def order(given: argparse.Namespace) -> list[dict[str, Any]]:
     for machine in SIMULATED:
         if given.names and machine.name not in given.names:
             continue
-        runs = [machine.record(500 + i, 600)[0] for i in range(4)]
+        runs = [machine.record(500 + i, 1200)[0] for i in range(4)]
         rows.append(invariance(machine.name, machine.prior, runs[:3], runs[3:], machine.dt))
         print(rows[-1], flush=True)
     for seed in range(given.priors):

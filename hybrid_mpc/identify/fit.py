@@ -1002,7 +1002,8 @@ class Shooting:
         """Covariance of ``theta``, and what the windows do not tell.
 
         It follows from the scatter of the slopes of ``CLUSTERS`` parts of the windows at least, since errors within one
-        are no white noise, and from what holds ``theta`` at the nominal values; none is larger than a half range.
+        are no white noise, and from what holds ``theta`` at the nominal values; none is smaller than white noise of
+        that size would make it, since so few parts tell their scatter roughly, and none is larger than a half range.
 
         Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters; Huber
         and Ronchetti, *Robust Statistics* (2009), section 7.6, of the robust loss.
@@ -1030,6 +1031,10 @@ class Shooting:
         inverse = 1.0 / (np.square(told) + LOOSE**-2)
         covariance = back @ ((middle + LOOSE**-2 * np.eye(k)) * np.outer(inverse, inverse)) @ back.T
         covariance = 0.5 * (covariance + covariance.T)
+        white = float(np.square(error).sum()) / max(left, 1.0)  # variance of errors that are white, weighed
+        least = np.square(back) @ (inverse * inverse * (white * np.square(told) + LOOSE**-2))
+        short = np.sqrt(np.maximum(least / np.maximum(np.diag(covariance), 1e-300), 1.0))
+        covariance = covariance * np.outer(short, short)
         values, directions = np.linalg.eigh(covariance / np.outer(half, half))
         untold = directions[:, values >= UNTOLD**2].T
         found = tuple(_combination(self.own, point.theta, covariance, one) for one in untold)
