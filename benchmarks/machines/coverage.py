@@ -66,7 +66,7 @@ class Tanks(Prior):
 
     def xdot(self, x, u, w, p):
         """Outflows by Torricelli."""
-        upper, lower = (ca.sqrt(ca.fmax(h, 1e-6)) for h in x)
+        upper, lower = (ca.sqrt(ca.fmax(h, 1e-3)) for h in x)
         return p.k * u.q - p.a * upper, p.a * upper - p.b * lower
 
 
@@ -178,7 +178,7 @@ def cramer_rao(machine: Simulated, runs: list[tuple[Trajectory, Array]]) -> Arra
     information = np.zeros((len(truth), len(truth)))
     for t, first in runs:
         windows = Windows(t.y[None], t.u[None], np.zeros((1, len(t.t), 0)), first[None])
-        steps = [*(1e-4 * truth), *(1e-4 * own.sizes)]
+        steps = [*(1e-7 * truth), *(1e-7 * own.sizes)]
         slopes = []
         for k, h in enumerate(steps):
             ends = []

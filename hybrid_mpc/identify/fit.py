@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
 """Lengths of the windows [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
 ones have one optimum, long ones are what counts."""
-FARTHEST = 2.0
+FARTHEST = 3.0
 """Length of the longest windows at most, over the time in which small errors grow a hundredfold: first states would be
 lost in rounding, and no digit of them would be found."""
 APART = 4.0
@@ -88,7 +88,7 @@ LOOSELY = 1e-2
 by the nominal prior is far off where that is, and errors are a small share of the spread once first states fit."""
 ROUNDING = 1e-12
 """Share that is added to the diagonal of the normal equations: first states that act alike stay solvable."""
-STEEP = 1e5
+STEEP = 1e8
 """Slopes beyond this many spreads of an output per size of a first state or parameter do not count: a run diverges."""
 LOOSE = 30.0
 """Half ranges from its nominal value that cost a parameter as much as a single error of one standard deviation: what
@@ -127,6 +127,8 @@ far less than a standard error."""
 SETTLING, DIGITS, SAME = 12, 1e-9, 1e-9
 """Steps at most at the end of a fit, which end where none moves a parameter by more than this share of its half range;
 and the share by which rounding may raise the cost there."""
+SHARES = 1.0, 0.5, 0.2, 0.05
+"""Shares of such a step, of which the first that does not raise the cost is taken."""
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
 BEYOND = 0.05
@@ -259,6 +261,11 @@ class OutputWindows:
     known: NDArray[np.bool_]
     group: NDArray[np.int_]
     warm: int = 0
+
+    def beginning(self, periods: int) -> OutputWindows:
+        """The first so many periods of each."""
+        y, w, censored = (v[:, : periods + 1] for v in (self.y, self.w, self.censored))
+        return replace(self, y=y, u=self.u[:, : self.lead + periods + 1], w=w, censored=censored)
 
     def times(self, n: int) -> OutputWindows:
         """The same windows, ``n`` times one behind the other."""
@@ -723,7 +730,11 @@ class Shooting:
         share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
         for some in unknown.values():  # all at once: windows do not know of each other
             problem = Shooting(self.own, self.windows.times(len(some)), self.sizes, self.spread)
-            point = problem._states(problem.start(np.stack(some), problem.windows.x, "x"))
+            x = problem.windows.x
+            for periods in self._growing(some):
+                part = Shooting(self.own, problem.windows.beginning(periods), self.sizes, self.spread)
+                x = part._states(part.start(np.stack(some), x, "x")).x
+            point = problem._states(problem.start(np.stack(some), x, "x"))
             over = (
                 np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
                 * self.count
@@ -733,6 +744,16 @@ class Shooting:
                 error = float(np.sqrt(np.square(over[part]).sum() / share))
                 self._known[theta.tobytes()] = error, point.x[part]
         return [self._known[theta.tobytes()][0] for theta in thetas]
+
+    def _growing(self, thetas: Sequence[Array]) -> list[int]:
+        """Lengths [periods] over which first states are found one after the other before those of the windows, where
+        small errors grow more than a hundredfold: what is found over one tells where the next half as much begins.
+        """
+        periods, dt = self.windows.y.shape[1] - 1, self.own.dt
+        reach = min(self.own.reach(theta) for theta in thetas) / dt
+        if self.windows.warm or 0.8 * periods <= reach:
+            return []
+        return [int(own) for own in np.arange(max(reach, 4.0), periods, max(0.5 * reach, 2.0))]
 
     def first_states(self, theta: Array) -> Array:
         """First states ``(n, n_x)`` that are best for ``theta``."""
@@ -762,18 +783,28 @@ class Shooting:
             point = replace(point, scale=self._left(point.error))
             normal = self._behind(point) if self.windows.warm else self._normal(point)
             step, moved, _ = self._step(normal, 0.0, point.theta)
-            theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
-            x = point.x + moved[self.windows.group] * self.sizes
-            if self.windows.warm:
-                x = self._states(self._at(point, theta, x, "x")).x
-            trial, cost = self._at(point, theta, x, "all"), self._cost(point)
-            if not self._cost(trial) <= cost * (1 + SAME):
+            for share in SHARES:
+                trial = self._along(point, share * step, share * moved)
+                if better := self._cost(trial) <= self._cost(point) * (1 + SAME):
+                    break
+            if not better:
                 break
-            small = (np.abs(theta - point.theta) <= DIGITS * self.own.half).all()
-            point = trial
-            if small:
+            far, point = np.abs(trial.theta - point.theta), trial
+            if (far <= DIGITS * self.own.half).all():
                 break
         return Fitted(point.theta, *self._covariance(point))
+
+    def _along(self, point: _Point, step: Array, moved: Array) -> _Point:
+        """The point a step of ``theta`` and first states further, these corrected where the cost would rise without."""
+        theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
+        x = point.x + moved[self.windows.group] * self.sizes
+        if self.windows.warm:
+            x = self._states(self._at(point, theta, x, "x")).x
+        trial, cost = self._at(point, theta, x, "all"), self._cost(point)
+        if self._cost(trial) <= cost * (1 + SAME) or self.windows.warm:
+            return trial
+        own = self._followed(point, trial)
+        return self._at(point, theta, own.x, "all") if self._cost(own) <= cost * (1 + SAME) else trial
 
     def forget(self) -> None:
         """Forget the first states that were found with other integration steps."""
