@@ -6,7 +6,7 @@
     python benchmarks/unknown_machines.py random --priors 50    # random priors
 
 An error is the root mean square of free runs over held-out windows, over the outputs' spreads, from the first states
-that suit a model best (:mod:`machines.independent`). Prints a Markdown table, and with ``--out FILE.json`` writes it.
+that suit a model best (:mod:`unknown.independent`). Prints a Markdown table, and with ``--out FILE.json`` writes it.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machines.cases import Case, cases
-from machines.common import Machine
-from machines.coverage import MACHINES as SIMULATED
-from machines.coverage import Simulated, cramer_rao
-from machines.independent import Runs, cut, fit, free_run_errors
-from machines.motion import MOTION
-from machines.processes import PROCESSES
-from machines.random_priors import Drawn, drawn
+from unknown.cases import Case, cases
+from unknown.common import Machine
+from unknown.coverage import MACHINES as SIMULATED
+from unknown.coverage import Simulated, cramer_rao
+from unknown.independent import Runs, cut, fit, free_run_errors
+from unknown.motion import MOTION
+from unknown.processes import PROCESSES
+from unknown.random_priors import Drawn, drawn
 
 from hybrid_mpc import InputError, Prior, Trajectory, fit_prior, load_trajectories
 from hybrid_mpc.data.scales import time_unit

@@ -779,6 +779,8 @@ class Shooting:
         """The same fit from near its end on, to the last digits: neither start nor rounding is left in it."""
         point = self.start(theta, self.first_states(theta), "all")
         point = self._descend(replace(point, scale=self._left(point.error), held=1.0), FIRST)
+        if (np.abs(point.error) > GROSS * point.scales).any():
+            point = replace(point, far=GROSS)
         for _ in range(SETTLING):
             point = replace(point, scale=self._left(point.error))
             normal = self._behind(point) if self.windows.warm else self._normal(point)
@@ -906,7 +908,7 @@ class Shooting:
         return point
 
     def _followed(self, point: _Point, trial: _Point) -> _Point:
-        """Another ``theta`` with first states that suit it: from the trial's, or from where they were, in each window."""
+        """Another ``theta`` with first states that suit it: from the trial's, or from those before, in each window."""
         moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
         still = self._at(point, trial.theta, point.x, "x")
         better = self._costs(still) < self._costs(moved)
@@ -927,7 +929,9 @@ class Shooting:
                     x = self._states(self._at(point, theta, x, "x")).x
                 trial = self._at(point, theta, x, "all")
                 new = self._cost(trial)
-                if not (new < cost or last or followed or self.windows.warm):  # first states may not have followed
+                if not (
+                    new < cost or last or followed or self.windows.warm
+                ):  # first states may not have followed
                     followed = True
                     own = self._followed(point, trial)
                     if self._cost(own) < cost:
@@ -1227,7 +1231,9 @@ def fit_prior(
             found.append((name, solved, problem))
             followed = [one.theta for one in solved]
             if fit.reach(followed[0]) < AWAY * lengths[-1] * dt:
-                again = rough_smoother(make(fit.values(followed[0])), shifted(train, fit.delay(followed[0])), dt, time_unit=unit)
+                again = rough_smoother(
+                    make(fit.values(followed[0])), shifted(train, fit.delay(followed[0])), dt, time_unit=unit
+                )
                 again = replace(again, substeps=fit.substeps(followed[0]))
                 every = with_states([*train, *valid], again, fit.delay(followed[0]))
                 guesses = every[: len(train)], every[len(train) :]

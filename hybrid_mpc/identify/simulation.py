@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 MAX_SUBSTEPS = 20
 """A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
 USUALLY = 0.98
-"""Share of the samples at which a prior must not be too stiff: an edge that is touched now and then, such as the root of
-an empty tank's level, is integrated as well as can be."""
+"""Share of the samples at which a prior must not be too stiff: an edge that is touched now and then, such as the root
+of an empty tank's level, is integrated as well as can be."""
 VISITED = 200
 """Samples of the recordings that are asked how stiff the prior is there, beside the outermost ones."""
 Points: TypeAlias = tuple[Array, Array, Array]

@@ -1,7 +1,7 @@
 """Six processes: what the user writes, and the plant that is recorded.
 
-Sources: Bequette, *Process Control* (2003) for exchanger, column and bioreactor; Johansson, *The quadruple-tank process*
-(2000); Newell and Lee, *Applied Process Control* (1989) for the evaporator; Madsen and Holst, *Estimation of
+Sources: Bequette, *Process Control* (2003) for exchanger, column and bioreactor; Johansson, *The quadruple-tank
+process* (2000); Newell and Lee, *Applied Process Control* (1989) for the evaporator; Madsen and Holst, *Estimation of
 continuous-time models for the heat dynamics of a building* (1995).
 """
 
@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from hybrid_mpc import DataSpec, OperatingPoint, Parameter, Prior, Signal
-from machines.common import Array, Machine, drop_outs, levels, quantised, run
+from unknown.common import Array, Machine, drop_outs, levels, quantised, run
 
 
 class HeatExchanger(Prior):
@@ -167,7 +167,7 @@ class Evaporator(Prior):
         Parameter("k", 0.012, "1/K", 0.002, 0.06, "condenser"),
         Parameter("X1", 5.0, "%", 5.0, 5.0, "feed"),
     )
-    operating_point = OperatingPoint(x=(1.0, 22.0, 50.0), u=(2.2727, 206.8, 208.0), w=(10.0,))
+    operating_point = OperatingPoint(x=(1.0, 15.0, 50.0), u=(3.333, 213.7, 143.4), w=(10.0,))
 
     def xdot(self, x, u, w, p):
         """Minutes to seconds."""
@@ -193,7 +193,7 @@ def evaporator(seed: int) -> Array:
     goal, memory = levels(rng, n, 0.8, 1.3, 150, 400), [0.0]
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        level, conc, p, lag = x
+        _, conc, p, lag = x
         f1 = feed[min(int(t / dt), n - 1)]
         t2 = 0.5616 * p + 0.3126 * conc + 48.43
         f4 = 0.2 * (0.1538 * lag + 90.0 - t2)
@@ -263,14 +263,14 @@ def column(seed: int) -> Array:
     boil = reflux + levels(rng, n, 0.4, 0.6, 40, 200)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        f, (l, v) = feed[min(int(t / dt), n - 1)], u
+        f, (down, v) = feed[min(int(t / dt), n - 1)], u
         y = 1.9 * x / (1 + 0.9 * x)
-        liquid = np.where(np.arange(m) <= at, l + 1.0, l)
+        liquid = np.where(np.arange(m) <= at, down + 1.0, down)
         out = np.zeros(m)
         out[0] = (liquid[1] * x[1] - (liquid[1] - v) * x[0] - v * y[0]) / 14
         for i in range(1, m - 1):
-            down = (l if i == at else liquid[i + 1]) * x[i + 1] + (f if i == at else 0.0)
-            out[i] = (down - liquid[i] * x[i] + v * (y[i - 1] - y[i])) / 1.5
+            into = (down if i == at else liquid[i + 1]) * x[i + 1] + (f if i == at else 0.0)
+            out[i] = (into - liquid[i] * x[i] + v * (y[i - 1] - y[i])) / 1.5
         out[-1] = v * (y[-2] - x[-1]) / 15
         return out / 60
 
@@ -356,7 +356,8 @@ PROCESSES = (
     ),
     Machine(
         "quadruple_tank", QuadrupleTank, DataSpec("t", ("v1", "v2"), ("h1", "h2"), 4.0, 12.0, 40.0, 60.0),
-        quadruple_tank, "t,v1,v2,h1,h2", 500.0, {"a12": 0.0042, "a34": 0.0066, "k1": 6e-4, "k2": 7e-4, "g1": 0.65, "g2": 0.6}, True,
+        quadruple_tank, "t,v1,v2,h1,h2", 500.0,
+        {"a12": 0.0042, "a34": 0.0066, "k1": 6e-4, "k2": 7e-4, "g1": 0.65, "g2": 0.6}, True,
     ),
     Machine(
         "bioreactor", Bioreactor,
@@ -366,7 +367,8 @@ PROCESSES = (
     Machine(
         "evaporator", Evaporator,
         DataSpec("t", ("F2", "steam", "F200"), ("L", "P"), 12.0, 60.0, 120.0, 300.0, disturbances=("F1",)),
-        evaporator, "t,F2,steam,F200,F1,L,P", 2400.0, {"A": 28.0, "M": 26.0, "C": 3.0, "UA": 0.2, "k": 0.0101}, True, True,
+        evaporator, "t,F2,steam,F200,F1,L,P", 2400.0,
+        {"A": 28.0, "M": 26.0, "C": 3.0, "UA": 0.2, "k": 0.0101}, True, True,
     ),
     Machine(
         "column", Column,
@@ -376,6 +378,7 @@ PROCESSES = (
     Machine(
         "building", Building,
         DataSpec("t", ("heat",), ("T_i",), 600.0, 3600.0, 3600.0, 7200.0, disturbances=("T_o", "sun")),
-        building, "t,heat,T_o,sun,T_i", 86400.0, {"C_i": 1.85, "C_m": 17.0, "H_im": 0.7, "H_mo": 0.29, "A_w": 3.0}, False,
+        building, "t,heat,T_o,sun,T_i", 86400.0,
+        {"C_i": 1.85, "C_m": 17.0, "H_im": 0.7, "H_mo": 0.29, "A_w": 3.0}, False,
     ),
 )  # fmt: skip

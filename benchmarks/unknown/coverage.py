@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 
 from hybrid_mpc import Parameter, Prior, Signal, Trajectory
-from machines.common import Array, levels
-from machines.independent import Runs, Windows
+from unknown.common import Array, levels
+from unknown.independent import Runs, Windows
 
 SUBSTEPS = 4
 Control = Callable[[Array, float], float]

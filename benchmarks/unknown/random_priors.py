@@ -15,6 +15,7 @@ from hybrid_mpc import Parameter, Prior, Signal, Trajectory
 
 Array = NDArray[np.float64]
 DT, SAMPLES, SUBSTEPS = 0.05, 300, 4
+ROLES = ("train", "train", "train", "valid", "test")
 GROWTH = 2.0
 """Largest rate at which an unstable one may grow [1/s]."""
 REACH = 30.0
@@ -137,7 +138,7 @@ def _draw(rng: np.random.Generator, seed: int) -> Drawn | None:
             states[:, outputs] + noise * spread[outputs] * rng.standard_normal((SAMPLES, len(outputs))),
             nothing, nothing,
         )
-        for i, (role, (states, inputs)) in enumerate(zip(("train", "train", "train", "valid", "test"), runs, strict=True))
+        for i, (role, (states, inputs)) in enumerate(zip(ROLES, runs, strict=True))
     ]  # fmt: skip
     length = 5.0 if growth <= 0 else min(5.0, np.log(30.0) / growth)
     return Drawn(prior, truth, stable, tuple(made[:3]), tuple(made[3:4]), tuple(made[4:]), float(length))

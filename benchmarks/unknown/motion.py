@@ -1,6 +1,6 @@
 """Six machines that move: what the user writes, and the plant that is recorded, most of them under a controller.
 
-Sources: Franklin, Powell and Emami-Naeini, *Feedback Control of Dynamic Systems* (2015) for shaft, ball, magnet and cart;
+Sources: Franklin, Powell and Emami-Naeini, *Feedback Control of Dynamic Systems* (2015) for shaft, ball, magnet, cart;
 Fossen, *Handbook of Marine Craft Hydrodynamics and Motion Control* (2011) for the ship; Merritt, *Hydraulic Control
 Systems* (1967) for the cylinder.
 """
@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from hybrid_mpc import DataSpec, MechanicalPrior, OperatingPoint, Parameter, Prior, Signal
-from machines.common import Array, Machine, drop_outs, levels, quantised, run
+from unknown.common import Array, Machine, drop_outs, levels, quantised, run
 
 G = 9.81
 
@@ -47,10 +47,14 @@ def flexible_shaft(seed: int) -> Array:
     volts = levels(rng, n, -8, 8, 20, 200)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        m, l, q = x
-        shaft = 1.4 * q + 3.0 * q**3 + 0.006 * (m - l)
+        m, load, q = x
+        shaft = 1.4 * q + 3.0 * q**3 + 0.006 * (m - load)
         return np.array(
-            [(0.04 * u[0] - 0.0028 * m - shaft) / 7e-4, (shaft - 0.02 * np.tanh(l / 1.0)) / 4.2e-3, m - l]
+            [
+                (0.04 * u[0] - 0.0028 * m - shaft) / 7e-4,
+                (shaft - 0.02 * np.tanh(load / 1.0)) / 4.2e-3,
+                m - load,
+            ]
         )
 
     t, u, y = run(rates, np.zeros(3), lambda k, y: volts[k : k + 1], lambda x: x[:2], dt, n, 2)
@@ -149,15 +153,15 @@ def cart_pole(seed: int) -> Array:
     """Another length and mass, dry friction, held by state feedback."""
     rng = np.random.default_rng([seed, 13])
     n, dt = 2500, 0.01
-    m_c, m, l, j, b = 0.7, 0.28, 0.25, 0.0075, 1.6
+    m_c, m, half, j, b = 0.7, 0.28, 0.25, 0.0075, 1.6
     goal, push = levels(rng, n, -0.5, 0.5, 200, 500), levels(rng, n, -2.0, 2.0, 10, 60)
     memory = np.zeros(4)
 
     def rates(x: Array, u: Array, t: float) -> Array:
         _, phi, sd, pd = x
-        a, c, e = m_c + m, m * l * np.cos(phi), j + m * l * l
-        f1 = u[0] - b * sd - 0.4 * np.tanh(sd / 0.02) + m * l * np.sin(phi) * pd**2
-        f2 = m * G * l * np.sin(phi) - 0.002 * pd
+        a, c, e = m_c + m, m * half * np.cos(phi), j + m * half * half
+        f1 = u[0] - b * sd - 0.4 * np.tanh(sd / 0.02) + m * half * np.sin(phi) * pd**2
+        f2 = m * G * half * np.sin(phi) - 0.002 * pd
         det = a * e - c * c
         return np.array([sd, pd, (e * f1 - c * f2) / det, (a * f2 - c * f1) / det])
 
@@ -204,7 +208,7 @@ def ship(seed: int) -> Array:
     waves = 0.02 * np.cumsum(rng.standard_normal(n)) * 0.05
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        psi, r, d = x
+        _, r, d = x
         return np.array(
             [
                 r,
@@ -304,7 +308,7 @@ def hydraulic_cylinder(seed: int) -> Array:
     goal, push = levels(rng, n, -0.15, 0.15, 150, 500), levels(rng, n, -1.5, 1.5, 10, 60)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        s, v, p, q = x
+        _, v, p, q = x
         flow = 3.6e-6 * q * np.sqrt(max(70 - np.sign(q) * p, 1e-3)) - 2.0e-7 * p
         return np.array(
             [
@@ -333,7 +337,8 @@ def hydraulic_cylinder(seed: int) -> Array:
 MOTION = (
     Machine(
         "flexible_shaft", FlexibleShaft, DataSpec("t", ("u",), ("motor", "load"), 0.002, 0.02, 0.02, 0.1),
-        flexible_shaft, "t,u,motor,load", 1.0, {"J_m": 7e-4, "J_l": 4.2e-3, "c": 1.5, "d": 6e-3, "k": 0.04, "b": 2.8e-3}, True,
+        flexible_shaft, "t,u,motor,load", 1.0,
+        {"J_m": 7e-4, "J_l": 4.2e-3, "c": 1.5, "d": 6e-3, "k": 0.04, "b": 2.8e-3}, True,
     ),
     Machine(
         "magnetic_levitation", MagneticLevitation, DataSpec("t", ("u",), ("gap", "i"), 0.002, 0.02, 0.02, 0.1),

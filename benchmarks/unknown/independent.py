@@ -1,7 +1,8 @@
 """A fit of a prior that shares nothing with the library's own, and the error that both are compared by.
 
-Multiple shooting: recordings are cut into windows, the state at the start of each is an unknown. Runge-Kutta of order 4,
-differences of outputs as derivatives, ``scipy.optimize.least_squares``. Of the library it uses the prior's equations alone.
+Multiple shooting: recordings are cut into windows, the state at the start of each is an unknown. Runge-Kutta of order
+4, differences of outputs as derivatives, ``scipy.optimize.least_squares``. Of the library it uses the prior's equations
+alone.
 
 Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
 """
