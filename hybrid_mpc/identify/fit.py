@@ -24,7 +24,7 @@ from hybrid_mpc.data.scales import evenly, robust_spread, within
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.delay import NONE, shifted
-from hybrid_mpc.identify.prior_result import PREDICTIONS, Combination, PriorFit, winner
+from hybrid_mpc.identify.prior_result import ENOUGH, PREDICTIONS, Combination, PriorFit, winner
 from hybrid_mpc.identify.simulation import (
     MAX_SUBSTEPS,
     Points,
@@ -124,6 +124,8 @@ DAMPING, WORST = 1e-3, 1e9
 CONVERGED = 0.01
 """A step that takes off less than this share of a window's mean cost is the last of a fit: what would come after it is
 far less than a standard error."""
+CLOSELY = 1e-4
+"""The same share at the end of a fit: steps along a narrow valley are short."""
 SETTLING, DIGITS, SAME = 12, 1e-9, 1e-9
 """Steps at most at the end of a fit, which end where none moves a parameter by more than this share of its half range;
 and the share by which rounding may raise the cost there."""
@@ -732,8 +734,8 @@ class Shooting:
             problem = Shooting(self.own, self.windows.times(len(some)), self.sizes, self.spread)
             x = problem.windows.x
             for periods in self._growing(some):
-                part = Shooting(self.own, problem.windows.beginning(periods), self.sizes, self.spread)
-                x = part._states(part.start(np.stack(some), x, "x")).x
+                begun = Shooting(self.own, problem.windows.beginning(periods), self.sizes, self.spread)
+                x = begun._states(begun.start(np.stack(some), x, "x")).x
             point = problem._states(problem.start(np.stack(some), x, "x"))
             over = (
                 np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
@@ -778,7 +780,9 @@ class Shooting:
     def settled(self, theta: Array) -> Fitted:
         """The same fit from near its end on, to the last digits: neither start nor rounding is left in it."""
         point = self.start(theta, self.first_states(theta), "all")
-        point = self._descend(replace(point, scale=self._left(point.error), held=1.0), FIRST)
+        for _ in range(2):
+            rescaled = replace(point, scale=self._left(point.error), held=1.0)
+            point = self._descend(rescaled, ITERATIONS, CLOSELY)
         if (np.abs(point.error) > GROSS * point.scales).any():
             point = replace(point, far=GROSS)
         for _ in range(SETTLING):
@@ -914,15 +918,17 @@ class Shooting:
         better = self._costs(still) < self._costs(moved)
         return self._states(moved.where(better[self.windows.group], still), FOLLOWING)
 
-    def _descend(self, point: _Point, iterations: int) -> _Point:
-        """Steps of Levenberg and Marquardt, of ``theta`` with the first states."""
+    def _descend(self, point: _Point, iterations: int, enough: float = CONVERGED) -> _Point:
+        """Steps of Levenberg and Marquardt, of ``theta`` with the first states, until one takes off less than a share
+        ``enough`` of a window's mean cost.
+        """
         damping, cost, n = DAMPING, self._cost(point), len(point.x)
         for _ in range(iterations):
             better = followed = False
             normal = self._behind(point) if self.windows.warm else self._normal(point)
             while not better and damping < WORST:
                 step, moved, promised = self._step(normal, damping, point.theta)
-                last = promised < CONVERGED * cost / n
+                last = promised < enough * cost / n
                 theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
                 x = point.x + moved[self.windows.group] * self.sizes
                 if self.windows.warm:  # the warm-up tells the first states of every theta
@@ -944,7 +950,7 @@ class Shooting:
             if not better:
                 break
             gain, point, cost = cost - new, trial, new
-            if last or gain < CONVERGED * cost / n:
+            if last or gain < enough * cost / n:
                 break
         return point
 
@@ -1006,8 +1012,8 @@ class Shooting:
         )  # fmt: skip
 
     def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
-        """Step of ``theta``, of which those at a bound that would leave it rest, and of the first states by groups; and
-        how far it takes the cost down to first order.
+        """Step of ``theta`` within its bounds, and of the first states by groups, which follow it; and how far it takes
+        the cost down to first order.
         """
         xx, xt, tt, gx, gt = normal
         reduced, slope = tt, gt
@@ -1018,17 +1024,10 @@ class Shooting:
         if not self.windows.warm:
             reduced = tt - (xt.swapaxes(1, 2) @ by_theta).sum(axis=0)
             slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
-        step, free = np.zeros(len(theta)), np.arange(len(theta))
-        reduced = reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30))
-        for _ in range(len(theta) + 1):
-            step[:] = 0.0
-            if len(free):
-                step[free] = -np.linalg.lstsq(reduced[np.ix_(free, free)], slope[free], rcond=1e-14)[0]
-            low = (theta[free] <= self.own.lower[free]) & (step[free] < 0)
-            high = (theta[free] >= self.own.upper[free]) & (step[free] > 0)
-            if not (low | high).any():
-                break
-            free = free[~(low | high)]
+        step = _bounded(
+            reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30)), slope,
+            self.own.lower - theta, self.own.upper - theta,
+        )  # fmt: skip
         moved = -own - (by_theta @ step[:, None])[..., 0]
         of_states = 0.0 if self.windows.warm else float(np.sum(gx * moved))
         return step, moved, -2.0 * (float(gt @ step) + of_states)
@@ -1075,6 +1074,27 @@ class Shooting:
         found = tuple(_combination(self.own, point.theta, covariance, one) for one in untold)
         bounded = directions * np.minimum(values, 1.0) @ directions.T * np.outer(half, half)
         return bounded, tuple({one.parameters: one for one in found}.values())
+
+
+def _bounded(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
+    """Step ``(n,)`` to the least of ``s' matrix s / 2 + slope' s`` between ``low <= 0`` and ``high >= 0``.
+
+    Of the components that would go beyond, the first one to meet its bound is held there, and the others are solved for
+    anew: held together, two that lie along a valley would both rest in a corner. None is let go of again.
+    """
+    step, free = np.zeros(len(slope)), np.arange(len(slope))
+    held = np.zeros(len(slope), dtype=bool)
+    for _ in range(len(slope)):
+        free = np.flatnonzero(~held)
+        right = slope[free] + matrix[np.ix_(free, np.flatnonzero(held))] @ step[held]
+        step[free] = -np.linalg.lstsq(matrix[np.ix_(free, free)], right, rcond=1e-14)[0]
+        ends = np.clip(step, low, high)
+        beyond = free[ends[free] != step[free]]
+        if not len(beyond):
+            break
+        first = beyond[np.lexsort((-np.abs(step - ends)[beyond], (ends[beyond] / step[beyond])))[0]]
+        held[first], step[first] = True, ends[first]
+    return step
 
 
 def _regular(xx: Array, held: float) -> Array:
@@ -1265,7 +1285,9 @@ def fit_prior(
     name, chosen = candidates[winner([name for name, _ in candidates], scores)]
     if len(chosen.covariance):
         chosen = _with_enough_substeps(fit, problems[name], chosen)
-        chosen = problems[name].settled(chosen.theta)
+        settled = problems[name].settled(chosen.theta)
+        before, after = problems[name].explained([chosen.theta, settled.theta])
+        chosen = settled if after <= ENOUGH * before else chosen  # weights that follow may favour one output
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
     answered = feedback(acting, smoother.prediction_errors(acting, smoother.prior.p[None])[1])
