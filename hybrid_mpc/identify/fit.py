@@ -103,6 +103,9 @@ SHIFT, EXACT = 0.2, 1e-5
 """Shift of a parameter by half as long integration steps that is small enough: standard errors, and share of it."""
 OUTLIERS = 3.0
 """Residuals beyond this many robust standard deviations count by their size, not by its square."""
+COMMON = 0.7
+"""Least robust standard deviation of an output's errors, over their root mean square without gross outliers: where a
+prior is far off for a part of the time, that part is no outlier."""
 GROSS = 10.0
 """Residuals beyond this many are no measurements at the end of a fit; what they weigh before would bias it."""
 SCALINGS = 4
@@ -889,7 +892,7 @@ class Shooting:
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
         whole = np.array([float(np.sqrt(np.mean(within(v) ** 2))) if len(v) else 0.0 for v in left])
-        robust = np.maximum(robust, 0.1 * whole)  # where most samples are met exactly, the rest is no outlier
+        robust = np.maximum(robust, COMMON * whole)  # errors that are common are the prior's, and no outliers
         return np.maximum(robust, 1e-9 * self.spread)
 
     def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
