@@ -24,7 +24,7 @@ from hybrid_mpc.data.scales import evenly, robust_spread, within
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.delay import NONE, shifted
-from hybrid_mpc.identify.prior_result import PREDICTIONS, Combination, PriorFit, winner
+from hybrid_mpc.identify.prior_result import ENOUGH, PREDICTIONS, Combination, PriorFit, winner
 from hybrid_mpc.identify.simulation import (
     MAX_SUBSTEPS,
     Points,
@@ -46,6 +46,9 @@ Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
 """Lengths of the windows [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
 ones have one optimum, long ones are what counts."""
+FARTHEST = 3.0
+"""Length of the longest windows at most, over the time in which small errors grow a hundredfold: first states would be
+lost in rounding, and no digit of them would be found."""
 APART = 4.0
 """Ratio of one length to the next at most."""
 SLOWEST = 3.0
@@ -71,15 +74,21 @@ DISTINCT, FACTOR = 0.1, 3.0
 differ in one of them at least."""
 GROWN = 10.0, 100.0
 """Growth of a small error over the two shortest windows of a machine that runs away."""
+AWAY = 10.0
+"""Time in which small errors grow a hundredfold, over the longest windows, up to which each length's fit smooths the
+recordings anew: there the nominal prior's states are no start for longer windows."""
 WHOLE = 1.2
 """Ratio of the longest recording to the windows before from which on whole recordings are fitted, where it pays."""
 LONGEST = 20_000
 """Periods of a whole recording at most: longer ones are cut."""
 QUIET = 3.0
 """Ratio of what is left to the sensors' noise up to which windows grow on beyond that."""
+LOOSELY = 1e-2
+"""Weight of a first state's distance from its guess, over its size, beside errors that are counted in spreads: a guess
+by the nominal prior is far off where that is, and errors are a small share of the spread once first states fit."""
 ROUNDING = 1e-12
 """Share that is added to the diagonal of the normal equations: first states that act alike stay solvable."""
-STEEP = 1e5
+STEEP = 1e8
 """Slopes beyond this many spreads of an output per size of a first state or parameter do not count: a run diverges."""
 LOOSE = 30.0
 """Half ranges from its nominal value that cost a parameter as much as a single error of one standard deviation: what
@@ -94,6 +103,9 @@ SHIFT, EXACT = 0.2, 1e-5
 """Shift of a parameter by half as long integration steps that is small enough: standard errors, and share of it."""
 OUTLIERS = 3.0
 """Residuals beyond this many robust standard deviations count by their size, not by its square."""
+COMMON = 0.7
+"""Least robust standard deviation of an output's errors, over their root mean square without gross outliers: where a
+prior is far off for a part of the time, that part is no outlier."""
 GROSS = 10.0
 """Residuals beyond this many are no measurements at the end of a fit; what they weigh before would bias it."""
 SCALINGS = 4
@@ -106,6 +118,8 @@ LARGEST = 1e3
 """Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
 COMPARED = 10
 """Steps at most of the first states alone, where candidates are compared."""
+FOLLOWING = 4
+"""Steps at most of the first states after ``theta``, where it would be rejected without."""
 ALIKE = 1e-3
 """They end when none takes off more than this share of a candidate's cost."""
 DAMPING, WORST = 1e-3, 1e9
@@ -113,6 +127,13 @@ DAMPING, WORST = 1e-3, 1e9
 CONVERGED = 0.01
 """A step that takes off less than this share of a window's mean cost is the last of a fit: what would come after it is
 far less than a standard error."""
+CLOSELY = 1e-4
+"""The same share at the end of a fit: steps along a narrow valley are short."""
+SETTLING, DIGITS, SAME = 12, 1e-9, 1e-9
+"""Steps at most at the end of a fit, which end where none moves a parameter by more than this share of its half range;
+and the share by which rounding may raise the cost there."""
+SHARES = 1.0, 0.5, 0.2, 0.05
+"""Shares of such a step, of which the first that does not raise the cost is taken."""
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
 BEYOND = 0.05
@@ -245,6 +266,11 @@ class OutputWindows:
     known: NDArray[np.bool_]
     group: NDArray[np.int_]
     warm: int = 0
+
+    def beginning(self, periods: int) -> OutputWindows:
+        """The first so many periods of each."""
+        y, w, censored = (v[:, : periods + 1] for v in (self.y, self.w, self.censored))
+        return replace(self, y=y, u=self.u[:, : self.lead + periods + 1], w=w, censored=censored)
 
     def times(self, n: int) -> OutputWindows:
         """The same windows, ``n`` times one behind the other."""
@@ -644,7 +670,8 @@ class _Point:
 
     ``error`` ``(n, (T + 1) n_y)`` is zero where nothing counts, ``slopes`` ``(n, (T + 1) n_y, columns)`` are by
     ``theta`` (or not) and by ``x`` in its sizes. ``scale`` ``(n_y,)`` is what an error of each output is counted in.
-    Errors beyond ``far`` scales are no measurements: they cost the same wherever they are.
+    Errors beyond ``far`` scales are no measurements: they cost the same wherever they are. ``held`` is the weight of
+    what first states move from their guess, in their sizes, beside errors in scales.
     """
 
     theta: Array
@@ -653,6 +680,7 @@ class _Point:
     scale: Array
     error: Array
     slopes: Array
+    held: float
     far: float = math.inf
 
     @property
@@ -707,7 +735,11 @@ class Shooting:
         share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
         for some in unknown.values():  # all at once: windows do not know of each other
             problem = Shooting(self.own, self.windows.times(len(some)), self.sizes, self.spread)
-            point = problem._states(problem.start(np.stack(some), problem.windows.x, "x"))
+            x = problem.windows.x
+            for periods in self._growing(some):
+                begun = Shooting(self.own, problem.windows.beginning(periods), self.sizes, self.spread)
+                x = begun._states(begun.start(np.stack(some), x, "x")).x
+            point = problem._states(problem.start(np.stack(some), x, "x"))
             over = (
                 np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
                 * self.count
@@ -717,6 +749,16 @@ class Shooting:
                 error = float(np.sqrt(np.square(over[part]).sum() / share))
                 self._known[theta.tobytes()] = error, point.x[part]
         return [self._known[theta.tobytes()][0] for theta in thetas]
+
+    def _growing(self, thetas: Sequence[Array]) -> list[int]:
+        """Lengths [periods] over which first states are found one after the other before those of the windows, where
+        small errors grow more than a hundredfold: what is found over one tells where the next half as much begins.
+        """
+        periods, dt = self.windows.y.shape[1] - 1, self.own.dt
+        reach = min(self.own.reach(theta) for theta in thetas) / dt
+        if self.windows.warm or 0.8 * periods <= reach:
+            return []
+        return [int(own) for own in np.arange(max(reach, 4.0), periods, max(0.5 * reach, 2.0))]
 
     def first_states(self, theta: Array) -> Array:
         """First states ``(n, n_x)`` that are best for ``theta``."""
@@ -730,13 +772,48 @@ class Shooting:
         if len(theta):
             point = self._descend(point, min(iterations, FIRST))
             for k in range(SCALINGS):
-                rescaled = replace(point, scale=self._left(point.error))
+                rescaled = replace(point, scale=self._left(point.error), held=1.0)
                 if k and (rescaled.scale > SETTLED * point.scale).all():
                     break
                 point = self._descend(rescaled, iterations)
             if (np.abs(point.error) > GROSS * point.scales).any():
                 point = self._descend(replace(point, far=GROSS), iterations)
         return Fitted(point.theta, *self._covariance(point))
+
+    def settled(self, theta: Array) -> Fitted:
+        """The same fit from near its end on, to the last digits: neither start nor rounding is left in it."""
+        point = self.start(theta, self.first_states(theta), "all")
+        for _ in range(2):
+            rescaled = replace(point, scale=self._left(point.error), held=1.0)
+            point = self._descend(rescaled, ITERATIONS, CLOSELY)
+        if (np.abs(point.error) > GROSS * point.scales).any():
+            point = replace(point, far=GROSS)
+        for _ in range(SETTLING):
+            point = replace(point, scale=self._left(point.error))
+            normal = self._behind(point) if self.windows.warm else self._normal(point)
+            step, moved, _ = self._step(normal, 0.0, point.theta)
+            for share in SHARES:
+                trial = self._along(point, share * step, share * moved)
+                if better := self._cost(trial) <= self._cost(point) * (1 + SAME):
+                    break
+            if not better:
+                break
+            far, point = np.abs(trial.theta - point.theta), trial
+            if (far <= DIGITS * self.own.half).all():
+                break
+        return Fitted(point.theta, *self._covariance(point))
+
+    def _along(self, point: _Point, step: Array, moved: Array) -> _Point:
+        """The point a step of ``theta`` and first states further, these corrected where the cost would rise without."""
+        theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
+        x = point.x + moved[self.windows.group] * self.sizes
+        if self.windows.warm:
+            x = self._states(self._at(point, theta, x, "x")).x
+        trial, cost = self._at(point, theta, x, "all"), self._cost(point)
+        if self._cost(trial) <= cost * (1 + SAME) or self.windows.warm:
+            return trial
+        own = self._followed(point, trial)
+        return self._at(point, theta, own.x, "all") if self._cost(own) <= cost * (1 + SAME) else trial
 
     def forget(self) -> None:
         """Forget the first states that were found with other integration steps."""
@@ -745,7 +822,7 @@ class Shooting:
     def shift(self, theta: Array, substeps: int) -> Array:
         """How far a Gauss-Newton step moves ``theta`` where the outputs are those of so many sub-steps a period."""
         point = self.start(theta, self.first_states(theta), "all")
-        point = replace(point, scale=self._left(point.error))
+        point = replace(point, scale=self._left(point.error), held=1.0)
         finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
         moved = [
             self._step(self._behind(p) if self.windows.warm else self._normal(p), 0.0, theta)[0]
@@ -757,7 +834,7 @@ class Shooting:
         """Errors at ``theta`` from ``x``, each output's over its spread."""
         nothing = np.zeros(0)
         substeps = max(self.own.substeps(one) for one in np.atleast_2d(theta))
-        empty = _Point(theta, x, substeps, self.spread, nothing, nothing)
+        empty = _Point(theta, x, substeps, self.spread, nothing, nothing, LOOSELY**2)
         return self._at(empty, theta, x, slopes)
 
     def _at(self, before: _Point, theta: Array, x: Array, slopes: Slopes) -> _Point:
@@ -798,8 +875,8 @@ class Shooting:
         return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
 
     def _moved(self, point: _Point) -> Array:
-        """What first states moved from their guess, in their sizes."""
-        return np.asarray((point.x - self.windows.x) / self.sizes)
+        """What first states moved from their guess, in their sizes, by the root of its weight."""
+        return np.asarray(math.sqrt(point.held) * (point.x - self.windows.x) / self.sizes)
 
     def _grouped(self, values: Array) -> Array:
         """Sums over the windows of each group."""
@@ -815,14 +892,14 @@ class Shooting:
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
         whole = np.array([float(np.sqrt(np.mean(within(v) ** 2))) if len(v) else 0.0 for v in left])
-        robust = np.maximum(robust, 0.1 * whole)  # where most samples are met exactly, the rest is no outlier
+        robust = np.maximum(robust, COMMON * whole)  # errors that are common are the prior's, and no outliers
         return np.maximum(robust, 1e-9 * self.spread)
 
-    def _states(self, point: _Point) -> _Point:
+    def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
         """First states at a ``theta``, each window by itself: with a damping of its own, until all have settled."""
         cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
         damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
-        for _ in range(COMPARED):
+        for _ in range(steps):
             xx, _, _, gx, _ = self._normal(point)
             moved = -np.linalg.solve(xx * (1 + damping * eye), gx[..., None])[..., 0]
             trial = self._at(point, point.theta, point.x + moved[group] * self.sizes, "x")
@@ -837,21 +914,38 @@ class Shooting:
                 break
         return point
 
-    def _descend(self, point: _Point, iterations: int) -> _Point:
-        """Steps of Levenberg and Marquardt, of ``theta`` with the first states."""
+    def _followed(self, point: _Point, trial: _Point) -> _Point:
+        """Another ``theta`` with first states that suit it: from the trial's, or from those before, in each window."""
+        moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
+        still = self._at(point, trial.theta, point.x, "x")
+        better = self._costs(still) < self._costs(moved)
+        return self._states(moved.where(better[self.windows.group], still), FOLLOWING)
+
+    def _descend(self, point: _Point, iterations: int, enough: float = CONVERGED) -> _Point:
+        """Steps of Levenberg and Marquardt, of ``theta`` with the first states, until one takes off less than a share
+        ``enough`` of a window's mean cost.
+        """
         damping, cost, n = DAMPING, self._cost(point), len(point.x)
         for _ in range(iterations):
-            better = False
+            better = followed = False
             normal = self._behind(point) if self.windows.warm else self._normal(point)
             while not better and damping < WORST:
                 step, moved, promised = self._step(normal, damping, point.theta)
-                last = promised < CONVERGED * cost / n
+                last = promised < enough * cost / n
                 theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
                 x = point.x + moved[self.windows.group] * self.sizes
                 if self.windows.warm:  # the warm-up tells the first states of every theta
                     x = self._states(self._at(point, theta, x, "x")).x
                 trial = self._at(point, theta, x, "all")
                 new = self._cost(trial)
+                if not (
+                    new < cost or last or followed or self.windows.warm
+                ):  # first states may not have followed
+                    followed = True
+                    own = self._followed(point, trial)
+                    if self._cost(own) < cost:
+                        trial = self._at(point, theta, own.x, "all")
+                        new = self._cost(trial)
                 better = new < cost
                 damping *= 0.2 if better else 5.0
                 if last:
@@ -859,7 +953,7 @@ class Shooting:
             if not better:
                 break
             gain, point, cost = cost - new, trial, new
-            if last or gain < CONVERGED * cost / n:
+            if last or gain < enough * cost / n:
                 break
         return point
 
@@ -876,9 +970,10 @@ class Shooting:
         every = rows.swapaxes(1, 2) @ rows
         t, x = slice(0, -1 - n_x), slice(-1 - n_x, -1)
         moved, n = self._moved(point) / self.members[:, None], rows.shape[-1] - 1 - n_x
+        moved = math.sqrt(point.held) * moved
         pull, from_nominal = self._pull(point, n)
         return (
-            _regular(self._grouped(every[:, x, x])), self._grouped(every[:, x, t]),
+            _regular(self._grouped(every[:, x, x]), point.held), self._grouped(every[:, x, t]),
             every[:, t, t].sum(axis=0) + pull, self._grouped(every[:, x, -1] + moved),
             every[:, t, -1].sum(axis=0) + from_nominal,
         )  # fmt: skip
@@ -897,14 +992,14 @@ class Shooting:
         rows, n_x = self._weighted(point), point.x.shape[1]
         b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
         at = (a * self.tell[:, None]).swapaxes(1, 2)
-        xx = _regular(self._grouped(at @ a))
+        xx = _regular(self._grouped(at @ a), point.held)
         follow = np.linalg.solve(xx, self._grouped(at @ np.concatenate([b, error], axis=-1)))
         left = np.concatenate([b, error], axis=-1) - a @ follow[self.windows.group]
         left *= self.count[:, None]
         taken = (
             0.0
             if self.windows.warm
-            else float(np.trace(np.eye(n_x) - np.linalg.inv(xx), axis1=1, axis2=2).sum())
+            else float(np.trace(np.eye(n_x) - point.held * np.linalg.inv(xx), axis1=1, axis2=2).sum())
         )
         return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64), taken
 
@@ -920,8 +1015,8 @@ class Shooting:
         )  # fmt: skip
 
     def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
-        """Step of ``theta``, of which those at a bound that would leave it rest, and of the first states by groups; and
-        how far it takes the cost down to first order.
+        """Step of ``theta`` within its bounds, and of the first states by groups, which follow it; and how far it takes
+        the cost down to first order.
         """
         xx, xt, tt, gx, gt = normal
         reduced, slope = tt, gt
@@ -932,17 +1027,10 @@ class Shooting:
         if not self.windows.warm:
             reduced = tt - (xt.swapaxes(1, 2) @ by_theta).sum(axis=0)
             slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
-        step, free = np.zeros(len(theta)), np.arange(len(theta))
-        reduced = reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30))
-        for _ in range(len(theta) + 1):
-            step[:] = 0.0
-            if len(free):
-                step[free] = -np.linalg.lstsq(reduced[np.ix_(free, free)], slope[free], rcond=1e-14)[0]
-            low = (theta[free] <= self.own.lower[free]) & (step[free] < 0)
-            high = (theta[free] >= self.own.upper[free]) & (step[free] > 0)
-            if not (low | high).any():
-                break
-            free = free[~(low | high)]
+        step = _bounded(
+            reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30)), slope,
+            self.own.lower - theta, self.own.upper - theta,
+        )  # fmt: skip
         moved = -own - (by_theta @ step[:, None])[..., 0]
         of_states = 0.0 if self.windows.warm else float(np.sum(gx * moved))
         return step, moved, -2.0 * (float(gt @ step) + of_states)
@@ -951,7 +1039,8 @@ class Shooting:
         """Covariance of ``theta``, and what the windows do not tell.
 
         It follows from the scatter of the slopes of ``CLUSTERS`` parts of the windows at least, since errors within one
-        are no white noise, and from what holds ``theta`` at the nominal values; none is larger than a half range.
+        are no white noise, and from what holds ``theta`` at the nominal values; none is smaller than white noise of
+        that size would make it, since so few parts tell their scatter roughly, and none is larger than a half range.
 
         Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters; Huber
         and Ronchetti, *Robust Statistics* (2009), section 7.6, of the robust loss.
@@ -979,6 +1068,10 @@ class Shooting:
         inverse = 1.0 / (np.square(told) + LOOSE**-2)
         covariance = back @ ((middle + LOOSE**-2 * np.eye(k)) * np.outer(inverse, inverse)) @ back.T
         covariance = 0.5 * (covariance + covariance.T)
+        white = float(np.square(error).sum()) / max(left, 1.0)  # variance of errors that are white, weighed
+        least = np.square(back) @ (inverse * inverse * (white * np.square(told) + LOOSE**-2))
+        short = np.sqrt(np.maximum(least / np.maximum(np.diag(covariance), 1e-300), 1.0))
+        covariance = covariance * np.outer(short, short)
         values, directions = np.linalg.eigh(covariance / np.outer(half, half))
         untold = directions[:, values >= UNTOLD**2].T
         found = tuple(_combination(self.own, point.theta, covariance, one) for one in untold)
@@ -986,10 +1079,31 @@ class Shooting:
         return bounded, tuple({one.parameters: one for one in found}.values())
 
 
-def _regular(xx: Array) -> Array:
+def _bounded(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
+    """Step ``(n,)`` to the least of ``s' matrix s / 2 + slope' s`` between ``low <= 0`` and ``high >= 0``.
+
+    Of the components that would go beyond, the first one to meet its bound is held there, and the others are solved for
+    anew: held together, two that lie along a valley would both rest in a corner. None is let go of again.
+    """
+    step, free = np.zeros(len(slope)), np.arange(len(slope))
+    held = np.zeros(len(slope), dtype=bool)
+    for _ in range(len(slope)):
+        free = np.flatnonzero(~held)
+        right = slope[free] + matrix[np.ix_(free, np.flatnonzero(held))] @ step[held]
+        step[free] = -np.linalg.lstsq(matrix[np.ix_(free, free)], right, rcond=1e-14)[0]
+        ends = np.clip(step, low, high)
+        beyond = free[ends[free] != step[free]]
+        if not len(beyond):
+            break
+        first = beyond[np.lexsort((-np.abs(step - ends)[beyond], (ends[beyond] / step[beyond])))[0]]
+        held[first], step[first] = True, ends[first]
+    return step
+
+
+def _regular(xx: Array, held: float) -> Array:
     """Normal matrices of first states ``(n, n_x, n_x)`` with what holds these at their guess."""
     eye = np.eye(xx.shape[-1])
-    return np.asarray(xx * (1.0 + ROUNDING * eye) + eye)
+    return np.asarray(xx * (1.0 + ROUNDING * eye) + held * eye)
 
 
 def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Array) -> Combination:
@@ -1114,7 +1228,7 @@ def fit_prior(
         return [problem_of(part, periods) for part in guesses if _longest(part) > (periods or 2) + fit.lead]
 
     periods, scoring = lengths[-1], parts_of(lengths[-1])
-    found: list[tuple[str, list[Fitted]]] = []
+    found: list[tuple[str, list[Fitted], Shooting]] = []
     if len(fit.nominal):
         on_progress(1, total, "several starts")
         far = max(p for p in lengths if p == lengths[0] or 0.8 * p * dt <= fit.reach(fit.nominal))
@@ -1122,27 +1236,42 @@ def fit_prior(
         begun = _starts(fit, short, long, start)
         followed, problem = begun, short
         for i, own in enumerate(lengths):
-            if i and 0.8 * own * dt > fit.reach(followed[0]) and not _quiet(problem, followed[0], noise):
+            beyond = i > 0 and 0.8 * own * dt > fit.reach(followed[0])
+            if beyond and not _quiet(problem, followed[0], noise):
                 break
-            name, periods, problem = f"free runs of {own * dt:.3g} s", own, problem_of(guesses[0], own)
+            name, longer = f"free runs of {own * dt:.3g} s", problem_of(guesses[0], own)
             on_progress(2 + i, total, name)
             every_start = [fit.nominal, *begun, *followed]  # short windows may have led astray
-            solved = [problem.solve(one) for one in _promising(fit, problem, every_start)]
+            solved = [longer.solve(one) for one in _promising(fit, longer, every_start)]
+            if beyond and not any(_quiet(longer, one.theta, noise) for one in solved):
+                break  # first states that explain so long windows were not found
+            periods, problem = own, longer
             if own == lengths[-1]:
                 solved += _further(fit, problem, solved)
             scoring = parts_of(own) or [problem]
             errors = _errors_of([one.theta for one in solved], scoring)
             solved = [solved[k] for k in np.argsort(errors, kind="stable")]
-            found.append((name, solved))
+            found.append((name, solved, problem))
             followed = [one.theta for one in solved]
+            if fit.reach(followed[0]) < AWAY * lengths[-1] * dt:
+                again = rough_smoother(
+                    make(fit.values(followed[0])), shifted(train, fit.delay(followed[0])), dt, time_unit=unit
+                )
+                again = replace(again, substeps=fit.substeps(followed[0]))
+                every = with_states([*train, *valid], again, fit.delay(followed[0]))
+                guesses = every[: len(train)], every[len(train) :]
         whole = _longest(guesses[0]) - fit.lead - 1
         more = whole > WHOLE * periods and 0.8 * min(whole, LONGEST) * dt < fit.reach(followed[0])
         if more and _quiet(problem, followed[0], noise):  # each window spends some numbers on its first state
             on_progress(total - 1, total, "whole recordings")
-            problem, scoring = problem_of(guesses[0], None), parts_of(None)
-            found.append(("whole recordings", [problem.solve(followed[0])]))
+            longer = problem_of(guesses[0], None)
+            solution = longer.solve(followed[0])
+            if _quiet(longer, solution.theta, noise):
+                problem, scoring = longer, parts_of(None)
+                found.append(("whole recordings", [solution], longer))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ()))]
-    for name, solved in found:  # of each length what is best over the longest windows
+    problems = {}
+    for name, solved, problems[name] in found:  # of each length what is best over the longest windows
         errors = _errors_of([one.theta for one in solved], scoring)
         candidates.append((name, solved[int(np.argmin(errors))]))
     scores = _errors_of([c.theta for _, c in candidates], scoring)
@@ -1156,9 +1285,12 @@ def fit_prior(
         fitted, substeps = make(fit.values(found.theta)), fit.substeps(found.theta)
         return fit_smoother(fitted, acting, dt, time_unit=unit, substeps=substeps)
 
-    chosen = candidates[winner([name for name, _ in candidates], scores)][1]
+    name, chosen = candidates[winner([name for name, _ in candidates], scores)]
     if len(chosen.covariance):
-        chosen = _with_enough_substeps(fit, problem, chosen)
+        chosen = _with_enough_substeps(fit, problems[name], chosen)
+        settled = problems[name].settled(chosen.theta)
+        before, after = problems[name].explained([chosen.theta, settled.theta])
+        chosen = settled if after <= ENOUGH * before else chosen  # weights that follow may favour one output
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
     answered = feedback(acting, smoother.prediction_errors(acting, smoother.prior.p[None])[1])
@@ -1317,7 +1449,7 @@ def _lengths(
         wanted.append(wanted[-1] * APART)
     wanted.append(length)
     grown = [reach * math.log(own) / math.log(GROWN[-1]) for own in GROWN]
-    slow = [own for own in wanted if own > 1.5 * grown[-1]]
+    slow = sorted({min(own, FARTHEST * grown[-1]) for own in wanted if own > 1.5 * grown[-1]})
     if slow:
         wanted = [*grown, *slow]
     fitting = [p for p in (scales.periods(own, dt, 2) for own in wanted) if p <= longest]

@@ -25,6 +25,9 @@ from nn_export.vectorised import vectorised
 Array = NDArray[np.float64]
 MAX_SUBSTEPS = 20
 """A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
+USUALLY = 0.98
+"""Share of the samples at which a prior must not be too stiff: an edge that is touched now and then, such as the root
+of an empty tank's level, is integrated as well as can be."""
 VISITED = 200
 """Samples of the recordings that are asked how stiff the prior is there, beside the outermost ones."""
 Points: TypeAlias = tuple[Array, Array, Array]
@@ -190,7 +193,8 @@ def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> 
     """Sub-steps a period that keep every eigenvalue of the prior within 1 / sub-step: at rest, and at points.
 
     Rest is the operating point, or else the middle of the signals' ranges (:func:`rest_of`). Points are where the
-    machine was (:func:`visited`); modes that grow there do not count: no number of sub-steps holds them. Runge-Kutta
+    machine was (:func:`visited`); modes that grow there do not count: no number of sub-steps holds them. A few points
+    that would need more than ``MAX_SUBSTEPS`` get these. Runge-Kutta
     of order 4 is stable up to 2.8 and accurate to per cents of the fast mode at 1.
 
     Raises:
@@ -201,8 +205,11 @@ def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> 
     if points is None or not len(points[0]):
         return substeps
     modes = np.linalg.eigvals(_flow_slopes(prior, points))
-    rate = float(np.abs(modes[modes.real <= 0]).max(initial=0.0))
-    return max(substeps, _substeps(rate, dt, name, "where the recordings go"))
+    fastest = np.where(modes.real <= 0, np.abs(modes), 0.0).max(axis=1, initial=0.0)
+    if not len(fastest):
+        return substeps
+    usual = _substeps(float(np.quantile(fastest, USUALLY)), dt, name, "where the recordings go")
+    return max(substeps, usual, min(MAX_SUBSTEPS, math.ceil(float(fastest.max()) * dt)))
 
 
 def growth_rate(prior: Prior, points: Points) -> float:

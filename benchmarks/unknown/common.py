@@ -1,0 +1,108 @@
+"""What all machines share: how a plant is run and recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc import DataSpec, Prior
+
+Array = NDArray[np.float64]
+Rates = Callable[[Array, Array, float], Array]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine as a new user has it: a prior, a data specification and recordings of a plant that differs from both.
+
+    Args:
+        name: Its name.
+        prior: The prior as written by the user.
+        spec: How recordings are read.
+        record: ``seed -> columns (n, m)`` of a recording.
+        header: Names of the columns.
+        length: Length [s] of the free runs that are compared.
+        truth: The plant's values of the prior's parameters, as far as there are such.
+        seen: Whether the fit was changed with this machine known.
+        closed: Whether it is unstable or recorded in closed loop.
+    """
+
+    name: str
+    prior: type[Prior]
+    spec: DataSpec
+    record: Callable[[int], Array]
+    header: str
+    length: float
+    truth: Mapping[str, float]
+    seen: bool
+    closed: bool = False
+
+    def write(self, folder: Path, runs: int = 4) -> list[Path]:
+        """Recordings as CSV files; the last ones are held out."""
+        folder.mkdir(parents=True, exist_ok=True)
+        files = []
+        for seed in range(runs):
+            files.append(folder / f"{self.name}_{seed + 1}.csv")
+            rows = self.record(seed)
+            with files[-1].open("w") as file:
+                file.write(self.header + "\n")
+                for row in rows:  # a blank cell is a missing sample
+                    file.write(",".join("" if np.isnan(v) else f"{v:.7g}" for v in row) + "\n")
+        return files
+
+
+def run(
+    rates: Rates,
+    x: Array,
+    control: Callable[[int, Array], Array],
+    measure: Callable[[Array], Array],
+    dt: float,
+    samples: int,
+    steps: int = 4,
+) -> tuple[Array, Array, Array]:
+    """Times, inputs and measured outputs of a plant ``rates(x, u, t)`` under ``control(k, y)``; RK4."""
+    t, h = dt * np.arange(samples), dt / steps
+    inputs, outputs = [], []
+    for k in range(samples):
+        y = measure(x)
+        u = np.atleast_1d(control(k, y))
+        inputs.append(u)
+        outputs.append(y)
+        for i in range(steps):
+            now = t[k] + i * h
+            k1 = rates(x, u, now)
+            k2 = rates(x + h / 2 * k1, u, now + h / 2)
+            k3 = rates(x + h / 2 * k2, u, now + h / 2)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3, u, now + h))
+    return t, np.array(inputs), np.array(outputs)
+
+
+def quantised(y: Array, steps: float | Array) -> Array:
+    """What a converter with such steps gives."""
+    return np.asarray(np.round(y / steps) * steps)
+
+
+def drop_outs(y: Array, rng: np.random.Generator, share: float, longest: int = 5) -> Array:
+    """Outputs with a share of their samples missing, some in a row."""
+    y = y.copy()
+    for column in y.T:
+        for start in rng.integers(0, len(y), round(share * len(y) / longest * 2)):
+            column[start : start + int(rng.integers(1, longest + 1))] = np.nan
+    return y
+
+
+def levels(
+    rng: np.random.Generator, samples: int, low: float, high: float, shortest: int, longest: int
+) -> Array:
+    """Steps between random levels that are held for random times."""
+    out = np.zeros(samples)
+    k = 0
+    while k < samples:
+        n = int(rng.integers(shortest, longest + 1))
+        out[k : k + n] = rng.uniform(low, high)
+        k += n
+    return out
