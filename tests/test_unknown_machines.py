@@ -40,10 +40,10 @@ def test_the_independent_fit_has_the_true_parameters():
     runs = [machine.record(40 + i)[0] for i in range(4)]
     spread = np.std(np.concatenate([t.y for t in runs]), axis=0)
     model = Runs(machine.prior(), machine.dt, spread)
-    found = fit(model, runs[:3], 100, machine.prior().values, 6)
+    found = fit(model, runs[:3], 99, machine.prior().values, 6)
     for key, value in machine.truth.items():
         assert found[key] == pytest.approx(value, rel=0.03), key
-    errors = free_run_errors(model, cut(machine.prior(), runs[3:], 100, 4), [found, machine.truth])
+    errors = free_run_errors(model, cut(machine.prior(), runs[3:], 99, 4), [found, machine.truth])
     assert errors[0] == pytest.approx(errors[1], rel=0.05)
     assert errors[1] == pytest.approx(machine.noise / spread[0], rel=0.2)
 
