@@ -97,6 +97,7 @@ def held(values: Array, first: Array) -> Array:
 def _function_of(reference: Preview | ArrayLike | None, standing: Array) -> Preview:
     """The reference as a function of time, also where a set-point or nothing was given."""
     if callable(reference):
+        check_function(reference, "reference")
         return reference
     goal = standing if reference is None else sampled(reference, standing.shape, "the reference")
     return lambda t: np.tile(goal, (len(t), 1))

@@ -193,8 +193,11 @@ def _disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview 
     """
     if not model.n_w and w is not None:
         raise InputError(f"w: measured disturbances given, model {model.name} has none")
-    if callable(w) or not model.n_w:
-        return w if callable(w) else None
+    if not model.n_w:
+        return None
+    if callable(w):
+        check_function(w, "w")
+        return w
     constant = model.w if w is None else vector(w, model.n_w, "w")
     return lambda t: np.tile(constant, (len(t), 1))
 

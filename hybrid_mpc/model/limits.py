@@ -139,11 +139,19 @@ def check_part(value: object, name: str, what: str, *needed: str) -> None:
 
 
 def check_function(value: object, name: str) -> None:
-    """Refuse what cannot be called.
+    """Refuse what cannot be called, and a class, whose instances would be taken for values.
 
     Raises:
         InputError: Naming the argument.
+
+    Example:
+        >>> check_function(float, "weight")
+        Traceback (most recent call last):
+        ...
+        hybrid_mpc.errors.InputError: weight: a function is needed, got the class float
     """
+    if isinstance(value, type):
+        raise InputError(f"{name}: a function is needed, got the class {value.__name__}")
     if not callable(value):
         raise InputError(f"{name}: a function is needed, got {type(value).__name__}")
 

@@ -156,14 +156,21 @@ def test_what_is_no_part_of_a_loop_is_refused_when_it_is_made(make, part):
     [
         (loop_of, "weight"),
         (loop_of, "now"),
+        (runner_of, "weight"),
         *((runner_of, name) for name in FUNCTIONS[2:6]),
         (runner_of, "clock"),
     ],
 )
 def test_what_cannot_be_called_is_refused_before_the_machine_moves(make, name):
-    for value in [np.nan, 3, "abc", {}, [1.0], object(), np.zeros(5)]:
+    for value in [np.nan, 3, "abc", {}, [1.0], object(), np.zeros(5), int]:
         with pytest.raises(InputError):
             make(**{name: value})
+
+
+@pytest.mark.parametrize("make", [loop_of, runner_of])
+def test_a_class_is_no_reference(make):
+    with pytest.raises(InputError):
+        make(reference=int)
 
 
 @pytest.mark.parametrize("name", ["input_delay", "sensor_delay"])
