@@ -1,4 +1,4 @@
-"""``hybrid-mpc new``: a scenario to begin with, written from a recording."""
+"""``hybrid-mpc new``: a scenario to begin with, written from recordings."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hybrid_mpc.cli.options import DisturbanceColumns, InputColumns, OutputColum
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc new my_machine.py --data monday.csv\n\n"
+    "  hybrid-mpc new my_machine.py --data monday.csv --data tuesday.csv\n\n"
     "  hybrid-mpc new my_machine.py --data monday.csv --input-column u --output-column level "
     "--disturbance-column inflow"
 )
@@ -20,17 +21,17 @@ EXAMPLES = (
 
 def new(
     path: Annotated[Path, typer.Argument(metavar="FILE.py", help="Python file to make.")],
-    data: Annotated[Path, typer.Option(help="A recording of the machine.")],
+    data: Annotated[list[Path], typer.Option(help="A recording of the machine; give it once for each file.")],
     time_column: TimeColumn = "",
     input_column: InputColumns = None,
     output_column: OutputColumns = None,
     disturbance_column: DisturbanceColumns = None,
 ) -> None:
-    """Write a scenario for a recording: its columns, sampling, ranges, units, and a first prior of linear lags.
+    """Write a scenario for recordings: their columns, sampling, ranges, units, and a first prior of linear lags.
 
     What only you can know is marked TODO; 'hybrid-mpc check' lists what is left.
     """
-    from hybrid_mpc.job.new import left_to_decide, printable, write_scenario
+    from hybrid_mpc.job.new import KINDS, horizon_of, left_to_decide, loop_lines, printable, write_scenario
 
     named = (tuple(columns or ()) for columns in (input_column, output_column, disturbance_column))
     inputs, outputs, disturbances = named
@@ -43,11 +44,18 @@ def new(
     ]
     if draft.disturbances:
         lines.append(f"measured disturbances: {', '.join(c.full for c in draft.disturbances)}")
+    if draft.set_points:
+        lines.append(f"set-points, not used: {', '.join(c.full for c in draft.set_points)}")
+    lines += [
+        f"  to decide: is {name} {KINDS[draft.verdicts[name].kind]}? {reason}"
+        for name, reason in draft.unsure.items()
+        if draft.verdicts[name].kind in KINDS
+    ]
+    lines += [f"  to decide: {line}" for line in loop_lines(draft)]
+    lines.append(f"horizon: {horizon_of(draft)[1]}")
     lines += [f"not used: {name} ({reason})" for name, reason in draft.left_out.items()]
     count = len(left_to_decide(path))
-    scenario, recording = shlex.quote(str(path)), shlex.quote(str(data))
-    lines.append(
-        f"{path}: {count} lines are left to decide. Next: hybrid-mpc check {scenario} --data {recording}"
-    )
+    words = [shlex.quote(str(path)), *(f"--data {shlex.quote(str(file))}" for file in data)]
+    lines.append(f"{path}: {count} lines are left to decide. Next: hybrid-mpc check {' '.join(words)}")
     for line in lines:
         print(printable(line))

@@ -1,4 +1,4 @@
-"""What a column's name says of it: that it is the time, or that it counts samples. Then it is no signal.
+"""What a column's name says of it: that it is the time, that it counts samples, its unit and its role.
 
 Names are compared in small letters, without accents, word by word; ``camelCase``, ``snake_case`` and blanks separate
 words. Names that may say it and may say something else (``T``, ``n``, ``valve_time``) are decided by their numbers.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 from hybrid_mpc.data.files import name_and_unit
@@ -141,3 +142,175 @@ def _of(words: list[str], first: str, unit: str, behind: bool) -> Said:
     if seen & (TIME - {"t"}) or (len(words) == 1 and seen & PERHAPS) or words == ["x", "value"]:
         return Said("time", True, unit, seconds, is_date)
     return Said("count", True) if len(words) == 1 and seen & COUNT_PERHAPS and not unit else Said()
+
+
+# Roles
+
+
+Role = Literal[
+    "set-point", "flag", "label", "command", "actuator", "answer", "disturbance", "measured", "quantity", ""
+]
+"""What a column is by its name: ``command`` is an input for certain, ``actuator`` probably; ``answer`` is what an
+actuator's sensor shows, ``label`` an entry about the recording (a fault, a correction), ``measured`` what a sensor
+shows, ``quantity`` something that machines reach and surroundings have, too."""
+SET_POINT = _words(
+    "ref refs reference references referencia referencias referenz set setpoint setpoints setpt setvalue sp target "
+    "targets desired des goal goals wanted soll sollwert fuhrungsgrosse consigne consigna riferimento demand planned "
+)
+"""Words for what a machine is asked to reach."""
+FLAG = _words(
+    "flag enable enabled enabling status alarm valid invalid active mode trigger event marker bool boolean ok ready "
+    "fehler freigabe moving running busy"
+)
+"""Words for switches of the recording or the controller."""
+LABEL = _words(
+    "feedforward ff offset fault faults label anomaly correction bias calibration error err residual residuum deviation"
+)
+"""Words for what somebody computed, noted down, or adds to a command."""
+COMMAND = _words(
+    "u command commands cmd commanded control controle controller ctrl input inputs eingang stellgrosse stellwert "
+    "steuerung manipulated mv op actuation actuator excitation entrada entree commande comando mando pwm duty dac"
+)
+"""Words for what somebody commands."""
+ACTUATOR = _words(
+    "pump valve heater heating cooler cooling coolant voltage volt volts torque tau force thrust throttle "
+    "steering steer brake fan pumpe ventil heizung spannung drehmoment moment kraft bomba valvula tensao "
+    "tension chauffage pompe vanne power burner damper rudder elevator aileron propeller rotor"
+)
+"""Words for what moves a machine."""
+DISTURBANCE = _words(
+    "ambient outside outdoor environment umgebung aussen weather wind disturbance disturbances disturb supply battery "
+    "mains reservoir storung sun solar radiation irradiance push kick"
+)
+"""Words for what acts on a machine and is not commanded."""
+MEASURED = _words(
+    "output outputs ausgang saida sortie salida measured measure measurement meas mes actual ist istwert sensor pv "
+    "feedback fb encoder enc tacho gyro imu"
+)
+"""Words for what a sensor shows, whatever it measures."""
+QUANTITY = _words(
+    "temperature temp temperatur temperatura level fullstand niveau nivel position pos angle ang winkel angulo "
+    "speed vel velocity geschwindigkeit drehzahl velocidade rate pressure druck concentration height altitude "
+    "heading yaw pitch roll theta phi psi alpha beta gamma q dq qd x z omega distance displacement "
+    "acceleration acc accel hohe weg pendulum cart"
+)
+"""Words for what machines reach."""
+ANGLES = ("rad", "mrad", "deg", "°", "rev", "turn")
+"""Units in which a column may be an angle that jumps by full turns."""
+DRIVING_UNITS = frozenset(
+    ("V", "mV", "kV", "%", "N m", "Nm", "mNm", "Ncm", "kNm", "N", "kN", "mN", "W", "kW")
+)
+"""Units in which machines are mostly driven."""
+REACHED_UNITS = frozenset((
+    "rad", "deg", "°", "mrad", "rev", "turn", "m", "mm", "cm", "km", "K", "degC", "°C", "degF", "rad/s", "deg/s",
+    "m/s", "mm/s", "cm/s", "km/h", "rpm", "rad/s^2", "deg/s^2", "m/s^2", "mol/l",
+))  # fmt: skip
+"""Units in which machines are mostly measured."""
+ENDINGS = {
+    "deg": "deg", "rad": "rad", "mrad": "mrad", "rpm": "rpm", "degc": "degC", "celsius": "degC", "degf": "degF",
+    "kelvin": "K", "pct": "%", "percent": "%", "mm": "mm", "cm": "cm", "km": "km", "mps": "m/s", "kmh": "km/h",
+    "kph": "km/h", "hz": "Hz", "khz": "kHz", "nm": "N m", "mnm": "mNm", "ncm": "Ncm", "bar": "bar",
+    "mbar": "mbar", "pa": "Pa", "kpa": "kPa", "hpa": "hPa", "psi": "psi", "mv": "mV", "ma": "mA", "kw": "kW",
+    "kg": "kg", "lpm": "l/min", "gpm": "gpm", "ppm": "ppm", "volt": "V", "volts": "V", "amp": "A", "amps": "A",
+    "watt": "W", "watts": "W", "newton": "N", "newtons": "N", "rad s": "rad/s", "rads": "rad/s", "deg s": "deg/s",
+    "degs": "deg/s", "m s": "m/s", "mm s": "mm/s", "cm s": "cm/s", "km h": "km/h", "rad s2": "rad/s^2",
+    "deg s2": "deg/s^2", "m s2": "m/s^2", "l min": "l/min", "l s": "l/s", "l h": "l/h", "ml min": "ml/min",
+    "m3 h": "m^3/h", "m3 s": "m^3/s", "kg h": "kg/h", "kg s": "kg/s", "kg min": "kg/min", "g s": "g/s",
+    "mol l": "mol/l", "w m2": "W/m^2",
+}  # fmt: skip
+"""Units by the last words of a name, in small letters."""
+LETTERS = {"K": "K", "V": "V", "A": "A", "N": "N", "W": "W", "m": "m"}
+"""Units of a single letter, which may be an index as well: the letter as it is written."""
+
+
+class Ending(NamedTuple):
+    """The unit at the end of a column's name, empty if there is none; whether it may be something else."""
+
+    unit: str = ""
+    perhaps: bool = False
+
+
+def _written(name: str, camel: bool) -> list[str]:
+    """The words of a name as they are written; ``camel``: a capital letter within one begins another."""
+    text = unicodedata.normalize("NFKC", name)
+    text = re.sub(r"(?<=[^\W\d_A-Z])(?=[A-Z])", " ", text) if camel else text
+    return [word for word in re.split(r"[\W_]+", text) if word and word.casefold() != "per"]
+
+
+def unit_behind(name: str, small: bool = False) -> Ending:
+    """The unit that a name ends with, ``_deg``, ``_rad_s``, ``_pct``; a single letter (``_K``) may be an index.
+
+    ``small``: letters may be small ones, ``_v``, where other names of the recording end with units, too.
+
+    Example:
+        >>> unit_behind("angle_deg").unit, unit_behind("vel_rad_s").unit, unit_behind("T_K")
+        ('deg', 'rad/s', Ending(unit='K', perhaps=True))
+        >>> unit_behind("deg"), unit_behind("level")
+        (Ending(unit='', perhaps=False), Ending(unit='', perhaps=False))
+    """
+    ending = _parted(name)[1]
+    if ending.unit or not small:
+        return ending
+    words = _written(name, camel=False)
+    letter = words[-1].upper() if len(words) > 1 and len(words[-1]) == 1 and words[-1].islower() else ""
+    return Ending(LETTERS[letter], True) if letter in LETTERS else ending
+
+
+def _parted(name: str) -> tuple[list[str], Ending]:
+    """The words of a name before its unit, and the unit; first as blanks and underscores part them (``_degC``)."""
+    for camel in (False, True):
+        words = _written(name, camel)
+        for count in (2, 1):
+            if len(words) > count and (unit := ENDINGS.get(" ".join(words[-count:]).casefold())):
+                return _written(" ".join(words[:-count]), camel=True), Ending(unit)
+        if len(words) > 1 and words[-1] in LETTERS:
+            return _written(" ".join(words[:-1]), camel=True), Ending(LETTERS[words[-1]], True)
+    return words, Ending()
+
+
+def role_said_by(column: str, unit: str = "", switches: bool = False) -> Role:
+    """What a column's words say that it is; empty where they say nothing, or two things.
+
+    Words for a function (a set-point, a command) decide before words for a quantity. A ``unit`` only contradicts:
+    a heater in degC is its temperature. Words for flags count where the numbers are a few whole ones, ``switches``.
+
+    Example:
+        >>> role_said_by("Referencia"), role_said_by("tau1_command_nm"), role_said_by("tau_meas_Nm", "N m")
+        ('set-point', 'command', 'answer')
+        >>> role_said_by("heater", "%"), role_said_by("steering", "rad"), role_said_by("level", "V")
+        ('actuator', '', 'quantity')
+    """
+    written = _parted(name_and_unit(column)[0])[0]
+    words = [re.sub(r"(?<=.)\d+$", "", _plain(word)) for word in written]
+    whole = frozenset(words) | {"".join(pair) for pair in pairwise(words)}
+    if switches and whole & FLAG:
+        return "flag"
+    if whole & SET_POINT:
+        return "set-point"
+    if whole & LABEL:
+        return "label"
+    if whole & (TIME - {"t"}):
+        return ""
+    if whole & MEASURED or ("y" in whole and not whole & (ACTUATOR | COMMAND)):
+        return "answer" if whole & (ACTUATOR | COMMAND) else "measured"
+    if whole & (COMMAND - {"u"}):
+        return "command"
+    if whole & DISTURBANCE or ("load" in whole and whole & ACTUATOR):
+        return "disturbance"
+    if "u" in whole:
+        return "command"
+    if whole & ACTUATOR:
+        return "" if unit in REACHED_UNITS or whole & (QUANTITY | {"y"}) else "actuator"
+    # a sensor gives V or % of whatever it measures; a heat flow q [W] is no position
+    return "quantity" if whole & QUANTITY and unit not in DRIVING_UNITS - {"V", "%"} else ""
+
+
+def is_command_of(command: str, other: str) -> bool:
+    """Whether two names differ by words for a command alone: ``tau1_command_nm`` and ``tau1_nm``.
+
+    Example:
+        >>> is_command_of("tau1_command_nm", "tau1_nm"), is_command_of("tau1_command_nm", "tau2_nm")
+        (True, False)
+    """
+    one, two = ([_plain(word) for word in _parted(name_and_unit(name)[0])[0]] for name in (command, other))
+    return one != two and [word for word in one if word not in COMMAND] == two

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Literal, TypeAlias
+from typing import Literal, Protocol, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -601,7 +601,15 @@ def fit_by_prediction(fit: OutputFit, theta: Array, windows: OutputWindows, smoo
     return Fitted(np.concatenate([found.theta[:n], theta[n:]]), covariance, known)
 
 
-def feedback(trajectories: Sequence[Trajectory], errors: Sequence[Array]) -> float:
+class Driven(Protocol):
+    """A recording with its inputs ``(n, n_u)``."""
+
+    @property
+    def u(self) -> Array:
+        """Inputs."""
+
+
+def feedback(trajectories: Sequence[Driven], errors: Sequence[Array]) -> float:
     """How far inputs answer to earlier prediction errors: the largest correlation, over what chance makes of it.
 
     What an input's own past does not tell of it is compared with the prediction errors of the same sample and of those

@@ -93,7 +93,7 @@ def test_a_swing_has_two_states(machine, tmp_path):
     # sqrt(J / mgl) = 0.30 s for small swings; these reach 1.4 rad, where it is longer
     assert 0.28 < scenario.prior().values["T_phi_rad"] < 0.36
     assert preflight(scenario).problems == ()
-    assert any("its unit" in line for line in left_to_decide(tmp_path / "swing.py"))
+    assert [s.unit for s in (*scenario.prior.inputs, *scenario.prior.states)] == ["N m", "rad", "rad/s"]
 
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
@@ -622,6 +622,9 @@ def passes_the_check(seed, dt, drive, columns):
         file, path = Path(folder) / "a.npz", Path(folder) / "m.py"
         np.savez(file, **table)
         outputs = [name for name in table if name not in ("t", "u") and not name.endswith("constant")]
+        for kind in ("rare", "quantised"):  # these are the same each time: all but one are copies
+            alike = [name for name in outputs if name.endswith(kind)]
+            outputs = [name for name in outputs if name not in alike[1:]]
         if not outputs:
             with pytest.raises(InputError, match="no column is left for an output"):
                 write_scenario(path, file, inputs=("u",))

@@ -1,0 +1,308 @@
+"""First linear models of a recording: lags for a first prior, its time constants, and whether a loop was closed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.signal import lfilter
+
+from hybrid_mpc.identify.fit import feedback
+
+Array = NDArray[np.float64]
+FEWEST = 20
+"""Fewest rows of a recording that tell anything."""
+MOST, JUDGED = 4000, 20_000
+"""Most samples from which a lag is fitted, and by which it is judged."""
+BETTER = 0.8
+"""Error of two states over that of one below which two are taken."""
+MATTERS = 0.1
+"""Share of an output's variance that its lag explains, from which on its time constant matters."""
+STRIDES = (1, 4, 16)
+"""Samples between those from which a growth is taken."""
+SHOWN = 10.0
+"""Length of a recording that shows a time constant, over it: a few slow motions are explained by any input."""
+LAGS = 4
+"""Samples of the past from which outputs are predicted."""
+ROWS = 10_000
+"""Most samples of a recording from which these predictions are fitted."""
+CLOSED = 2.0
+"""Feedback, in what chance makes of it (:func:`~hybrid_mpc.identify.fit.feedback`), from which on a loop was closed. In
+open loop it was 1.3 at most in eight recordings of machines, in closed loop 2.2 to 34 where it is seen."""
+GROWS = 3.0
+"""Growth over the length of a recording, as an exponent, from which on it is no drift."""
+PACE = 0.3
+"""Growth over the pace of the motion itself, the rms speed over the spread of the slowest output, from which on it is
+no bias of friction or another nonlinearity: these reach 0.15."""
+AGREE = 0.2
+"""Least of several estimates of a growth over the largest where they agree."""
+
+
+class Runs(NamedTuple):
+    """Outputs ``(m, n_y)``, NaN where blank, and inputs ``(m, n_u)`` of one recording."""
+
+    y: Array
+    u: Array
+
+
+@dataclass(frozen=True)
+class Lag:
+    """A first linear model of one output.
+
+    ``states`` 1 or 2, its time constant ``seconds`` [s], damping, gains, offset; the ``share`` of the output's variance
+    that its free run explains, and its ``reach``: what all inputs over their ranges make of the output in the end, over
+    its span.
+    """
+
+    states: int
+    seconds: float
+    damping: float
+    gains: tuple[float, ...]
+    offset: float
+    share: float = 0.0
+    reach: float = 1.0
+
+    @property
+    def matters(self) -> float:
+        """The time [s] that counts in control: its slowest time constant, or less where inputs reach farther.
+
+        A mode so slow that inputs carry the output over its span in a part of it is an integrator for a controller.
+        Of an oscillation it is half a swing at most, within which a controller ends it.
+        """
+        if self.states == 1:
+            return self.seconds / max(self.reach, 1.0)
+        if self.damping < 1:
+            return self.seconds * min(1 / max(self.damping, 1e-9), math.pi) / math.sqrt(max(self.reach, 1.0))
+        slow = self.seconds * (self.damping + math.sqrt(self.damping**2 - 1))
+        reach = max(self.reach, 1.0)
+        return max(slow / reach, self.seconds / math.sqrt(reach))
+
+
+def first_lag(runs: Sequence[Runs], output: int, dt: float, inputs: int) -> Lag:
+    """A lag of one or two states whose free runs are nearest to an output.
+
+    Each is fitted one step ahead at several strides, since noise hides a slow motion in a short one and a fast motion
+    is over in a long one; free runs at the sampling time choose.
+
+    Args:
+        runs: Recordings, of any lengths.
+        output: Index of the output.
+        dt: Sampling time [s].
+        inputs: How many of the columns that act are inputs, the first ones; the others are disturbances.
+    """
+    tables = [np.column_stack([run.y[:, output], run.u]) for run in runs]
+    every = np.concatenate(tables)
+    with np.errstate(over="ignore"):
+        middle, size = np.nanmean(every, axis=0), np.nanmax(every, axis=0) - np.nanmin(every, axis=0)
+    span, spans = float(size[0]), size[1:]
+    # a gain of zero would be no input at all
+    slight = 0.1 * span / spans
+    default = Lag(
+        1,
+        max(20 * dt, pace_of(runs, output, dt)),
+        1.0,
+        tuple(slight.tolist()),
+        float(middle[0] - slight @ middle[1:]),
+    )
+    if not (np.isfinite(middle).all() and np.isfinite(size).all()):
+        return default
+    # about their means and by their spans: levels and units do not enter
+    tables = [(table - middle) / size for table in tables]
+    judged = _middles_of(tables, 1, JUDGED)
+    variance = float(np.nanvar(np.concatenate([table[:, 0] for table in judged])))
+    best: dict[int, tuple[float, Lag]] = {}
+    stride = 1
+    while sum(len(table) // stride for table in tables) >= FEWEST:
+        blocks = _middles_of(tables, stride, MOST)
+        for order in (1, 2):
+            lag = _fitted(blocks, order, stride * dt)
+            if lag is None:
+                continue
+            error = _free_run_error(judged, lag, dt)
+            if order not in best or error < best[order][0]:
+                share = 1.0 - error**2 / variance if variance > 0 else 0.0
+                best[order] = error, replace(lag, share=share, reach=float(np.abs(lag.gains[:inputs]).sum()))
+        stride *= 3
+    if not best:
+        return default
+    error, lag = best.get(1, best.get(2, (0.0, default)))
+    if 2 in best and best[2][0] < BETTER * error:
+        lag = best[2][1]
+    gains = span / spans * np.array(lag.gains)
+    offset = float(middle[0] + span * lag.offset - gains @ middle[1:])
+    if not (np.isfinite(gains).all() and (gains != 0).all() and math.isfinite(offset)):
+        return default
+    return replace(lag, gains=tuple(gains.tolist()), offset=offset)
+
+
+def pace_of(runs: Sequence[Runs], output: int, dt: float) -> float:
+    """Spread of an output over its rms speed [s]: how long a motion takes."""
+    y = np.concatenate([run.y[:, output] for run in runs])
+    steps = np.concatenate([np.diff(run.y[:, output]) for run in runs])
+    speed = float(np.sqrt(np.nanmean(np.square(steps)))) if np.isfinite(steps).any() else 0.0
+    return dt * float(np.nanstd(y)) / speed if speed > 0 else 0.0
+
+
+def _middles_of(tables: Sequence[Array], stride: int, most: int) -> list[Array]:
+    """Rows of outputs (first column) at every ``stride``-th sample and means of inputs from there, ``most`` in all."""
+    found = []
+    for table in tables:
+        rows = min(max(most // len(tables), 4), len(table) // stride)
+        if rows <= 2:
+            continue
+        first = (len(table) - stride * rows) // 2
+        part = table[first : first + stride * rows].reshape(rows, stride, -1)
+        found.append(np.column_stack([part[:, 0, :1], part[:, :, 1:].mean(axis=1)]))
+    return found
+
+
+def _fitted(tables: Sequence[Array], order: int, dt: float) -> Lag | None:
+    """A lag by its errors one row ahead; None where it is none: unstable, or over within a row."""
+    rows, future = [], []
+    for table in tables:
+        past = [table[order - 1 - i : len(table) - 1 - i, 0] for i in range(order)]
+        rows.append(np.column_stack([*past, table[order - 1 : -1, 1:], np.ones(len(table) - order)]))
+        future.append(table[order:, 0])
+    if not rows:
+        return None
+    every, then = np.concatenate(rows), np.concatenate(future)
+    known = np.isfinite(every).all(axis=1) & np.isfinite(then)
+    if known.sum() < every.shape[1] + 5:
+        return None
+    theta = np.linalg.lstsq(every[known], then[known], rcond=None)[0]
+    poles = np.roots(np.concatenate([[1.0], -theta[:order]]))
+    if not (np.isfinite(theta).all() and (np.abs(poles) < 1).all() and (np.abs(poles) > 0.05).all()):
+        return None
+    if order == 1 and not poles[0].real > 0:
+        return None
+    rates = np.log(poles.astype(complex)) / dt
+    speed = float(np.sqrt(np.abs(np.prod(rates)))) if order == 2 else float(np.abs(rates[0]))
+    damping = float(-rates.real.sum() / (2 * speed)) if order == 2 else 1.0
+    still = 1.0 - theta[:order].sum()
+    if not (still > 0 and 0 < speed < math.inf and damping > 0):
+        return None
+    gains = theta[order:-1] / still
+    return Lag(order, 1 / speed, damping, tuple(gains.tolist()), float(theta[-1] / still))
+
+
+def _free_run_error(tables: Sequence[Array], lag: Lag, dt: float) -> float:
+    """Root mean square error of free runs from each recording's first output, at rest."""
+    if lag.states == 1:
+        pole = math.exp(-dt / lag.seconds)
+        b, a = np.array([0.0, 1 - pole]), np.array([1.0, -pole])
+    else:
+        system = np.zeros((3, 3))
+        system[:2, :2] = [[0.0, 1.0], [-1.0, -2 * lag.damping]]
+        system[1, 2] = 1.0
+        step = expm(system * dt / lag.seconds)
+        trace, det = np.trace(step[:2, :2]), np.linalg.det(step[:2, :2])
+        b = np.array([0.0, step[0, 2], step[0, 1] * step[1, 2] - step[1, 1] * step[0, 2]])
+        a = np.array([1.0, -trace, det])
+    errors = []
+    for table in tables:
+        known = np.flatnonzero(np.isfinite(table[:, 0]))
+        if not len(known):
+            continue
+        start = table[known[0], 0]
+        drive = np.nan_to_num(table[:, 1:]) @ np.array(lag.gains) + lag.offset - start
+        errors.append(start + lfilter(b, a, drive)[known] - table[known, 0])
+    with np.errstate(over="ignore"):
+        return float(np.sqrt(np.mean(np.square(np.concatenate(errors))))) if errors else math.inf
+
+
+def slowest(lags: Sequence[Lag], length: float) -> tuple[float, int]:
+    """The slowest time constant [s] that matters, and the output's index.
+
+    One counts where inputs explain a part of the output by it, and the recording is ``SHOWN`` times as long; where none
+    does, that part of the recording at most.
+    """
+    longest = length / SHOWN
+    good = [i for i, lag in enumerate(lags) if lag.share >= MATTERS and lag.matters <= longest]
+    best = max(good or range(len(lags)), key=lambda i: lags[i].matters)
+    return min(lags[best].matters, longest), best
+
+
+def feedback_of(runs: Sequence[Runs]) -> float:
+    """How far inputs answer to outputs, in what chance makes of it; zero where the recordings are too short to tell."""
+    parts = _middles(runs, 1)
+    fitted = _predictor(parts)
+    if fitted is None:
+        return 0.0
+    errors = [
+        np.vstack([np.full((LAGS, run.y.shape[1]), np.nan), run.y[LAGS:] - _rows(run) @ fitted])
+        for run in parts
+    ]
+    return feedback(parts, errors)
+
+
+def growth_of(runs: Sequence[Runs], dt: float) -> float:
+    """Rate [1/s] at which the machine leaves its rest by itself; zero where the data do not show that it does.
+
+    By the largest pole of predictions over several strides, from all recordings and from either half of them,
+    where these agree. One step ahead, feedback biases them little.
+    """
+    found = []
+    for stride in STRIDES:
+        parts = _middles(runs, stride)
+        halves = [
+            [Runs(*(a[: len(a) // 2] for a in run)) for run in parts],
+            [Runs(*(a[len(a) // 2 :] for a in run)) for run in parts],
+        ]
+        for part in (parts, *halves):
+            fitted = _predictor(part)
+            if fitted is None:
+                return 0.0
+            n = runs[0].y.shape[1]
+            matrix = np.eye(LAGS * n, k=-n)
+            matrix[:n] = fitted[: LAGS * n].T
+            largest = float(np.abs(np.linalg.eigvals(matrix)).max())
+            found.append(math.log(largest) / (stride * dt) if largest > 0 else -math.inf)
+    length = dt * max(len(run.y) for run in runs)
+    pace = 1 / max(1e-300, *(pace_of(runs, i, dt) for i in range(runs[0].y.shape[1])))
+    return (
+        float(np.median(found)) if min(found) > max(AGREE * max(found), GROWS / length, PACE * pace) else 0.0
+    )
+
+
+def _middles(runs: Sequence[Runs], stride: int) -> list[Runs]:
+    """The middle of each recording by its spread about its mean: outputs at every ``stride``-th row, inputs' means."""
+    y, u = (np.concatenate([run[i] for run in runs]) for i in (0, 1))
+    middle, size = [np.nanmean(z, axis=0) for z in (y, u)], [np.nanstd(z, axis=0) for z in (y, u)]
+    parts = []
+    for run in runs:
+        rows = min(ROWS, len(run.y) // stride)
+        first = (len(run.y) - stride * rows) // 2
+        y0, u0 = (z[first : first + stride * rows] for z in run)
+        # an input counts with its mean over the stride, in which it acts
+        blocks = y0[::stride], u0.reshape(rows, stride, -1).mean(axis=1)
+        parts.append(
+            Runs(*((z - m) / np.where(s > 0, s, 1.0) for z, m, s in zip(blocks, middle, size, strict=True)))
+        )
+    return [run for run in parts if len(run.y) > 3 * LAGS]
+
+
+def _rows(run: Runs) -> Array:
+    """Outputs and inputs before each row from ``LAGS`` on, and one."""
+    n = len(run.y)
+    past = [z[LAGS - 1 - i : n - 1 - i] for z in run for i in range(LAGS)]
+    return np.column_stack([*past, np.ones(n - LAGS)])
+
+
+def _predictor(runs: Sequence[Runs]) -> Array | None:
+    """Coefficients of predictions one row ahead; None where there are too few rows."""
+    runs = [run for run in runs if len(run.y) > 3 * LAGS]
+    if not runs:
+        return None
+    rows, future = (
+        np.concatenate([_rows(run) for run in runs]),
+        np.concatenate([run.y[LAGS:] for run in runs]),
+    )
+    known = np.isfinite(rows).all(axis=1) & np.isfinite(future).all(axis=1)
+    if known.sum() < 5 * rows.shape[1]:
+        return None
+    return np.asarray(np.linalg.lstsq(rows[known], future[known], rcond=1e-9)[0])

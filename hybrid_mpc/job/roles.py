@@ -1,0 +1,573 @@
+"""Roles of a recording's columns, by their names, their numbers and what moves what.
+
+Evidence is taken in this order, and the first that decides is the reason that is given:
+
+1. copies: a column that is a constant times another, or another one cut off at limits, is no signal of its own;
+2. the name: words for a set-point, a command, a sensor (:func:`hybrid_mpc.data.names.role_said_by`);
+3. a set-point: nothing moves it, a column follows it with gain one, and a third one answers to it;
+4. values that are held and then jump are commanded; a coarse sensor repeats itself, too, but moves by single steps;
+5. the unit: machines are driven in V, %, N m, and measured in rad, m, K;
+6. causality: an input is moved by no other column and helps to predict outputs (Granger, *Investigating causal
+   relations by econometric models and cross-spectral methods*, 1969); where all columns move each other, as in closed
+   loop, the input is the roughest, since machines are low-pass filters.
+
+Only 1 to 4 are sure; what rests on 5 and 6 is said to be doubtful.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import combinations
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.names import ANGLES, DRIVING_UNITS, REACHED_UNITS, Role, is_command_of, role_said_by
+
+Array = NDArray[np.float64]
+Kind = Literal["input", "output", "set-point", "disturbance", "none"]
+HELD = 0.5
+"""Share of samples equal to the one before from which on a column looks commanded."""
+COARSE_STEP, COARSE_SPAN = 3.5, 30.0
+"""A column whose usual change is at most so many of its smallest ones, and whose span is more than so many, is a coarse
+sensor at a slow motion: what is commanded jumps, or has few levels."""
+EXACT, ROUNDED = 1e-3, 1e-6
+"""Largest error of a copy over its span: the rounding of the file's digits, but no more than the first and no less than
+the second. Two sensors of one quantity differ by more."""
+SAMPLED = 2000
+"""Most rows by which two columns are first compared."""
+INTERIOR, LIMITED = 0.1, 0.02
+"""Least shares of samples within and at the limits of a copy that is cut off."""
+MOST_LEVELS = 8
+"""Most whole numbers that the modes of a machine have."""
+SWITCHES = 5
+"""Fewest changes of a switch that show what it moves."""
+LAGS = 6
+"""Samples of the past from which columns are predicted."""
+ROWS = 6000
+"""Most samples from which a prediction is fitted."""
+FEWEST_ROWS = 60
+"""Fewest."""
+STRIDES = (1, 4, 16, 64)
+"""Samples between those that are predicted: slow machines are sampled fast."""
+ACTS = 5.0
+"""Link of two columns that is one: chance gives 1, with a standard deviation of 0.6."""
+QUIET = 3.0
+"""Links up to here are chance."""
+LEADS = 2.0
+"""Times a link is stronger than the one back where the first column moves the second."""
+MOST_LINKED = 16
+"""Most columns among which links are computed."""
+FOLLOWS = 0.5
+"""Share of a column's variance by which it follows a set-point, at least."""
+GAIN, OFFSET = 0.25, 0.25
+"""By how much the gain of what follows may differ from one; and its mean from the set-point's, in the deviations of
+that."""
+ANSWERS = 0.8
+"""Share of variance that a command explains of what a drive measures of it."""
+RATE = 0.97
+"""Correlation of a column with the rate of another from which on it is that rate."""
+
+
+@dataclass(frozen=True)
+class Trait:
+    """A column as its role is judged: full name, unit, its numbers in each recording ``(m,)``, NaN where blank."""
+
+    full: str
+    unit: str
+    pieces: tuple[Array, ...]
+
+    @cached_property
+    def values(self) -> Array:
+        """All numbers that are known."""
+        whole = np.concatenate(self.pieces)
+        return whole[np.isfinite(whole)]
+
+    @cached_property
+    def changes(self) -> Array:
+        """Differences of neighbours within the recordings."""
+        steps = np.concatenate([np.diff(piece) for piece in self.pieces])
+        return steps[np.isfinite(steps)]
+
+    @cached_property
+    def levels(self) -> Array:
+        """Distinct numbers."""
+        return np.unique(self.values)
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is known in every row, as an input is."""
+        return sum(map(len, self.pieces)) == len(self.values)
+
+    @cached_property
+    def said(self) -> Role:
+        """What its name says."""
+        few = len(self.levels) <= MOST_LEVELS and bool((self.levels == np.round(self.levels)).all())
+        return role_said_by(self.full, self.unit, switches=few)
+
+    @cached_property
+    def is_held(self) -> bool:
+        """Whether it is held and then jumps."""
+        changes = np.abs(self.changes)
+        if not len(changes) or (changes == 0).mean() < HELD or not changes.any():
+            return False
+        moved = changes[changes > 0]
+        step = float(np.quantile(moved, 0.1))
+        return bool(np.median(moved) > COARSE_STEP * step or np.ptp(self.values) <= COARSE_SPAN * step)
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether it is zero or one."""
+        return set(self.levels.tolist()) <= {0.0, 1.0}
+
+    @property
+    def roughness(self) -> float:
+        """Size of its changes over its own."""
+        size = float(np.std(self.values))
+        return (
+            float(np.sqrt(np.mean(np.square(self.changes)))) / size if size > 0 and len(self.changes) else 0.0
+        )
+
+
+class Verdict(NamedTuple):
+    """A column's role, why, and whether that is sure; ``none`` is no signal."""
+
+    kind: Kind
+    reason: str
+    sure: bool = True
+
+
+BY_NAME = "by its name"
+
+
+@dataclass
+class _Links:
+    """How far one column helps to predict another, computed once."""
+
+    known: dict[tuple[str, ...], float] = field(default_factory=dict)
+
+    def of(self, source: Trait, target: Trait, now: bool = False, beside: Sequence[Trait] = ()) -> float:
+        """The strongest link over all strides: chance gives one.
+
+        ``now``: the source's present counts with its past. ``beside``: columns whose past is known as well.
+        """
+        key = source.full, target.full, "now" * now, *(one.full for one in beside)
+        if key not in self.known:
+            self.known[key] = max(_link(source, target, stride, now, beside) for stride in STRIDES)
+        return self.known[key]
+
+    def into(self, target: Trait, others: Sequence[Trait]) -> float:
+        """The strongest link into a column."""
+        return max((self.of(one, target) for one in others if one is not target), default=0.0)
+
+    def out_of(self, source: Trait, others: Sequence[Trait], beside: Sequence[Trait] = ()) -> float:
+        """The strongest link out of a column."""
+        return max((self.of(source, one, beside=beside) for one in others if one is not source), default=0.0)
+
+
+def _link(source: Trait, target: Trait, stride: int, now: bool, beside: Sequence[Trait]) -> float:
+    """How far the past of one column helps to predict another beyond its own past, and that of those beside.
+
+    Logarithm of the ratio of the residuals' variances, times samples over lags: a likelihood ratio, by chance 1.
+    """
+    pasts, others, nexts = [], [], []
+    budget = ROWS // len(target.pieces) + LAGS + 1
+    for i, whole in enumerate(target.pieces):
+        first = max(0, (len(whole) - stride * budget) // 2)
+        cut = slice(first, first + stride * budget, stride)
+        y, x, *more = (trait.pieces[i][cut] for trait in (target, source, *beside))
+        if len(y) <= 2 * LAGS:
+            continue
+        before = [slice(LAGS - k - 1, len(y) - k - 1) for k in range(LAGS)]
+        rows = np.column_stack([
+            *(one[s] for one in (y, *more) for s in before), *(x[s] for s in before), x[LAGS:], y[LAGS:],
+        ])  # fmt: skip
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        split = LAGS * (1 + len(more))
+        pasts.append(rows[:, :split])
+        others.append(rows[:, split : -1 if now else -2])
+        nexts.append(rows[:, -1:])
+    if sum(map(len, nexts)) < FEWEST_ROWS:
+        return 0.0
+    own, other, future = (_scaled(np.concatenate(parts)) for parts in (pasts, others, nexts))
+    alone, both = (_residual(parts, future) for parts in (own, np.hstack([own, other])))
+    return math.log((alone + 1e-12) / (both + 1e-12)) * len(future) / other.shape[1]
+
+
+def _scaled(rows: Array) -> Array:
+    centred = rows - rows.mean(axis=0)
+    size = np.sqrt(np.mean(np.square(centred), axis=0))
+    return centred / np.where(size > 0, size, 1.0)
+
+
+def _residual(rows: Array, future: Array) -> float:
+    return float(np.mean(np.square(future - rows @ np.linalg.lstsq(rows, future, rcond=1e-9)[0])))
+
+
+def _line(x: Array, y: Array) -> tuple[float, float, float]:
+    """Slope, constant and explained share of the variance of ``y`` as a line over ``x``."""
+    x0, y0 = float(x.mean()), float(y.mean())
+    xx, yy = float(np.mean((x - x0) ** 2)), float(np.mean((y - y0) ** 2))
+    if not (xx > 0 and yy > 0 and math.isfinite(xx) and math.isfinite(yy)):
+        return 0.0, y0, 0.0
+    xy = float(np.mean((x - x0) * (y - y0)))
+    return xy / xx, y0 - xy / xx * x0, xy * xy / (xx * yy)
+
+
+def copy_of(one: Trait, other: Trait) -> str:
+    """How the second column is a copy of the first: ``scaled``, ``cut off`` at limits, or empty if it is none."""
+    x, y = (np.concatenate(trait.pieces) for trait in (one, other))
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    if len(x) < FEWEST_ROWS:
+        return ""
+    few = slice(None, None, max(1, len(x) // SAMPLED))
+    return _copy(x, y) if _copy(x[few], y[few]) else ""
+
+
+def _copy(x: Array, y: Array) -> str:
+    span = float(np.ptp(y))
+    if not (np.ptp(x) > 0 and span > 0):
+        return ""
+
+    def exact(rows: NDArray[np.bool_]) -> tuple[float, float] | None:
+        slope, constant, _ = _line(x[rows], y[rows])
+        rounding = 0.6 * (_digit(y) + abs(slope) * _digit(x))
+        near = span * min(max(rounding / span, ROUNDED), EXACT)
+        good = slope != 0 and np.abs(y[rows] - slope * x[rows] - constant).max() <= near
+        return (slope, constant) if good else None
+
+    if exact(np.ones(len(x), dtype=bool)):
+        return "scaled"
+    low, high = y <= y.min() + 1e-9 * span, y >= y.max() - 1e-9 * span
+    inside = ~(low | high)
+    if inside.mean() < INTERIOR or 1 - inside.mean() < LIMITED or np.ptp(y[inside]) < INTERIOR * span:
+        return ""
+    found = exact(inside)
+    if found is None:
+        return ""
+    free = found[0] * x + found[1]
+    beyond = (free[low] <= y.min() + EXACT * span).all() and (free[high] >= y.max() - EXACT * span).all()
+    return "cut off" if beyond else ""
+
+
+def _digit(values: Array) -> float:
+    """The smallest difference of two numbers: what the file rounds to, or less."""
+    return float(np.diff(np.unique(values)).min(initial=math.inf))
+
+
+def follows(goal: Trait, reached: Trait) -> float:
+    """How well a column follows a set-point: the explained share of its variance at the best lag, with gain one.
+
+    Zero where gain or mean are others.
+    """
+    best = 0.0
+    longest = max(map(len, goal.pieces))
+    for lag in (0, *(2**i for i in range(int(math.log2(max(longest // 10, 1))) + 1))):
+        x, y = _shifted(goal, reached, lag)
+        if len(x) < FEWEST_ROWS:
+            continue
+        slope, _, share = _line(x, y)
+        size = float(np.std(x))
+        if abs(slope - 1) <= GAIN and abs(float(np.mean(y - x))) <= OFFSET * size:
+            best = max(best, share)
+    return best
+
+
+def _shifted(one: Trait, other: Trait, lag: int) -> tuple[Array, Array]:
+    """Numbers of a column and those of another ``lag`` samples later, where both are known."""
+    whole = [np.zeros((0, 2))]
+    for x, y in zip(one.pieces, other.pieces, strict=True):
+        rows = max(len(x) - lag, 0)
+        whole.append(np.column_stack([x[:rows], y[len(y) - rows :]]))
+    pairs = np.concatenate(whole)
+    pairs = pairs[np.isfinite(pairs).all(axis=1)]
+    return pairs[:, 0], pairs[:, 1]
+
+
+def is_rate(rate: Trait, whole: Trait) -> bool:
+    """Whether a column is the rate of change of another."""
+    slopes, values = [], []
+    for v, x in zip(rate.pieces, whole.pieces, strict=True):
+        half = max(1, len(x) // 400)
+        if len(x) > 4 * half:
+            slopes.append((x[2 * half :] - x[: -2 * half])[half:-half])
+            sums = np.cumsum(np.concatenate([[0.0], np.nan_to_num(v)]))
+            mean = (sums[2 * half :] - sums[: -2 * half]) / (2 * half)
+            values.append(mean[: len(x) - 2 * half][half:-half])
+    if not slopes:
+        return False
+    a, b = np.concatenate(slopes), np.concatenate(values)
+    known = np.isfinite(a) & np.isfinite(b)
+    return bool(known.sum() >= FEWEST_ROWS and _line(a[known], b[known])[2] >= RATE**2)
+
+
+def judged(traits: Sequence[Trait], given: Mapping[str, Kind] | None = None) -> dict[str, Verdict]:
+    """The role of every column; those ``given`` keep theirs, and count as what they are.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> u = np.repeat(rng.standard_normal(40), 10)
+        >>> y = np.convolve(u, 0.9 ** np.arange(60))[:400] + 0.01 * rng.standard_normal(400)
+        >>> found = judged([Trait("a", "", (y,)), Trait("b", "", (u,)), Trait("c", "", (2 * u,))])
+        >>> [(name, verdict.kind) for name, verdict in found.items()]
+        [('a', 'output'), ('b', 'input'), ('c', 'none')]
+    """
+    return _Judge(traits, given or {}).verdicts()
+
+
+class _Judge:
+    """Columns and what is found of them, step by step."""
+
+    def __init__(self, traits: Sequence[Trait], given: Mapping[str, Kind]) -> None:
+        self.traits = {trait.full: trait for trait in traits}
+        self.found = {full: Verdict(kind, "as you say") for full, kind in given.items()}
+        self.given = frozenset(given)
+        self.copies: set[str] = set()
+        self.links = _Links()
+
+    def verdicts(self) -> dict[str, Verdict]:
+        """Verdicts in the order of the columns."""
+        self._copies()
+        self._named()
+        self._set_points()
+        self._held()
+        self._by_unit()
+        self._by_cause()
+        self._answers()
+        self._rest()
+        self._something()
+        return {full: self.found[full] for full in self.traits}
+
+    def of(self, *kinds: Kind) -> list[Trait]:
+        """Columns of these roles."""
+        return [t for full, t in self.traits.items() if full in self.found and self.found[full].kind in kinds]
+
+    @property
+    def open(self) -> list[Trait]:
+        """Columns without a role yet."""
+        return [t for full, t in self.traits.items() if full not in self.found]
+
+    def _say(self, trait: Trait, kind: Kind, reason: str, sure: bool = True) -> None:
+        self.found[trait.full] = Verdict(kind, reason, sure)
+
+    def _copies(self) -> None:
+        """Of two copies that one stays which is given, else which acts, else whose name says more, else the first."""
+        if len(self.traits) < 3:  # of two columns one is the output, however exactly it answers
+            return
+        for one, other in combinations(self.traits.values(), 2):
+            if any(t.full in self.found and self.found[t.full].kind == "none" for t in (one, other)):
+                continue
+            there, back = copy_of(one, other), copy_of(other, one)
+            if not (there or back):
+                continue
+            kept, left, how = one, other, "a constant times {}"
+            if "scaled" in (there, back):
+                if other.said and not one.said:
+                    kept, left = other, one
+            elif {one.said, other.said} <= {"measured", "quantity"}:
+                kept, left, how = *((one, other) if there else (other, one)), "{} cut off at limits"
+            else:
+                kept, left, how = (
+                    *((other, one) if there else (one, other)),
+                    "{} before it is cut off at limits",
+                )
+            if left.full in self.given:
+                kept, left = left, kept
+            if left.full not in self.given and len(self.traits) - len(self.of("none")) > 2:
+                self._say(left, "none", f"it is {how.format(repr(kept.full))}")
+                self.copies.add(left.full)
+
+    def _named(self) -> None:
+        """What names say."""
+        kinds: dict[Role, Kind] = {
+            "command": "input", "actuator": "input", "set-point": "set-point", "measured": "output",
+            "quantity": "output", "disturbance": "disturbance", "flag": "none", "label": "none",
+        }  # fmt: skip
+        reasons = {
+            "flag": "a flag by its name: it has few values",
+            "label": "by its name an error, a fault, a correction or a part of a command",
+        }
+        for trait in self.open:
+            if trait.said in kinds:
+                self._say(
+                    trait, kinds[trait.said], reasons.get(trait.said, BY_NAME), trait.said != "disturbance"
+                )
+        # what a drive measures of its command, or the second of two commands in series
+        inputs = [t for t in self.of("input") if t.full not in self.given]
+        for one in [t for t in inputs if t.said == "actuator"]:
+            for other in [t for t in self.of("input") if t is not one and t.unit == one.unit]:
+                if is_command_of(other.full, one.full) or self._answers_to(one, other):
+                    self._say(one, "none", f"it follows {other.full!r}: what the drive makes of it")
+                    break
+
+    def _answers_to(self, answer: Trait, command: Trait) -> bool:
+        """Whether a column is what a drive measures of a command."""
+        if self.links.of(command, answer) < LEADS * self.links.of(answer, command):
+            return False
+        pairs = [_shifted(command, answer, lag) for lag in range(LAGS + 1)]
+        shares = [_line(x, y)[2] for x, y in pairs if len(x) >= FEWEST_ROWS]
+        return max(shares, default=0.0) >= ANSWERS
+
+    def _set_points(self) -> None:
+        """Columns that nothing moves, that one follows with gain one, and to which what drives it answers.
+
+        A drive's torque follows its command as well, but there no third column moves it as much.
+        """
+        others = [*self.open, *self.of("input", "output")]
+        if not 3 <= len(others) <= MOST_LINKED:
+            return
+        for goal in [t for t in self.open if t.whole]:
+            reached = [t for t in [*self.open, *self.of("output")] if t is not goal]
+            best = max(reached, key=lambda t: follows(goal, t), default=None)
+            if best is None or follows(goal, best) < FOLLOWS:
+                continue
+            link = self.links.of(goal, best)
+            if link < ACTS or self.links.into(goal, others) * LEADS > link:
+                continue
+            drives = [
+                t for t in [*self.open, *self.of("input")]
+                if t is not goal and t is not best and not is_rate(t, best) and not is_rate(best, t)
+                and self.links.of(goal, t, now=True) >= ACTS and self.links.of(t, best) * LEADS >= link
+            ]  # fmt: skip
+            if not drives:
+                continue
+            self._say(goal, "set-point", f"{best.full!r} follows it", False)
+            if best.full not in self.found:
+                self._say(best, "output", f"it follows {goal.full!r}", False)
+            drive = max(drives, key=lambda t: t.roughness)
+            if drive.full not in self.found and drive.said == "":
+                self._say(drive, "input", f"it answers to {goal.full!r} and moves {best.full!r}", False)
+
+    def _held(self) -> None:
+        """What is held and jumps, beside something that is not."""
+        if all(t.is_held for t in [*self.open, *self.of("output")]):
+            return
+        named = bool(self.of("input"))  # beside a command by its name it may be a load that is held
+        for trait in self.open:
+            if trait.is_held and not trait.is_switch:
+                self._say(trait, "input", "it is held and jumps", sure=not named)
+        for trait in self.open:
+            if trait.is_held:
+                moved = [t for t in [*self.open, *self.of("output")] if t is not trait]
+                moves = (trait.changes != 0).sum() >= SWITCHES and self.links.out_of(trait, moved) >= ACTS
+                if moves or not self.of("input"):
+                    why = "moves other columns" if moves else "is held, and no other column drives"
+                    self._say(trait, "input", f"it is a switch that {why}", False)
+                else:
+                    self._say(trait, "none", "it is a switch that moves nothing: a flag", False)
+
+    def _by_unit(self) -> None:
+        """Units in which machines are driven, and in which they are measured."""
+        driven = [t for t in self.open if t.unit in DRIVING_UNITS and t.said == "" and t.whole]
+        if not self.of("input"):
+            for trait in driven:
+                if len(self.open) > 1 or self.of("output"):
+                    self._say(trait, "input", f"machines are driven in {trait.unit}", False)
+
+    def _by_cause(self) -> None:
+        """An input where there is none yet: what moves the others, else the roughest."""
+        if self.of("input"):
+            return
+        answers = [t for t in self.open if t.said == "answer"]
+        for trait in answers:
+            self._say(trait, "input", "what drives, as it is measured; no command is recorded", False)
+        if answers:
+            return
+        free = self.open
+        goals = [t for t in self.of("set-point") if t.full not in self.given]
+        if goals and (not free or len(free) + len(self.of("output")) < 2):
+            for goal in goals:
+                self._say(
+                    goal, "input", "a set-point, but nothing else drives: machine and controller", False
+                )
+            return
+        free = free or [t for t in self.of("output") if t.full not in self.given]
+        outputs = [t for t in self.of("output") if t not in free]
+        if len(free) + len(outputs) < 2:
+            return
+        candidates = [t for t in free if t.whole] or free  # an input is known in every row
+        candidates = [t for t in candidates if t.said != "measured"] or candidates
+        candidates = [t for t in candidates if t.unit not in REACHED_UNITS] or candidates
+        if len(free) + len(outputs) <= MOST_LINKED:
+            every = [*free, *outputs]
+            causes = [
+                t for t in candidates
+                if self.links.out_of(t, every) >= ACTS
+                and all(
+                    self.links.of(o, t) < max(QUIET, self.links.of(t, o) / LEADS) for o in every if o is not t
+                )
+            ]  # fmt: skip
+            if causes and len(causes) < len(every):
+                for trait in causes:
+                    self._say(trait, "input", "it moves other columns, and none moves it", False)
+                return
+            if any(self.links.out_of(t, every) >= ACTS for t in candidates):
+                roughest = max(candidates, key=lambda t: t.roughness)
+                commands = [t for t in candidates if t is not roughest and self._answers_to(roughest, t)]
+                if commands:
+                    self._say(
+                        roughest, "none", f"it follows {commands[0].full!r}: what a drive makes of it", False
+                    )
+                    roughest = commands[0]
+                self._say(roughest, "input", "columns move each other, and it is the roughest", False)
+                return
+        self._say(candidates[0], "input", "nothing tells inputs from outputs; it is the first column", False)
+
+    def _answers(self) -> None:
+        """What drives measure where a command is recorded."""
+        for trait in [t for t in self.open if t.said == "answer"]:
+            self._say(trait, "none", "what a drive measures of its command")
+
+    def _rest(self) -> None:
+        """What is left is measured: an output, or a disturbance if nothing moves it and it moves an output."""
+        inputs = self.of("input")
+        weak = [t for t in self.of("output") if t.said == "quantity" and t.full not in self.given]
+        for trait in [*self.open, *weak]:
+            outputs = [t for t in [*self.open, *self.of("output")] if t is not trait]
+            if not outputs or len(outputs) + len(inputs) > MOST_LINKED:
+                self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
+                continue
+            # what no input reaches is no output of the machine; an angle is the machine's own
+            free = trait.unit not in ANGLES and all(self.links.of(t, trait) < QUIET for t in inputs)
+            free = free and not any(is_rate(trait, t) or is_rate(t, trait) for t in outputs)
+            moved = [t for t in outputs if self.links.of(trait, t, beside=inputs) >= ACTS] if free else []
+            back = max((self.links.of(t, trait) for t in moved), default=0.0)
+            there = max((self.links.of(trait, t, beside=inputs) for t in moved), default=0.0)
+            if moved and back < max(QUIET, there / LEADS):
+                if trait.unit in DRIVING_UNITS and trait.whole and trait.said == "":
+                    self._say(
+                        trait, "input", f"it moves outputs, and machines are driven in {trait.unit}", False
+                    )
+                else:
+                    self._say(trait, "disturbance", "no input moves it, and it moves outputs", False)
+            elif free and trait.said == "":
+                self._say(trait, "output", "no input moves it; does it act on the machine instead?", False)
+            else:
+                self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
+
+    def _something(self) -> None:
+        """An output and an input, if need be of columns whose names say something else; copies stay copies."""
+        inputs = self.of("input")
+        if not self.of("output") and len(inputs) > 1:
+            ours = [t for t in inputs if t.full not in self.given]
+            ours = [t for t in ours if t.said != "command"] or ours
+            if ours:
+                last = max(ours, key=lambda t: self.links.into(t, inputs))
+                self._say(last, "output", "nothing else is measured, and the others move it most", False)
+        spare = [
+            t for t in [*self.of("disturbance"), *self.of("set-point"), *self.of("none")]
+            if t.full not in self.given and t.full not in self.copies
+        ]  # fmt: skip
+        needed: tuple[Kind, ...] = ("output", "input")
+        for kind in needed:
+            if not self.of(kind) and spare:
+                trait = next((t for t in spare if t.whole), spare[0])
+                spare.remove(trait)
+                self._say(
+                    trait, kind, f"nothing else is left; its name says {trait.said or 'nothing'}", False
+                )
