@@ -25,7 +25,7 @@ from hybrid_mpc.estimate.offset_free import OffsetFree, distinguishable, offset_
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import periods_to_find
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.kit.assembly import FOUND_HORIZONS, make_ocp
+from hybrid_mpc.kit.assembly import FOUND_HORIZONS, SEARCHED, make_ocp
 from hybrid_mpc.kit.promises import Promise, Verdict
 from hybrid_mpc.loop.plant import ModelPlant, ModelState
 from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
@@ -41,8 +41,9 @@ tell, and about what a load of another mass or a worn bearing does."""
 LOAD = 0.2
 """Load of a trial, as a share of the room from the set-point's input to its limit, or of a disturbance's size: that of
 the default task ``hold``."""
-PERIODS, FEWEST, MOST = 1500, 2, 4
-"""Periods that all trials of a run may take together, a few seconds of computing; trials of a set-point."""
+PERIODS, LONGER, FEWEST, MOST = 1200, 800, 2, 4
+"""Periods that all trials of a run may take together, a few seconds of computing, and those of a trial of a slow loop;
+trials of a set-point."""
 LASTS = 6
 """Horizons that a trial lasts: a load that no jump shows is found to two thirds within 1.5 horizons, so 2 % are left."""
 END = 1.0 / 3.0
@@ -72,8 +73,6 @@ WHITE = 0.3
 SURE = 4.0
 """Largest mean of normalised squared innovations, and one over the smallest: errors of twice or half the deviation that
 the observer assumes."""
-LONGEST_FIND = 100
-"""Horizons after which a load that is not found to two thirds counts as never found."""
 
 
 @dataclass(frozen=True)
@@ -448,7 +447,7 @@ def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
         return f"{model.inputs[int(at.argmax())].name} is at its limit"
     if result.reached.size and not np.all(result.reached[late]):
         return "the set-point cannot be reached within the limits"
-    periods = periods_to_find(quiet(point.estimator), LONGEST_FIND * problem.horizon)
+    periods = periods_to_find(quiet(point.estimator), SEARCHED * problem.horizon)
     slowest = float(np.max(np.where(np.isnan(periods), np.inf, periods)))
     if not math.isfinite(slowest):
         return "the disturbance model does not move: the observer's noise takes every load for noise of the states"
@@ -775,7 +774,7 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
     worst = (0.0, "")
     for point, one in zip(points, trials, strict=True):
         n, dt = point.problem.horizon, model.dt
-        periods = periods_to_find(quiet(point.estimator), LONGEST_FIND * n)
+        periods = periods_to_find(quiet(point.estimator), SEARCHED * n)
         dead = [j for j, v in enumerate(periods) if not math.isfinite(v)]
         if dead:
             return Promise(
@@ -861,7 +860,7 @@ def examine(
         trials = [trial(point, draw, length) for draw in range(number)]
         worst = max(range(number), key=lambda draw: trials[draw].worst.size)
         if trials[worst].why.startswith(SLOW):
-            longer = trial(point, worst, max(length, PERIODS))
+            longer = trial(point, worst, max(2 * length, LONGER))
             trials[worst] = replace(trials[worst], why=f"{trials[worst].why}; {_needed(longer)}")
         every.append(trials)
     own = [one for trials in every for one in trials]

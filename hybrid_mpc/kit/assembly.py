@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
@@ -25,7 +24,7 @@ from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
-from hybrid_mpc.estimate.tuning import load_left, most_likely
+from hybrid_mpc.estimate.tuning import FOUND, load_left, most_likely
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian, positions_of
 from hybrid_mpc.monitor.calibrate import Calibration
@@ -50,6 +49,9 @@ step is doubled for that at most. A load that a jump does not show takes as long
 1.3 horizons, the disk less, so neither is doubled: quick steps make a loop hunt around sticking friction, and where a
 model's errors come and go they are taken for loads. Four horizons cost machines that only lag, as heaters and arms, 1.3
 to 1.5 times as much under a load (docs/results/simulated_machines.md)."""
+SEARCHED = 100
+"""Horizons after which a load that no filter has found counts as never found: its offset would last for minutes where a
+plan lasts seconds."""
 JUMP_SHARE = 0.05
 """The same when a load comes or goes. A load of a twentieth of what the drive can do is ordinary; for a larger one
 the filter needs a few periods."""
@@ -134,15 +136,17 @@ def tuned_noise(
 ) -> Array:
     """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
 
-    ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of
+    No state strays further in a period than its spread in the recordings. ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of
     single states by name, which no scale changes.
     """
     own = np.array([(known or {}).get(s.name, np.nan) for s in model.states])
+    spread = np.array(model.state_spread) if model.state_spread else np.zeros(model.n_x)
+    most = np.where(spread > 0, spread, np.inf)
     chosen = [recordings[i] for i in evenly(len(recordings), TUNED_RECORDINGS)]
     parts = [r.part(slice(TUNED_PERIODS), r.name, "train") for r in chosen]
 
     def scaled(scale: float) -> Array:
-        return np.where(np.isnan(own), scale * base, own)
+        return np.where(np.isnan(own), np.minimum(scale * base, most), own)
 
     def filter_of(scale: float) -> Filter:
         return make_estimator(model, scenario, scaled(scale), observer=observer)
@@ -172,8 +176,9 @@ def make_estimator(
         observer: Whether it estimates the unmeasured disturbances. Default: yes.
 
     Raises:
-        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, there is no control problem, or the
-            outputs cannot tell the disturbances from the states.
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, there is no control problem, the
+            outputs cannot tell the disturbances from the states, or the noise of the states hides them: an observer
+            that never finds a load is no observer of loads.
 
     Example:
         ``make_estimator(model, scenario, process_noise(model, train))``
@@ -200,7 +205,24 @@ def make_estimator(
         return filter_of(1.0, None)
     shares = quiet_shares(lambda s: filter_of(1.0, s), round(FOUND_HORIZONS * control.horizon), model.n_d)
     modes = filter_of(1.0, shares), filter_of(SLIP, shares), filter_of(1.0, np.full(model.n_d, JUMP_SHARE))
+    _check_found(modes, SEARCHED * control.horizon)
     return SwitchingFilter(modes, SWITCHES)
+
+
+def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int) -> None:
+    """Refuse filters none of which finds two thirds of a constant load within so many periods."""
+    model, sigma = modes[0].model, np.sqrt(modes[0].noise[0])
+    lost = np.flatnonzero(~np.any([load_left(one, periods) <= FOUND for one in modes], axis=0))
+    if not lost.size:
+        return
+    d = model.disturbance_model
+    where = f"the input {model.inputs[lost[0]].name}" if d is None else f"the {d[lost[0]].at} {d[lost[0]].signal}"
+    noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
+    raise InputError(
+        f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states ({noise} "
+        "a period) it takes every load for noise, and a constant one would leave an offset. Correct the prior, give "
+        "Scenario(state_noise={...}), or run the scenario again"
+    )
 
 
 def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: int, n_d: int) -> Array:
@@ -211,7 +233,7 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: in
     """
     shares = np.full(n_d, QUIET_SHARE)
     for _ in range(MOST_DOUBLED):
-        slow = load_left(filter_of(shares), periods) > math.exp(-1.0)
+        slow = load_left(filter_of(shares), periods) > FOUND
         if not slow.any():
             break
         shares = np.where(slow, 2.0 * shares, shares)

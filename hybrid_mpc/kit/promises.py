@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -89,6 +90,24 @@ def read_promises(folder: Path) -> PromiseTable | None:
             f"reads no other. {REMEDY}"
         )
     return record(PromiseTable, document, str(path))
+
+
+def promise_lines(rows: Sequence[Promise]) -> list[str]:
+    """The table for a terminal: a line each, what is not shown first.
+
+    Example:
+        >>> late = Promise("step time", "doubted", "99 % of the steps take 9 ms, the period is 10 ms", "Solver native.")
+        >>> print(*promise_lines([Promise("horizon", "shown", "it holds 99 % of the cost"), late]), sep="\n")
+        what this kit promises:
+          doubted       step time: 99 % of the steps take 9 ms, the period is 10 ms. Solver native.
+          shown         horizon: it holds 99 % of the cost.
+    """
+    order: tuple[Verdict, ...] = ("not promised", "doubted", "shown")
+    lines = [
+        f"  {one.verdict:12}  {one.name}: {one.evidence}." + f" {one.remedy}" * bool(one.remedy)
+        for one in sorted(rows, key=lambda one: order.index(one.verdict))
+    ]
+    return ["what this kit promises:", *lines] if lines else []
 
 
 def none_made(why: str) -> tuple[Promise, ...]:
