@@ -178,9 +178,7 @@ def solved_gain(
     for _ in range(SETTLE):
         plan = solved(at, u0, row, plan)
     if np.any(plan.u[0] <= ocp.u_min) or np.any(plan.u[0] >= ocp.u_max):
-        raise InputError(
-            f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, where it does not move"
-        )
+        raise InputError(f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, where it does not move")
     steps = DIFFERENCE * np.concatenate(
         [sizes.states, sizes.hidden, disturbance_sizes(model, ocp), ocp.input_scale, np.ones(row.size)]
     )

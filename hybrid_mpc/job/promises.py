@@ -46,8 +46,8 @@ PERIODS, LONGER, FEWEST, MOST = 1200, 800, 2, 4
 trials of a set-point."""
 LASTS = 6
 """Horizons that a trial lasts: a load that no jump shows is found to two thirds within 1.5 horizons, so 2 % are left."""
-END = 1.0 / 3.0
-"""Share of a trial, or of a task, at its end over which offset and scatter count."""
+END = 0.2
+"""Share of a trial, or of a task, at its end over which offset and scatter count: as in the report's step responses."""
 NOISE = 1.0
 """Largest offset within the noise, in standard deviations of the sensor."""
 RESTS = 5.0
@@ -57,6 +57,8 @@ SLOW = "the observer is slow"
 """How the reason begins where a load is found, but not within a trial."""
 STILL_MOVES = 0.02
 """Change of the estimated load from the first half of the end of a trial to the second, over the load: it still moves."""
+CONSTANTS = 3
+"""Time constants of the observer after which a load counts as found: a twentieth of it is left."""
 AT_LIMIT = 1e-3
 """Distance from a limit, over the input's range, that counts as at the limit."""
 CARRIES = 0.95
@@ -283,7 +285,11 @@ def task_end(kit: Kit, task: Task, loop: Mapping[str, Array]) -> TaskEnd | None:
     held = held_outputs(model, problem, x, model.u0, w)
     before = np.vstack([loop["u"][:1], loop["u"][:-1]])
     errors = errors_of(model, problem, row, w, loop["y"], before)
-    return TaskEnd(task.name, deviations(model.outputs, held, np.array(kit.sensor_sigma), errors)) if held else None
+    return (
+        TaskEnd(task.name, deviations(model.outputs, held, np.array(kit.sensor_sigma), errors))
+        if held
+        else None
+    )
 
 
 def quiet(estimator: Filter) -> ExtendedKalmanFilter:
@@ -311,9 +317,7 @@ def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
             same.append(task)
     if not groups:
         groups = [(kit.problem(), [])]
-    ends = [
-        {task.name: end for task in own if (end := end_of(task, model)) is not None} for _, own in groups
-    ]
+    ends = [{task.name: end for task in own if (end := end_of(task, model)) is not None} for _, own in groups]
     if not any(ends):  # only trajectories
         groups, ends = groups[:1], ends[:1]
     for (problem, own), at in zip(groups, ends, strict=True):
@@ -387,7 +391,9 @@ def trial(point: SetPoint, draw: int, periods: int) -> Trial:
         InputError: If the set-point has no steady state.
     """
     x, _ = point.rest
-    plant = LoadedPlant(wrong_model(point.model, draw), tuple(point.sigma), tuple(loads(point, draw).tolist()))
+    plant = LoadedPlant(
+        wrong_model(point.model, draw), tuple(point.sigma), tuple(loads(point, draw).tolist())
+    )
     return tried(point, plant, x, periods, draw)
 
 
@@ -414,20 +420,23 @@ def deviations(
     late = errors[int((1.0 - END) * len(errors)) :]
     with np.errstate(over="ignore", invalid="ignore"):
         return tuple(
-            Deviation(signals[i], float(sigma[i]), float(np.nanmean(late[:, i])), float(np.nanstd(late[:, i])))
+            Deviation(
+                signals[i], float(sigma[i]), float(np.nanmean(late[:, i])), float(np.nanstd(late[:, i]))
+            )
             for i in held
         )
 
 
 def _settled(errors: Array, sigma: Array, horizon: int) -> int | None:
-    """Period from which means of errors over a quarter of a horizon stay within the noise; None: never."""
-    width = max(1, horizon // 4)
+    """Period from which means of errors over half a horizon stay within twice the noise; None: never.
+
+    Twice, since an observer hands noise on to the input, and means of few samples move.
+    """
+    width = max(1, horizon // 2)
     if len(errors) < 2 * width:
         return None
     means = np.apply_along_axis(lambda v: np.convolve(v, np.full(width, 1.0 / width), "valid"), 0, errors)
-    # a mean of so few samples has noise of its own
-    allowed = NOISE * sigma + 2.0 * sigma / math.sqrt(width)
-    outside = np.flatnonzero(~np.all(np.abs(means) <= allowed, axis=1))
+    outside = np.flatnonzero(~np.all(np.abs(means) <= 2.0 * NOISE * sigma, axis=1))
     last = int(outside[-1]) + 1 if outside.size else 0
     return last if last < len(means) else None
 
@@ -457,10 +466,8 @@ def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
     half = (len(errors) - late.start) // 2
     d, sizes = result.d[late], LOAD * disturbance_sizes(model, problem)
     moved = np.abs(d[half:].mean(axis=0) - d[:half].mean(axis=0)) / sizes
-    if moved.max() > STILL_MOVES:
-        return (
-            f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load still moves"
-        )
+    if moved.max() > STILL_MOVES or CONSTANTS * slowest > len(errors):
+        return f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load is still on its way"
     if not problem.n_y and np.any(problem.r > 0) and np.any(np.abs(point.rest[1] - model.u0) > edge):
         return "the weight r asks for the operating point's input; let r be 0 and weigh changes by r_delta"
     return "no disturbance of the model explains the error"
@@ -475,7 +482,10 @@ def ranks(point: SetPoint) -> OffsetFree:
     """The rank conditions of the set-point; friction at rest may hide a load that shows in motion."""
     x, u = point.rest
     found = offset_free(point.model, point.held, x=x, u=u, w=point.w)
-    if not found.detectable and distinguishable(point.model, Sizes(point.model, point.problem).states).detectable:
+    if (
+        not found.detectable
+        and distinguishable(point.model, Sizes(point.model, point.problem).states).detectable
+    ):
         return replace(found, rank=found.needed)
     return found
 
@@ -521,9 +531,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
     if worst.why:
         return Promise(name, "doubted", within, remedy_of(worst.why))
     times = [one.settled_s for one in trials if one.settled_s is not None]
-    return Promise(
-        name, "shown", f"{within}, after {max(times):.3g} s at most" if times else within
-    )
+    return Promise(name, "shown", f"{within}, after {max(times):.3g} s at most" if times else within)
 
 
 def remedy_of(why: str) -> str:
@@ -682,9 +690,15 @@ def limits(
     if not hard:
         soft = any(_is_soft(point.problem) for point in points)
         told = "bounds of states and outputs are soft" if soft else "only inputs are bounded"
-        return Promise(name, "shown", f"{told}: every period has a plan within the inputs' limits ({len(sources)} periods tried)")
+        return Promise(
+            name,
+            "shown",
+            f"{told}: every period has a plan within the inputs' limits ({len(sources)} periods tried)",
+        )
     told = f"no hard bound gives way from {len(starts)} starts within {100 * NEAR:.0f} % of one"
-    return Promise(name, "shown", told + (", and the plan ends in a set" if ends else "; in simulation, no proof"))
+    return Promise(
+        name, "shown", told + (", and the plan ends in a set" if ends else "; in simulation, no proof")
+    )
 
 
 def _is_soft(problem: OCP) -> bool:
@@ -727,7 +741,9 @@ def process_noise(kit: Kit) -> Promise:
     name, model = "process noise", kit.models[kit.recommended]
     sigma = kit.noise(f"{kit.recommended}_observer")
     if not model.state_spread:
-        return Promise(name, "not promised", "this kit does not hold the spread of the states", "Run the main job again.")
+        return Promise(
+            name, "not promised", "this kit does not hold the spread of the states", "Run the main job again."
+        )
     spread = np.array(model.state_spread)
     shares = np.where(spread > 0, sigma / np.where(spread > 0, spread, 1.0), 0.0)
     i = int(shares.argmax())
@@ -812,8 +828,12 @@ def tasks_end(ends: Sequence[TaskEnd], where: str) -> Promise:
     """
     name = "set-points of the tasks"
     if not ends:
-        return Promise(name, "not promised", "no task of the run's loops ends at a set-point", "Add one, e.g. a step.")
-    missed = [f"{one.task}: {deviation}" for one in ends for deviation in one.deviations if not deviation.kept]
+        return Promise(
+            name, "not promised", "no task of the run's loops ends at a set-point", "Add one, e.g. a step."
+        )
+    missed = [
+        f"{one.task}: {deviation}" for one in ends for deviation in one.deviations if not deviation.kept
+    ]
     if not missed:
         return Promise(name, "shown", f"{', '.join(one.task for one in ends)} end within the noise, {where}")
     return Promise(
@@ -881,4 +901,8 @@ def examine(
 def _needed(longer: Trial) -> str:
     """How long a slow loop needs, by a longer trial."""
     seconds = len(longer.result.t) * longer.result.dt
-    return f"not settled after {seconds:.3g} s either" if longer.why else f"it settles after {longer.settled_s:.3g} s"
+    return (
+        f"not settled after {seconds:.3g} s either"
+        if longer.why
+        else f"it settles after {longer.settled_s:.3g} s"
+    )

@@ -563,7 +563,9 @@ class Kit:
                 "promises"
             )
         if self.promised.of != self.identity:
-            return none_made("models, noise or control problems are others than those that the table was made of")
+            return none_made(
+                "models, noise or control problems are others than those that the table was made of"
+            )
         return self.promised.rows
 
     @property

@@ -42,11 +42,11 @@ MODES = ("quiet", "slip", "jump")
 """Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
 QUIET_SHARE = 0.0003
 """Step of the estimated load per period while nothing happens (drift, temperature), as a share of its size. Where
-it finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
+a filter finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
 FOUND_HORIZONS, MOST_DOUBLED = 1.5, 7
-"""Horizons of the controller within which the quiet filter has found two thirds of a constant load, and how often its
-step is doubled for that at most. A load that a jump does not show takes as long to be compensated. The golf robot takes
-1.3 horizons, the disk less, so neither is doubled: quick steps make a loop hunt around sticking friction, and where a
+"""Horizons of the controller within which the quiet filter, and the slip filter, has found two thirds of a constant load,
+and how often its step is doubled for that at most. A load that a jump does not show takes as long to be compensated. The
+quiet filter of the golf robot takes 1.3 horizons, the disk's less, so neither is doubled: quick steps make a loop hunt around sticking friction, and where a
 model's errors come and go they are taken for loads. Four horizons cost machines that only lag, as heaters and arms, 1.3
 to 1.5 times as much under a load (docs/results/simulated_machines.md)."""
 SEARCHED = 100
@@ -203,8 +203,14 @@ def make_estimator(
 
     if not observer:
         return filter_of(1.0, None)
-    shares = quiet_shares(lambda s: filter_of(1.0, s), round(FOUND_HORIZONS * control.horizon), model.n_d)
-    modes = filter_of(1.0, shares), filter_of(SLIP, shares), filter_of(1.0, np.full(model.n_d, JUMP_SHARE))
+    periods = round(FOUND_HORIZONS * control.horizon)
+    quiet, slip = (
+        quiet_shares(lambda s, scale=scale: filter_of(scale, s), periods, model.n_d) for scale in (1.0, SLIP)
+    )
+    # where a load lasts, the slip filter would explain it by slip after slip, and the load would never be found
+    modes = (
+        filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, JUMP_SHARE)),
+    )  # fmt: skip
     _check_found(modes, SEARCHED * control.horizon)
     return SwitchingFilter(modes, SWITCHES)
 
@@ -216,7 +222,9 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int) -> None:
     if not lost.size:
         return
     d = model.disturbance_model
-    where = f"the input {model.inputs[lost[0]].name}" if d is None else f"the {d[lost[0]].at} {d[lost[0]].signal}"
+    where = (
+        f"the input {model.inputs[lost[0]].name}" if d is None else f"the {d[lost[0]].at} {d[lost[0]].signal}"
+    )
     noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
     raise InputError(
         f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states ({noise} "
@@ -226,7 +234,7 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int) -> None:
 
 
 def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: int, n_d: int) -> Array:
-    """Steps ``(n_d,)`` of the loads in the quiet filter a period, as shares of their sizes.
+    """Steps ``(n_d,)`` of the loads in a filter that no jump drives, a period, as shares of their sizes.
 
     Each is :data:`QUIET_SHARE`, doubled until the filter has found two thirds of a constant load of that kind after
     ``periods``, at rest or in motion; at most :data:`MOST_DOUBLED` times.

@@ -95,7 +95,9 @@ def test_trials_are_on_wrong_models_with_loads_and_always_the_same(good):
     gains = [p.wrong_model(point.model, draw).p[0] for draw in range(8)]
     assert gains[0] == 1.0
     assert set(np.round(gains[1:], 12)) == {0.8, 1.2}
-    assert abs(p.loads(point, 0)[0]) == pytest.approx(0.2 * 0.7)  # the input is at 0.3, its limits at 1
+    # a fifth of the room from the input at 0.3 to the limit at -1, or 1, on the side that meets the load
+    found = {round(abs(p.loads(point, draw)[0]), 6) for draw in range(8)}
+    assert found == {0.26, 0.14}
     first, again = (p.trial(point, 1, 120) for _ in range(2))
     np.testing.assert_array_equal(first.result.y, again.result.y)
     assert not first.why
@@ -114,18 +116,18 @@ def no_offset_of(kit, task=None, draws=2):
 
 
 def test_a_set_point_at_the_limit_of_the_input_is_no_longer_promised():
-    found = no_offset_of(kit_of(tank()), hold(0.95))
+    found = no_offset_of(kit_of(tank()), hold(0.95), draws=4)
     assert found.verdict == "doubted"
     assert "valve is at its limit" in found.evidence
     assert re.search(r"level 0\.\d+ m off \(noise 0\.01 m\)", found.evidence)
 
 
 def test_a_weight_on_the_input_asks_for_an_offset():
-    problem = OCP(20, [10.0], [1.0], [0.1], [-1.0], [1.0])
-    found = no_offset_of(kit_of(tank(), problem))
+    problem = OCP(20, [10.0], [10.0], [0.1], [-1.0], [1.0])
+    found = no_offset_of(kit_of(tank(), problem), hold(0.6))
     assert found.verdict == "doubted"
     assert "weight r" in found.evidence
-    assert no_offset_of(kit_of(tank(), problem.changed(r=[0.0]))).verdict == "shown"
+    assert no_offset_of(kit_of(tank(), problem.changed(r=[0.0])), hold(0.6)).verdict == "shown"
 
 
 def test_an_observer_drowned_in_noise_is_slow_and_one_that_never_finds_a_load_cannot_be_made():
@@ -163,7 +165,8 @@ def test_ranks_that_lack_and_economic_costs_promise_nothing():
     found = no_offset_of(kit_of(model, problem), task, draws=1)
     assert found.verdict == "not promised"
     assert "2 outputs (left, right) are held by 1 input" in found.evidence
-    price = ca.Function("price", [x[0], u], [u])
+    level = ca.MX.sym("level")
+    price = ca.Function("price", [level, u], [u])
     cheap = OCP(20, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0], economic=price)
     assert no_offset_of(kit_of(tank(), cheap), draws=1).verdict == "not promised"
 
@@ -241,7 +244,7 @@ def test_a_horizon_shorter_than_the_slowest_mode_is_a_doubt():
 
 def test_a_loop_with_small_margins_is_a_doubt():
     """An unstable lag under a controller that knows no limit of speed, with an observer that is slow."""
-    wild = tank(a=1.3, b=0.3)
+    wild = tank(a=2.5, b=0.3)
     problem = OCP(20, [0.0], [0.0], [1e-6], [-50.0], [50.0], q_y=[10.0])
     row = p.margins([point_of(kit_of(wild, problem, noise=1e-4, sigma=0.5), hold(0.0))])
     assert row.verdict == "doubted"

@@ -151,7 +151,15 @@ def leaves(values=RESULTS, prefix=""):
             yield prefix + key
 
 
-DEFAULTS = ("on_model.", "estimation.", "promises.", "timing.controller_step_ms.", "residuals.", "guard.", "analysis.")
+DEFAULTS = (
+    "on_model.",
+    "estimation.",
+    "promises.",
+    "timing.controller_step_ms.",
+    "residuals.",
+    "guard.",
+    "analysis.",
+)
 """Groups whose values may be left out."""
 
 

@@ -350,7 +350,9 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     after: Notes = {}
     control = results.control
     if results.promises.rows is None:
-        instead["promises"] = (f"It was not examined what the kit promises: {results.promises.reason.rstrip('.')}.",)
+        instead["promises"] = (
+            f"It was not examined what the kit promises: {results.promises.reason.rstrip('.')}.",
+        )
     if control.gap_closed is None:
         reason = control.gap_closed_reason.rstrip(".")
         if control.hybrid.cost is None:
