@@ -66,8 +66,8 @@ def run(
     """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
 
     The stages are data, prior, training, choice, evaluation, export, noise, control, on_model, estimation, promises,
-    residuals, monitor, guard, analysis and report. With --resume a stage runs again only where something that it reads has
-    changed. Exit code 1 if a stage after the export could not run; the report then says why.
+    residuals, monitor, guard, analysis and report. With --resume a stage runs again only where something that it reads
+    has changed. Exit code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.job.run import failed_stages

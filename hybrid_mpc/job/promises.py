@@ -26,7 +26,7 @@ from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import periods_to_find
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import FOUND_HORIZONS, SEARCHED, make_ocp
-from hybrid_mpc.kit.promises import Promise, Verdict
+from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.plant import ModelPlant, ModelState
 from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
 from hybrid_mpc.machine.signals import Signal
@@ -45,18 +45,18 @@ PERIODS, LONGER, FEWEST, MOST = 1200, 800, 2, 4
 """Periods that all trials of a run may take together, a few seconds of computing, and those of a trial of a slow loop;
 trials of a set-point."""
 LASTS = 6
-"""Horizons that a trial lasts: a load that no jump shows is found to two thirds within 1.5 horizons, so 2 % are left."""
+"""Horizons that a trial lasts: a load that no jump shows is found to two thirds within 1.5 of them, so 2 % are left."""
 END = 0.2
 """Share of a trial, or of a task, at its end over which offset and scatter count: as in the report's step responses."""
 NOISE = 1.0
 """Largest offset within the noise, in standard deviations of the sensor."""
 RESTS = 5.0
-"""Largest scatter of an output that has settled, in standard deviations of its sensor. The sensor itself is one of them;
-an observer hands a part of its noise on to the input, and an unstable machine moves by several."""
+"""Largest scatter of an output that has settled, in standard deviations of its sensor. The sensor itself makes one; an
+observer hands a part of its noise on to the input, and an unstable machine moves by several."""
 SLOW = "the observer is slow"
 """How the reason begins where a load is found, but not within a trial."""
 STILL_MOVES = 0.02
-"""Change of the estimated load from the first half of the end of a trial to the second, over the load: it still moves."""
+"""Change of the estimated load within the end of a trial, over the load, from which on it still moves."""
 CONSTANTS = 3
 """Time constants of the observer after which a load counts as found: a twentieth of it is left."""
 AT_LIMIT = 1e-3
@@ -71,7 +71,7 @@ HALF = 0.5
 NEAR = 0.05
 """Distance from a hard bound, over the room to it, at which a loop starts."""
 WHITE = 0.3
-"""Largest correlation of an innovation with earlier ones: they explain less than a tenth (0.3 squared) of its variance."""
+"""Largest correlation of an innovation with an earlier one: that explains less than a tenth of the variance."""
 SURE = 4.0
 """Largest mean of normalised squared innovations, and one over the smallest: errors of twice or half the deviation that
 the observer assumes."""
@@ -323,7 +323,7 @@ def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
     for (problem, own), at in zip(groups, ends, strict=True):
         if not at and any(ends):
             continue
-        named = sorted((task.name for task in own), key=lambda name: name not in at)  # noqa: B023
+        named = sorted((task.name for task in own), key=lambda name: name not in at)
         first = named[0] if named else ""
         asked = first if first in kit.loop.control else ""
         controller, estimator = kit.controller(task=asked), kit.observer(task=asked)
@@ -558,7 +558,10 @@ def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
     """Whether a step ends within the period, of processor time, which no other work of the computer changes."""
     ms = np.sort(np.concatenate([one.result.timing_ms["total"] for one in trials]))
     p99, worst = float(np.quantile(ms, 0.99)), float(ms[-1])
-    told = f"99 % of {ms.size} steps take {p99:.3g} ms of processor time, the longest {worst:.3g} ms, the period is {period_ms:.3g} ms"
+    told = (
+        f"99 % of {ms.size} steps take {p99:.3g} ms of processor time, the longest {worst:.3g} ms, the period is "
+        f"{period_ms:.4g} ms"
+    )
     remedy = "Solver native (compiled C), a shorter horizon, move blocks or a longer dt (docs/choosing.md)."
     if p99 > period_ms:
         return Promise("step time", "not promised", told, remedy)
@@ -621,7 +624,7 @@ def _carried(point: SetPoint) -> tuple[float, SetPoint, int, float]:
 def margins(points: Sequence[SetPoint]) -> Promise:
     """Stability margins of the loop of observer and controller, linearized at the set-points, broken at each input."""
     name = "stability margins"
-    remedy = "Larger weights of changes (r_delta), or less process noise of the observer; hybrid-mpc analyze shows more."
+    remedy = "Larger weights of changes (r_delta), or less process noise; hybrid-mpc analyze shows more."
     worst: tuple[float, str, bool] | None = None
     lacks = []
     for point in points:
@@ -707,7 +710,7 @@ def _is_soft(problem: OCP) -> bool:
 
 
 def starts_near(point: SetPoint) -> Sequence[tuple[str, Array]]:
-    """States close to each hard bound of a state, and of an output that shows a state alone, else as at the set-point."""
+    """States close to each hard bound of a state, and of an output that shows a state alone; the others rest."""
     model, (x, u) = point.model, point.rest
     rows = output_with_jacobian(model)(x, u, point.w)[1].full()
     found: list[tuple[str, Array]] = []
@@ -766,8 +769,8 @@ def innovations(found: Tested | str) -> Promise:
     if isinstance(found, str):
         return Promise(name, "not promised", found, "Give longer test recordings.")
     told = (
-        f"largest correlation {found.correlation:.2g} (white: below {WHITE:g}), squared size {found.nis:.3g} times what the "
-        f"observer assumes, on {found.samples} samples"
+        f"largest correlation {found.correlation:.2g} (white: below {WHITE:g}), squared size {found.nis:.3g} of "
+        f"what the observer assumes, on {found.samples} samples"
     )
     if found.correlation <= WHITE and 1.0 / SURE <= found.nis <= SURE:
         return Promise(name, "shown", told)
@@ -791,20 +794,19 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
     for point, one in zip(points, trials, strict=True):
         n, dt = point.problem.horizon, model.dt
         periods = periods_to_find(quiet(point.estimator), SEARCHED * n)
-        dead = [j for j, v in enumerate(periods) if not math.isfinite(v)]
+        dead = [_disturbance(model, j) for j, v in enumerate(periods) if not math.isfinite(v)]
         if dead:
-            return Promise(
-                name, "not promised", f"the load at {_disturbance(model, dead[0])} is not found: the observer's gain on it is zero",
-                remedy,
-            )  # fmt: skip
-        d = np.array(one.result.d)
-        goal = loads(point, 0)
-        off = np.abs(d - goal) > np.abs(goal) / 3.0
-        late = np.max(np.where(off.any(axis=0), len(d) - np.argmax(off[::-1], axis=0), 0))
-        told = f"in a loop on the model itself in {point.title} two thirds of a load are found after {late * dt:.3g} s ({late / n:.2g} horizons)"
-        if late >= len(d):
-            told = f"in a loop on the model itself in {point.title} a load is not found within {late * dt:.3g} s ({late / n:.2g} horizons)"
-        told += f"; its quiet filter alone takes {float(periods.max()) * dt:.3g} s"
+            told = f"the load at {dead[0]} is not found: the observer's gain on it is zero"
+            return Promise(name, "not promised", told, remedy)
+        goal, d = loads(point, 0), one.result.d
+        # a load may be as small as the noise of its estimate: then a tenth of an ordinary one counts
+        near = np.maximum(np.abs(goal) / 3.0, 0.1 * LOAD * disturbance_sizes(model, point.problem))
+        late = int(np.flatnonzero(np.append(True, np.any(np.abs(d - goal) > near, axis=1)))[-1])
+        found = "two thirds of a load are found after" if late < len(d) else "a load is not found within"
+        told = (
+            f"in a loop on the model itself in {point.title} {found} {late * dt:.3g} s ({late / n:.2g} horizons); the "
+            f"quiet filter alone takes {float(periods.max()) * dt:.3g} s"
+        )
         worst = max(worst, (late / n, told))
     if worst[0] <= FOUND_HORIZONS:
         return Promise(name, "shown", worst[1])
@@ -838,7 +840,7 @@ def tasks_end(ends: Sequence[TaskEnd], where: str) -> Promise:
         return Promise(name, "shown", f"{', '.join(one.task for one in ends)} end within the noise, {where}")
     return Promise(
         name, "doubted", f"{'; '.join(missed)}; {where}",
-        "Look at these loops in the report: friction, a limit, a slow observer, or a load that no disturbance stands for.",
+        "Look at these loops in the report: friction, a limit, a slow observer, or a load without a disturbance model.",
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -44,11 +45,11 @@ QUIET_SHARE = 0.0003
 """Step of the estimated load per period while nothing happens (drift, temperature), as a share of its size. Where
 a filter finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
 FOUND_HORIZONS, MOST_DOUBLED = 1.5, 7
-"""Horizons of the controller within which the quiet filter, and the slip filter, has found two thirds of a constant load,
-and how often its step is doubled for that at most. A load that a jump does not show takes as long to be compensated. The
-quiet filter of the golf robot takes 1.3 horizons, the disk's less, so neither is doubled: quick steps make a loop hunt around sticking friction, and where a
-model's errors come and go they are taken for loads. Four horizons cost machines that only lag, as heaters and arms, 1.3
-to 1.5 times as much under a load (docs/results/simulated_machines.md)."""
+"""Horizons of the controller within which the quiet filter, and the slip filter, have found two thirds of a constant
+load, and how often their steps are doubled at most. A load that a jump does not show takes as long to be compensated.
+The quiet filter of the golf robot takes 1.3 horizons, the disk's less, so neither is doubled: quick steps make a loop
+hunt around sticking friction, and where a model's errors come and go they are taken for loads. Four horizons cost
+machines that only lag, as heaters and arms, 1.3 to 1.5 times as much under a load (docs/results/simulated_machines.md)."""
 SEARCHED = 100
 """Horizons after which a load that no filter has found counts as never found: its offset would last for minutes where a
 plan lasts seconds."""
@@ -136,8 +137,9 @@ def tuned_noise(
 ) -> Array:
     """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
 
-    No state strays further in a period than its spread in the recordings. ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of
-    single states by name, which no scale changes.
+    No state strays further in a period than its spread in the recordings. ``base`` are the model's one-period errors
+    ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of single states by name, which no scale
+    changes.
     """
     own = np.array([(known or {}).get(s.name, np.nan) for s in model.states])
     spread = np.array(model.state_spread) if model.state_spread else np.zeros(model.n_x)
@@ -204,9 +206,7 @@ def make_estimator(
     if not observer:
         return filter_of(1.0, None)
     periods = round(FOUND_HORIZONS * control.horizon)
-    quiet, slip = (
-        quiet_shares(lambda s, scale=scale: filter_of(scale, s), periods, model.n_d) for scale in (1.0, SLIP)
-    )
+    quiet, slip = (quiet_shares(partial(filter_of, scale), periods, model.n_d) for scale in (1.0, SLIP))
     # where a load lasts, the slip filter would explain it by slip after slip, and the load would never be found
     modes = (
         filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, JUMP_SHARE)),
@@ -227,8 +227,8 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int) -> None:
     )
     noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
     raise InputError(
-        f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states ({noise} "
-        "a period) it takes every load for noise, and a constant one would leave an offset. Correct the prior, give "
+        f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states "
+        f"({noise} a period) it takes every load for noise, and a constant one would leave an offset. Correct the prior, give "
         "Scenario(state_noise={...}), or run the scenario again"
     )
 

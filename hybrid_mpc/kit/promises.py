@@ -93,7 +93,7 @@ def read_promises(folder: Path) -> PromiseTable | None:
 
 
 def promise_lines(rows: Sequence[Promise]) -> list[str]:
-    """The table for a terminal: a line each, what is not shown first.
+    r"""The table for a terminal: a line each, what is not shown first.
 
     Example:
         >>> late = Promise("step time", "doubted", "99 % of the steps take 9 ms, the period is 10 ms", "Solver native.")

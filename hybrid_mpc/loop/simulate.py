@@ -172,9 +172,9 @@ def simulate(
         reference_now, factors = loop.previewed if acting is None else acting(t)
         goal = _goal(ocp, model, reference_now[0], loop.decision.solution.steady)
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
-            now = 1.0 if factors is None else factors[0]
+            weights = 1.0 if factors is None else factors[0]
             error = model.output(x, u, now_w, model.p).full().ravel() - goal.y if cost.n_y else None
-            stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, now, u_ref=goal.u, y_error=error))
+            stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, weights, u_ref=goal.u, y_error=error))
         step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
         rows.append(_row(step, goal, now_w, stage, loop.spent))
         if on_step is not None:

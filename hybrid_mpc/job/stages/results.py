@@ -251,7 +251,7 @@ class Estimation:
 
 @dataclass(frozen=True)
 class Promises:
-    """The table "What this kit promises", as :attr:`~hybrid_mpc.kit.artifact.Kit.promises`; None: it was not examined."""
+    """The table "What this kit promises" (:attr:`~hybrid_mpc.kit.artifact.Kit.promises`); None: it was not examined."""
 
     rows: tuple[Promise, ...] | None = None
     reason: str = ""
