@@ -49,7 +49,8 @@ FOUND_HORIZONS, MOST_DOUBLED = 1.5, 7
 load, and how often their steps are doubled at most. A load that a jump does not show takes as long to be compensated.
 The quiet filter of the golf robot takes 1.3 horizons, the disk's less, so neither is doubled: quick steps make a loop
 hunt around sticking friction, and where a model's errors come and go they are taken for loads. Four horizons cost
-machines that only lag, as heaters and arms, 1.3 to 1.5 times as much under a load (docs/results/simulated_machines.md)."""
+machines that only lag, as heaters and arms, 1.3 to 1.5 times as much under a load
+(docs/results/simulated_machines.md)."""
 SEARCHED = 100
 """Horizons after which a load that no filter has found counts as never found: its offset would last for minutes where a
 plan lasts seconds."""
@@ -228,8 +229,8 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int) -> None:
     noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
     raise InputError(
         f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states "
-        f"({noise} a period) it takes every load for noise, and a constant one would leave an offset. Correct the prior, give "
-        "Scenario(state_noise={...}), or run the scenario again"
+        f"({noise} a period) it takes every load for noise, and a constant one would leave an offset. Correct the "
+        "prior, give Scenario(state_noise={...}), or run the scenario again"
     )
 
 
