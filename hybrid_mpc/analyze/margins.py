@@ -39,6 +39,8 @@ the digits of each."""
 DIFFERENCE = 1e-4
 """Step of a difference, as a share of a signal's size: its error falls with the square of the step, that of the solves
 (1e-9) is divided by it."""
+INTEGRATES = 1e-5
+"""Distance from 1 at which a pole is an integrator's: rounding (1e-16) moves three that are one by its third root."""
 MOST_DELAY = 200
 """Most whole periods of delay that are tried."""
 
@@ -567,7 +569,7 @@ def _at_rest(sys: Any) -> float:
     a, b, c, d = matrices(sys)
     if not len(a):
         return float(d.item())
-    if np.abs(np.linalg.eigvals(a) - 1.0).min() < 1e-9:
+    if np.abs(np.linalg.eigvals(a) - 1.0).min() < INTEGRATES:
         return 0.0
     return float((c @ np.linalg.solve(np.eye(len(a)) - a, b) + d).item())
 

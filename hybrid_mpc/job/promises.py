@@ -25,7 +25,7 @@ from hybrid_mpc.estimate.offset_free import OffsetFree, distinguishable, offset_
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import periods_to_find
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.kit.assembly import FOUND_HORIZONS, SEARCHED, make_ocp
+from hybrid_mpc.kit.assembly import SEARCHED, make_ocp
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.plant import ModelPlant, ModelState
 from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
@@ -57,10 +57,16 @@ SLOW = "the observer is slow"
 """How the reason begins where a load is found, but not within a trial."""
 STILL_MOVES = 0.02
 """Change of the estimated load within the end of a trial, over the load, from which on it still moves."""
+STANDS = 0.2
+"""Motion of a true output, over the noise of its sensor, below which it stands still."""
 CONSTANTS = 3
 """Time constants of the observer after which a load counts as found: a twentieth of it is left."""
 AT_LIMIT = 1e-3
 """Distance from a limit, over the input's range, that counts as at the limit."""
+TAIL = (0.05, 0.01)
+"""Shares of the cost that are left between which the slowest mode that counts is seen."""
+LOOKED = 20
+"""Horizons over which the cost of a deviation is followed."""
 CARRIES = 0.95
 """Share of the cost of a deviation that is to lie within the horizon; the terminal weight stands for the rest."""
 MODULUS = 0.5
@@ -470,6 +476,9 @@ def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
         return f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load is still on its way"
     if not problem.n_y and np.any(problem.r > 0) and np.any(np.abs(point.rest[1] - model.u0) > edge):
         return "the weight r asks for the operating point's input; let r be 0 and weigh changes by r_delta"
+    true = np.array([model.output(x, model.u0, point.w, model.p).full().ravel() for x in result.x[late]])
+    if all(float(np.std(true[:, one])) < STANDS * point.sigma[one] for one in point.held):
+        return "it stands still there, as where dry friction sticks"
     return "no disturbance of the model explains the error"
 
 
@@ -545,6 +554,8 @@ def remedy_of(why: str) -> str:
         )
     if "weight r" in why:
         return "Set r = 0."
+    if "friction" in why:
+        return "Friction in the prior (docs/control.md#loads-and-stiction), or a machine that sticks less."
     return (
         "Declare a disturbance where the error enters (Scenario(disturbance_model=...)), and look at friction and "
         "at the task's own loops in the report."
@@ -578,47 +589,41 @@ def horizon(points: Sequence[SetPoint]) -> Promise:
     """Whether a plan is long enough: what share of the cost of a deviation lies within it, and the slowest mode of it.
 
     Of the linear-quadratic regulator at the working point: ``x' P x`` is the cost of all time, and ``x_N' P x_N`` what
-    the horizon leaves to the terminal weight, mean over deviations of each state by its size.
+    the horizon leaves to the terminal weight; mean over the deviations that inputs of their ranges leave behind.
     """
     name = "horizon"
-    found = [_carried(point) for point in points]
-    share, point, enough, slow = min(found, key=lambda one: one[0])
-    dt, n = point.model.dt, point.problem.horizon
-    told = (
-        f"the {n} periods ({n * dt:.3g} s) hold {100 * share:.3g} % of the cost of a deviation; the slowest mode that "
-        f"counts falls to a third in {slow:.3g} s"
+    point, cost = min(
+        ((one, _left_costs(one)) for one in points), key=lambda pair: -pair[1][pair[0].problem.horizon]
     )
+    dt, n = point.model.dt, point.problem.horizon
+    share = 1.0 - float(cost[n])
+    told = f"the {n} periods ({n * dt:.3g} s) hold {100 * share:.3g} % of the cost of a deviation"
+    tail = [int(np.argmax(cost < left)) for left in TAIL]
+    if all(tail):
+        # exp(-2 t / tau): the cost is a square
+        slow = 2.0 * dt * max(tail[1] - tail[0], 1) / math.log(TAIL[0] / TAIL[1])
+        told += f"; the slowest mode that counts has a time constant of {slow:.2g} s"
     if share >= CARRIES:
         return Promise(name, "shown", told)
+    enough = int(np.argmax(cost <= 1.0 - CARRIES))
     want = f"A horizon of {enough} periods holds {100 * CARRIES:.0f} %" if enough else "Weigh what drifts"
     return Promise(name, "doubted", told, f"{want}; a longer dt or move blocks make that cheaper.")
 
 
-def _carried(point: SetPoint) -> tuple[float, SetPoint, int, float]:
-    """Share of the cost within the horizon, the set-point, horizon for a share of :data:`CARRIES` (0: none), and time
-    constant of the slowest mode that carries a hundredth of the cost [s].
-    """
+def _left_costs(point: SetPoint) -> Array:
+    """Share of the cost of a deviation that is left after each period, ``(m,)``, over some horizons."""
     model, n = point.model, point.problem.horizon
     a, b, q, r = make_ocp(model, point.problem).linear_quadratic(model)
     p, k = dare(a, b, q, r)
-    closed = a - b @ k
-    sizes = np.concatenate([Sizes(model, point.problem).states, np.zeros(model.n_h)])
-    first = np.diag(sizes**2)
-    whole = float(np.trace(p @ first))
-    values, vectors = np.linalg.eig(closed)
-    parts = np.abs(np.linalg.solve(vectors, np.diag(sizes).astype(complex)))
-    weights = np.real(np.einsum("im,ij,jm->m", vectors.conj(), q, vectors)) * np.sum(parts**2, axis=1)
-    sums = weights / np.maximum(1.0 - np.abs(values) ** 2, 1e-12)
-    counts = sums > 0.01 * sums.max()
-    radius = float(np.abs(values[counts]).max())
-    slow = -model.dt / math.log(radius) if 0.0 < radius < 1.0 else math.inf if radius >= 1.0 else model.dt
-
-    def within(periods: int) -> float:
-        power = np.linalg.matrix_power(closed, periods)
-        return 1.0 - float(np.trace(power.T @ p @ power @ first)) / whole
-
-    enough = next((m for m in (2**i * n // 4 for i in range(1, 12)) if within(m) >= CARRIES), 0)
-    return within(n), point, enough, slow
+    pushed, reached = b * point.problem.input_scale, []
+    for _ in range(n):
+        reached.append(pushed)
+        pushed = a @ pushed
+    x, closed, found = np.hstack(reached), a - b @ k, []
+    for _ in range(LOOKED * n + 1):
+        found.append(float(np.sum(x * (p @ x))))
+        x = closed @ x
+    return np.array(found) / found[0]
 
 
 def margins(points: Sequence[SetPoint]) -> Promise:
@@ -808,7 +813,7 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
             f"quiet filter alone takes {float(periods.max()) * dt:.3g} s"
         )
         worst = max(worst, (late / n, told))
-    if worst[0] <= FOUND_HORIZONS:
+    if worst[0] <= LASTS / CONSTANTS:  # then a twentieth is left at the end of a trial
         return Promise(name, "shown", worst[1])
     return Promise(name, "doubted", worst[1], remedy)
 
@@ -901,10 +906,6 @@ def examine(
 
 
 def _needed(longer: Trial) -> str:
-    """How long a slow loop needs, by a longer trial."""
+    """Whether a slow loop settles in a longer trial."""
     seconds = len(longer.result.t) * longer.result.dt
-    return (
-        f"not settled after {seconds:.3g} s either"
-        if longer.why
-        else f"it settles after {longer.settled_s:.3g} s"
-    )
+    return f"in a loop of {seconds:.3g} s it {'does not settle either' if longer.why else 'settles'}"

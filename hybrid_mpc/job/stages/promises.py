@@ -9,7 +9,7 @@ import numpy as np
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.loops import ON_MODEL, LoopRow
+from hybrid_mpc.job.loops import LoopRow
 from hybrid_mpc.job.promises import TaskEnd, Tested, examine, task_end
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import CONTROL, what_loops_read
@@ -70,7 +70,7 @@ def _loops(context: Context, controller: str) -> tuple[list[LoopRow], str]:
     if isinstance(on_model, Absent):
         return [], ""
     rows = [row for row in on_model.drawn if row.controller == controller]
-    return rows, f"on {on_model.plants.get(controller, 'no model')}, {ON_MODEL}"
+    return rows, f"on the model {on_model.plants.get(controller, '')}, not the machine"
 
 
 def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
