@@ -65,8 +65,8 @@ AT_LIMIT = 1e-3
 """Distance from a limit, over the input's range, that counts as at the limit."""
 TAIL = (0.05, 0.01)
 """Shares of the cost that are left between which the slowest mode that counts is seen."""
-LOOKED = 20
-"""Horizons over which the cost of a deviation is followed."""
+LOOKED, LEAST = 20, 2000
+"""Horizons over which the cost of a deviation is followed, and periods at least."""
 CARRIES = 0.95
 """Share of the cost of a deviation that is to lie within the horizon; the terminal weight stands for the rest."""
 MODULUS = 0.5
@@ -511,8 +511,9 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
     settled = [one for one in trials if not one.why]
     assert trials
     worst = max(trials, key=lambda one: one.worst.size)
-    what = f"{len(trials)} loops on models with loads" + (
-        f" and parameters {100 * OFF:.0f} % off" if any(not p.fixed for p in point.model.parameters) else ""
+    moved = len(trials) - 1 if any(not one.fixed for one in point.model.parameters) else 0
+    what = f"{len(trials)} loops with constant loads" + (
+        f", {moved} of them on models with parameters {100 * OFF:.0f} % off," if moved else ""
     )
     within = f"{len(settled)} of {what} settle within the noise"
     if worst.why:
@@ -620,7 +621,7 @@ def _left_costs(point: SetPoint) -> Array:
         reached.append(pushed)
         pushed = a @ pushed
     x, closed, found = np.hstack(reached), a - b @ k, []
-    for _ in range(LOOKED * n + 1):
+    for _ in range(max(LOOKED * n, LEAST) + 1):
         found.append(float(np.sum(x * (p @ x))))
         x = closed @ x
     return np.array(found) / found[0]

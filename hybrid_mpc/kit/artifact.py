@@ -570,8 +570,10 @@ class Kit:
 
     @property
     def identity(self) -> str:
-        """Digest of all that promises depend on: models, the recommended one, sensors, noise and control problems."""
-        loop = replace(self.loop, causes={}, tasks=(), safe_input=None)
+        """Digest of all that promises depend on: models, the recommended one, its observer, and control problems."""
+        own = f"{self.recommended}_observer"
+        noise = {name: sigma for name, sigma in self.loop.process_noise.items() if name == own}
+        loop = replace(self.loop, causes={}, tasks=(), safe_input=None, process_noise=noise)
         return digest([self.programs_sha256, self.recommended, self.input_delay, loop])
 
     @property

@@ -212,14 +212,21 @@ def make_estimator(
     modes = (
         filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, JUMP_SHARE)),
     )  # fmt: skip
-    _check_found(modes, SEARCHED * control.horizon)
+    _check_found(modes, SEARCHED * control.horizon, Sizes(model, control).states)
     return SwitchingFilter(modes, SWITCHES)
 
 
-def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int) -> None:
-    """Refuse filters none of which finds two thirds of a constant load within so many periods."""
+def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Array) -> None:
+    """Refuse filters none of which finds two thirds of a constant load within so many periods.
+
+    Where no covariance settles there is too little noise for a state that stays, which does no harm, or so much that
+    rounding is all: more than the states' ``sizes`` ``(n_x,)``.
+    """
     model, sigma = modes[0].model, np.sqrt(modes[0].noise[0])
-    lost = np.flatnonzero(~np.any([load_left(one, periods) <= FOUND for one in modes], axis=0))
+    left = np.array([load_left(one, periods) for one in modes])
+    drowned = bool(np.any(sigma[: model.n_x] > sizes))
+    unsettled = np.all(np.isnan(left), axis=0)
+    lost = np.flatnonzero(~np.any(left <= FOUND, axis=0) & (drowned | ~unsettled))
     if not lost.size:
         return
     d = model.disturbance_model

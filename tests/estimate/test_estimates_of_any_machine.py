@@ -263,6 +263,22 @@ def test_an_observer_that_never_finds_a_load_is_refused(noise):
     assert make_estimator(lag(), NOISY, np.array([noise]), observer=False).model.name == "lag"
 
 
+def test_a_state_without_noise_that_stays_hides_no_load():
+    """The covariance of a constant that nothing moves does not settle."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    nxt = ca.vertcat(0.9 * x[0] + 0.1 * u + 0.1 * x[1], x[1])
+    pair = (Signal("x", "m", -1.0, 1.0), Signal("still", "m", -1.0, 1.0))
+    model = HybridModel.of(
+        "still", 0.1, pair, (Signal("u", "m"),), (*pair, ), x=x, u=u, x_next=nxt, xdot=(nxt - x) / 0.1, y=x,
+    )  # fmt: skip
+    scenario = SimpleNamespace(
+        name="still", sensor_sigma=(0.01, 0.01), first_sigma=None,
+        control=OCP(20, [1, 0], [0], [1], [-1], [1]),
+    )  # fmt: skip
+    estimator = make_estimator(model, scenario, np.array([0.002, 0.0]))
+    assert np.isnan(load_left(estimator.filters[0], 100)).all()
+
+
 def test_tuned_noise_stays_within_the_spread_of_the_states():
     rng, n = np.random.default_rng(0), 200
     y = rng.standard_normal((n, 1))

@@ -233,10 +233,11 @@ def test_late_steps_are_no_promise():
 
 
 def test_a_horizon_shorter_than_the_slowest_mode_is_a_doubt():
-    slow = tank(a=0.999, b=0.001)
+    slow = tank(a=0.98, b=0.02)
     problem = OCP(5, [0.0], [0.0], [100.0], [-1.0], [1.0], q_y=[1.0])
     row = p.horizon([point_of(kit_of(slow, problem))])
     assert row.verdict == "doubted"
+    assert re.search(r"the 5 periods \(0\.5 s\) hold \d+(\.\d+)? % of the cost", row.evidence)
     wanted = int(re.search(r"A horizon of (\d+) periods", row.remedy)[1])
     longer = p.horizon([point_of(kit_of(slow, problem.changed(horizon=wanted)))])
     assert longer.verdict == "shown"
