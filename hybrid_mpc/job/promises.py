@@ -41,7 +41,7 @@ tell, and about what a load of another mass or a worn bearing does."""
 LOAD = 0.2
 """Load of a trial, as a share of the room from the set-point's input to its limit, or of a disturbance's size: that of
 the default task ``hold``."""
-PERIODS, LONGER, FEWEST, MOST = 1200, 800, 2, 4
+PERIODS, LONGER, FEWEST, MOST = 800, 800, 3, 4
 """Periods that all trials of a run may take together, a few seconds of computing, and those of a trial of a slow loop;
 trials of a set-point."""
 LASTS = 6
