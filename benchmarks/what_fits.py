@@ -23,6 +23,7 @@ from hybrid_mpc import (
     Scenario,
     Signal,
 )
+from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.kit.artifact import build_model, loop_settings
@@ -185,7 +186,8 @@ def times(case: Scenario, control: OCP) -> tuple[float, float]:
     model = deployed(case)
     settings = loop_settings(case)
     loop = Loop(
-        make_estimator(model, settings, np.ones(model.n_x), control), CondensedController(model, control)
+        make_estimator(model, settings, 1e-4 * Sizes(model, control).states, control),
+        CondensedController(model, control),
     )
     rng, x = np.random.default_rng(0), model.x0
     u, spent = loop.start(model.output(x, model.u0, model.w, model.p).full().ravel()), []

@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     )
     from hybrid_mpc.analyze.margins import (
         gain_schedule as gain_schedule, mpc_gain as mpc_gain, mpc_loop as mpc_loop,
-        steady_filter as steady_filter,
+        solved_gain as solved_gain, steady_filter as steady_filter,
     )
     from hybrid_mpc.analyze.measured import (
         multisine_response as multisine_response, run_model as run_model, run_plant as run_plant,
@@ -114,6 +114,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         make_resting_guard as make_resting_guard,
     )
     from hybrid_mpc.kit.export_c import generate_controller as generate_controller
+    from hybrid_mpc.kit.promises import Promise as Promise
     from hybrid_mpc.loop.faults import (
         Fault as Fault, check_plant_faults as check_plant_faults, corrupt_input as corrupt_input,
         corrupt_measurement as corrupt_measurement,
@@ -169,7 +170,7 @@ _ROOMS = {
     "analyze.linearize": (
         "friction_slopes", "jacobians", "linearize", "linearize_along", "linearize_at_speed", "linearize_secant",
     ),
-    "analyze.margins": ("gain_schedule", "mpc_gain", "mpc_loop", "steady_filter"),
+    "analyze.margins": ("gain_schedule", "mpc_gain", "mpc_loop", "solved_gain", "steady_filter"),
     "analyze.measured": ("multisine_response", "run_model", "run_plant"),
     "analyze.memory": ("contraction", "feature_box", "gru_weights", "lyapunov_exponent"),
     "analyze.properties": (
@@ -234,6 +235,7 @@ _ROOMS = {
         "make_resting_guard",
     ),
     "kit.export_c": ("generate_controller",),
+    "kit.promises": ("Promise",),
     "loop.faults": ("Fault", "check_plant_faults", "corrupt_input", "corrupt_measurement"),
     "loop.guard": ("Guard", "Mode"),
     "loop.loop": ("Loop",),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from types import MappingProxyType
 from typing import Any
@@ -22,7 +22,9 @@ from hybrid_mpc.analyze.linearize import (
     period,
 )
 from hybrid_mpc.analyze.properties import frequency_response, matrices
+from hybrid_mpc.control.problem import Controller, Solution
 from hybrid_mpc.control.rti import CondensedController, propagate
+from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
 from hybrid_mpc.model.model import HybridModel
@@ -31,6 +33,14 @@ from hybrid_mpc.model.riccati import dare, vector
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 FREQUENCIES = 2000
+SETTLE = 10
+"""Solves after which a real-time iteration has settled on its plan: one linearization each, and Newton's method doubles
+the digits of each."""
+DIFFERENCE = 1e-4
+"""Step of a difference, as a share of a signal's size: its error falls with the square of the step, that of the solves
+(1e-9) is divided by it."""
+INTEGRATES = 1e-5
+"""Distance from 1 at which a pole is an integrator's: rounding (1e-16) moves three that are one by its third root."""
 MOST_DELAY = 200
 """Most whole periods of delay that are tried."""
 
@@ -40,7 +50,7 @@ class MpcGain:
     """An MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
 
     It is exact as long as no bound acts and the prediction's linearization stays the same. ``z = (x, h)`` and ``d``,
-    the disturbance at the inputs, are estimates; ``u_before`` is the input held before (its gain is zero without
+    the unmeasured disturbances, are estimates; ``u_before`` is the input held before (its gain is zero without
     ``r_delta``), and ``r`` a reference that is constant over the horizon.
     """
 
@@ -120,6 +130,73 @@ def mpc_gain(
     first = -cho_solve(cho_factor(hessian), slopes)[:n_u]
     edges = np.cumsum([len(a), n_u, n_u])
     return MpcGain(*np.split(first, edges, axis=1))
+
+
+def solved_gain(
+    controller: Controller, x: ArrayLike, u: ArrayLike, reference: ArrayLike, h: ArrayLike | None = None,
+    *, w: ArrayLike | None = None,
+) -> MpcGain:  # fmt: skip
+    """The same of any solver and problem, by central differences of its own solves around the plan that it settles on.
+
+    Unlike :func:`mpc_gain` it knows weights on outputs, their targets, economic costs and any disturbance model.
+
+    Args:
+        controller: The solver.
+        x: Operating point ``(n_x,)``.
+        u: Input there ``(n_u,)``, within the bounds.
+        reference: What is asked for, a row ``(columns,)``, held over the horizon.
+        h: Hidden state ``(n_h,)``. Default: its equilibrium.
+        w: Measured disturbances ``(n_w,)``. Default: the operating point's.
+
+    Raises:
+        InputError: If a size is wrong, the input that the plan holds lies on a bound, or a solve fails.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.model.model import HybridModel
+        >>> from hybrid_mpc.control.ocp import OCP
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> controller = CondensedController(model, OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0]))
+        >>> solved_gain(controller, [0.0], [0.0], [0.0]).by_state.round(6)
+        array([[-0.618034]])
+    """
+    model, ocp = controller.model, controller.ocp
+    x0, u0, h0 = operating_point(model, x, u, h)
+    w0 = model.w if w is None else vector(w, model.n_w, "w")
+    row, sizes = vector(reference, ocp.columns, "reference"), Sizes(model, ocp)
+    n_z, n_d = model.n_x + model.n_h, model.n_d
+    unknown = np.full((n_z + n_d,) * 2, np.nan)
+    at = Estimate(0.0, x0, h0, np.zeros(n_d), unknown, np.full(model.n_y, np.nan), float("nan"), w=w0)
+    plan = controller.initial(at, np.tile(u0, (ocp.horizon, 1)))
+
+    def solved(estimate: Estimate, before: Array, goal: Array, last: Solution) -> Solution:
+        found = controller.solve(last.beginning_with(before), estimate, np.tile(goal, (ocp.horizon + 1, 1)))
+        if not found.status.ok:
+            raise InputError(f"MPC gain: a solve at x = {x0.tolist()} fails: {found.status.value}")
+        return found
+
+    for _ in range(SETTLE):
+        plan = solved(at, u0, row, plan)
+    if np.any(plan.u[0] <= ocp.u_min) or np.any(plan.u[0] >= ocp.u_max):
+        raise InputError(f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, where it does not move")
+    steps = DIFFERENCE * np.concatenate(
+        [sizes.states, sizes.hidden, disturbance_sizes(model, ocp), ocp.input_scale, np.ones(row.size)]
+    )
+    edges = np.cumsum([model.n_x, model.n_h, n_d, model.n_u])
+    slopes = []
+    for i, step in enumerate(steps):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = np.zeros(steps.size)
+            moved[i] = sign * step
+            dx, dh, dd, du, dr = np.split(moved, edges)
+            estimate = replace(at, x=x0 + dx, h=h0 + dh, d=dd)
+            ends.append(solved(estimate, u0 + du, row + dr, plan).u[0])
+        slopes.append((ends[0] - ends[1]) / (2.0 * step))
+    parts = np.split(np.array(slopes).T, [n_z, n_z + n_d, n_z + n_d + model.n_u], axis=1)
+    return MpcGain(*parts)
 
 
 @dataclass(frozen=True)
@@ -226,16 +303,18 @@ def steady_filter(
         raise InputError(
             f"model {model.name}: an output depends on the input at once; the loop here has no such path"
         )
-    n_z, n_u = model.n_x + model.n_h, model.n_u
-    n_w = n_z + n_u
+    n_z, n_u, n_d = model.n_x + model.n_h, model.n_u, model.n_d
+    on_u, on_x, on_y = model.disturbed
+    n_w = n_z + n_d
     known = Estimate(
-        0.0, x0, h0, np.zeros(n_u), np.zeros((n_w, n_w)), np.full(model.n_y, np.nan), float("nan")
+        0.0, x0, h0, np.zeros(n_d), np.zeros((n_w, n_w)), np.full(model.n_y, np.nan), float("nan")
     )
     noise = np.diag(ekf.predict(known, u0).P)  # of a state that was known exactly: what one period adds
     noise_y = ekf.innovation_covariance(known, u0)
     f, g = np.eye(n_w), np.zeros((n_w, n_u))
-    f[:n_z, :n_z], f[:n_z, n_z:], g[:n_z] = sys.A, sys.B, sys.B
-    c = np.hstack([np.asarray(sys.C, dtype=float), np.zeros((model.n_y, n_u))])
+    f[:n_z, :n_z], f[:n_z, n_z:], g[:n_z] = sys.A, np.asarray(sys.B) @ on_u, sys.B
+    f[: model.n_x, n_z:] += on_x
+    c = np.hstack([np.asarray(sys.C, dtype=float), on_y])
     alive = np.concatenate([np.ones(n_z, dtype=bool), noise[n_z:] > 0])
     gain, p = np.zeros((n_w, model.n_y)), np.zeros((n_w, n_w))
     where = np.ix_(alive, alive)
@@ -418,11 +497,11 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
         (True, 4.0, 0.75)
     """
     period(plant)
-    (n_u, n_z), (n_w, n_y) = gain.by_state.shape, filter.gain.shape
-    if (plant.ninputs, plant.noutputs, n_w) != (n_u, n_y, n_z + n_u):
+    (n_u, n_z), (n_w, n_y), n_d = gain.by_state.shape, filter.gain.shape, gain.by_load.shape[1]
+    if (plant.ninputs, plant.noutputs, n_w) != (n_u, n_y, n_z + n_d):
         raise InputError(
             f"loop: plant with {plant.ninputs} inputs and {plant.noutputs} outputs, filter over {n_w} with {n_y} "
-            f"outputs, gain of {n_u} inputs by {n_z} states; these do not fit each other"
+            f"outputs, gain of {n_u} inputs by {n_z} states and {n_d} disturbances; these do not fit each other"
         )
     if np.any(np.asarray(plant.D) != 0):
         raise InputError(
@@ -490,7 +569,7 @@ def _at_rest(sys: Any) -> float:
     a, b, c, d = matrices(sys)
     if not len(a):
         return float(d.item())
-    if np.abs(np.linalg.eigvals(a) - 1.0).min() < 1e-9:
+    if np.abs(np.linalg.eigvals(a) - 1.0).min() < INTEGRATES:
         return 0.0
     return float((c @ np.linalg.solve(np.eye(len(a)) - a, b) + d).item())
 

@@ -68,6 +68,7 @@ def control(
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.job.control import run_control
     from hybrid_mpc.job.study import DEFAULT_CONTROLLERS, Study
+    from hybrid_mpc.kit.promises import promise_lines
 
     guarded = guard or adapt
     controllers = controller or (("hybrid_observer",) if guarded else DEFAULT_CONTROLLERS)
@@ -78,7 +79,7 @@ def control(
     )  # fmt: skip
     with make_progress() as progress:
         results = run_control(study, out, progress, gif=gif, resume=resume)
-    print_summary(summary(results), out / "results.json")
+    print_summary([*summary(results), *promise_lines(results.promises)], out / "results.json")
 
 
 def summary(results: ControlResults) -> list[str]:

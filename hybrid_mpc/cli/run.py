@@ -65,9 +65,9 @@ def run(
 ) -> None:
     """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
 
-    The stages are data, prior, training, choice, evaluation, export, noise, control, on_model, estimation, residuals,
-    monitor, guard, analysis and report. With --resume a stage runs again only where something that it reads has
-    changed. Exit code 1 if a stage after the export could not run; the report then says why.
+    The stages are data, prior, training, choice, evaluation, export, noise, control, on_model, estimation, promises,
+    residuals, monitor, guard, analysis and report. With --resume a stage runs again only where something that it reads
+    has changed. Exit code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.job.run import failed_stages
@@ -93,6 +93,8 @@ def run(
 
 def summary(results: Results) -> list[str]:
     """The figures of a run that are worth a line on the terminal."""
+    from hybrid_mpc.kit.promises import promise_lines
+
     found = results.identification
     lines = errors_table(found)
     lines.append(found.details.choice.reason)
@@ -107,7 +109,10 @@ def summary(results: Results) -> list[str]:
     lines += residual_lines(results.residuals)
     if results.monitor.alarms is None:
         lines.append(f"energy monitor: {results.monitor.reason}")
-    return lines + guard_lines(results.guard)
+    lines += guard_lines(results.guard)
+    if results.promises.rows is None:
+        return [*lines, f"promises of the kit: not examined: {results.promises.reason}"]
+    return lines + promise_lines(results.promises.rows)
 
 
 def comparison_lines(found: Control) -> list[str]:

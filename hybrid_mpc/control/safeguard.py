@@ -120,7 +120,7 @@ class SafeController:
             gain = dare(*ocp.linear_quadratic(fallback))[1]
             self._gain = gain[:, : ocp.n_x]
             self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
-            self._rest_input = _equilibrium_input(fallback, ocp)
+            self._rest_input = equilibrium_input(fallback, ocp)
             self._rest_input(fallback.x0, fallback.w)  # a CasADi function's first call is slow
 
     def initial(
@@ -247,7 +247,7 @@ def checked_safe_input(given: ArrayLike, ocp: OCP) -> Array:
     return u
 
 
-def _equilibrium_input(model: HybridModel, ocp: OCP) -> ca.Function:
+def equilibrium_input(model: HybridModel, ocp: OCP) -> ca.Function:
     """``(x, w) -> u`` that holds a state best; see :func:`holding`."""
     x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
     rates = model.xdot(x, ca.DM.zeros(model.n_h, 1), u, w, model.p)

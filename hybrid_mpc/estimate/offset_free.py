@@ -1,4 +1,4 @@
-"""Whether outputs can be held without offset: the rank test of a disturbance model, and that of the targets."""
+"""Whether outputs could be held without offset: the rank test of a disturbance model, and that of the targets."""
 
 from __future__ import annotations
 
@@ -49,7 +49,10 @@ class OffsetFree:
 
     @property
     def promised(self) -> bool:
-        """Whether constant disturbances leave no offset in the controlled outputs, where no limit is active."""
+        """Whether the rank conditions hold under which constant disturbances can leave no offset in the controlled
+        outputs, where no limit is active. Whether a kit's loop leaves none is tried by its run
+        (:attr:`~hybrid_mpc.kit.artifact.Kit.promises`).
+        """
         return not self.why
 
     @property
@@ -59,7 +62,7 @@ class OffsetFree:
 
     @property
     def why(self) -> str:
-        """What is missing for that; empty: nothing."""
+        """Which condition is missing; empty: none."""
         few = f"{self.n_d} disturbances for {self.n_y} outputs; as many are needed"
         parts = (self.why_undetectable, few * (self.n_d != self.n_y), self.why_unreachable)
         return "; ".join(part for part in parts if part)

@@ -19,6 +19,9 @@ from hybrid_mpc.model.riccati import dare, hidden_fixed_point
 Array = NDArray[np.float64]
 BESIDE = 0.1
 """Share of its range by which each state lies beside the operating point where a load is looked for in motion."""
+FOUND = math.exp(-1.0)
+"""Share of a constant disturbance that is left when a filter has found it: a filter of one time constant leaves so much
+after that time."""
 ROUNDING = 1e-9
 """Share of a state's size below which a model's error is rounding: no filter assumes less noise."""
 
@@ -129,7 +132,7 @@ def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
 
     With the gain of the settled covariance, at the model's operating point and beside it, every state moved by a tenth
     of its range (one without a range by its first deviation). The smaller share counts: dry friction at rest hides a
-    load that shows in motion. Of a filter whose covariance settles at neither nobody can tell: zeros.
+    load that shows in motion. NaN of a filter whose covariance settles at neither.
 
     Example:
         >>> import casadi as ca
@@ -143,17 +146,55 @@ def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
 
     Source: Anderson and Moore, *Optimal Filtering*, 1979, section 4.4.
     """
+    return _left(_errors(ekf), periods, ekf.model.n_d)
+
+
+def periods_to_find(ekf: ExtendedKalmanFilter, most: int) -> Array:
+    """Periods ``(n_d,)`` after which a filter has found two thirds of each constant disturbance; infinite where it has
+    not after ``most``, NaN where its covariance does not settle.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
+        >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> steps = (0.1, 0.01, 1e-9)
+        >>> filters = [ExtendedKalmanFilter(model, sigma_y=[1.0], sigma_x=[1.0], sigma_x0=[1.0], sigma_d=[s])
+        ...            for s in steps]
+        >>> [float(periods_to_find(one, 1000)[0]) for one in filters]
+        [11.0, 101.0, inf]
+    """
+    errors, n_d = _errors(ekf), ekf.model.n_d
+    low, high, last = np.zeros(n_d), np.full(n_d, float(most)), _left(errors, most, n_d)
+    while np.any(high - low > 1.0):
+        middle = np.where(high - low > 1.0, np.floor(0.5 * (low + high)), high)
+        left = np.array([_left(errors, int(n), n_d)[i] for i, n in enumerate(middle)])
+        found = left <= FOUND
+        low, high = np.where(found, low, middle), np.where(found, middle, high)
+    return np.where(np.isnan(last), np.nan, np.where(last <= FOUND, high, np.inf))
+
+
+def _left(errors: Sequence[Array], periods: int, n_d: int) -> Array:
+    """:func:`load_left` of the errors' matrices at the points looked at."""
+    powers = [np.linalg.matrix_power(one, periods) for one in errors]
+    found = [np.abs(np.diag(power)[len(power) - n_d :]) for power in powers]
+    return np.min(found, axis=0) if found else np.full(n_d, np.nan)
+
+
+def _errors(ekf: ExtendedKalmanFilter) -> list[Array]:
+    """Matrices ``(n, n)`` by which errors of a settled filter go on from one period to the next, at the operating point
+    and beside it; none where its covariance does not settle.
+    """
     model = ekf.model
     rest = ekf.start(np.full(model.n_y, np.nan))
     ranges = np.array([s.upper - s.lower for s in model.states])
     x = rest.x + np.where(np.isfinite(ranges), BESIDE * ranges, np.sqrt(ekf.first[: model.n_x]))
     moving = replace(rest, x=x, h=hidden_fixed_point(model, x, model.u0, limit=START_LIMIT))
-    found = [left for at in (rest, moving) if (left := _load_left(ekf, at, periods)) is not None]
-    return np.min(found, axis=0) if found else np.zeros(model.n_d)
+    return [found for at in (rest, moving) if (found := _error(ekf, at)) is not None]
 
 
-def _load_left(ekf: ExtendedKalmanFilter, at: Estimate, periods: int) -> Array | None:
-    """:func:`load_left` at one point; None where the covariance does not settle."""
+def _error(ekf: ExtendedKalmanFilter, at: Estimate) -> Array | None:
+    """The matrix at one point; None where the covariance does not settle."""
     f, c = ekf.tangent(at, ekf.model.u0)
     noise, noise_y = ekf.noise
     try:
@@ -161,5 +202,4 @@ def _load_left(ekf: ExtendedKalmanFilter, at: Estimate, periods: int) -> Array |
     except InputError:
         return None
     gain = np.linalg.solve(c @ p @ c.T + np.diag(noise_y), c @ p).T
-    left = np.linalg.matrix_power(f - gain @ c @ f, periods)
-    return np.abs(np.diag(left)[len(left) - ekf.model.n_d :])
+    return f - gain @ c @ f

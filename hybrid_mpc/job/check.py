@@ -13,6 +13,7 @@ from scipy.optimize import root
 
 from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.recording import COARSE, check_unit
 from hybrid_mpc.errors import InputError, named_extra, no_exit, refuse
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Dataset
 
 Array = NDArray[np.float64]
+QUIET = 1e-4
+"""Process noise a period of the observer that is tried, over the states' sizes: little, as that of a good prior."""
 STARTS = 32
 """Starts of the search for equilibria."""
 FEW = 6
@@ -388,7 +391,7 @@ def _check_problem(
     # each start is sought from for seconds, and their shapes are known to be right
     control = control.changed(starts=())
     with report.part(f"{what}: estimator"):
-        estimator = make_estimator(model, scenario, np.ones(model.n_x), control)
+        estimator = make_estimator(model, scenario, QUIET * Sizes(model, control).states, control)
     with report.part(f"{what}: controller"):
         controller = make_controller(model, model, control)
     if len(report.problems) > before:

@@ -22,6 +22,7 @@ from hybrid_mpc.job.study_run import StudyModel, load_models
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.artifact import Provenance
+from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.faults import fault_text
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.monitor.detector import Detector
@@ -31,7 +32,7 @@ from hybrid_mpc.scenario import load_scenario
 
 Array = NDArray[np.float64]
 NOUN = "control"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class ControlResults:
     energy cannot be watched, ``reaction`` what it does; ``step_ms`` are percentiles of the
     durations of steps by controller, ``summary`` is by task and controller. ``on_model`` names the model that stood in
     for the machine, by controller, where there is no plant: then nothing here is of the machine, and controllers, which
-    met different plants, are not to be compared.
+    met different plants, are not to be compared. ``promises`` are those of the model's folder.
     """
 
     schema: str
@@ -83,6 +84,7 @@ class ControlResults:
     on_model: Mapping[str, str]
     summary: Mapping[str, Mapping[str, Summary]]
     loops: tuple[LoopRow, ...]
+    promises: tuple[Promise, ...]
 
 
 def run_control(
@@ -164,6 +166,7 @@ def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[Loop
         on_model={row.controller: row.on_model for row in rows if row.on_model},
         summary=summaries(rows),
         loops=tuple(rows),
+        promises=kit.promises,
     )
 
 

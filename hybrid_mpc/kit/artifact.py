@@ -19,7 +19,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
-from hybrid_mpc.files import is_file, read_document, read_object, reason, sha256, write_document
+from hybrid_mpc.files import digest, is_file, read_document, read_object, reason, sha256, write_document
 from hybrid_mpc.kit.assembly import (
     energy_is_watched,
     make_adaptive_guard,
@@ -30,6 +30,7 @@ from hybrid_mpc.kit.assembly import (
     sensor_steps,
 )
 from hybrid_mpc.kit.prediction import Predicting
+from hybrid_mpc.kit.promises import Promise, PromiseTable, none_made, read_promises
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
@@ -491,7 +492,7 @@ def load(folder: str | Path) -> Kit:
     return Kit(
         models, found.calibration, found.provenance, found.model.input_delay, found.loop,
         found.recommended or ("hybrid" if "hybrid" in models else found.models[0]), found.residuals,
-        members, found.predicting,
+        members, found.predicting, found.programs_sha256, read_promises(folder),
     )  # fmt: skip
 
 
@@ -526,6 +527,8 @@ class Kit:
         residuals: Limits of the monitor of residuals, by model. Default: none were learned.
         members: The networks that the hybrid is the mean of, by name, the best first. Default: none.
         predicting: What :func:`hybrid_mpc.predict` needs beside the models. Default: there can be no predictions.
+        programs_sha256: Hash of the models' programs. Default: not known.
+        promised: The table that the run left beside the models (:attr:`promises`). Default: there is none.
 
     Example: the whole way from a folder to a loop::
 
@@ -542,6 +545,36 @@ class Kit:
     residuals: Mapping[str, ResidualLimits] = field(default_factory=dict, repr=False)
     members: Mapping[str, HybridModel] = field(default_factory=dict, repr=False)
     predicting: Predicting | None = field(default=None, repr=False)
+    programs_sha256: str = field(default="", repr=False)
+    promised: PromiseTable | None = field(default=None, repr=False)
+
+    @property
+    def promises(self) -> tuple[Promise, ...]:
+        """What this kit promises of its loops, and why or why not: the table that its run has made (docs/promises.md).
+
+        Where there is none, or models, noise or control problems are others since, one row says so.
+
+        Example:
+            ``[promise.name for promise in kit.promises if promise.verdict != "shown"]``
+        """
+        if self.promised is None:
+            return none_made(
+                "this kit holds no table of promises: an older version made it, or its run did not come to the stage "
+                "promises"
+            )
+        if self.promised.of != self.identity:
+            return none_made(
+                "models, noise or control problems are others than those that the table was made of"
+            )
+        return self.promised.rows
+
+    @property
+    def identity(self) -> str:
+        """Digest of all that promises depend on: models, the recommended one, its observer, and control problems."""
+        own = f"{self.recommended}_observer"
+        noise = {name: sigma for name, sigma in self.loop.process_noise.items() if name == own}
+        loop = replace(self.loop, causes={}, tasks=(), safe_input=None, process_noise=noise)
+        return digest([self.programs_sha256, self.recommended, self.input_delay, loop])
 
     @property
     def name(self) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -25,7 +25,7 @@ from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
-from hybrid_mpc.estimate.tuning import load_left, most_likely
+from hybrid_mpc.estimate.tuning import FOUND, load_left, most_likely
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian, positions_of
 from hybrid_mpc.monitor.calibrate import Calibration
@@ -43,13 +43,17 @@ MODES = ("quiet", "slip", "jump")
 """Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
 QUIET_SHARE = 0.0003
 """Step of the estimated load per period while nothing happens (drift, temperature), as a share of its size. Where
-it finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
+a filter finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
 FOUND_HORIZONS, MOST_DOUBLED = 1.5, 7
-"""Horizons of the controller within which the quiet filter has found two thirds of a constant load, and how often its
-step is doubled for that at most. A load that a jump does not show takes as long to be compensated. The golf robot takes
-1.3 horizons, the disk less, so neither is doubled: quick steps make a loop hunt around sticking friction, and where a
-model's errors come and go they are taken for loads. Four horizons cost machines that only lag, as heaters and arms, 1.3
-to 1.5 times as much under a load (docs/results/simulated_machines.md)."""
+"""Horizons of the controller within which the quiet filter, and the slip filter, have found two thirds of a constant
+load, and how often their steps are doubled at most. A load that a jump does not show takes as long to be compensated.
+The quiet filter of the golf robot takes 1.3 horizons, the disk's less, so neither is doubled: quick steps make a loop
+hunt around sticking friction, and where a model's errors come and go they are taken for loads. Four horizons cost
+machines that only lag, as heaters and arms, 1.3 to 1.5 times as much under a load
+(docs/results/simulated_machines.md)."""
+SEARCHED = 100
+"""Horizons after which a load that no filter has found counts as never found: its offset would last for minutes where a
+plan lasts seconds."""
 JUMP_SHARE = 0.05
 """The same when a load comes or goes. A load of a twentieth of what the drive can do is ordinary; for a larger one
 the filter needs a few periods."""
@@ -134,15 +138,18 @@ def tuned_noise(
 ) -> Array:
     """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
 
-    ``base`` are the model's one-period errors ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of
-    single states by name, which no scale changes.
+    No state strays further in a period than its spread in the recordings. ``base`` are the model's one-period errors
+    ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of single states by name, which no scale
+    changes.
     """
     own = np.array([(known or {}).get(s.name, np.nan) for s in model.states])
+    spread = np.array(model.state_spread) if model.state_spread else np.zeros(model.n_x)
+    most = np.where(spread > 0, spread, np.inf)
     chosen = [recordings[i] for i in evenly(len(recordings), TUNED_RECORDINGS)]
     parts = [r.part(slice(TUNED_PERIODS), r.name, "train") for r in chosen]
 
     def scaled(scale: float) -> Array:
-        return np.where(np.isnan(own), scale * base, own)
+        return np.where(np.isnan(own), np.minimum(scale * base, most), own)
 
     def filter_of(scale: float) -> Filter:
         return make_estimator(model, scenario, scaled(scale), observer=observer)
@@ -172,8 +179,9 @@ def make_estimator(
         observer: Whether it estimates the unmeasured disturbances. Default: yes.
 
     Raises:
-        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, there is no control problem, or the
-            outputs cannot tell the disturbances from the states.
+        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, there is no control problem, the
+            outputs cannot tell the disturbances from the states, or the noise of the states hides them: an observer
+            that never finds a load is no observer of loads.
 
     Example:
         ``make_estimator(model, scenario, process_noise(model, train))``
@@ -198,20 +206,50 @@ def make_estimator(
 
     if not observer:
         return filter_of(1.0, None)
-    shares = quiet_shares(lambda s: filter_of(1.0, s), round(FOUND_HORIZONS * control.horizon), model.n_d)
-    modes = filter_of(1.0, shares), filter_of(SLIP, shares), filter_of(1.0, np.full(model.n_d, JUMP_SHARE))
+    periods = round(FOUND_HORIZONS * control.horizon)
+    quiet, slip = (quiet_shares(partial(filter_of, scale), periods, model.n_d) for scale in (1.0, SLIP))
+    # where a load lasts, the slip filter would explain it by slip after slip, and the load would never be found
+    modes = (
+        filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, JUMP_SHARE)),
+    )  # fmt: skip
+    _check_found(modes, SEARCHED * control.horizon, Sizes(model, control).states)
     return SwitchingFilter(modes, SWITCHES)
 
 
+def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Array) -> None:
+    """Refuse filters none of which finds two thirds of a constant load within so many periods.
+
+    Where no covariance settles there is too little noise for a state that stays, which does no harm, or so much that
+    rounding is all: more than the states' ``sizes`` ``(n_x,)``.
+    """
+    model, sigma = modes[0].model, np.sqrt(modes[0].noise[0])
+    left = np.array([load_left(one, periods) for one in modes])
+    drowned = bool(np.any(sigma[: model.n_x] > sizes))
+    unsettled = np.all(np.isnan(left), axis=0)
+    lost = np.flatnonzero(~np.any(left <= FOUND, axis=0) & (drowned | ~unsettled))
+    if not lost.size:
+        return
+    d = model.disturbance_model
+    where = (
+        f"the input {model.inputs[lost[0]].name}" if d is None else f"the {d[lost[0]].at} {d[lost[0]].signal}"
+    )
+    noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
+    raise InputError(
+        f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states "
+        f"({noise} a period) it takes every load for noise, and a constant one would leave an offset. Correct the "
+        "prior, give Scenario(state_noise={...}), or run the scenario again"
+    )
+
+
 def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: int, n_d: int) -> Array:
-    """Steps ``(n_d,)`` of the loads in the quiet filter a period, as shares of their sizes.
+    """Steps ``(n_d,)`` of the loads in a filter that no jump drives, a period, as shares of their sizes.
 
     Each is :data:`QUIET_SHARE`, doubled until the filter has found two thirds of a constant load of that kind after
     ``periods``, at rest or in motion; at most :data:`MOST_DOUBLED` times.
     """
     shares = np.full(n_d, QUIET_SHARE)
     for _ in range(MOST_DOUBLED):
-        slow = load_left(filter_of(shares), periods) > math.exp(-1.0)
+        slow = load_left(filter_of(shares), periods) > FOUND
         if not slow.any():
             break
         shares = np.where(slow, 2.0 * shares, shares)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from time import perf_counter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -71,6 +72,7 @@ def simulate(
     input_delay: int = 0,
     late: Callable[[float], bool] | None = None,
     guard: Guard | None = None,
+    now: Callable[[], float] = perf_counter,
 ) -> ClosedLoopResult:
     """Run a plant under control; deterministic except for the recorded durations.
 
@@ -108,6 +110,7 @@ def simulate(
         input_delay: Periods after which an input reaches the plant: computing and transport.
         late: ``t [s] -> True`` where the solve misses its deadline. Default: never.
         guard: What to do on alarms of the monitor, which it needs. Default: nothing.
+        now: Clock [s] of the recorded durations, e.g. ``time.thread_time``. Default: the computer's.
 
     Returns:
         The record of ``round(duration / dt)`` periods.
@@ -138,7 +141,7 @@ def simulate(
     loop = Loop(
         estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
         w=_disturbances(w, estimator.model), end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
-        sensor_delay=sensor_delay,
+        sensor_delay=sensor_delay, now=now,
     )  # fmt: skip
     surroundings = _disturbances(w, estimator.model)
     ocp, model, periods = loop.ocp, loop.model, round(duration / dt)
@@ -169,9 +172,9 @@ def simulate(
         reference_now, factors = loop.previewed if acting is None else acting(t)
         goal = _goal(ocp, model, reference_now[0], loop.decision.solution.steady)
         with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
-            now = 1.0 if factors is None else factors[0]
+            weights = 1.0 if factors is None else factors[0]
             error = model.output(x, u, now_w, model.p).full().ravel() - goal.y if cost.n_y else None
-            stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, now, u_ref=goal.u, y_error=error))
+            stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, weights, u_ref=goal.u, y_error=error))
         step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
         rows.append(_row(step, goal, now_w, stage, loop.spent))
         if on_step is not None:

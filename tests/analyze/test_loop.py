@@ -1,5 +1,7 @@
 """Gains of controller and filter, loops and margins, reduction: against LQR, python-control and each other."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from online_models import linear_model, pendulum_model, random_linear
 from hybrid_mpc import (
     OCP,
     CondensedController,
+    Disturbance,
     Estimate,
     ExtendedKalmanFilter,
     InputError,
@@ -17,6 +20,7 @@ from hybrid_mpc import (
     mpc_gain,
     mpc_loop,
     physical_states,
+    solved_gain,
     steady_filter,
     system_structure,
 )
@@ -92,6 +96,48 @@ def test_gain_is_the_derivative_of_the_controller_s_own_answer(blocks):
     whole = np.hstack([found.by_state, found.by_load, found.by_before, found.by_reference])
     # The answer is affine in all of these, so the step is no matter; the QP solver's own error is 1e-8 or so.
     assert np.abs(whole - np.array(numeric).T).max() < 1e-5
+
+
+def test_the_gain_of_solves_is_that_of_the_qp():
+    model, *_ = random_linear(0, n_x=3, n_u=2)
+    controller = controller_of(model, r_delta=0.5)
+    own, solved = (
+        mpc_gain(controller, np.zeros(3), np.zeros(2)),
+        solved_gain(controller, np.zeros(3), np.zeros(2), np.zeros(3)),
+    )
+    for name in ("by_state", "by_load", "by_before", "by_reference"):
+        # solves are right to 1e-8 of the inputs' scale (50), over differences of 1e-4 of the signals' sizes
+        np.testing.assert_allclose(getattr(solved, name), getattr(own, name), atol=1e-4)
+
+
+@pytest.mark.parametrize("at", ["rate", "output"])
+def test_loops_of_outputs_and_of_any_disturbance_model_leave_no_offset(at):
+    model, *_ = random_linear(3, n_x=2, n_u=1, radius=0.9)
+    place = model.states[0].name if at == "rate" else model.outputs[0].name
+    model = replace(model, disturbance_model=(Disturbance(at, place, 1.0),))
+    problem = OCP(20, [0.0, 0.0], [0.0], [0.3], [-50.0], [50.0], q_y=[1.0])
+    gain = solved_gain(CondensedController(model, problem), np.zeros(2), np.zeros(1), np.zeros(1))
+    if at == "output":  # an offset of the sensor is a set-point that lies lower
+        np.testing.assert_allclose(gain.by_load, -gain.by_reference, atol=1e-5)
+    ekf = ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.1, 0.1], sigma_x0=[1.0, 1.0], sigma_d=[0.05])
+    filter, estimate = steady_filter(ekf, np.zeros(2), np.zeros(1)), ekf.start(np.zeros(1))
+    for _ in range(600):
+        before = ekf.predict(estimate, np.zeros(1))
+        estimate = ekf.correct(before, np.zeros(1))
+    settled = before.P @ filter.C.T / (filter.C @ before.P @ filter.C.T + 0.01)
+    np.testing.assert_allclose(filter.gain, settled, atol=1e-6)
+    loop = mpc_loop(gain, filter, linearize(model, np.zeros(2), np.zeros(1)))
+    assert loop.stable
+    # integral action: a constant load at the input is gone in the end
+    closed = loop.closed
+    a, b, c = (np.asarray(m) for m in (closed.A, closed.B, closed.C))
+    from_load = c[:1] @ np.linalg.solve(np.eye(len(a)) - a, b[:, :1])
+    assert abs(from_load.item()) < 1e-4
+
+
+def test_gain_of_solves_at_a_bound_is_refused():
+    with pytest.raises(InputError, match="lies on a bound"):
+        solved_gain(controller_of(pendulum_model()), [0.0, 0.0], [0.0], [40.0, 0.0])
 
 
 def test_gain_where_a_bound_acts_is_refused():

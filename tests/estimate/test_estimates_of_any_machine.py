@@ -21,7 +21,8 @@ from hybrid_mpc import (
 )
 from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.estimate.offset_free import distinguishable
-from hybrid_mpc.kit.assembly import first_deviations
+from hybrid_mpc.estimate.tuning import FOUND, load_left
+from hybrid_mpc.kit.assembly import FOUND_HORIZONS, first_deviations, tuned_noise
 
 ALL = (two_tanks, dc_motor, thermal)
 
@@ -220,3 +221,70 @@ def test_a_load_that_a_bristle_takes_up_at_rest_is_told_in_motion():
     assert distinguishable(model).detectable
     twice = replace(model, disturbance_model=(Disturbance("input", "force"), Disturbance("output", "q", 0.1)))
     assert not distinguishable(twice).detectable  # two loads and one output: nowhere
+
+
+NOISY = SimpleNamespace(
+    name="lag", sensor_sigma=(0.01,), first_sigma=None, control=OCP(20, [1], [0], [1], [-1], [1])
+)
+
+
+def lag(spread=()):
+    """A lag with a gain of 1 from its input."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    nxt = 0.9 * x + 0.1 * u
+    model = HybridModel.of(
+        "lag", 0.1, (Signal("x", "m"),), (Signal("u", "m"),), (Signal("y", "m"),), x=x, u=u, x_next=nxt,
+        xdot=(nxt - x) / 0.1, y=x,
+    )  # fmt: skip
+    return replace(model, state_spread=spread)
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.02])
+def test_no_filter_explains_a_load_that_lasts_by_noise(noise):
+    """Of the three only the quiet filter found a load in time: the observer went on in the slip filter, and a load that
+    a horizon's time should show took ten."""
+    model, load = lag(), 0.4
+    estimator = make_estimator(model, NOISY, np.array([noise]))
+    periods = round(FOUND_HORIZONS * NOISY.control.horizon)
+    for one in estimator.filters:
+        assert load_left(one, periods)[0] <= FOUND
+    rng, x = np.random.default_rng(0), 0.0
+    estimate = estimator.start([0.0])
+    for _ in range(3 * periods):
+        x = 0.9 * x + 0.1 * load
+        estimate = estimator.update(estimate, [x + 0.01 * rng.standard_normal()], [0.0])
+    assert estimate.d[0] == pytest.approx(load, abs=load / 4)
+
+
+@pytest.mark.parametrize("noise", [1e3, 1e9, 7e16])
+def test_an_observer_that_never_finds_a_load_is_refused(noise):
+    with pytest.raises(InputError, match="never finds a load at the input u"):
+        make_estimator(lag(), NOISY, np.array([noise]))
+    assert make_estimator(lag(), NOISY, np.array([noise]), observer=False).model.name == "lag"
+
+
+def test_a_state_without_noise_that_stays_hides_no_load():
+    """The covariance of a constant that nothing moves does not settle."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    nxt = ca.vertcat(0.9 * x[0] + 0.1 * u + 0.1 * x[1], x[1])
+    pair = (Signal("x", "m", -1.0, 1.0), Signal("still", "m", -1.0, 1.0))
+    model = HybridModel.of(
+        "still", 0.1, pair, (Signal("u", "m"),), (*pair, ), x=x, u=u, x_next=nxt, xdot=(nxt - x) / 0.1, y=x,
+    )  # fmt: skip
+    scenario = SimpleNamespace(
+        name="still", sensor_sigma=(0.01, 0.01), first_sigma=None,
+        control=OCP(20, [1, 0], [0], [1], [-1], [1]),
+    )  # fmt: skip
+    estimator = make_estimator(model, scenario, np.array([0.002, 0.0]))
+    assert np.isnan(load_left(estimator.filters[0], 100)).all()
+
+
+def test_tuned_noise_stays_within_the_spread_of_the_states():
+    rng, n = np.random.default_rng(0), 200
+    y = rng.standard_normal((n, 1))
+    still = SimpleNamespace(u=np.zeros((n, 1)), y=y, w=np.zeros((n, 0)), name="still")
+    still.part = lambda rows, name, role: still
+    assert tuned_noise(lag((0.3,)), NOISY, np.array([50.0]), [still], observer=True)[0] == 0.3
+    assert tuned_noise(lag((0.0,)), NOISY, np.array([0.5]), [still], observer=True)[0] >= 0.5
+    known = tuned_noise(lag((0.3,)), NOISY, np.array([50.0]), [still], observer=True, known={"x": 0.9})
+    assert known[0] == 0.9

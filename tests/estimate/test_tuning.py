@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise
-from hybrid_mpc.estimate.tuning import _load_left, load_left, log_likelihood, most_likely
+from hybrid_mpc.estimate.tuning import _error, _left, load_left, log_likelihood, most_likely, periods_to_find
 from hybrid_mpc.kit.assembly import MOST_DOUBLED, QUIET_SHARE, quiet_shares
 
 DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
@@ -128,7 +128,7 @@ def test_friction_that_hides_a_load_at_rest_does_not_make_the_filter_quick():
 
     quiet, periods = np.array([QUIET_SHARE]), 500
     ekf = filter_of(quiet)
-    at_rest = _load_left(ekf, ekf.start(np.full(1, np.nan)), periods)
+    at_rest = _left([_error(ekf, ekf.start(np.full(1, np.nan)))], periods, 1)
     assert at_rest[0] > np.exp(-1) > load_left(ekf, periods)[0]
     assert quiet_shares(filter_of, periods, 1).tolist() == quiet.tolist()
 
@@ -136,4 +136,5 @@ def test_friction_that_hides_a_load_at_rest_does_not_make_the_filter_quick():
 def test_a_filter_that_does_not_settle_keeps_its_step():
     """No noise reaches the speed, which nothing damps."""
     still = observer_of(0.0, (0.0, 0.0))
-    assert load_left(still, 10).tolist() == [0.0]
+    assert np.isnan(load_left(still, 10)).tolist() == [True]
+    assert np.isnan(periods_to_find(still, 100)).tolist() == [True]

@@ -66,7 +66,7 @@ def own(machine, finished, arguments, tmp_path, monkeypatch):
         pytest.param(
             r"q=\(",
             "q=(2.0 * ",
-            ["control", "on_model", "residuals", "monitor", "guard", "analysis", "report"],
+            ["control", "on_model", "promises", "residuals", "monitor", "guard", "analysis", "report"],
             marks=pytest.mark.full,
         ),
         ("$", "\n# a remark\n", []),

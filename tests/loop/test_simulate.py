@@ -42,6 +42,14 @@ def test_two_runs_differ_in_nothing_but_durations(model, safe):
     assert np.isfinite(first.violation).any()
 
 
+def test_durations_are_those_of_the_clock_that_is_given(safe):
+    ticks = iter(range(10**6))
+    found = run(pendulum_model(z=2), safe, seed=0, now=lambda: float(next(ticks)))
+    # a tick at either end of each part
+    assert np.all(found.timing_ms["solve"] == 1e3)
+    assert np.all(found.timing_ms["estimate"][1:] == 1e3)
+
+
 def test_the_seed_changes_the_noise_and_only_the_noise(model, safe):
     one, two = (run(model, safe, seed=seed) for seed in (0, 1))
     assert not np.array_equal(one.y, two.y)

@@ -202,6 +202,7 @@ FIGURES = {
     "bode": bode_figure,
 }
 PLACES = {
+    "promises": (),
     "data": ("recordings", "coverage"),
     "models": (),
     "training": ("training",),

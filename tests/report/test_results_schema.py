@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 9,
+    "schema_version": 10,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
@@ -98,6 +98,11 @@ RESULTS = {
         }
         for name in ("prior_observer", "hybrid_observer")
     },
+    "promises": {
+        "rows": [
+            {"name": "horizon", "verdict": "shown", "evidence": "it holds 99 % of the cost", "remedy": ""}
+        ]
+    },
     "timing": {
         "controller_step_ms": {"median": 2.0, "p95": 3.0, "p99": 4.0, "max": 9.0},
         "period_ms": 20.0,
@@ -146,7 +151,15 @@ def leaves(values=RESULTS, prefix=""):
             yield prefix + key
 
 
-DEFAULTS = ("on_model.", "estimation.", "timing.controller_step_ms.", "residuals.", "guard.", "analysis.")
+DEFAULTS = (
+    "on_model.",
+    "estimation.",
+    "promises.",
+    "timing.controller_step_ms.",
+    "residuals.",
+    "guard.",
+    "analysis.",
+)
 """Groups whose values may be left out."""
 
 
@@ -190,7 +203,7 @@ def test_null_needs_a_reason():
 
 
 def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match="this version reads 9"):
+    with pytest.raises(InputError, match="this version reads 10"):
         read_results(put("schema_version", 4))
     with pytest.raises(InputError, match="no field 'programs'"):
         read_results(put("export.programs", 3))

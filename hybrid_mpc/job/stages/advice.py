@@ -30,7 +30,7 @@ def advice(results: Results) -> list[Hint]:
     own = results.identification
     found = [
         *_doubt(own), *_recordings(results), *_prior(own), *_choice(own), *_linear(own), *_floor(own), *_bands(own),
-        *_loops(results), *_watching(results),
+        *_promises(results), *_loops(results), *_watching(results),
     ]  # fmt: skip
     if not any(hint.verdict == "bad" for hint in found):
         found.append(
@@ -140,6 +140,18 @@ def _bands(found: Identification) -> Iterator[Hint]:
             "plain", f"The {band.share:.0%} band holds {band.coverage:.0%} of unseen measurements: it is wide.",
             "Validation recordings were harder than the unseen ones.",
         )  # fmt: skip
+
+
+def _promises(results: Results) -> Iterator[Hint]:
+    """What the kit does not promise, in one hint."""
+    rows = results.promises.rows or ()
+    for verdict, say in (("doubted", "Doubted"), ("not promised", "Not promised")):
+        names = [one.name for one in rows if one.verdict == verdict]
+        if names:
+            yield Hint(
+                "bad" if verdict == "doubted" else "plain", f"{say} of this kit: {', '.join(names)}.",
+                'The table "What this kit promises" says why, and what to do.',
+            )  # fmt: skip
 
 
 def _loops(results: Results) -> Iterator[Hint]:

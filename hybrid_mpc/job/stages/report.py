@@ -29,6 +29,7 @@ from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop
 from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, TRAINING, models_of, training_settings
 from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL
+from hybrid_mpc.job.stages.promises import PROMISES
 from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import (
     REPORTED,
@@ -40,6 +41,7 @@ from hybrid_mpc.job.stages.results import (
     Identification,
     Monitor,
     OnModel,
+    Promises,
     Residuals,
     Results,
     Timing,
@@ -57,6 +59,7 @@ from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 
 TITLES: Mapping[str, str] = {
+    "promises": "What this kit promises",
     "data": "Data",
     "models": "Prior and models",
     "training": "Training",
@@ -240,6 +243,7 @@ def command(context: Context, scenario: str = "") -> str:
 def _report(context: Context, results: Results, figures: Figures) -> Report:
     found = results.identification
     tables: dict[str, Sequence[Table | None]] = {
+        "promises": [_promises_table(results.promises)],
         "data": [_data_table(results.data)],
         "models": [_prior_table(context)],
         "free_run": _free_run_tables(context, found),
@@ -345,6 +349,10 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     instead: Notes = {}
     after: Notes = {}
     control = results.control
+    if results.promises.rows is None:
+        instead["promises"] = (
+            f"It was not examined what the kit promises: {results.promises.reason.rstrip('.')}.",
+        )
     if control.gap_closed is None:
         reason = control.gap_closed_reason.rstrip(".")
         if control.hybrid.cost is None:
@@ -544,6 +552,13 @@ def _number(value: Any) -> float | None:
 
 def _percent(value: float | None, base: float | None) -> str:
     return "–" if value is None or not base else f"{100 * (value / base - 1):+.0f} %"
+
+
+def _promises_table(found: Promises) -> Table | None:
+    if not found.rows:
+        return None
+    rows = [(one.name, one.verdict, one.evidence, one.remedy) for one in found.rows]
+    return Table(("promise", "verdict", "evidence", "what to do"), rows)
 
 
 def _export_table(export: Export) -> Table:
@@ -750,7 +765,7 @@ def _pole_table(analysis: Analysis) -> Table | None:
 
 REPORT = Stage(
     "report", "writing the report", ReportResult, report_stage, what_report_reads,
-    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, RESIDUALS, MONITOR,
-     GUARD, ANALYSIS),
+    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES, RESIDUALS,
+     MONITOR, GUARD, ANALYSIS),
     restore=report_is_there,
 )  # fmt: skip

@@ -31,15 +31,17 @@ from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLo
 from hybrid_mpc.job.stages.identify import DATA, MODELS, BaselineScores, CutInterval
 from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
+from hybrid_mpc.job.stages.promises import PROMISES
 from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
 from hybrid_mpc.job.summary import Summary, by_task, summaries
+from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
 from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import plain, record
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 ENERGY = "energy [W]"
 """The balance that the monitor watches, with the unit of its rate."""
 Errors = Mapping[str, Mapping[str, float] | str | None]
@@ -248,6 +250,14 @@ class Estimation:
 
 
 @dataclass(frozen=True)
+class Promises:
+    """The table "What this kit promises" (:attr:`~hybrid_mpc.kit.artifact.Kit.promises`); None: it was not examined."""
+
+    rows: tuple[Promise, ...] | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class StepTimes:
     """Durations of whole controller steps [ms]."""
 
@@ -387,6 +397,7 @@ class Results:
     control: Control
     on_model: OnModel
     estimation: Estimation
+    promises: Promises
     timing: Timing
     residuals: Residuals
     monitor: Monitor
@@ -424,7 +435,7 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
         )
     for group in (
-        "identification", "control", "estimation", "timing", "residuals", "monitor", "guard", "analysis",
+        "identification", "control", "estimation", "promises", "timing", "residuals", "monitor", "guard", "analysis",
     ):  # fmt: skip
         _check_values(values[group], group, where)
     return results
@@ -456,6 +467,7 @@ def collect(context: Context) -> Results:
         _control(context),
         _on_model(context),
         _estimation(context),
+        promises(context),
         _timing(context),
         _residuals(context),
         _monitor(context),
@@ -640,6 +652,12 @@ def _observer(test: ObserverTest | Absent) -> ObserverFigures:
         test.mean_nis, test.nis_low, test.nis_high, test.nis_inside, test.ljung_box, test.ljung_box_limit,
         test.samples,
     )  # fmt: skip
+
+
+def promises(context: Context) -> Promises:
+    """What the kit promises, or why that was not examined."""
+    found = context.find(PROMISES)
+    return Promises(reason=found.reason) if isinstance(found, Absent) else Promises(found.rows)
 
 
 def step_times(context: Context) -> dict[str, Array]:

@@ -1,0 +1,912 @@
+"""What a kit promises of its loops, examined: loops on wrong models with loads, margins, limits, the observer.
+
+Everything is computed from the kit, the scenario's tasks, and what the run has found so far. No recordings are needed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from time import thread_time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.analyze.linearize import linearize
+from hybrid_mpc.analyze.margins import mpc_loop, solved_gain, steady_filter
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.safeguard import SafeController, Source, equilibrium_input
+from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
+from hybrid_mpc.estimate.offset_free import OffsetFree, distinguishable, offset_free
+from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
+from hybrid_mpc.estimate.tuning import periods_to_find
+from hybrid_mpc.kit.artifact import Kit
+from hybrid_mpc.kit.assembly import SEARCHED, make_ocp
+from hybrid_mpc.kit.promises import Promise
+from hybrid_mpc.loop.plant import ModelPlant, ModelState
+from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.model import HybridModel, output_with_jacobian
+from hybrid_mpc.model.riccati import dare, hidden_fixed_point
+from hybrid_mpc.scenario import Task
+
+Array = NDArray[np.float64]
+OFF = 0.2
+"""Share by which each parameter of the wrong models is off, up or down: more than a fit leaves of what its recordings
+tell, and about what a load of another mass or a worn bearing does."""
+LOAD = 0.2
+"""Load of a trial, as a share of the room from the set-point's input to its limit, or of a disturbance's size: that of
+the default task ``hold``."""
+PERIODS, LONGER, FEWEST, MOST = 800, 800, 3, 4
+"""Periods that all trials of a run may take together, a few seconds of computing, and those of a trial of a slow loop;
+trials of a set-point."""
+LASTS = 6
+"""Horizons that a trial lasts: a load that no jump shows is found to two thirds within 1.5 of them, so 2 % are left."""
+END = 0.2
+"""Share of a trial, or of a task, at its end over which offset and scatter count: as in the report's step responses."""
+NOISE = 1.0
+"""Largest offset within the noise, in standard deviations of the sensor."""
+RESTS = 5.0
+"""Largest scatter of an output that has settled, in standard deviations of its sensor. The sensor itself makes one; an
+observer hands a part of its noise on to the input, and an unstable machine moves by several."""
+SLOW = "the observer is slow"
+"""How the reason begins where a load is found, but not within a trial."""
+STILL_MOVES = 0.02
+"""Change of the estimated load within the end of a trial, over the load, from which on it still moves."""
+STANDS = 0.2
+"""Motion of a true output, over the noise of its sensor, below which it stands still."""
+CONSTANTS = 3
+"""Time constants of the observer after which a load counts as found: a twentieth of it is left."""
+AT_LIMIT = 1e-3
+"""Distance from a limit, over the input's range, that counts as at the limit."""
+TAIL = (0.05, 0.01)
+"""Shares of the cost that are left between which the slowest mode that counts is seen."""
+LOOKED, LEAST = 20, 2000
+"""Horizons over which the cost of a deviation is followed, and periods at least."""
+CARRIES = 0.95
+"""Share of the cost of a deviation that is to lie within the horizon; the terminal weight stands for the rest."""
+MODULUS = 0.5
+"""Least distance of the Nyquist curve from -1: peak sensitivity 2, gain margin 2, phase margin 29 degrees (Astrom and
+Hagglund, *Advanced PID Control*, 2006, section 4.6)."""
+HALF = 0.5
+"""Share of the period that 99 of 100 steps may take: the rest is for sensors, for the actuator and for other work."""
+NEAR = 0.05
+"""Distance from a hard bound, over the room to it, at which a loop starts."""
+WHITE = 0.3
+"""Largest correlation of an innovation with an earlier one: that explains less than a tenth of the variance."""
+SURE = 4.0
+"""Largest mean of normalised squared innovations, and one over the smallest: errors of twice or half the deviation that
+the observer assumes."""
+
+
+@dataclass(frozen=True)
+class LoadedPlant(ModelPlant):
+    """A model in place of the machine, on which constant unmeasured disturbances act.
+
+    Args:
+        d: The disturbances ``(n_d,)``, in the order of the model's ``disturbance_model``.
+    """
+
+    d: tuple[float, ...]
+
+    def step(self, state: ModelState, u: Array, dt: float, w: Array | None = None) -> ModelState:
+        """A period on."""
+        on_u, on_x, _ = self.model.disturbed
+        after = super().step(state, u + on_u @ np.array(self.d), dt, w)
+        return after._replace(x=after.x + on_x @ np.array(self.d))
+
+    def measure(self, state: ModelState, rng: np.random.Generator) -> Array:
+        """Outputs with noise and disturbances."""
+        return np.asarray(super().measure(state, rng) + self.model.disturbed[2] @ np.array(self.d))
+
+
+@dataclass(frozen=True)
+class SetPoint:
+    """Where loops are examined: a set-point of a control problem, with the parts of its loop.
+
+    Args:
+        model: The model that the kit recommends.
+        problem: The control problem.
+        tasks: Names of the tasks that have this problem; the first one ends at this set-point, if any does.
+        reference: The set-point ``(columns,)``.
+        w: Measured disturbances ``(n_w,)`` there.
+        estimator: The kit's observer.
+        controller: Its controller.
+    """
+
+    model: HybridModel
+    problem: OCP
+    tasks: tuple[str, ...]
+    reference: Array
+    w: Array
+    estimator: Filter
+    controller: SafeController
+
+    @cached_property
+    def rest(self) -> tuple[Array, Array]:
+        """State and input of the set-point's steady state; of a reference of states that, and the input that holds it.
+
+        Raises:
+            InputError: If there is no such steady state.
+        """
+        m = self.model
+        empty = np.full(m.n_y, np.nan)
+        n = m.n_x + m.n_h + m.n_d
+        at = Estimate(
+            0.0, m.x0, hidden_fixed_point(m, m.x0, m.u0, w=self.w), np.zeros(m.n_d), np.zeros((n, n)), empty,
+            float("nan"), w=self.w,
+        )  # fmt: skip
+        target = self.controller.controller.problem.target(self.reference[None], None, at)
+        x, u = target.x[0], target.u[0]
+        if self.problem.n_y and (target.steady is None or not target.steady.steady):
+            raise InputError(f"the set-point {self.reference.tolist()} of {self.title} has no steady state")
+        if not self.problem.n_y:
+            best = equilibrium_input(m, self.problem)(x, self.w).full().ravel()
+            u = np.clip(best, self.problem.u_min, self.problem.u_max)
+        return x, u
+
+    @property
+    def title(self) -> str:
+        """The tasks, in words."""
+        others = f" and {len(self.tasks) - 1} more" if len(self.tasks) > 1 else ""
+        return f"task {self.tasks[0]}{others}" if self.tasks else "the operating point"
+
+    @cached_property
+    def held(self) -> list[int]:
+        """Places of the outputs that are held."""
+        return held_outputs(self.model, self.problem, *self.rest, self.w)
+
+    def errors(self, y: Array, u: Array) -> Array:
+        """Deviations ``(n, n_y)`` of measured outputs ``(n, n_y)`` from the set-point, under inputs ``(n, n_u)``."""
+        return errors_of(self.model, self.problem, self.reference, self.w, y, u)
+
+    @property
+    def sigma(self) -> Array:
+        """Noise of the sensors ``(n_y,)``, standard deviations."""
+        return np.sqrt(quiet(self.estimator).noise[1])
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far an output is from its set-point at the end of a loop [its unit].
+
+    Args:
+        signal: The output.
+        sigma: Standard deviation of its sensor.
+        offset: Mean deviation over the end.
+        scatter: Standard deviation there.
+    """
+
+    signal: Signal
+    sigma: float
+    offset: float
+    scatter: float
+
+    @property
+    def kept(self) -> bool:
+        """Whether it has settled within the noise."""
+        return abs(self.offset) <= NOISE * self.sigma and self.scatter <= RESTS * self.sigma
+
+    @property
+    def size(self) -> float:
+        """The larger of offset and scatter over what they may be; infinite where a loop diverges."""
+        found = max(abs(self.offset) / NOISE, self.scatter / RESTS) / self.sigma
+        return found if math.isfinite(found) else math.inf
+
+    def __str__(self) -> str:
+        if not math.isfinite(self.size):
+            return f"{self.signal.name} runs away"
+        what = f"{abs(self.offset):.2g} {self.signal.unit} off"
+        if self.scatter > RESTS * self.sigma:
+            what += f", moving by {self.scatter:.2g} {self.signal.unit}"
+        return f"{self.signal.name} {what} (noise {self.sigma:.2g} {self.signal.unit})"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A simulated loop at a set-point, on a wrong model with loads.
+
+    Args:
+        deviations: Of the outputs that are held.
+        settled_s: Time after which they stay within the noise [s]; None: not within the trial.
+        why: Why they do not; empty where they do.
+        result: The loop's record.
+    """
+
+    deviations: tuple[Deviation, ...]
+    settled_s: float | None
+    why: str
+    result: ClosedLoopResult = field(repr=False)
+
+    @property
+    def worst(self) -> Deviation:
+        """The output that is furthest off."""
+        return max(self.deviations, key=lambda one: one.size)
+
+
+@dataclass(frozen=True)
+class TaskEnd:
+    """How a task of the run's loops ends that ends at a set-point.
+
+    Args:
+        task: Its name.
+        deviations: Of the outputs that are held.
+    """
+
+    task: str
+    deviations: tuple[Deviation, ...]
+
+
+@dataclass(frozen=True)
+class Tested:
+    """What the innovations of the kit's observer say on test recordings.
+
+    Args:
+        correlation: Largest autocorrelation in size [-].
+        nis: Mean normalised innovation squared of an output [-]; 1 is as sure as it may be.
+        samples: Samples looked at.
+    """
+
+    correlation: float
+    nis: float
+    samples: int
+
+
+def held_outputs(model: HybridModel, problem: OCP, x: Array, u: Array, w: Array) -> list[int]:
+    """Places of the outputs that a problem holds: weighed ones, or those that show a weighed state at a point."""
+    if problem.n_y:
+        return [int(i) for i in np.flatnonzero(problem.q_y > 0)]
+    by_x = output_with_jacobian(model)(x, u, w)[1].full()
+    return [int(i) for i in np.flatnonzero(np.any(by_x[:, problem.q > 0] != 0, axis=1))]
+
+
+def errors_of(model: HybridModel, problem: OCP, reference: Array, w: Array, y: Array, u: Array) -> Array:
+    """Deviations ``(n, n_y)`` of measured outputs ``(n, n_y)`` from a set-point ``(columns,)``, under the inputs
+    ``(n, n_u)`` that acted.
+    """
+    if problem.n_y:
+        return np.asarray(y - reference[: problem.n_y])
+    x = reference[: model.n_x]
+    return np.asarray(y - np.array([model.output(x, one, w, model.p).full().ravel() for one in u]))
+
+
+def task_end(kit: Kit, task: Task, loop: Mapping[str, Array]) -> TaskEnd | None:
+    """How a task ended in a loop of the run; None where it ends at no set-point, or weighs no output.
+
+    Args:
+        kit: The kit.
+        task: The task.
+        loop: Its arrays ``u`` ``(n, n_u)`` and ``y`` ``(n, n_y)``.
+    """
+    model, problem = kit.models[kit.recommended], task.control or kit.problem()
+    end = end_of(task, model)
+    if end is None:
+        return None
+    row, w = end
+    x = model.x0 if problem.n_y else row[: model.n_x]
+    held = held_outputs(model, problem, x, model.u0, w)
+    before = np.vstack([loop["u"][:1], loop["u"][:-1]])
+    errors = errors_of(model, problem, row, w, loop["y"], before)
+    return (
+        TaskEnd(task.name, deviations(model.outputs, held, np.array(kit.sensor_sigma), errors))
+        if held
+        else None
+    )
+
+
+def quiet(estimator: Filter) -> ExtendedKalmanFilter:
+    """The filter that observes while nothing happens."""
+    return estimator.filters[0] if isinstance(estimator, SwitchingFilter) else estimator
+
+
+def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
+    """One set-point of each control problem of a kit's tasks: that at which a task ends, else the operating point.
+
+    Raises:
+        InputError: If the kit lacks a control problem or noise.
+
+    Example:
+        ``[one.title for one in set_points(hm.load("runs/golf"), load_scenario("golf_robot").tasks)]``
+    """
+    model, found = kit.models[kit.recommended], list[SetPoint]()
+    groups: list[tuple[OCP, list[Task]]] = []
+    for task in tasks:
+        problem = task.control or kit.problem()
+        same = next((own for known, own in groups if known == problem), None)
+        if same is None:
+            groups.append((problem, [task]))
+        else:
+            same.append(task)
+    if not groups:
+        groups = [(kit.problem(), [])]
+    ends = [{task.name: end for task in own if (end := end_of(task, model)) is not None} for _, own in groups]
+    if not any(ends):  # only trajectories
+        groups, ends = groups[:1], ends[:1]
+    for (problem, own), at in zip(groups, ends, strict=True):
+        if not at and any(ends):
+            continue
+        named = sorted((task.name for task in own), key=lambda name: name not in at)
+        first = named[0] if named else ""
+        asked = first if first in kit.loop.control else ""
+        controller, estimator = kit.controller(task=asked), kit.observer(task=asked)
+        row = at.get(first, (controller.controller.problem.standing()[0], model.w))
+        found.append(SetPoint(model, problem, tuple(named), row[0], row[1], estimator, controller))
+    return found
+
+
+def end_of(task: Task, model: HybridModel) -> tuple[Array, Array] | None:
+    """Set-point and measured disturbances at which a task ends; None where they move, or weights do."""
+    t = task.duration * np.linspace(1.0 - END, 1.0, 50)
+    rows = np.asarray(task.reference(t), dtype=np.float64)
+    w = np.tile(model.w, (len(t), 1)) if task.w is None else np.asarray(task.w(t), dtype=np.float64)
+    still = all(np.all(np.isfinite(v)) and np.array_equal(v, np.tile(v[-1], (len(v), 1))) for v in (rows, w))
+    return (rows[-1], w[-1]) if still and task.weight is None else None
+
+
+# No offset: loops on wrong models with loads.
+
+
+def wrong_model(model: HybridModel, draw: int) -> HybridModel:
+    """The model with each parameter that a fit may move a fifth off, up or down, within its bounds.
+
+    Args:
+        model: The model.
+        draw: Number of the draw; each has signs of its own, always the same. 0: the model itself.
+    """
+    if not draw:
+        return model
+    signs = np.random.default_rng([draw, 0]).choice((-1.0, 1.0), model.n_p)
+    return replace(
+        model,
+        name=f"{model.name}_wrong_{draw}",
+        parameters=tuple(
+            replace(one, value=float(np.clip(one.value * (1.0 + OFF * sign), one.lower, one.upper)))
+            for one, sign in zip(model.parameters, signs, strict=True)
+        ),
+    )
+
+
+def loads(point: SetPoint, draw: int) -> Array:
+    """A constant value ``(n_d,)`` of each disturbance of the model: a fifth of the room from the set-point's input to
+    the limit on that side, or of the disturbance's size; signs by the draw.
+    """
+    model, problem, (_, u) = point.model, point.problem, point.rest
+    sizes = disturbance_sizes(model, problem)
+    signs = np.random.default_rng([draw, 1]).choice((-1.0, 1.0), model.n_d)
+    found = LOAD * sizes * signs
+    for j, i in zip(*np.nonzero(model.disturbed[0].T), strict=True):
+        # a load is met by the input's motion the other way
+        room = u[i] - problem.u_min[i] if signs[j] > 0 else problem.u_max[i] - u[i]
+        found[j] = signs[j] * LOAD * min(room, sizes[j]) if math.isfinite(room) else found[j]
+    return np.asarray(found)
+
+
+def trial(point: SetPoint, draw: int, periods: int) -> Trial:
+    """A loop of the kit's observer and controller at a set-point, on a wrong model with loads.
+
+    Args:
+        point: The set-point.
+        draw: Number of the draw; 0 has the right parameters, and loads.
+        periods: Length.
+
+    Raises:
+        InputError: If the set-point has no steady state.
+    """
+    x, _ = point.rest
+    plant = LoadedPlant(
+        wrong_model(point.model, draw), tuple(point.sigma), tuple(loads(point, draw).tolist())
+    )
+    return tried(point, plant, x, periods, draw)
+
+
+def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int = 0) -> Trial:
+    """A loop of the kit's parts on a plant, from a state ``(n_x,)``; durations are the processor's, not the clock's."""
+    model = point.model
+    result = simulate(
+        plant, point.estimator, point.controller, point.reference, dt=model.dt, duration=periods * model.dt, x0=x0,
+        seed=seed, w=point.w if model.n_w else None, now=thread_time,
+    )  # fmt: skip
+    before = np.vstack([result.u[:1], result.u[:-1]])
+    errors = point.errors(result.y, before)
+    found = deviations(point.model.outputs, point.held, point.sigma, errors)
+    settled = _settled(errors[:, point.held], point.sigma[point.held], point.problem.horizon)
+    kept = all(one.kept for one in found)
+    settled_s = None if settled is None or not kept else settled * model.dt
+    return Trial(found, settled_s, "" if kept else _why(point, result, errors), result)
+
+
+def deviations(
+    signals: Sequence[Signal], held: Sequence[int], sigma: Array, errors: Array
+) -> tuple[Deviation, ...]:
+    """How far outputs are off over the end of a loop, of errors ``(n, n_y)``; NaN are samples that were lost."""
+    late = errors[int((1.0 - END) * len(errors)) :]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return tuple(
+            Deviation(
+                signals[i], float(sigma[i]), float(np.nanmean(late[:, i])), float(np.nanstd(late[:, i]))
+            )
+            for i in held
+        )
+
+
+def _settled(errors: Array, sigma: Array, horizon: int) -> int | None:
+    """Period from which means of errors over half a horizon stay within twice the noise; None: never.
+
+    Twice, since an observer hands noise on to the input, and means of few samples move.
+    """
+    width = max(1, horizon // 2)
+    if len(errors) < 2 * width:
+        return None
+    means = np.apply_along_axis(lambda v: np.convolve(v, np.full(width, 1.0 / width), "valid"), 0, errors)
+    outside = np.flatnonzero(~np.all(np.abs(means) <= 2.0 * NOISE * sigma, axis=1))
+    last = int(outside[-1]) + 1 if outside.size else 0
+    return last if last < len(means) else None
+
+
+def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
+    """Why a loop does not settle within the noise."""
+    problem, model = point.problem, point.model
+    late = slice(int((1.0 - END) * len(errors)), None)
+    if not np.all(np.isfinite(result.x)):
+        return "the loop runs away"
+    away = np.abs(result.x[late] - point.rest[0]).max(axis=0) > 2.0 * np.abs(_room(model))
+    if away.any():
+        return f"the loop does not hold {model.states[int(np.flatnonzero(away)[0])].name}"
+    edge = AT_LIMIT * problem.input_range
+    at = np.mean((result.u[late] >= problem.u_max - edge) | (result.u[late] <= problem.u_min + edge), axis=0)
+    if at.max() > 0.5:
+        return f"{model.inputs[int(at.argmax())].name} is at its limit"
+    if result.reached.size and not np.all(result.reached[late]):
+        return "the set-point cannot be reached within the limits"
+    periods = periods_to_find(quiet(point.estimator), SEARCHED * problem.horizon)
+    slowest = float(np.max(np.where(np.isnan(periods), np.inf, periods)))
+    if not math.isfinite(slowest):
+        return "the disturbance model does not move: the observer's noise takes every load for noise of the states"
+    found = deviations(model.outputs, point.held, point.sigma, errors)
+    if all(abs(one.offset) <= NOISE * one.sigma for one in found):
+        return "it does not come to rest: noise or friction keeps it moving"
+    half = (len(errors) - late.start) // 2
+    d, sizes = result.d[late], LOAD * disturbance_sizes(model, problem)
+    moved = np.abs(d[half:].mean(axis=0) - d[:half].mean(axis=0)) / sizes
+    if moved.max() > STILL_MOVES or CONSTANTS * slowest > len(errors):
+        return f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load is still on its way"
+    if not problem.n_y and np.any(problem.r > 0) and np.any(np.abs(point.rest[1] - model.u0) > edge):
+        return "the weight r asks for the operating point's input; let r be 0 and weigh changes by r_delta"
+    true = np.array([model.output(x, model.u0, point.w, model.p).full().ravel() for x in result.x[late]])
+    if all(float(np.std(true[:, one])) < STANDS * point.sigma[one] for one in point.held):
+        return "it stands still there, as where dry friction sticks"
+    return "no disturbance of the model explains the error"
+
+
+def _room(model: HybridModel) -> Array:
+    """Ranges of the states ``(n_x,)``; infinite where there is none."""
+    return np.array([s.upper - s.lower for s in model.states])
+
+
+def ranks(point: SetPoint) -> OffsetFree:
+    """The rank conditions of the set-point; friction at rest may hide a load that shows in motion."""
+    x, u = point.rest
+    found = offset_free(point.model, point.held, x=x, u=u, w=point.w)
+    if (
+        not found.detectable
+        and distinguishable(point.model, Sizes(point.model, point.problem).states).detectable
+    ):
+        return replace(found, rank=found.needed)
+    return found
+
+
+def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -> Promise:
+    """Whether a constant load leaves no offset at a set-point.
+
+    Args:
+        point: The set-point.
+        trials: Its trials.
+        several: Whether there are other set-points, so that the row names its tasks.
+    """
+    name = "no offset" + (f" in {point.title}" if several else "")
+    settled = [one for one in trials if not one.why]
+    assert trials
+    worst = max(trials, key=lambda one: one.worst.size)
+    moved = len(trials) - 1 if any(not one.fixed for one in point.model.parameters) else 0
+    what = f"{len(trials)} loops with constant loads" + (
+        f", {moved} of them on models with parameters {100 * OFF:.0f} % off," if moved else ""
+    )
+    within = f"{len(settled)} of {what} settle within the noise"
+    if worst.why:
+        within += f"; the worst leaves {worst.worst}: {worst.why}"
+    if point.problem.economic is not None:
+        return Promise(
+            name, "not promised", f"the cost is economic, and may want an offset; {within}",
+            "Weigh the outputs (q_y) without an economic cost where a set-point is to be held.",
+        )  # fmt: skip
+    lacks = []
+    if len(point.held) > point.model.n_u:
+        names = ", ".join(point.model.outputs[i].name for i in point.held)
+        lacks.append(
+            f"{len(point.held)} outputs ({names}) are held by {point.model.n_u} input"
+            + "s" * (point.model.n_u > 1)
+        )
+    if why := ranks(point).why:
+        lacks.append(why)
+    if lacks:
+        return Promise(
+            name, "not promised", f"{'; '.join(lacks)}; {within}",
+            "Weigh no more outputs than there are inputs, and declare as many disturbances as outputs "
+            "(docs/mpc.md#set-points).",
+        )  # fmt: skip
+    if worst.why:
+        return Promise(name, "doubted", within, remedy_of(worst.why))
+    times = [one.settled_s for one in trials if one.settled_s is not None]
+    return Promise(name, "shown", f"{within}, after {max(times):.3g} s at most" if times else within)
+
+
+def remedy_of(why: str) -> str:
+    """What to do where a loop keeps an offset, by its reason."""
+    if "limit" in why:
+        return "Choose set-points with more room to the limits of the inputs, or a stronger actuator."
+    if "slow" in why or "does not move" in why:
+        return (
+            "Give the states less noise (Scenario(state_noise=...)), or a prior that errs less over one period; "
+            "see the rows on the observer."
+        )
+    if "weight r" in why:
+        return "Set r = 0."
+    if "friction" in why:
+        return "Friction in the prior (docs/control.md#loads-and-stiction), or a machine that sticks less."
+    return (
+        "Declare a disturbance where the error enters (Scenario(disturbance_model=...)), and look at friction and "
+        "at the task's own loops in the report."
+    )
+
+
+# Step time.
+
+
+def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
+    """Whether a step ends within the period, of processor time, which no other work of the computer changes."""
+    ms = np.sort(np.concatenate([one.result.timing_ms["total"] for one in trials]))
+    p99, worst = float(np.quantile(ms, 0.99)), float(ms[-1])
+    told = (
+        f"99 % of {ms.size} steps take {p99:.3g} ms of processor time, the longest {worst:.3g} ms, the period is "
+        f"{period_ms:.4g} ms"
+    )
+    remedy = "Solver native (compiled C), a shorter horizon, move blocks or a longer dt (docs/choosing.md)."
+    if p99 > period_ms:
+        return Promise("step time", "not promised", told, remedy)
+    # a single long step may be the operating system's
+    if p99 > HALF * period_ms or ms[-2] > period_ms:
+        return Promise("step time", "doubted", told, remedy)
+    return Promise("step time", "shown", f"{told}; on this computer")
+
+
+# Horizon and margins.
+
+
+def horizon(points: Sequence[SetPoint]) -> Promise:
+    """Whether a plan is long enough: what share of the cost of a deviation lies within it, and the slowest mode of it.
+
+    Of the linear-quadratic regulator at the working point: ``x' P x`` is the cost of all time, and ``x_N' P x_N`` what
+    the horizon leaves to the terminal weight; mean over the deviations that inputs of their ranges leave behind.
+    """
+    name = "horizon"
+    point, cost = min(
+        ((one, _left_costs(one)) for one in points), key=lambda pair: -pair[1][pair[0].problem.horizon]
+    )
+    dt, n = point.model.dt, point.problem.horizon
+    share = 1.0 - float(cost[n])
+    told = f"the {n} periods ({n * dt:.3g} s) hold {100 * share:.3g} % of the cost of a deviation"
+    tail = [int(np.argmax(cost < left)) for left in TAIL]
+    if all(tail):
+        # exp(-2 t / tau): the cost is a square
+        slow = 2.0 * dt * max(tail[1] - tail[0], 1) / math.log(TAIL[0] / TAIL[1])
+        told += f"; the slowest mode that counts has a time constant of {slow:.2g} s"
+    if share >= CARRIES:
+        return Promise(name, "shown", told)
+    enough = int(np.argmax(cost <= 1.0 - CARRIES))
+    want = f"A horizon of {enough} periods holds {100 * CARRIES:.0f} %" if enough else "Weigh what drifts"
+    return Promise(name, "doubted", told, f"{want}; a longer dt or move blocks make that cheaper.")
+
+
+def _left_costs(point: SetPoint) -> Array:
+    """Share of the cost of a deviation that is left after each period, ``(m,)``, over some horizons."""
+    model, n = point.model, point.problem.horizon
+    a, b, q, r = make_ocp(model, point.problem).linear_quadratic(model)
+    p, k = dare(a, b, q, r)
+    pushed, reached = b * point.problem.input_scale, []
+    for _ in range(n):
+        reached.append(pushed)
+        pushed = a @ pushed
+    x, closed, found = np.hstack(reached), a - b @ k, []
+    for _ in range(max(LOOKED * n, LEAST) + 1):
+        found.append(float(np.sum(x * (p @ x))))
+        x = closed @ x
+    return np.array(found) / found[0]
+
+
+def margins(points: Sequence[SetPoint]) -> Promise:
+    """Stability margins of the loop of observer and controller, linearized at the set-points, broken at each input."""
+    name = "stability margins"
+    remedy = "Larger weights of changes (r_delta), or less process noise; hybrid-mpc analyze shows more."
+    worst: tuple[float, str, bool] | None = None
+    lacks = []
+    for point in points:
+        model, (x, u) = point.model, point.rest
+        try:
+            h = hidden_fixed_point(model, x, u, w=point.w)
+            gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.w)
+            system = linearize(model, x, u, h)
+            loop = mpc_loop(gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system)
+            for j, signal in enumerate(model.inputs):
+                own = loop.margins(j)
+                late = f"{own.delay_periods} period" + "s" * (own.delay_periods != 1)
+                told = (
+                    f"at {signal.name} in {point.title}: gain {own.gain_down:.2g} to {own.gain_up:.3g} times, phase "
+                    f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay"
+                )
+                good = own.modulus >= MODULUS and own.delay_periods >= 1
+                if worst is None or own.modulus < worst[0]:
+                    worst = own.modulus, told, good and (worst is None or worst[2])
+        except InputError as error:
+            lacks.append(f"{point.title}: {error}")
+    if lacks or worst is None:
+        return Promise(name, "not promised", "; ".join(lacks), remedy)
+    return Promise(name, "shown" if worst[2] else "doubted", worst[1], "" if worst[2] else remedy)
+
+
+# Limits.
+
+
+def limits(
+    points: Sequence[SetPoint], trials: Sequence[Trial], given_way: Mapping[str, Mapping[str, float]]
+) -> Promise:
+    """Whether every period has a plan within the hard bounds, from starts close to them.
+
+    Args:
+        points: The set-points.
+        trials: All trials.
+        given_way: Share of the periods in which each hard bound gave way, by task of the run's loops.
+    """
+    name, model = "limits", points[0].model
+    results = [one.result for one in trials]
+    hard = [point for point in points if point.problem.hard]
+    starts = [(point, *start) for point in hard for start in starts_near(point)]
+    found: list[str] = []
+    for point, label, x0 in starts:
+        plant = ModelPlant(model, tuple(point.sigma))
+        own = tried(point, plant, x0, point.problem.horizon).result
+        results.append(own)
+        if gave := sorted({way for period in own.given_way for way in period}):
+            found.append(f"from {label} the bound of {', '.join(gave)} gives way")
+    found += [
+        f"in task {task} the bound of {bound} gave way in {100 * share:.2g} % of the periods"
+        for task, own in given_way.items()
+        for bound, share in own.items()
+    ]
+    sources = [source for one in results for source in one.source]
+    failed = sum(source != Source.MPC.name for source in sources)
+    if failed:
+        found.append(f"{failed} of {len(sources)} solves failed, and the safeguard gave the input")
+    if found:
+        return Promise(
+            name, "doubted", "; ".join(found),
+            "Bounds further apart, a longer horizon, or a set at the end of the plan (HardBound(..., at_end=True)).",
+        )  # fmt: skip
+    ends = [bound for point in hard for bound in point.problem.hard if bound.at_end]
+    if not hard:
+        soft = any(_is_soft(point.problem) for point in points)
+        told = "bounds of states and outputs are soft" if soft else "only inputs are bounded"
+        return Promise(
+            name,
+            "shown",
+            f"{told}: every period has a plan within the inputs' limits ({len(sources)} periods tried)",
+        )
+    told = f"no hard bound gives way from {len(starts)} starts within {100 * NEAR:.0f} % of one"
+    return Promise(
+        name, "shown", told + (", and the plan ends in a set" if ends else "; in simulation, no proof")
+    )
+
+
+def _is_soft(problem: OCP) -> bool:
+    ranges = (problem.x_min, problem.x_max, problem.y_min, problem.y_max)
+    return bool(problem.soft) or any(np.any(np.isfinite(v)) for v in ranges)
+
+
+def starts_near(point: SetPoint) -> Sequence[tuple[str, Array]]:
+    """States close to each hard bound of a state, and of an output that shows a state alone; the others rest."""
+    model, (x, u) = point.model, point.rest
+    rows = output_with_jacobian(model)(x, u, point.w)[1].full()
+    found: list[tuple[str, Array]] = []
+
+    def add(i: int, value: float) -> None:
+        if math.isfinite(value):
+            start = x.copy()
+            start[i] = x[i] + (1.0 - NEAR) * (value - x[i])
+            found.append((f"{model.states[i].name} = {start[i]:.3g} {model.states[i].unit}", start))
+
+    for bound in point.problem.hard:
+        if bound.at_end or not isinstance(bound.what, str):
+            continue
+        for j, ends in enumerate(zip(bound.lower, bound.upper, strict=True)):
+            if bound.what == "x":
+                for value in ends:
+                    add(j, float(value))
+            elif np.flatnonzero(rows[j]).size == 1:
+                i = int(np.flatnonzero(rows[j])[0])
+                y = float(model.output(x, u, point.w, model.p).full()[j, 0])
+                for value in ends:
+                    add(i, float(x[i] + (value - y) / rows[j, i]))
+    return found
+
+
+# The observer, and the run's own loops.
+
+
+def process_noise(kit: Kit) -> Promise:
+    """Whether the observer takes the states to stray less in a period than they moved in all recordings."""
+    name, model = "process noise", kit.models[kit.recommended]
+    sigma = kit.noise(f"{kit.recommended}_observer")
+    if not model.state_spread:
+        return Promise(
+            name, "not promised", "this kit does not hold the spread of the states", "Run the main job again."
+        )
+    spread = np.array(model.state_spread)
+    shares = np.where(spread > 0, sigma / np.where(spread > 0, spread, 1.0), 0.0)
+    i = int(shares.argmax())
+    signal = model.states[i]
+    told = (
+        f"{signal.name} strays by {sigma[i]:.2g} {signal.unit} a period, {100 * shares[i]:.2g} % of its spread "
+        f"({spread[i]:.2g} {signal.unit})"
+    )
+    if shares[i] <= 1.0:
+        return Promise(name, "shown", told)
+    return Promise(
+        name, "doubted", told,
+        "The prior does not describe this state: correct it, or give Scenario(state_noise=...).",
+    )  # fmt: skip
+
+
+def innovations(found: Tested | str) -> Promise:
+    """Whether innovations on test recordings are white enough, and as large as the observer assumes; or why unknown."""
+    name = "innovations"
+    if isinstance(found, str):
+        return Promise(name, "not promised", found, "Give longer test recordings.")
+    told = (
+        f"largest correlation {found.correlation:.2g} (white: below {WHITE:g}), squared size {found.nis:.3g} of "
+        f"what the observer assumes, on {found.samples} samples"
+    )
+    if found.correlation <= WHITE and 1.0 / SURE <= found.nis <= SURE:
+        return Promise(name, "shown", told)
+    return Promise(
+        name, "doubted", told,
+        "The observer lacks something that the recordings have: a state, friction, a delay, or the sensor's noise "
+        "(sensor_sigma); section Estimation of the report shows it.",
+    )  # fmt: skip
+
+
+def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Promise:
+    """Whether the observer finds a constant load: by its quiet filter's gain, and in a loop on the model itself.
+
+    Args:
+        points: The set-points.
+        trials: The first trial of each, on the right parameters.
+    """
+    name, model = "disturbance model", points[0].model
+    remedy = "Less process noise (Scenario(state_noise=...)), or other disturbances (Scenario(disturbance_model=...))."
+    worst = (0.0, "")
+    for point, one in zip(points, trials, strict=True):
+        n, dt = point.problem.horizon, model.dt
+        periods = periods_to_find(quiet(point.estimator), SEARCHED * n)
+        dead = [_disturbance(model, j) for j, v in enumerate(periods) if not math.isfinite(v)]
+        if dead:
+            told = f"the load at {dead[0]} is not found: the observer's gain on it is zero"
+            return Promise(name, "not promised", told, remedy)
+        goal, d = loads(point, 0), one.result.d
+        # a load may be as small as the noise of its estimate: then a tenth of an ordinary one counts
+        near = np.maximum(np.abs(goal) / 3.0, 0.1 * LOAD * disturbance_sizes(model, point.problem))
+        late = int(np.flatnonzero(np.append(True, np.any(np.abs(d - goal) > near, axis=1)))[-1])
+        found = "two thirds of a load are found after" if late < len(d) else "a load is not found within"
+        told = (
+            f"in a loop on the model itself in {point.title} {found} {late * dt:.3g} s ({late / n:.2g} horizons); the "
+            f"quiet filter alone takes {float(periods.max()) * dt:.3g} s"
+        )
+        worst = max(worst, (late / n, told))
+    if worst[0] <= LASTS / CONSTANTS:  # then a twentieth is left at the end of a trial
+        return Promise(name, "shown", worst[1])
+    return Promise(name, "doubted", worst[1], remedy)
+
+
+def _disturbance(model: HybridModel, j: int) -> str:
+    """Name of a disturbance."""
+    chosen = model.disturbance_model
+    if chosen is None:
+        return f"the input {model.inputs[j].name}"
+    return f"the {chosen[j].at} {chosen[j].signal}"
+
+
+def tasks_end(ends: Sequence[TaskEnd], where: str) -> Promise:
+    """Whether the run's own loops of tasks that end at a set-point end there.
+
+    Args:
+        ends: The tasks' ends.
+        where: What the loops ran on, in words.
+    """
+    name = "set-points of the tasks"
+    if not ends:
+        return Promise(
+            name, "not promised", "no task of the run's loops ends at a set-point", "Add one, e.g. a step."
+        )
+    missed = [
+        f"{one.task}: {deviation}" for one in ends for deviation in one.deviations if not deviation.kept
+    ]
+    if not missed:
+        return Promise(name, "shown", f"{', '.join(one.task for one in ends)} end within the noise, {where}")
+    return Promise(
+        name, "doubted", f"{'; '.join(missed)}; {where}",
+        "Look at these loops in the report: friction, a limit, a slow observer, or a load without a disturbance model.",
+    )  # fmt: skip
+
+
+def examine(
+    kit: Kit,
+    tasks: Sequence[Task],
+    *,
+    ends: Sequence[TaskEnd] = (),
+    where: str = "",
+    given_way: Mapping[str, Mapping[str, float]] | None = None,
+    tested: Tested | str = "no test recording was looked at",
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> tuple[Promise, ...]:
+    """All promises of a kit.
+
+    Args:
+        kit: The kit.
+        tasks: The scenario's tasks.
+        ends: How tasks end in the run's own loops.
+        where: What these ran on.
+        given_way: Share of their periods in which hard bounds gave way, by task.
+        tested: What innovations on recordings say, or why nothing.
+        report: Called with what is done, of how many, and what comes.
+
+    Raises:
+        InputError: If the kit lacks a control problem or noise.
+
+    Example:
+        ``for promise in examine(kit, scenario.tasks): print(promise)``
+    """
+    points = set_points(kit, tasks)
+    lengths = [LASTS * point.problem.horizon for point in points]
+    draws = min(max(round(PERIODS / sum(lengths)), FEWEST), MOST)
+    every: list[list[Trial]] = []
+    for i, (point, length) in enumerate(zip(points, lengths, strict=True)):
+        report(i, len(points), f"loops on wrong models, {point.title}")
+        # where the ranks lack nothing is promised: the loop on the right parameters tells how long steps take
+        number = 1 if len(point.held) > point.model.n_u or ranks(point).why else draws
+        trials = [trial(point, draw, length) for draw in range(number)]
+        worst = max(range(number), key=lambda draw: trials[draw].worst.size)
+        if trials[worst].why.startswith(SLOW):
+            longer = trial(point, worst, max(2 * length, LONGER))
+            trials[worst] = replace(trials[worst], why=f"{trials[worst].why}; {_needed(longer)}")
+        every.append(trials)
+    own = [one for trials in every for one in trials]
+    report(len(points), len(points), "margins, limits, observer")
+    return (
+        *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
+        tasks_end(ends, where),
+        step_time(own, 1e3 * points[0].model.dt),
+        horizon(points),
+        margins(points),
+        limits(points, own, given_way or {}),
+        process_noise(kit),
+        innovations(tested),
+        disturbance_model(points, [trials[0] for trials in every]),
+    )
+
+
+def _needed(longer: Trial) -> str:
+    """Whether a slow loop settles in a longer trial."""
+    seconds = len(longer.result.t) * longer.result.dt
+    return f"in a loop of {seconds:.3g} s it {'does not settle either' if longer.why else 'settles'}"

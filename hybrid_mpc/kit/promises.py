@@ -1,0 +1,115 @@
+"""What a kit promises of its loops: a table that its run leaves beside the models, each row shown or doubted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import is_file, read_document, write_document
+from hybrid_mpc.records import Fields, plain, record
+from hybrid_mpc.rules import Line, Text
+
+PROMISES = "promises.json"
+"""File of the promises in a model's folder; the run's stage ``promises`` alone writes it."""
+SCHEMA_VERSION = 1
+Verdict: TypeAlias = Literal["shown", "doubted", "not promised"]
+NONE_MADE = "promises"
+"""Name of the only row where a kit holds no table that fits it."""
+REMEDY = "Run the main job on this folder again: hybrid-mpc run SCENARIO --out FOLDER --resume."
+
+
+@dataclass(frozen=True)
+class Promise:
+    """One row of the table "What this kit promises".
+
+    Args:
+        name: What it is about, e.g. ``"no offset"``.
+        verdict: ``"shown"``: the run has shown that it holds; ``"doubted"``: the run has found a reason why it may not
+            hold; ``"not promised"``: it does not hold, or the run could not examine it.
+        evidence: Numbers with their units, or the reason.
+        remedy: What to do. Default: nothing needs to be done.
+
+    Raises:
+        InputError: If a field is of another kind.
+
+    Example:
+        >>> print(Promise("step time", "shown", "99 % of the steps take 2.1 ms, the period is 20 ms"))
+        step time: shown. 99 % of the steps take 2.1 ms, the period is 20 ms.
+    """
+
+    name: Line
+    verdict: Verdict
+    evidence: Text
+    remedy: Text = ""
+
+    def __post_init__(self) -> None:
+        Fields(self, f"promise {self.name!r}").refuse()
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.verdict}. {self.evidence}." + f" {self.remedy}" * bool(self.remedy)
+
+
+@dataclass(frozen=True)
+class PromiseTable:
+    """What ``promises.json`` holds.
+
+    Args:
+        of: Digest of the models and of what loops are made of, for which the table was made.
+        rows: The promises, in the order in which they are shown.
+    """
+
+    of: Line
+    rows: tuple[Promise, ...]
+
+
+def write_promises(folder: Path, table: PromiseTable) -> None:
+    """Write the table beside the models in ``folder``.
+
+    Raises:
+        StorageError: If it cannot be written.
+    """
+    write_document(folder / PROMISES, {"schema_version": SCHEMA_VERSION, **plain(table)})
+
+
+def read_promises(folder: Path) -> PromiseTable | None:
+    """The table of a model's folder; None where there is none.
+
+    Raises:
+        InputError: If the file is damaged, was changed by hand, or is of another schema.
+    """
+    path = folder / PROMISES
+    if not is_file(path):
+        return None
+    document = read_document(path, f"delete it; {REMEDY[0].lower()}{REMEDY[1:]}")
+    if document.pop("schema_version", None) != SCHEMA_VERSION:
+        raise InputError(
+            f"{path} is no table of schema version {SCHEMA_VERSION} (field schema_version): this version of hybrid-mpc "
+            f"reads no other. {REMEDY}"
+        )
+    return record(PromiseTable, document, str(path))
+
+
+def promise_lines(rows: Sequence[Promise]) -> list[str]:
+    r"""The table for a terminal: a line each, what is not shown first.
+
+    Example:
+        >>> late = Promise("step time", "doubted", "99 % of the steps take 9 ms, the period is 10 ms", "Solver native.")
+        >>> print(*promise_lines([Promise("horizon", "shown", "it holds 99 % of the cost"), late]), sep="\n")
+        what this kit promises:
+          doubted       step time: 99 % of the steps take 9 ms, the period is 10 ms. Solver native.
+          shown         horizon: it holds 99 % of the cost.
+    """
+    order: tuple[Verdict, ...] = ("not promised", "doubted", "shown")
+    lines = [
+        f"  {one.verdict:12}  {one.name}: {one.evidence}." + f" {one.remedy}" * bool(one.remedy)
+        for one in sorted(rows, key=lambda one: order.index(one.verdict))
+    ]
+    return ["what this kit promises:", *lines] if lines else []
+
+
+def none_made(why: str) -> tuple[Promise, ...]:
+    """The only row of a kit without a table that fits it: nothing is promised, and why."""
+    return (Promise(NONE_MADE, "not promised", why, REMEDY),)
