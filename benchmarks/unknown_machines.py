@@ -37,9 +37,11 @@ from unknown.random_priors import Drawn, drawn
 
 from hybrid_mpc import InputError, Prior, Trajectory, fit_prior, load_trajectories
 from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.sound import bound_costs, reversed_signals, trial_length
+from hybrid_mpc.identify.sound import bound_costs, trial_length
+from hybrid_mpc.identify.structure import causes, named, run_length
 
 MACHINES = (*PROCESSES, *MOTION)
 WITHIN = 1.05
@@ -83,14 +85,17 @@ def judged(
     return free_run_errors(runs, cut(prior, held, periods, HELD_OUT), [prior.values, *others])
 
 
-def said(make: type[Prior], found: PriorFit, parts: Parts, dt: float) -> list[str]:
-    """What a run would say of a fit: its warnings, bounds that cost something, signals counted the other way."""
+def said(make: type[Prior], found: PriorFit, parts: Parts, dt: float, longest: float) -> list[str]:
+    """What a run would say of a fit: its warnings, bounds that cost something, terms that are wrong."""
     unit = time_unit(parts[0], dt)
     known = smoothed(make, found, parts[0], dt)
     length = trial_length(make, found, known, dt, None, unit)
     reasons = list(found.warnings)
     reasons += [str(one) for one in bound_costs(make, found, known, dt, length) if one.costs]
-    return reasons + list(reversed_signals(make, found, parts[0], dt, length, unit))
+    acting = shifted(parts[0], found.delay)
+    length = run_length(make, found.values, acting, dt, longest, unit)
+    wrong = named(causes(make, found.values, acting, dt, length, unit))
+    return [*reasons, *([wrong] if wrong else [])]
 
 
 def compared(
@@ -117,7 +122,7 @@ def compared(
         for start in (prior.values, {**prior.values, **(truth or found.values)})
     ]
     nominal, ours, *theirs = judged(make, parts, dt, length, [found.values, *independent], steps)
-    return _row(name, seconds, ours, min(theirs), nominal, "; ".join(said(make, found, parts, dt)))
+    return _row(name, seconds, ours, min(theirs), nominal, "; ".join(said(make, found, parts, dt, length)))
 
 
 def _row(

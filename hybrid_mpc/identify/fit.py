@@ -437,7 +437,7 @@ class OutputFit:
         """
         thetas, n = np.atleast_2d(theta), len(x)
         each = n // len(thetas)
-        p = np.repeat([self._constants(one) for one in thetas], each, axis=0)
+        p = np.repeat(self._every(thetas), each, axis=0)
         acting = [self._acting(one, windows.u[i * each :][:each], windows) for i, one in enumerate(thetas)]
         simulation = self._simulation(tuple(self._free) if slopes == "all" else ())
         given = x, np.concatenate(acting), windows.w, p, substeps
@@ -448,6 +448,10 @@ class OutputFit:
             with np.errstate(over="ignore"):  # what runs away is left out where it is used
                 by[..., : len(self.unit)] *= self.unit
         return y, by
+
+    def _every(self, thetas: Array) -> list[list[float]]:
+        """What a simulation has as its parameters with each of several ``thetas``."""
+        return [self._constants(one) for one in thetas]
 
     def _constants(self, theta: Array) -> list[float]:
         """What a simulation has as its parameters: the prior's, and a small change of the delay."""
@@ -673,6 +677,15 @@ class Fitted:
 
 
 @dataclass(frozen=True)
+class Trial:
+    """What a short fit found: the number of its start, ``theta``, and the error of the windows over the spread."""
+
+    start: int
+    theta: Array
+    error: float
+
+
+@dataclass(frozen=True)
 class _Point:
     """Errors of the outputs at ``theta`` and first states ``x`` ``(n, n_x)``, and their slopes.
 
@@ -787,6 +800,69 @@ class Shooting:
             if (np.abs(point.error) > GROSS * point.scales).any():
                 point = self._descend(replace(point, far=GROSS), iterations)
         return Fitted(point.theta, *self._covariance(point))
+
+    def several(
+        self,
+        thetas: Array,
+        each: Callable[[Sequence[int]], OutputFit],
+        keep: Sequence[int],
+        free: int | None = None,
+    ) -> list[Trial]:
+        """Short fits from several ``thetas`` ``(m, k)`` at once, one batch of free runs for all; the worst end early.
+
+        Args:
+            thetas: Starts.
+            each: Fit for the starts of these numbers, whose windows lie one behind the other.
+            keep: How many go on after each two steps.
+            free: How many parameters are fitted, the first ones. Default: all.
+        """
+        alive, n = list(range(len(thetas))), len(self.windows.x)
+        damping = np.full(len(thetas), DAMPING)
+        share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
+
+        def many(numbers: Sequence[int]) -> Shooting:
+            return Shooting(each(numbers), self.windows.times(len(numbers)), self.sizes, self.spread)
+
+        def parts(point: _Point) -> list[_Point]:
+            rows = [slice(i * n, (i + 1) * n) for i in range(len(point.theta))]
+            return [
+                replace(point, theta=theta, x=point.x[r], error=point.error[r], slopes=point.slopes[r])
+                for theta, r in zip(point.theta, rows, strict=True)
+            ]
+
+        problem = many(alive)
+        begun = problem._states(problem.start(thetas, problem.windows.x, "x"))
+        found = dict(zip(alive, parts(problem._at(begun, thetas, begun.x, "all")), strict=True))
+        for left in keep:
+            for _ in range(2):
+                steps = []
+                for k in alive:
+                    xx, xt, tt, gx, gt = self._normal(found[k])
+                    normal = xx, xt[..., :free], tt[:free, :free], gx, gt[:free]
+                    step, moved, _ = self._step(normal, damping[k], found[k].theta[:free])
+                    steps.append((np.pad(step, (0, thetas.shape[1] - len(step))), moved))
+                theta = np.stack([
+                    np.clip(found[k].theta + step, self.own.lower, self.own.upper)
+                    for k, (step, _) in zip(alive, steps, strict=True)
+                ])  # fmt: skip
+                x = np.concatenate([
+                    found[k].x + moved[self.windows.group] * self.sizes
+                    for k, (_, moved) in zip(alive, steps, strict=True)
+                ])  # fmt: skip
+                trials = parts(many(alive)._at(begun, theta, x, "all"))
+                for k, trial in zip(alive, trials, strict=True):
+                    better = self._cost(trial) < self._cost(found[k])
+                    found[k] = trial if better else found[k]
+                    damping[k] *= 0.2 if better else 5.0
+            alive = sorted(alive, key=lambda k: self._cost(found[k]))[:left]
+        over = {
+            k: np.clip(found[k].error / np.tile(self.spread, self.windows.y.shape[1]), -FAR, FAR)
+            for k in alive
+        }
+        return [
+            Trial(k, found[k].theta, math.sqrt(float(np.square(over[k] * self.count).sum()) / share))
+            for k in alive
+        ]
 
     def settled(self, theta: Array) -> Fitted:
         """The same fit from near its end on, to the last digits: neither start nor rounding is left in it."""
@@ -1037,7 +1113,7 @@ class Shooting:
             slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
         step = _bounded(
             reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30)), slope,
-            self.own.lower - theta, self.own.upper - theta,
+            self.own.lower[: len(theta)] - theta, self.own.upper[: len(theta)] - theta,
         )  # fmt: skip
         moved = -own - (by_theta @ step[:, None])[..., 0]
         of_states = 0.0 if self.windows.warm else float(np.sum(gx * moved))

@@ -12,21 +12,18 @@ from numpy.typing import NDArray
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import (
     AT_BOUND,
     GROWN,
     LENGTHS,
-    POOR,
     WINDOWS,
     OutputFit,
     Shooting,
     cut_outputs,
-    with_states,
 )
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import visited
-from hybrid_mpc.identify.smooth import Smoother, rough_smoother
+from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
@@ -39,8 +36,6 @@ CLEARLY = 0.75
 structure, fitted to the same recordings, differ by less."""
 COSTLY = 0.95
 """Error without a bound over the error with it below which the bound costs something."""
-REVERSED = 0.5
-"""Error with one signal counted the other way over the error as recorded below which its sign is in doubt."""
 ITERATIONS = 12
 """Gauss-Newton steps of a trial fit at most; it shows the size of an error, no more."""
 
@@ -198,72 +193,6 @@ def bound_costs(
         ratio = after / before if before and outside else 1.0
         found.append(BoundCost(name, float(theta[i] * unit), float(solved[i] * unit), ratio))
     return tuple(found)
-
-
-def reversed_signals(
-    make: Callable[..., Prior],
-    fit: PriorFit,
-    recorded: Sequence[Trajectory],
-    dt: float,
-    length: float,
-    time_unit: float,
-) -> tuple[str, ...]:
-    """Inputs and outputs that fit far better when they are counted the other way.
-
-    A wrong sign of a sensor or an actuator is the most common error of a first prior, and no parameter can mend it. It
-    is looked for where the fitted prior leaves more than ``POOR`` of the outputs' spread: each signal whose range has
-    both signs is negated by itself, and the prior is fitted anew to free runs of ``length`` [s], as it is without.
-
-    Args:
-        make: Prior class or factory ``(values=None) -> Prior``.
-        fit: What the fit gave.
-        recorded: Training trajectories as recorded.
-        dt: Model period [s].
-        length: Length [s] of the windows.
-        time_unit: The machine's second [s].
-    """
-    if not len(fit.stages) or min(row["validation_error"] for row in fit.stages) <= POOR:
-        return ()
-    prior, acting = make(), shifted(recorded, fit.delay)
-    # a fit with a wrong sign has no values to begin with: both begin at the nominal ones, or at the fitted
-    own = OutputFit(make, dt)
-    starts = [own.nominal, own.scaled(fit.values)]
-
-    def error_of(trajectories: Sequence[Trajectory]) -> float:
-        smoother = rough_smoother(prior, trajectories, dt, time_unit=time_unit)
-        known = with_states(trajectories, smoother, 0.0)
-        trial = OutputFit(make, dt)
-        trial.points = visited(known)
-        problem = _windows(trial, known, np.array(smoother.sizes.x), length)
-        try:
-            return min(problem.explained([problem.solve(one, ITERATIONS).theta for one in starts]))
-        except InputError:  # too stiff for the period with such values
-            return math.inf
-
-    before, found = error_of(acting), []
-    for key, signals in (("y", prior.outputs), ("u", prior.inputs)):
-        for j, signal in enumerate(signals):
-            if not signal.lower < 0.0 < signal.upper:
-                continue
-            after = error_of([_negated(t, key, j) for t in acting])
-            if after < REVERSED * before:
-                found.append(
-                    f"{signal.label} seems to be counted the other way: with its sign changed free runs of "
-                    f"{length:.3g} s leave {after:.2g} of the outputs' spread, as recorded {before:.2g}. Change its "
-                    "sign in the prior or in the data specification"
-                )
-    return tuple(found)
-
-
-def _negated(trajectory: Trajectory, key: str, j: int) -> Trajectory:
-    """The trajectory with one of its outputs (``"y"``) or inputs (``"u"``) counted the other way."""
-    values = np.array(getattr(trajectory, key))
-    values[:, j] = -values[:, j]
-    if key == "u":
-        return replace(trajectory, u=values)
-    censored = np.array(trajectory.censored)
-    censored[:, j] = -censored[:, j]
-    return replace(trajectory, y=values, censored=censored)
 
 
 def _windows(fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float) -> Shooting:

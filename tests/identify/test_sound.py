@@ -6,18 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from example_priors import Swing
-from simulated_pendulum import DT, TRUTH, Pendulum, record
+from simulated_pendulum import DT, Pendulum, record
 
 from hybrid_mpc import Parameter, Signal, fit_prior
 from hybrid_mpc.identify.fit import smoothed
-from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.sound import (
     bound_costs,
     constant_runs,
     problems,
-    reversed_signals,
     structure_doubt,
-    trial_length,
 )
 
 SECONDS = 1.0
@@ -59,15 +56,10 @@ def tight(runs):
     return fitted(Tight, runs)
 
 
-def negated(runs, key):
-    return [replace(t, **{key: -getattr(t, key)}) for t in runs]
-
-
 def test_a_sound_fit_has_no_problem_and_no_doubt(runs, sound):
     states = smoothed(Pendulum, sound, runs, DT)
     assert problems(sound.smoother(Pendulum(sound.values), DT), sound, states) == ()
     assert bound_costs(Pendulum, sound, states, DT, 2.0) == ()
-    assert reversed_signals(Pendulum, sound, runs, DT, 2.0, SECONDS) == ()
 
 
 def test_numbers_that_are_not_finite_are_problems(runs, sound):
@@ -107,16 +99,6 @@ def test_the_cost_of_a_bound_is_that_of_a_fit_without_it(runs, tight, sound):
     assert found.ratio < 0.6
 
 
-@pytest.mark.parametrize("key", ["y", "u"])
-def test_a_signal_that_is_counted_the_other_way_is_found(runs, key):
-    """An angle with the wrong sign is one with an input of the wrong sign: an odd machine cannot tell them apart."""
-    wrong = negated(runs, key)
-    fit = fitted(Pendulum, wrong)
-    length = trial_length(Pendulum, fit, smoothed(Pendulum, fit, wrong, DT), DT, None, SECONDS)
-    found = reversed_signals(Pendulum, fit, wrong, DT, length, SECONDS)
-    assert [text.split()[0] for text in found] == ["phi", "torque"]
-
-
 def test_a_constant_runs_at_the_mean_of_the_training_outputs(runs):
     (found,) = constant_runs(runs[:2], runs[2:], 10)
     assert found.shape == (len(runs[2].t) - 10, 1)
@@ -138,7 +120,3 @@ def test_a_simpler_model_that_is_clearly_better_puts_the_structure_in_doubt(erro
     found = structure_doubt(error, baselines)
     assert bool(found) == bool(doubted)
     assert doubted in found
-
-
-def test_a_fit_without_stages_is_not_asked_for_signs(runs):
-    assert reversed_signals(Pendulum, PriorFit(TRUTH, {}, (), ()), runs, DT, 2.0, SECONDS) == ()

@@ -37,11 +37,11 @@ from hybrid_mpc.identify.sound import (
     correlation_of_errors,
     growth_time,
     problems,
-    reversed_signals,
     structure_doubt,
     trial_length,
 )
 from hybrid_mpc.identify.step import PriorStep, Scaling
+from hybrid_mpc.identify.structure import causes, named, run_length
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.check import rests_no_more
 from hybrid_mpc.job.context import Context
@@ -294,11 +294,13 @@ def prior_stage(context: Context) -> PriorResult:
     # of a machine that runs away, recorded under its controller, inputs tell linear models what outputs will be
     compared = baselines if not told else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
-    reversed_ = reversed_signals(make, fit, train, spec.dt, trial, context.time_unit)
-    in_doubt = tuple(one for one in (structure_doubt(error, simpler), *reversed_) if one)
+    acting, unit = shifted(train, fit.delay), context.time_unit
+    length = run_length(make, fit.values, acting, spec.dt, longest_run or longest or trial, unit)
+    context.progress.update("free runs", 1, 1, "looking for wrong terms")
+    wrong = named(causes(make, fit.values, acting, spec.dt, length, unit))
+    in_doubt = tuple(one for one in (structure_doubt(error, simpler), wrong) if one)
     for doubt in in_doubt:
         context.progress.warn(f"the structure of the prior is in doubt: {doubt}")
-    acting = shifted(train, fit.delay)
     one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
     return PriorResult(
         fit,

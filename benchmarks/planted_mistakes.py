@@ -1,0 +1,377 @@
+"""Priors with a planted mistake: is the right one named, and none where there is none?
+
+    python benchmarks/planted_mistakes.py
+
+Five priors of each of the twelve machines of :mod:`unknown`: as a user would have written it, and with one mistake of a
+kind that users make. Plants differ from the right prior, too, as they do there. Each prior is fitted and judged as in a
+run (:func:`hybrid_mpc.identify.structure.causes`). ``first`` is what is named first; where two explanations are equal
+to 25 %, any of those named counts. Prints a Markdown table, and with ``--out FILE.json`` writes it.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy is loaded
+
+import argparse
+import inspect
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from unknown.common import Machine
+from unknown.motion import MOTION
+from unknown.processes import PROCESSES
+from unknown_machines import read
+
+from hybrid_mpc import InputError, Prior, fit_prior
+from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.structure import causes, run_length
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A text of a prior that is replaced by a wrong one.
+
+    Args:
+        machine: Its name.
+        kind: What users do wrong.
+        old: Text of the prior's source. Empty: the prior is right.
+        new: What replaces it; for ``swapped column`` the data specification is changed instead.
+        named: Texts of which the named cause must contain all of one entry.
+    """
+
+    machine: str
+    kind: str
+    old: str = ""
+    new: str = ""
+    named: tuple[tuple[str, ...], ...] = ()
+
+
+SIGN, SMALL = "sign", "times too large"
+MISTAKES = (
+    *(Mistake(m.name, "none") for m in (*PROCESSES, *MOTION)),
+    # heat exchanger
+    Mistake(
+        "heat_exchanger_2",
+        "sign",
+        "- k * (x.hot_1 - x.cold_2)) / p.V_h",
+        "+ k * (x.hot_1 - x.cold_2)) / p.V_h",
+        (("(hot_1 - cold_2)", "rate of hot_1", SIGN),),
+    ),
+    Mistake(
+        "heat_exchanger_2",
+        "unit",
+        "qh, qc = u.hot_flow / 60, u",
+        "qh, qc = u.hot_flow, u",
+        (("hot_flow", "60"),),
+    ),
+    Mistake(
+        "heat_exchanger_2",
+        "sign",
+        "+ k * (x.hot_1 - x.cold_2)) / p.V_c",
+        "- k * (x.hot_1 - x.cold_2)) / p.V_c",
+        (("(hot_1 - cold_2)", "rate of cold_2", SIGN),),
+    ),
+    Mistake("heat_exchanger_2", "swapped column", "outputs", "", (("outputs", "exchanged"),)),
+    # quadruple tank
+    Mistake(
+        "quadruple_tank",
+        "sign",
+        "p.g1 * p.k1 * u.v1 + p.a34 * q[2]",
+        "p.g1 * p.k1 * u.v1 - p.a34 * q[2]",
+        (("a34", "rate of h1", SIGN),),
+    ),
+    Mistake(
+        "quadruple_tank", "swapped column", "inputs", "", (("inputs", "exchanged"), ("outputs", "exchanged"))
+    ),
+    Mistake(
+        "quadruple_tank",
+        "unit",
+        "p.g1 * p.k1 * u.v1 +",
+        "p.g1 * p.k1 * u.v1 * 100 +",
+        (("v1", "rate of h1", "1e2"),),
+    ),
+    Mistake(
+        "quadruple_tank",
+        "sign",
+        "(1 - p.g2) * p.k2 * u.v2 - p.a34 * q[2]",
+        "(1 - p.g2) * p.k2 * u.v2 + p.a34 * q[2]",
+        (("rate of h3", SIGN),),
+    ),
+    # bioreactor
+    Mistake("bioreactor", "sign", "(mu - u.D) * x.X", "(mu + u.D) * x.X", (("D in the rate of X", SIGN),)),
+    Mistake("bioreactor", "sign", "- mu * x.X / p.Y", "+ mu * x.X / p.Y", (("rate of S", SIGN),)),
+    Mistake("bioreactor", "unit", "(mu - u.D) * x.X / 3600", "(mu - u.D) * x.X", (("rate of X", "3600"),)),
+    Mistake(
+        "bioreactor",
+        "unit",
+        "(mu - u.D) * x.X / 3600, (u.D * (p.S_f - x.S) - mu * x.X / p.Y) / 3600",
+        "(mu - u.D) * x.X / 3600, (u.D * (p.S_f - x.S) - mu * x.X / p.Y) / 60",
+        (("rate of S", "60"),),
+    ),
+    # evaporator
+    Mistake(
+        "evaporator", "sign", "(w.F1 - f4 - u.F2)", "(w.F1 - f4 + u.F2)", (("F2 in the rate of L", SIGN),)
+    ),
+    Mistake("evaporator", "sign", "(f4 - f5)", "(f5 - f4)", (("rate of P", SIGN),)),
+    Mistake(
+        "evaporator",
+        "unit",
+        "(w.F1 - f4 - u.F2) / p.A / 60",
+        "(w.F1 - f4 - u.F2) / p.A",
+        (("rate of L", "60"),),
+    ),
+    Mistake("evaporator", "sign", "(w.F1 - f4 - u.F2)", "(w.F1 + f4 - u.F2)", (("rate of L", SIGN),)),
+    # column
+    Mistake(
+        "column",
+        "sign",
+        "(below - u.boil_up) * x.x_B - u.boil_up * y(x.x_B)",
+        "(below - u.boil_up) * x.x_B + u.boil_up * y(x.x_B)",
+        (("boil_up", "rate of x_B", SIGN),),
+    ),
+    Mistake("column", "swapped column", "inputs", "", (("inputs", "exchanged"),)),
+    Mistake(
+        "column",
+        "sign",
+        "u.boil_up * (y(x.x_2) - x.x_D)",
+        "u.boil_up * (x.x_D - y(x.x_2))",
+        (("rate of x_D", SIGN),),
+    ),
+    Mistake(
+        "column",
+        "unit",
+        "u.boil_up * (y(x.x_2) - x.x_D) / p.M_e / 60",
+        "u.boil_up * (y(x.x_2) - x.x_D) / p.M_e",
+        (("rate of x_D", "60"),),
+    ),
+    # building
+    Mistake("building", "sign", "p.H_mo * (x.T_m - w.T_o)", "p.H_mo * (x.T_m + w.T_o)", (("T_o", SIGN),)),
+    Mistake(
+        "building",
+        "sign",
+        "(flow - p.H_mo",
+        "(-flow - p.H_mo",
+        (("H_im * (T_i - T_m)", "rate of T_m", SIGN),),
+    ),
+    Mistake("building", "sign", "+ p.A_w * w.sun - flow", "- p.A_w * w.sun - flow", (("sun", SIGN),)),
+    Mistake("building", "unit", "(u.heat + p.A_w", "(1000 * u.heat + p.A_w", (("heat", "1e3"),)),
+    # flexible shaft
+    Mistake(
+        "flexible_shaft",
+        "sign",
+        "- shaft) / p.J_m",
+        "+ shaft) / p.J_m",
+        (("c * twist", "rate of motor", SIGN),),
+    ),
+    Mistake("flexible_shaft", "swapped column", "outputs", "", (("outputs", "exchanged"),)),
+    Mistake("flexible_shaft", "sign", "x.motor - x.load\n", "x.load - x.motor\n", (("rate of twist", SIGN),)),
+    Mistake(
+        "flexible_shaft",
+        "unit",
+        "shaft / p.J_l, x.motor - x.load",
+        "shaft / p.J_l, (x.motor - x.load) * 57.29578",
+        (("rate of twist", "degrees"), ("rate of twist", "radians")),
+    ),
+    # magnetic levitation
+    Mistake(
+        "magnetic_levitation",
+        "sign",
+        "9810.0 - p.k *",
+        "9810.0 + p.k *",
+        (("rate of gap_dot", SIGN), ("9810", SIGN)),
+    ),
+    Mistake("magnetic_levitation", "unit", "9810.0 - p.k", "9.81 - p.k", (("9.81", "1e3"),)),
+    Mistake(
+        "magnetic_levitation",
+        "sign",
+        "(u.u - p.R * x.i)",
+        "(u.u + p.R * x.i)",
+        (("R * i", SIGN), ("input u", SIGN)),
+    ),
+    Mistake(
+        "magnetic_levitation",
+        "missing factor",
+        "x.gap_dot, 9810",
+        "0.001 * x.gap_dot, 9810",
+        (("rate of gap", "1e3"),),
+    ),
+    # inverted pendulum
+    Mistake(
+        "inverted_pendulum",
+        "angle",
+        "return p.m * G * p.l * ca.cos(q.phi)",
+        "return -p.m * G * p.l * ca.cos(q.phi)",
+        (("potential", SIGN), ("phi", "another zero")),
+    ),
+    Mistake(
+        "inverted_pendulum",
+        "sign",
+        "return u.F, 0.0",
+        "return -u.F, 0.0",
+        (("F", SIGN), ("output s", "other way"), ("output phi", "other way")),
+    ),
+    Mistake(
+        "inverted_pendulum",
+        "sign",
+        "c = p.m * p.l * ca.cos(q.phi)",
+        "c = -p.m * p.l * ca.cos(q.phi)",
+        (("(s, phi)", SIGN), ("output phi", "other way"), ("output s", "other way")),
+    ),
+    Mistake("inverted_pendulum", "swapped column", "outputs", "", (("outputs", "exchanged"), ("phi", "s"))),
+    # ship
+    Mistake(
+        "ship",
+        "sign",
+        "(u.delta - x.rudder)",
+        "(-u.delta - x.rudder)",
+        (("delta", SIGN), ("psi", "other way"), ("psi", SIGN)),
+    ),
+    Mistake(
+        "ship",
+        "unit",
+        "return x.r, (p.K",
+        "return x.r * 57.29578, (p.K",
+        (("rate of psi", "degrees"), ("rate of psi", "radians"), ("r in", "degrees")),
+    ),
+    Mistake(
+        "ship",
+        "sign",
+        "x.r, (p.K * (x.rudder - p.bias) - x.r)",
+        "x.r, (p.K * (x.rudder - p.bias) + x.r)",
+        (("r in the rate of r", SIGN),),
+    ),
+    Mistake("ship", "sign", "(u.delta - x.rudder)", "(u.delta + x.rudder)", (("rudder", SIGN),)),
+    # ball and beam
+    Mistake(
+        "ball_and_beam",
+        "sign",
+        "-p.k * ca.sin(x.beam - p.off)",
+        "p.k * ca.sin(x.beam - p.off)",
+        (("rate of s_dot", SIGN), ("command", SIGN), ("output s", "other way")),
+    ),
+    Mistake(
+        "ball_and_beam",
+        "unit",
+        "ca.sin(x.beam - p.off)",
+        "ca.sin((x.beam - p.off) * 0.01745329)",
+        (
+            ("rate of s_dot", "degrees"),
+            ("rate of s_dot", "radians"),
+            ("s_dot in the rate of s", "degrees"),
+            ("s_dot in the rate of s", "radians"),
+        ),
+    ),
+    Mistake("ball_and_beam", "sign", "(u.command - x.beam)", "(u.command + x.beam)", (("beam", SIGN),)),
+    Mistake(
+        "ball_and_beam",
+        "unit",
+        "(u.command - x.beam)",
+        "(u.command * 57.29578 - x.beam)",
+        (("command", "degrees"), ("command", "radians")),
+    ),
+    # hydraulic cylinder
+    Mistake(
+        "hydraulic_cylinder",
+        "sign",
+        "- p.b * x.s_dot) / p.m",
+        "+ p.b * x.s_dot) / p.m",
+        (("b * s_dot", SIGN),),
+    ),
+    Mistake(
+        "hydraulic_cylinder",
+        "sign",
+        "(flow - p.A * x.s_dot)",
+        "(flow + p.A * x.s_dot)",
+        (("s_dot", "p_L", SIGN),),
+    ),
+    Mistake("hydraulic_cylinder", "unit", "(1e5 * p.A * x.p_L", "(p.A * x.p_L", (("p_L", "1e5"),)),
+    Mistake(
+        "hydraulic_cylinder",
+        "unit",
+        "flow = p.k_q * u.u *",
+        "flow = 1000 * p.k_q * u.u *",
+        (("flow", "1e3"), ("k_q", "1e3"), ("k_q", "1000")),
+    ),
+)
+MACHINES = {m.name: m for m in (*PROCESSES, *MOTION)}
+
+
+def mistaken(machine: Machine, mistake: Mistake) -> Machine:
+    """The machine as the user with this mistake has it."""
+    if not mistake.old:
+        return machine
+    if mistake.kind == "swapped column":
+        columns = getattr(machine.spec, mistake.old)
+        return replace(
+            machine, spec=replace(machine.spec, **{mistake.old: (columns[1], columns[0], *columns[2:])})
+        )
+    source = inspect.getsource(machine.prior)
+    if mistake.old not in source:
+        raise ValueError(f"{machine.name}: its prior has no {mistake.old!r}")
+    own: dict[str, Any] = {}
+    exec(source.replace(mistake.old, mistake.new, 1), dict(vars(sys.modules[machine.prior.__module__])), own)
+    made: type[Prior] = own[machine.prior.__name__]
+    return replace(machine, prior=made)
+
+
+def judged(mistake: Mistake, folder: Path) -> dict[str, Any]:
+    """A row: what is named of one prior."""
+    machine = mistaken(MACHINES[mistake.machine], mistake)
+    row = {"machine": mistake.machine, "kind": mistake.kind, "planted": mistake.new or mistake.old}
+    dt, began = machine.spec.dt, time.process_time()
+    try:
+        train, valid, _ = read(machine.write(folder / machine.name), machine.prior, machine.spec)
+        fit = fit_prior(machine.prior, train, valid, dt=dt, length=machine.length)
+        fitted = time.process_time()
+        unit, acting = time_unit(train, dt), shifted(train, fit.delay)
+        length = run_length(machine.prior, fit.values, acting, dt, machine.length, unit)
+        found = causes(machine.prior, fit.values, acting, dt, length, unit)
+    except InputError as error:
+        return {**row, "right": "refused", "first": str(error)[:200], "seconds": "–", "of the fit": "–"}
+    said = [str(one) for one in found]
+    hit = any(all(text in one for text in texts) for one in said for texts in mistake.named)
+    right = not said if mistake.kind == "none" else hit
+    return {
+        **row, "right": "yes" if right else "no", "first": " OR ".join(said) or "nothing",
+        "seconds": f"{time.process_time() - fitted:.1f}", "of the fit": f"{fitted - began:.1f}",
+    }  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """All of them, or those of some machines."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--names", nargs="+", default=(), help="some machines alone")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    given = parser.parse_args(arguments)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for mistake in MISTAKES:
+            if not given.names or mistake.machine in given.names:
+                rows.append(judged(mistake, Path(folder)))
+                print(rows[-1], flush=True)
+    print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
+    for row in rows:
+        print("| " + " | ".join(str(v).replace("|", "\\|") for v in row.values()) + " |")
+    planted = [r for r in rows if r["kind"] != "none"]
+    sound = [r for r in rows if r["kind"] == "none"]
+    print(
+        f"\nplanted: {sum(r['right'] == 'yes' for r in planted)} of {len(planted)} named right; none: "
+        f"{sum(r['right'] == 'yes' for r in sound)} of {len(sound)} left alone"
+    )
+    if given.out is not None:
+        given.out.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

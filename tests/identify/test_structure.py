@@ -1,0 +1,199 @@
+"""Which term or signal of a prior is wrong."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from simulated_pendulum import DT, Pendulum, record
+
+from hybrid_mpc import MechanicalPrior, Parameter, Prior, Signal, fit_prior
+from hybrid_mpc.identify.structure import (
+    Cause,
+    causes,
+    named,
+    reading_of,
+    run_length,
+    terms_of,
+    with_factor,
+)
+
+SECONDS = 1.0
+
+
+class WrongSpring(Pendulum):
+    """Its spring drives it away from rest."""
+
+    def potential(self, q, p):
+        return -super().potential(q, p)
+
+
+class Cart(MechanicalPrior):
+    """Two coupled masses."""
+
+    states = tuple(Signal(name, "m") for name in ("a", "b")) + tuple(
+        Signal(name, "m/s") for name in ("v", "w")
+    )
+    inputs = (Signal("F", "N"),)
+    outputs = states[:2]
+    parameters = (Parameter("m", 1.0, "kg", 0.5, 2.0), Parameter("k", 3.0, "N/m", 1.0, 9.0))
+
+    def mass_matrix(self, q, p):
+        return (2 * p.m, p.m * ca.cos(q.b)), (p.m * ca.cos(q.b), p.m)
+
+    def potential(self, q, p):
+        return 0.5 * p.k * q.b**2
+
+    def force(self, q, v, u, w, p):
+        return u.F, 0.0
+
+
+class Tank(Prior):
+    """Two terms in one rate, one of them a product with a sum."""
+
+    states = (Signal("h", "m"), Signal("T", "K"))
+    inputs = (Signal("q", "m^3/s"),)
+    outputs = states
+    parameters = (Parameter("k", 0.3, "m^2.5/s", 0.1, 1.0), Parameter("A", 2.0, "m^2", 1.0, 4.0))
+
+    def xdot(self, x, u, w, p):
+        return (u.q - p.k * ca.sqrt(x.h)) / p.A, u.q * (20.0 - x.T)
+
+
+def test_every_term_and_signal_gets_a_factor():
+    assert terms_of(Tank()) == [
+        "input q [m^3/s]",
+        "(q - k * sqrt(h)) / A in the rate of h",
+        "q in the rate of h",
+        "k * sqrt(h) in the rate of h",
+        "q * (20 - T) in the rate of T",
+        "20 in the rate of T",
+        "T in the rate of T",
+        "h in the output h",
+        "T in the output T",
+    ]
+
+
+class Mixer(Prior):
+    """An input that stands in two rates, and a product that does."""
+
+    states = (Signal("h", "m"), Signal("T", "K"))
+    inputs = (Signal("q", "m^3/s"), Signal("heat", "W"))
+    outputs = states
+    disturbances = (Signal("rain", "m^3/s"),)
+
+    def xdot(self, x, u, w, p):
+        flow = u.q * x.h
+        return w.rain - flow + u.q, flow - u.q * x.T + u.heat
+
+
+def test_terms_are_counted_alike_with_and_without_factors():
+    """Inputs that stand in several rates and products that do: each factor turns the term of its name."""
+    terms, factored = terms_of(Mixer()), with_factor(Mixer)()
+    h, t, q, heat, rain = 0.3, 0.7, 0.2, 0.11, 0.05
+    flow = q * h
+    turned = {
+        "input q [m^3/s]": (rain + flow - q, -flow + q * t + heat),
+        "q in the rate of h": (rain - flow - q, flow - q * t + heat),
+        "rain in the rate of h": (-rain - flow + q, flow - q * t + heat),
+        "q * h in the rate of h": (rain + flow + q, flow - q * t + heat),
+        "q * h in the rate of T": (rain - flow + q, -flow - q * t + heat),
+        "q * h wherever the rate of h uses it": (rain + flow + q, -flow - q * t + heat),
+        "q * T in the rate of T": (rain - flow + q, flow + q * t + heat),
+        "heat in the rate of T": (rain - flow + q, flow - q * t - heat),
+    }
+    for term, rates in turned.items():
+        given = [-1.0, *np.eye(len(terms))[terms.index(term)]]
+        found = factored.equations.xdot([h, t], [q, heat], [rain], given).full().ravel()
+        assert found == pytest.approx(rates, abs=1e-14)
+
+
+def test_entries_of_a_symmetric_mass_matrix_share_a_factor():
+    found = terms_of(Cart())
+    assert sum("mass matrix (a, b)" in term for term in found) == 1
+    assert "0.5 * k * b^2 in the potential" in found
+    assert "F in the force of a" in found
+
+
+@pytest.mark.parametrize("make", [Tank, Cart])
+def test_a_factor_multiplies_its_term_alone(make):
+    """With factor 1, or with none chosen, the equations are the prior's own; each factor changes them somewhere."""
+    prior, factored = make(), with_factor(make)()
+    n, terms = len(prior.states), len(terms_of(prior))
+    x, u = np.linspace(0.4, 0.9, n), [0.7]
+    for one in ("xdot", "output"):
+        own, other = getattr(prior.equations, one), getattr(factored.equations, one)
+        for factor, k in ((1.0, 2), (5.0, None)):
+            chosen = np.eye(terms)[k] if k is not None else np.zeros(terms)
+            given = [*prior.p, factor, *chosen]
+            assert other(x, u, [], given).full() == pytest.approx(own(x, u, [], prior.p).full(), abs=1e-12)
+    for k in range(terms):
+        given = [*prior.p, -1.0, *np.eye(terms)[k]]
+        changed = [
+            np.abs(
+                getattr(factored.equations, one)(x, u, [], given).full()
+                - getattr(prior.equations, one)(x, u, [], prior.p).full()
+            ).max()
+            for one in ("xdot", "output")
+        ]
+        assert max(changed) > 1e-3
+    if make is Tank:  # sqrt(h) outflow of the other sign
+        given = [*prior.p, -1.0, *np.eye(terms)[3]]
+        assert float(factored.equations.xdot([0.25, 0.0], [0.1], [], given)[0]) == pytest.approx(
+            (0.1 + 0.15) / 2
+        )
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (-0.9, "sign"), (57.0, "degrees"), (0.0175, "radians"), (1010.0, "1e3"), (0.5, "twice"), (61.0, "60"),
+        (-4.0, "sign"), (7.9, "unit"), (1.3, ""), (0.7, ""),
+    ],
+)  # fmt: skip
+def test_what_a_factor_says(factor, said):
+    assert said in reading_of(factor)
+    assert bool(said) == bool(reading_of(factor))
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rng = np.random.default_rng(1)
+    made = [record(seed) for seed in range(3)]
+    return [replace(t, y=t.y + 2e-3 * rng.standard_normal(t.y.shape)) for t in made]
+
+
+def found_of(make, runs):
+    *train, valid = runs
+    fit = fit_prior(make, train, [replace(valid, role="valid")], dt=DT, time_unit=SECONDS)
+    length = run_length(make, fit.values, train, DT, 4.0, SECONDS)
+    return causes(make, fit.values, train, DT, length, SECONDS)
+
+
+def test_a_sound_prior_is_left_alone(runs):
+    assert found_of(Pendulum, runs) == ()
+
+
+def test_a_wrong_sign_is_named(runs):
+    found = found_of(WrongSpring, runs)
+    assert "potential" in found[0].what
+    assert "sign" in found[0].why
+    assert found[0].ratio < 0.1
+    assert str(found[0]) in named(found)
+
+
+@pytest.mark.parametrize("key", ["y", "u"])
+def test_a_signal_that_is_counted_the_other_way_is_named(runs, key):
+    """An angle with the wrong sign is one with an input of the wrong sign: an odd machine cannot tell them apart."""
+    found = found_of(Pendulum, [replace(t, **{key: -getattr(t, key)}) for t in runs])
+    assert any("torque" in one.what or "phi" in one.what for one in found)
+    assert all("sign" in one.why or "other way" in one.why for one in found[:1])
+
+
+def test_equal_explanations_are_named_together():
+    both = named(
+        [Cause("a", "its sign seems wrong", 0.1, -1.0), Cause("b", "they seem to be exchanged", 0.1)]
+    )
+    assert both.startswith("a: its sign seems wrong (factor -1)")
+    assert "b: they seem to be exchanged; mended" in both
+    assert named([]) == ""
