@@ -83,6 +83,8 @@ ANGLES: Mapping[str, float] = {"rad": 0.5 * math.pi, "deg": 90.0}
 
 VAGUE = ("its sign seems wrong, and its size too", "a factor or a unit seems to be wrong")
 """What is said of other factors."""
+COMMON = 0.05, 15.0
+"""Factors between these that are positive may stand for missing physics, too: 0.5 and 2 say little of a mistake."""
 SUMS = (ca.OP_ADD, ca.OP_SUB)
 
 
@@ -109,7 +111,7 @@ class Cause:
     @property
     def exact(self) -> bool:
         """Whether the factor says what the mistake is."""
-        return self.why not in VAGUE
+        return self.why not in VAGUE and not COMMON[0] < self.factor < COMMON[1]
 
     def __str__(self) -> str:
         factor = "" if math.isnan(self.factor) else f" (factor {self.factor:.3g})"

@@ -197,3 +197,12 @@ def test_equal_explanations_are_named_together():
     assert both.startswith("a: its sign seems wrong (factor -1)")
     assert "b: they seem to be exchanged; mended" in both
     assert named([]) == ""
+
+
+@pytest.mark.parametrize(
+    ("factor", "exact"),
+    [(-1.0, True), (57.0, True), (1e-3, True), (0.5, False), (2.0, False), (-7.0, False), (np.nan, True)],
+)
+def test_factors_that_missing_physics_may_have_are_not_exact(factor, exact):
+    why = "they seem to be exchanged" if np.isnan(factor) else reading_of(factor)
+    assert Cause("a", why, 0.5, factor).exact == exact
