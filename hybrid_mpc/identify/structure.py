@@ -306,7 +306,7 @@ def terms_of(prior: Prior) -> list[str]:
     Example:
         >>> from scenarios.pendulum.prior import PendulumPrior
         >>> terms_of(PendulumPrior())[0]
-        'input tau [N m]'
+        'input u [N m]'
     """
     editor = _Editor(prior, {})
     editor.expressions(*_symbols(prior))
