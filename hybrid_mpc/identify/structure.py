@@ -416,7 +416,8 @@ def causes(
     """Mistakes in a prior that explain why it does not follow recordings; the likeliest first, equal ones behind it.
 
     Each term of its equations and each signal gets a factor, which is fitted with all parameters, from 1 and from -1
-    on. Outputs are also counted the other way, signals of one unit exchanged, and angles turned by quarters of a turn.
+    on. Where no factor explains the error, outputs are counted the other way, signals of a kind are exchanged, and
+    angles are turned by quarters of a turn.
     A mistake is named where mending it takes the error of free runs to less than ``NAMED``, or ``GUESSED`` where its
     factor does not say what is wrong (:func:`reading_of`).
 
