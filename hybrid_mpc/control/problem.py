@@ -15,10 +15,11 @@ from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.control.soft import GIVES_WAY, HIGHER, HardBound, fixed, output_bounds, state_bounds
-from hybrid_mpc.control.targets import Steady, Targets
+from hybrid_mpc.control.targets import Targets
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import free_run, stage_step
 

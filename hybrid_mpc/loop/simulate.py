@@ -24,9 +24,8 @@ from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
 from hybrid_mpc.loop.plant import Plant, SimulatedMachine
 from hybrid_mpc.loop.preview import Preview, Previews
-from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
+from hybrid_mpc.model.limits import check_function, check_part, sampled, vector, whole
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import vector
 
 if TYPE_CHECKING:
     import pandas as pd
