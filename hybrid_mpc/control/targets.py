@@ -49,12 +49,12 @@ class Targets:
 
     The search is :class:`~hybrid_mpc.model.equilibrium.SteadySearch`. It begins where it is told to. Where there is no
     such start, or Newton's method does not contract from it, set-point and disturbances are led there from the
-    operating point, by parts of the way that keep Newton's method contracting: the answer is on the operating point's branch, whatever the
-    rounding. Where that branch ends, the branch of the start is followed. Where it ends too, descents begin at the
-    operating point, beside it, and where the model's own run from there ends; of the steady states found that are
-    equally near to the set-point the one nearest to the operating point counts. All counts in the
-    :class:`~hybrid_mpc.control.sizes.Sizes` of the problem, so that no answer depends on units. No method changes the
-    object's answers; not for several threads at once.
+    operating point, by parts of the way that keep Newton's method contracting: the answer is on the operating point's
+    branch, whatever the rounding. Where that branch ends, the branch of the start is followed. Where it ends too,
+    descents begin at the operating point, beside it, and where the model's own run from there ends; of the steady
+    states found that are equally near to the set-point the one nearest to the operating point counts. All counts in
+    the :class:`~hybrid_mpc.control.sizes.Sizes` of the problem, so that no answer depends on units. No method changes
+    the object's answers; not for several threads at once.
 
     Args:
         model: The model, with its disturbance model.
@@ -152,10 +152,11 @@ class Targets:
                 return self._steady(found)
             tried.append(found)
         if wide:
-            for follow in (self._followed(goal, d, w), self._followed(goal, d, w, given)):
-                if follow is not None and not self._lost(follow):
-                    return self._steady(follow)
-                tried += [follow] if follow is not None else []
+            for begun in (None,) if given is None else (None, given):
+                led = self._followed(goal, d, w, begun)
+                if led is not None and not self._lost(led):
+                    return self._steady(led)
+                tried += [] if led is None else [led]
             tried += [search.descend(v, goal) for v in (*self.beside, *self.run_out)]
             if (best := search.best(tried)) is not None:
                 return self._steady(best)

@@ -432,7 +432,7 @@ def _tables(
             "target_scale": own.scale, "target_heed": own.scale[: own.heed.size] * own.heed,
             "target_root": np.sqrt(ocp.q_y), "target_starts": target_starts(own),
             "target_x_range": np.array(own.x_range).T, "target_y_range": np.array(own.y_range).T,
-            "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
+            "target_begun": own.begun[1], "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
         }  # fmt: skip
     if estimator is not None:
         modes = _modes(estimator)

@@ -45,7 +45,7 @@ CONTRACTS = 0.7
 """Largest share of the step before that a step has along a descent whose end no rounding changes."""
 LEAST_SHARE = 1e-3
 """Smallest share of a step that is tried."""
-FOLLOWED, LEAST_PART, MOST_PARTS = 0.125, 1 / 512, 60
+FOLLOWED, LEAST_PART, MOST_PARTS = 0.125, 1 / 1024, 100
 """First part of the way that a continuation goes at once, the least one, and descents at most."""
 RUN = 5000
 """Periods of the model's own run at most."""
