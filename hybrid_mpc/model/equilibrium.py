@@ -489,6 +489,22 @@ def rest_search(
     )  # fmt: skip
 
 
+def rate_search(
+    equations: RateEquations, scale: Array, near: Array, root: Array, *, bounds: Range | None = None,
+    free: Places | None = None,
+) -> SteadySearch:  # fmt: skip
+    """A search for steady states ``v = (x, u)`` of rates, which count by what a state or input of its size changes.
+
+    ``near`` is the operating point, which the inputs stay near; the rest is as in :class:`SteadySearch`.
+    """
+    slopes = equations.rest(near)[1]
+    size = np.linalg.norm(np.where(np.isfinite(slopes), slopes * scale, 0.0), axis=1)
+    size = np.where(size > 0, size, 1.0)
+    return SteadySearch(
+        equations, scale, size, root, near, np.arange(len(size), len(near)), bounds, free=free, steady=EXACT
+    )
+
+
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is no rest
 def run_to_rest(search: SteadySearch, v: Array) -> Array | None:
     """Where a model's own run from ``v = (x, h, u)`` comes nearly to rest under its input; None where it does not."""
