@@ -36,7 +36,7 @@ ROOMS = {
     "job": "nn_export errors rules records files machine data model estimate control loop scenario monitor analyze kit "
     "identify plots report",
     "cli": "errors rules records files machine data scenario kit identify job",
-    "scenarios.paper": "errors records files machine data scenario identify plots job cli",
+    "scenarios.paper": "errors rules records files machine data scenario identify plots job cli",
     "scenarios.golf_robot.monitor_study": "errors records files loop scenario monitor kit plots report job cli",
     "scenarios": "nn_export",
 }
