@@ -371,16 +371,21 @@ def make_controller(
         )
     options = {} if iterations is None else {"iterations": iterations}
     controller = SOLVERS[known(solver, SOLVERS, "solver")](model, ocp, **options)
-    first = None if controller.converges else first_controller(model, ocp)
+    first = None if controller.converges else first_controller(model, ocp, controller)
     return SafeController(controller, prior, first=first, safe_input=safe_input)
 
 
-def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:
-    """What makes the first plan: SQP, from each of the problem's starts if there are any."""
+def first_controller(
+    model: HybridModel, ocp: OCP, controller: Controller | None = None
+) -> SQPController | BestOf:
+    """What makes the first plan: SQP, from each of the problem's starts if there are any. It shares the functions of
+    the ``controller`` that goes on from there, if that is a real-time iteration in Python.
+    """
     from hybrid_mpc.control.best_of import BestOf
+    from hybrid_mpc.control.rti import CondensedController
     from hybrid_mpc.control.sqp import SQPController
 
-    sqp = SQPController(model, ocp)
+    sqp = SQPController(model, ocp, inner=controller if isinstance(controller, CondensedController) else None)
     return BestOf(sqp, starts=ocp.starts) if ocp.starts else sqp
 
 
