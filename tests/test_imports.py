@@ -282,6 +282,7 @@ def test_help_and_version_load_nothing_that_computes(option):
     told, _, loaded = done.stdout.partition("LOADED ")
     assert "hybrid-mpc" in told or "reproduce" in told
     heavy = {
+        "numpy",
         "scipy",
         "casadi",
         "torch",
@@ -294,3 +295,28 @@ def test_help_and_version_load_nothing_that_computes(option):
         "jinja2",
     }
     assert not heavy & set(loaded.split())
+
+
+HEAVY = ("torch", "scipy.stats", "scipy.signal", "matplotlib", "pandas", "control", "jinja2", "joblib")
+
+
+def loaded_by(code, *arguments):
+    """Modules that a process of its own has loaded at the end of ``code``."""
+    code += "\nimport sys; print('LOADED', *sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.partition("LOADED ")[2].split())
+
+
+def test_the_list_of_scenarios_needs_nothing_that_computes_on_recordings():
+    listed = "from hybrid_mpc.cli.scenarios import scenarios; scenarios()"
+    assert not loaded_by(listed).intersection((*HEAVY, "scipy.interpolate", "scipy.io"))
+
+
+def test_a_kit_loads_no_solver_and_its_loop_nothing_that_plots_or_trains(golf_artifact):
+    load = "import sys, hybrid_mpc as hm; kit = hm.load(sys.argv[1])"
+    assert not loaded_by(load, str(golf_artifact)).intersection((*HEAVY, "scipy", "hybrid_mpc.control.rti"))
+    used = loaded_by(f"{load}; kit.observer(); kit.controller()", str(golf_artifact))
+    assert "hybrid_mpc.control.rti" in used
+    assert not used.intersection((*HEAVY, "hybrid_mpc.embedded.generate", "hybrid_mpc.control.nlp"))
