@@ -317,6 +317,8 @@ def test_the_list_of_scenarios_needs_nothing_that_computes_on_recordings():
 def test_a_kit_loads_no_solver_and_its_loop_nothing_that_plots_or_trains(golf_artifact):
     load = "import sys, hybrid_mpc as hm; kit = hm.load(sys.argv[1])"
     assert not loaded_by(load, str(golf_artifact)).intersection((*HEAVY, "scipy", "hybrid_mpc.control.rti"))
-    used = loaded_by(f"{load}; kit.observer(); kit.controller()", str(golf_artifact))
+    made = "from hybrid_mpc import load_scenario, make_controller; golf = load_scenario('golf_robot').control"
+    made += "; make_controller(kit.models['hybrid'], kit.models['prior'], golf)"
+    used = loaded_by(f"{load}; {made}", str(golf_artifact))
     assert "hybrid_mpc.control.rti" in used
     assert not used.intersection((*HEAVY, "hybrid_mpc.embedded.generate", "hybrid_mpc.control.nlp"))
