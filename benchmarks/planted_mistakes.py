@@ -33,7 +33,7 @@ from unknown_machines import read
 from hybrid_mpc import InputError, Prior, fit_prior
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.identify.delay import shifted
-from hybrid_mpc.identify.structure import causes, run_length
+from hybrid_mpc.identify.structure import causes
 
 
 @dataclass(frozen=True)
@@ -333,8 +333,7 @@ def judged(mistake: Mistake, folder: Path) -> dict[str, Any]:
         fit = fit_prior(machine.prior, train, valid, dt=dt, length=machine.length)
         fitted = time.process_time()
         unit, acting = time_unit(train, dt), shifted(train, fit.delay)
-        length = run_length(machine.prior, fit.values, acting, dt, machine.length, unit)
-        found = causes(machine.prior, fit.values, acting, dt, length, unit)
+        found = causes(machine.prior, fit.values, acting, dt, machine.length, unit)
     except InputError as error:
         return {**row, "right": "refused", "first": str(error)[:200], "seconds": "–", "of the fit": "–"}
     said = [str(one) for one in found]

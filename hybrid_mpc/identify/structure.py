@@ -29,10 +29,11 @@ from hybrid_mpc.identify.fit import (
     OutputFit,
     Shooting,
     Trial,
+    check_observable,
     cut_outputs,
     with_states,
 )
-from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, visited
+from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, required_substeps, visited
 from hybrid_mpc.identify.smooth import rough_smoother
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 
@@ -55,6 +56,12 @@ READINGS = (
     *((10.0**-k, f"it is 1e{k} times too large, as between units") for k in (1, 2, 3, 5, 6)),
 )
 """Factors that say what the mistake is."""
+UNITS = tuple(value for value, _ in READINGS if value not in (-1.0, 2.0, 0.5))
+"""Those that stand for a unit: too far from 1 to be found from there."""
+TAKEN = 30.0
+"""What parameters may take of a mistake at most."""
+EACH = 2
+"""Mistakes of a unit that are tried of a term."""
 NEAR = 0.2
 """Relative distance of a factor from such a value that counts as the same: parameters take a part of a mistake."""
 SMALL = 0.1
@@ -97,6 +104,8 @@ class Cause:
         why: What is wrong with it.
         ratio: Error of free runs with the mistake mended over the error without [-].
         factor: Factor that the recordings give the term; NaN where there is none.
+        before: Whether there is an error without the mistake mended; where the prior cannot be fitted with it, the
+            ratio is over the outputs' spread.
 
     Example:
         >>> print(Cause("k * u in the rate of v", "its sign seems wrong", 0.1, -1.02))
@@ -107,6 +116,7 @@ class Cause:
     why: str
     ratio: float
     factor: float = math.nan
+    before: bool = True
 
     @property
     def exact(self) -> bool:
@@ -115,7 +125,9 @@ class Cause:
 
     def __str__(self) -> str:
         factor = "" if math.isnan(self.factor) else f" (factor {self.factor:.3g})"
-        return f"{self.what}: {self.why}{factor}; mended, the error of free runs falls to {100 * self.ratio:.0f} %"
+        left = f"{100 * self.ratio:.0f} %"
+        told = f"falls to {left}" if self.before else f"is {left} of the outputs' spread"
+        return f"{self.what}: {self.why}{factor}; mended, the error of free runs {told}"
 
 
 def reading_of(factor: float, needed: bool = True) -> str:
@@ -343,8 +355,11 @@ class _Lenient(OutputFit):
 
     def substeps(self, theta: Array) -> int:
         """As many as are needed, or the most that there may be: a model that is stiffer runs away and is not named."""
+        return self._enough(self.values(theta))
+
+    def _enough(self, values: Mapping[str, float]) -> int:
         try:
-            return super().substeps(theta)
+            return max(self.least, required_substeps(self.make(values), self.dt, self.points))
         except InputError:
             return MAX_SUBSTEPS
 
@@ -356,8 +371,8 @@ class _FactorFit(_Lenient):
     """
 
     def __init__(self, make: Callable[..., Prior], dt: float) -> None:
-        super().__init__(make, dt)
-        self.terms = sum(p.name.startswith("chosen ") for p in self.prior.parameters)
+        super().__init__(with_factor(make), dt)
+        self.term_names = terms_of(make())
         self.chosen: Sequence[int] = ()
 
     def choosing(self, chosen: Sequence[int]) -> _FactorFit:
@@ -366,31 +381,41 @@ class _FactorFit(_Lenient):
         other.chosen = chosen
         return other
 
+    def most_substeps(self, thetas: Array) -> int:
+        """With each factor on its term."""
+        return max(
+            self._enough({**self.values(theta), **({f"chosen {k}": 1.0} if k >= 0 else {})})
+            for theta, k in zip(thetas, self.chosen, strict=True)
+        )
+
     def _every(self, thetas: Array) -> list[list[float]]:
-        chosen = np.array(self.chosen)[:, None] == np.arange(self.terms)
+        terms = len(self.term_names)
+        chosen = np.array(self.chosen)[:, None] == np.arange(terms)
         rows = []
         for one, own in zip(thetas, chosen, strict=True):
             *constants, late = self._constants(one)
-            rows.append([*constants[: -self.terms], *own.astype(float), late])
+            rows.append([*constants[:-terms], *own.astype(float), late])
         return rows
 
 
-def run_length(
-    make: Callable[..., Prior],
-    values: Mapping[str, float],
-    recorded: Sequence[Trajectory],
-    dt: float,
-    longest: float,
-    time_unit: float,
-) -> float:
-    """Length [s] of the free runs by which explanations are compared: that of the runs by which models are judged, less
-    where small errors grow faster. There it is twice the time in which they grow tenfold: first states are free.
+def _off_nominal(fit: OutputFit, theta: Array) -> float:
+    """How far parameters are off their nominal values over half their ranges: by ratios where none may be negative."""
+    ratio = (fit.lower > 0.0) & (fit.upper > fit.lower)
+    low, high, own, nominal = (np.where(ratio, v, 1.0) for v in (fit.lower, fit.upper, theta, fit.nominal))
+    relative = np.log(own / nominal) / np.where(ratio, 0.5 * np.log(high / low), 1.0)
+    linear = (theta - fit.nominal) / np.where(fit.half > 0.0, fit.half, 1.0)
+    return float(np.square(np.where(ratio, relative, linear)).sum())
+
+
+def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[float]:
+    """Lengths [s] of the free runs by which explanations are compared: less than the longest where small errors grow
+    faster, and the longest too, since a mistake may be what lets them grow.
+
+    The shorter is twice the time in which they grow tenfold: first states are free.
     """
-    fit = OutputFit(make, dt)
-    fit.points = visited(_smoothed(make, recorded, dt, time_unit)[0])
     tenfold = math.log(GROWN[0]) / math.log(GROWN[-1])
-    reach = min(fit.reach(theta) for theta in (fit.nominal, fit.scaled(values))) * tenfold
-    return max(4 * dt, min(longest, 2 * reach))
+    shorter = max(4 * fit.dt, 2 * tenfold * min(fit.reach(theta) for theta in thetas))
+    return [shorter, longest] if shorter < SHORTER * longest else [longest]
 
 
 def _cut(fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float) -> Shooting:
@@ -410,14 +435,14 @@ def causes(
     values: Mapping[str, float],
     recorded: Sequence[Trajectory],
     dt: float,
-    length: float,
+    longest: float,
     time_unit: float,
 ) -> tuple[Cause, ...]:
     """Mistakes in a prior that explain why it does not follow recordings; the likeliest first, equal ones behind it.
 
-    Each term of its equations and each signal gets a factor, which is fitted with all parameters, from 1 and from -1
-    on. Where no factor explains the error, outputs are counted the other way, signals of a kind are exchanged, and
-    angles are turned by quarters of a turn.
+    Each term of its equations and each signal gets a factor, which is fitted with all parameters: from 1, from -1, and
+    from the mistakes of a unit that explain short runs best. Where no factor explains the error, outputs are counted
+    the other way, signals of a kind are exchanged, and angles are turned by quarters of a turn.
     A mistake is named where mending it takes the error of free runs to less than ``NAMED``, or ``GUESSED`` where its
     factor does not say what is wrong (:func:`reading_of`).
 
@@ -426,79 +451,223 @@ def causes(
         values: Fitted values [their units] by name.
         recorded: Training trajectories as recorded, with the inputs that act.
         dt: Model period [s].
-        length: Length [s] of the free runs.
+        longest: Length [s] of the free runs by which models are judged; shorter ones are taken where small errors grow.
         time_unit: The machine's second [s].
     """
     known, sizes, noise = _smoothed(make, recorded, dt, time_unit)
-    fit = _FactorFit(with_factor(make), dt)
+    fit = _FactorFit(make, dt)
     fit.points = visited(known)
-    problem, names = _cut(fit, known, sizes, length), terms_of(make())
-    thetas = fit.nominal, fit.scaled({**fit.prior.values, **values})
-    begun = [(-1, theta) for theta in thetas]
-    begun += [
-        (k, np.append(theta[:-1], one)) for k in range(len(names)) for theta in thetas for one in (-1.0, 1.0)
-    ]
-    (plain,) = problem.several(thetas[1][None], lambda numbers: fit.choosing([-1] * len(numbers)), [])
-    if plain.error <= QUIET * float(np.sqrt(np.mean(np.square(noise / problem.spread)))):
-        return ()  # little is left but the sensors' noise
-    short = _cut(fit, known, sizes, min(LENGTHS[1] * time_unit, length))
-    before, terms = _fitted(fit, problem, _moved(fit, short, begun))
-    found = [
-        Cause(names[k], why, trial.error / before, float(trial.theta[-1]))
-        for k, trial in terms.items()
-        if (why := reading_of(float(trial.theta[-1]), _needed(fit, problem, k, trial)))
-    ]
-    found = [one for one in found if one.ratio <= (NAMED if one.exact else GUESSED)]
+    thetas = [fit.nominal, fit.scaled({**fit.prior.values, **values})]
+    lengths = _lengths(fit, thetas, longest)
+    found: list[Cause] = []
+    for length in lengths:
+        problem, short = (
+            _cut(fit, known, sizes, own) for own in (length, min(LENGTHS[1] * time_unit, length))
+        )
+        (plain,) = _tried(fit, problem, [_Start(-1, thetas[1])], 0)
+        if plain.error <= QUIET * float(np.sqrt(np.mean(np.square(noise / problem.spread)))):
+            continue  # little is left but the sensors' noise
+        before, found = _explained(fit, problem, short, thetas)
+        if before * min((one.ratio for one in found), default=1.0) > POOR or not found:
+            signals = _signals(
+                make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit
+            )
+            found += [one for one in signals if one.ratio <= NAMED]
+        if length > lengths[0]:  # of a machine that does run away, another model may only run away later
+            found = [one for one in found if before * one.ratio <= POOR]
+        if found:
+            break
     least = min((one.ratio for one in found), default=1.0)
-    if before * least > POOR or not found:
-        signals = _signals(make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit)
-        found += [one for one in signals if one.ratio <= NAMED]
-    found.sort(key=lambda one: one.ratio)
-    return tuple(one for one in found if one.ratio <= ALIKE * found[0].ratio)[:MOST]
+    found = [one for one in found if one.ratio <= ALIKE * least]
+    return tuple(sorted(found, key=lambda one: (not one.exact, one.ratio)))[:MOST]
 
 
-def _moved(fit: _FactorFit, short: Shooting, begun: Sequence[tuple[int, Array]]) -> list[tuple[int, Array]]:
-    """Starts to which a few steps over short windows lead, with factors held: long windows have more optima."""
-    chosen = [k for k, _ in begun]
-    every = short.several(
-        np.stack([theta for _, theta in begun]), lambda numbers: fit.choosing([chosen[i] for i in numbers]),
-        [len(begun)] * STEPS, -1,
-    )  # fmt: skip
-    return [(chosen[one.start], one.theta) for one in every]
+def _explained(
+    fit: _FactorFit, problem: Shooting, short: Shooting, thetas: Sequence[Array]
+) -> tuple[float, list[Cause]]:
+    """Error of free runs without a factor, and the terms whose factor explains it."""
+    terms = range(len(fit.term_names))
+    plain = [_Start(-1, theta) for theta in thetas]
+    turned = [_Start(k, np.append(theta[:-1], -1.0)) for k in terms for theta in thetas]
+    # over short windows first, with factors held: long windows have more optima
+    moved, mended, scaled = (
+        _best(one, _tried(fit, short, one, STEPS, held=True), each)
+        for one, each in ((plain, len(plain)), (turned, 1), (_units(fit, short), EACH))
+    )
+    moved += [_Start(k, moved[0].theta) for k in terms] + mended + scaled
+    before, trials = _fitted(fit, problem, moved)
+    least = min((one.error for one in trials.values()), default=math.inf)
+    found = [
+        _cause(fit, problem, short, k, one, before)
+        for k, one in trials.items()
+        if one.error <= min(ALIKE * least, NAMED * before)
+    ]
+    return before, [one for one in found if one.why and one.ratio <= (NAMED if one.exact else GUESSED)]
 
 
-def _needed(fit: _FactorFit, problem: Shooting, k: int, trial: Trial) -> bool:
+def causes_of_refusal(
+    make: Callable[..., Prior], recorded: Sequence[Trajectory], dt: float, longest: float, time_unit: float
+) -> tuple[Cause, ...]:
+    """Mistakes of a unit, or of a sign, with which a prior cannot be fitted at all: too stiff, or not observable.
+
+    Each term that would make the prior fit for use gets such a factor, and its parameters are fitted to short runs. A
+    ratio is the error of free runs with the mistake mended over the outputs' spread.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        recorded: Training trajectories as recorded.
+        dt: Model period [s].
+        longest: Length [s] of the free runs by which models are judged.
+        time_unit: The machine's second [s].
+    """
+    fit = _FactorFit(make, dt)
+    usable, known = [], None
+    for k in range(len(fit.term_names)):
+        for value in (-1.0, *UNITS):
+            one = _with_mended(make, k, value)
+            try:
+                check_observable(one(), dt, time_unit)
+                required_substeps(one(), dt)
+                known = known or _smoothed(one, recorded, dt, time_unit)
+            except InputError:
+                continue
+            usable.append(_Start(k, np.append(fit.nominal[:-1], value)))
+    if known is None:
+        return ()
+    tried: list[Trial] = []
+    for steps in (0, STEPS):
+        if tried:  # first states as the best of them smooths them
+            usable = [usable[one.start] for one in tried[:TRIED]]
+            best = _with_mended(make, usable[0].term, float(usable[0].theta[-1]))
+            known = _smoothed(best, recorded, dt, time_unit)
+        fit.points = visited(known[0])
+        short = _cut(fit, known[0], known[1], min(LENGTHS[1] * time_unit, longest))
+        tried = sorted(_tried(fit, short, usable, steps, held=True), key=lambda one: one.error)
+    alike = [one for one in tried if one.error <= min(GUESSED, ALIKE * tried[0].error)]
+    alike.sort(key=lambda one: _off_nominal(fit, one.theta))
+    values = [
+        (fit.term_names[usable[one.start].term], float(one.theta[-1]), one.error) for one in alike[:MOST]
+    ]
+    return tuple(Cause(name, reading_of(value), error, value, before=False) for name, value, error in values)
+
+
+def _with_mended(make: Callable[..., Prior], term: int, value: float) -> type[Prior]:
+    """The prior as a class of its own whose factor on one term is ``value``."""
+    base = with_factor(make)
+    fixed = {"factor": value, f"chosen {term}": 1.0}
+    own = (
+        Parameter(p.name, fixed[p.name], p.unit, fixed[p.name], fixed[p.name]) if p.name in fixed else p
+        for p in base.parameters
+    )
+    return type(base.__name__, (base,), {"parameters": tuple(own), "__module__": __name__})
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A start of a trial fit: the term that has the factor (-1: none), and ``theta`` with the factor behind it."""
+
+    term: int
+    theta: Array
+
+
+def _tried(
+    fit: _FactorFit, problem: Shooting, begun: Sequence[_Start], steps: int, most: int = 0, held: bool = False
+) -> list[Trial]:
+    """Trial fits from starts, by their numbers.
+
+    Args:
+        fit: Parameters with the factor, which is held where ``held`` says so.
+        problem: Windows.
+        begun: Starts.
+        steps: Pairs of Gauss-Newton steps; without any, first states alone are fitted.
+        most: About how many fits go on to the end. Default 0: all.
+        held: Whether factors stay as they are.
+    """
+    groups: dict[int, list[int]] = {}
+    for i, one in enumerate(begun):  # a stiff one does not slow the others down
+        substeps = fit.choosing([one.term]).most_substeps(one.theta[None])
+        groups.setdefault(substeps.bit_length(), []).append(i)
+    found = []
+    for own in groups.values():
+        size = math.ceil(most * len(own) / len(begun)) if most else len(own)
+        every = problem.several(
+            np.stack([begun[i].theta for i in own]),
+            lambda numbers, own=own: fit.choosing([begun[own[i]].term for i in numbers]),  # type: ignore[misc]
+            [max(size, len(own) // 2**i) for i in range(steps)],
+            -1 if held else None,
+        )
+        found += [replace(one, start=own[one.start]) for one in every]
+    return found
+
+
+def _units(fit: _FactorFit, short: Shooting) -> list[_Start]:
+    """Mistakes of a unit that explain short windows best at the nominal values, ``EACH`` of a term at most."""
+    (before,) = _tried(fit, short, [_Start(-1, fit.nominal)], 0)
+    terms = len(fit.term_names)
+    begun = [_Start(k, np.append(fit.nominal[:-1], unit)) for k in range(terms) for unit in UNITS]
+    slow = [one for one in begun if fit.choosing([one.term]).most_substeps(one.theta[None]) < MAX_SUBSTEPS]
+    better = [one for one in _tried(fit, short, slow, 0) if one.error < BETTER * before.error]
+    return _best(slow, better, EACH)[: max(TRIED, terms)]
+
+
+def _best(begun: Sequence[_Start], trials: Sequence[Trial], each: int) -> list[_Start]:
+    """Starts from where trial fits ended, ``each`` of a term at most; the best come first."""
+    count: Counter[int] = Counter()
+    found = []
+    for one in sorted(trials, key=lambda trial: trial.error):
+        own = begun[one.start]
+        count[own.term] += 1
+        if count[own.term] <= each:
+            found.append(replace(own, theta=one.theta))
+    return found
+
+
+def _cause(
+    fit: _FactorFit, problem: Shooting, short: Shooting, term: int, free: Trial, before: float
+) -> Cause:
+    """What a term's factor says: a value that says what the mistake is where that explains as much as any other, those
+    with parameters nearest to their nominal values where several do.
+    """
+    name = fit.term_names[term]
+    why = reading_of(float(free.theta[-1]), _needed(fit, problem, term, free))
+    plain = Cause(name, why, free.error / before, float(free.theta[-1]))
+    if not why or not free.theta[-1]:
+        return plain
+    values = [value for value, _ in READINGS if 1 / TAKEN < value / free.theta[-1] < TAKEN]
+    if not values:
+        return plain
+    begun = [_Start(term, np.append(fit.nominal[:-1], value)) for value in values]
+    begun = _best(begun, _tried(fit, short, begun, STEPS, held=True), len(values))
+    begun += [_Start(term, np.append(free.theta[:-1], value)) for value in values]
+    held = _tried(fit, problem, begun, STEPS, len(values), held=True)
+    least = min(free.error, *(one.error for one in held))
+    alike = [one for one in held if one.error <= least / BETTER]
+    if not alike:
+        return plain
+    alike.sort(key=lambda one: _off_nominal(fit, one.theta))
+    said = list(dict.fromkeys(reading_of(float(one.theta[-1])) for one in alike))
+    chosen = alike[0]
+    return Cause(name, ", or ".join(said[:2]), chosen.error / before, float(chosen.theta[-1]))
+
+
+def _needed(fit: _FactorFit, problem: Shooting, term: int, trial: Trial) -> bool:
     """Whether free runs need a term whose factor is small."""
     if abs(trial.theta[-1]) > SMALL:
         return True
-    without = np.append(trial.theta[:-1], 0.0)[None]
-    (nothing,) = problem.several(without, lambda numbers: fit.choosing([k] * len(numbers)), [])
+    (nothing,) = _tried(fit, problem, [_Start(term, np.append(trial.theta[:-1], 0.0))], 0)
     return trial.error < BETTER * nothing.error
 
 
-def _fitted(
-    fit: _FactorFit, problem: Shooting, begun: Sequence[tuple[int, Array]]
-) -> tuple[float, dict[int, Trial]]:
-    """Error without a factor, and for each term what is best of the fits that went on to the end."""
-
-    def choosing(numbers: Sequence[int]) -> _FactorFit:
-        return fit.choosing([begun[i][0] for i in numbers])
-
-    plain = [theta for k, theta in begun if k < 0]
-    before = min(
-        t.error
-        for t in problem.several(np.stack(plain), lambda n: fit.choosing([-1] * len(n)), [len(plain)] * STEPS)
-    )
-    keep = [max(TRIED, len(begun) // 2**i) for i in range(2 * STEPS)]
-    found: dict[int, Trial] = {}
-    every = problem.several(np.stack([theta for _, theta in begun]), choosing, keep)
-    for one in sorted(every, key=lambda t: t.error):
-        k = begun[one.start][0]
-        other = found.setdefault(k, one)
+def _fitted(fit: _FactorFit, problem: Shooting, begun: Sequence[_Start]) -> tuple[float, dict[int, Trial]]:
+    """Error without a factor, and for each term the best of the fits that went on to the end."""
+    plain = [one for one in begun if one.term < 0]
+    before = min(t.error for t in _tried(fit, problem, plain, STEPS, held=True))
+    some, found = [one for one in begun if one.term >= 0], dict[int, Trial]()
+    for one in sorted(_tried(fit, problem, some, 2 * STEPS, TRIED), key=lambda trial: trial.error):
+        other = found.setdefault(some[one.start].term, one)
         turned = one.theta[-1] < 0.0 and abs(one.theta[-1] + 1.0) < abs(other.theta[-1] + 1.0)
         if turned and other.theta[-1] < 0.0 and other.error > BETTER * one.error:
-            found[k] = one  # where its size is unknown, its sign alone counts
-    found.pop(-1, None)
+            found[some[one.start].term] = one  # where its size is unknown, its sign alone counts
     return before, found
 
 

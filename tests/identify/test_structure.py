@@ -13,7 +13,6 @@ from hybrid_mpc.identify.structure import (
     causes,
     named,
     reading_of,
-    run_length,
     terms_of,
     with_factor,
 )
@@ -166,8 +165,7 @@ def runs():
 def found_of(make, runs):
     *train, valid = runs
     fit = fit_prior(make, train, [replace(valid, role="valid")], dt=DT, time_unit=SECONDS)
-    length = run_length(make, fit.values, train, DT, 4.0, SECONDS)
-    return causes(make, fit.values, train, DT, length, SECONDS)
+    return causes(make, fit.values, train, DT, 4.0, SECONDS)
 
 
 def test_a_sound_prior_is_left_alone(runs):

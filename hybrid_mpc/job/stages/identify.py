@@ -41,7 +41,7 @@ from hybrid_mpc.identify.sound import (
     trial_length,
 )
 from hybrid_mpc.identify.step import PriorStep, Scaling
-from hybrid_mpc.identify.structure import causes, named, run_length
+from hybrid_mpc.identify.structure import causes, named
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.check import rests_no_more
 from hybrid_mpc.job.context import Context
@@ -295,7 +295,7 @@ def prior_stage(context: Context) -> PriorResult:
     compared = baselines if not told else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
     acting, unit = shifted(train, fit.delay), context.time_unit
-    length = run_length(make, fit.values, acting, spec.dt, longest_run or longest or trial, unit)
+    length = longest_run or longest or trial
     context.progress.update("free runs", 1, 1, "looking for wrong terms")
     wrong = named(causes(make, fit.values, acting, spec.dt, length, unit))
     in_doubt = tuple(one for one in (structure_doubt(error, simpler), wrong) if one)
