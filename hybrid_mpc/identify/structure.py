@@ -56,8 +56,12 @@ READINGS = (
     *((10.0**-k, f"it is 1e{k} times too large, as between units") for k in (1, 2, 3, 5, 6)),
 )
 """Factors that say what the mistake is."""
-UNITS = tuple(value for value, _ in READINGS if value not in (-1.0, 2.0, 0.5))
-"""Those that stand for a unit: too far from 1 to be found from there."""
+UNITS = tuple(v for one in (10.0, 60.0, 1e3, 1e5) for v in (one, 1 / one))
+"""Factors from which trial fits start, beside 1 and -1: mistakes of a unit are too far from these. From each the values
+of ``READINGS`` within ``TAKEN`` are tried at the end.
+"""
+FEW = 4
+"""Windows by which such starts are compared: a mistake of a unit is large."""
 TAKEN = 30.0
 """What parameters may take of a mistake at most."""
 EACH = 2
@@ -76,8 +80,10 @@ mistake is, and where it says no more than that something is wrong.
 """
 BETTER = 0.95
 """Ratio of two errors from which on the smaller counts."""
-ALIKE = 1.25
-"""Ratio of two errors up to which their explanations count as equal."""
+ALIKE, TOLD = 1.25, 2.0
+"""Ratio of two errors up to which their explanations count as equal; and up to which one whose factor says what the
+mistake is counts for more than one whose factor may be anything.
+"""
 TRIED = 16
 """Trial fits at least that go on to the end."""
 STEPS = 3
@@ -418,11 +424,13 @@ def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[fl
     return [shorter, longest] if shorter < SHORTER * longest else [longest]
 
 
-def _cut(fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float) -> Shooting:
-    """Windows of ``length`` [s], or as long as the recordings hold."""
+def _cut(
+    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = WINDOWS // 4
+) -> Shooting:
+    """At most so many windows of ``length`` [s], or as long as the recordings hold."""
     longest = max(len(t.t) for t in known) - 1
     periods = min(scales.periods(length, fit.dt, 2), longest)
-    return Shooting(fit, cut_outputs(known, periods, 0, WINDOWS // 4, fit.prior.states), sizes)
+    return Shooting(fit, cut_outputs(known, periods, 0, most, fit.prior.states), sizes)
 
 
 def named(found: Sequence[Cause]) -> str:
@@ -459,15 +467,25 @@ def causes(
     fit.points = visited(known)
     thetas = [fit.nominal, fit.scaled({**fit.prior.values, **values})]
     lengths = _lengths(fit, thetas, longest)
+
+    def quiet(windows: Shooting) -> float:
+        """Error up to which little is left but the sensors' noise."""
+        return QUIET * float(np.sqrt(np.mean(np.square(noise / windows.spread))))
+
     found: list[Cause] = []
     for length in lengths:
-        problem, short = (
-            _cut(fit, known, sizes, own) for own in (length, min(LENGTHS[1] * time_unit, length))
+        problem, short, few = (
+            _cut(fit, known, sizes, min(own, length), most)
+            for own, most in (
+                (length, WINDOWS // 4),
+                (LENGTHS[1] * time_unit, WINDOWS // 4),
+                (time_unit, FEW),
+            )
         )
         (plain,) = _tried(fit, problem, [_Start(-1, thetas[1])], 0)
-        if plain.error <= QUIET * float(np.sqrt(np.mean(np.square(noise / problem.spread)))):
-            continue  # little is left but the sensors' noise
-        before, found = _explained(fit, problem, short, thetas)
+        if plain.error <= quiet(problem):
+            continue
+        before, found = _explained(fit, (problem, short, few), thetas, quiet)
         if before * min((one.ratio for one in found), default=1.0) > POOR or not found:
             signals = _signals(
                 make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit
@@ -478,29 +496,48 @@ def causes(
         if found:
             break
     least = min((one.ratio for one in found), default=1.0)
-    found = [one for one in found if one.ratio <= ALIKE * least]
-    return tuple(sorted(found, key=lambda one: (not one.exact, one.ratio)))[:MOST]
+    found = [one for one in found if one.exact and one.ratio <= TOLD * least] or found
+    least = min((one.ratio for one in found), default=1.0)
+    found.sort(key=lambda one: one.ratio)
+    return tuple(one for one in found if one.ratio <= ALIKE * least)[:MOST]
 
 
 def _explained(
-    fit: _FactorFit, problem: Shooting, short: Shooting, thetas: Sequence[Array]
+    fit: _FactorFit,
+    windows: tuple[Shooting, Shooting, Shooting],
+    thetas: Sequence[Array],
+    quiet: Callable[[Shooting], float],
 ) -> tuple[float, list[Cause]]:
-    """Error of free runs without a factor, and the terms whose factor explains it."""
+    """Error of free runs without a factor, and the terms whose factor explains it.
+
+    Args:
+        fit: Parameters with the factor.
+        windows: Those by which explanations are judged, short ones, and a few short ones.
+        thetas: Parameters to start from.
+        quiet: Error of windows up to which little is left but the sensors' noise.
+    """
+    problem, short, few = windows
     terms = range(len(fit.term_names))
-    plain = [_Start(-1, theta) for theta in thetas]
-    turned = [_Start(k, np.append(theta[:-1], -1.0)) for k in terms for theta in thetas]
-    # over short windows first, with factors held: long windows have more optima
-    moved, mended, scaled = (
-        _best(one, _tried(fit, short, one, STEPS, held=True), each)
-        for one, each in ((plain, len(plain)), (turned, 1), (_units(fit, short), EACH))
-    )
-    moved += [_Start(k, moved[0].theta) for k in terms] + mended + scaled
-    before, trials = _fitted(fit, problem, moved)
+    begun = [_Start(-1, theta) for theta in thetas]
+    # over short windows first: long windows have more optima
+    plain = _best(begun, tried := _tried(fit, short, begun, STEPS, held=True), len(begun))
+    enough = BETTER * min(one.error for one in tried)
+    enough = math.inf if enough <= quiet(short) else enough
+    moved = []
+    for begun, held, each in (
+        ([_Start(k, plain[0].theta) for k in terms], False, 1),
+        ([_Start(k, np.append(theta[:-1], -1.0)) for k in terms for theta in thetas], True, 1),
+        (_units(fit, few), True, EACH),
+    ):
+        tried = _tried(fit, short, begun, STEPS, held=held)
+        moved += _best(begun, [one for one in tried if one.error <= enough], each)
+    before = min(one.error for one in _tried(fit, problem, plain, STEPS, held=True))
+    trials = _fitted(fit, problem, moved)
     least = min((one.error for one in trials.values()), default=math.inf)
     found = [
         _cause(fit, problem, short, k, one, before)
         for k, one in trials.items()
-        if one.error <= min(ALIKE * least, NAMED * before)
+        if one.error <= min(TOLD * least, NAMED * before)
     ]
     return before, [one for one in found if one.why and one.ratio <= (NAMED if one.exact else GUESSED)]
 
@@ -523,7 +560,7 @@ def causes_of_refusal(
     fit = _FactorFit(make, dt)
     usable, known = [], None
     for k in range(len(fit.term_names)):
-        for value in (-1.0, *UNITS):
+        for value in (value for value, _ in READINGS if value not in (0.5, 2.0)):
             one = _with_mended(make, k, value)
             try:
                 check_observable(one(), dt, time_unit)
@@ -600,13 +637,13 @@ def _tried(
     return found
 
 
-def _units(fit: _FactorFit, short: Shooting) -> list[_Start]:
-    """Mistakes of a unit that explain short windows best at the nominal values, ``EACH`` of a term at most."""
-    (before,) = _tried(fit, short, [_Start(-1, fit.nominal)], 0)
+def _units(fit: _FactorFit, few: Shooting) -> list[_Start]:
+    """Mistakes of a unit that explain a few short windows best at the nominal values, ``EACH`` of a term at most."""
+    (before,) = _tried(fit, few, [_Start(-1, fit.nominal)], 0)
     terms = len(fit.term_names)
     begun = [_Start(k, np.append(fit.nominal[:-1], unit)) for k in range(terms) for unit in UNITS]
     slow = [one for one in begun if fit.choosing([one.term]).most_substeps(one.theta[None]) < MAX_SUBSTEPS]
-    better = [one for one in _tried(fit, short, slow, 0) if one.error < BETTER * before.error]
+    better = [one for one in _tried(fit, few, slow, 0) if one.error < BETTER * before.error]
     return _best(slow, better, EACH)[: max(TRIED, terms)]
 
 
@@ -658,17 +695,15 @@ def _needed(fit: _FactorFit, problem: Shooting, term: int, trial: Trial) -> bool
     return trial.error < BETTER * nothing.error
 
 
-def _fitted(fit: _FactorFit, problem: Shooting, begun: Sequence[_Start]) -> tuple[float, dict[int, Trial]]:
-    """Error without a factor, and for each term the best of the fits that went on to the end."""
-    plain = [one for one in begun if one.term < 0]
-    before = min(t.error for t in _tried(fit, problem, plain, STEPS, held=True))
-    some, found = [one for one in begun if one.term >= 0], dict[int, Trial]()
-    for one in sorted(_tried(fit, problem, some, 2 * STEPS, TRIED), key=lambda trial: trial.error):
-        other = found.setdefault(some[one.start].term, one)
+def _fitted(fit: _FactorFit, problem: Shooting, begun: Sequence[_Start]) -> dict[int, Trial]:
+    """For each term the best of the fits with a free factor that went on to the end."""
+    found: dict[int, Trial] = {}
+    for one in sorted(_tried(fit, problem, begun, 2 * STEPS, TRIED), key=lambda trial: trial.error):
+        other = found.setdefault(begun[one.start].term, one)
         turned = one.theta[-1] < 0.0 and abs(one.theta[-1] + 1.0) < abs(other.theta[-1] + 1.0)
         if turned and other.theta[-1] < 0.0 and other.error > BETTER * one.error:
-            found[some[one.start].term] = one  # where its size is unknown, its sign alone counts
-    return before, found
+            found[begun[one.start].term] = one  # where its size is unknown, its sign alone counts
+    return found
 
 
 def _smoothed(
