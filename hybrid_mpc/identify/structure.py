@@ -545,7 +545,7 @@ def _explained(
 def causes_of_refusal(
     make: Callable[..., Prior], recorded: Sequence[Trajectory], dt: float, longest: float, time_unit: float
 ) -> tuple[Cause, ...]:
-    """Mistakes of a unit, or of a sign, with which a prior cannot be fitted at all: too stiff, or not observable.
+    """Mistakes of a unit, or of a sign, with which a prior is refused: too stiff for the period, or not observable.
 
     Each term that would make the prior fit for use gets such a factor, and its parameters are fitted to short runs. A
     ratio is the error of free runs with the mistake mended over the outputs' spread.
@@ -557,18 +557,16 @@ def causes_of_refusal(
         longest: Length [s] of the free runs by which models are judged.
         time_unit: The machine's second [s].
     """
+    if _fits(make, dt, time_unit):
+        return ()
     fit = _FactorFit(make, dt)
     usable, known = [], None
     for k in range(len(fit.term_names)):
         for value in (value for value, _ in READINGS if value not in (0.5, 2.0)):
             one = _with_mended(make, k, value)
-            try:
-                check_observable(one(), dt, time_unit)
-                required_substeps(one(), dt)
+            if _fits(one, dt, time_unit):
                 known = known or _smoothed(one, recorded, dt, time_unit)
-            except InputError:
-                continue
-            usable.append(_Start(k, np.append(fit.nominal[:-1], value)))
+                usable.append(_Start(k, np.append(fit.nominal[:-1], value)))
     if known is None:
         return ()
     tried: list[Trial] = []
@@ -586,6 +584,16 @@ def causes_of_refusal(
         (fit.term_names[usable[one.start].term], float(one.theta[-1]), one.error) for one in alike[:MOST]
     ]
     return tuple(Cause(name, reading_of(value), error, value, before=False) for name, value, error in values)
+
+
+def _fits(make: Callable[..., Prior], dt: float, time_unit: float) -> bool:
+    """Whether a prior is observable, and not too stiff for the period."""
+    try:
+        check_observable(make(), dt, time_unit)
+        required_substeps(make(), dt)
+    except InputError:
+        return False
+    return True
 
 
 def _with_mended(make: Callable[..., Prior], term: int, value: float) -> type[Prior]:
