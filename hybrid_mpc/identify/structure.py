@@ -85,7 +85,7 @@ ALIKE, TOLD = 1.25, 2.0
 mistake is counts for more than one whose factor may be anything.
 """
 TRIED = 16
-"""Trial fits at least that go on to the end."""
+"""Trial fits over long windows at most."""
 STEPS = 3
 """Pairs of Gauss-Newton steps of a trial fit; it shows the size of an error, no more."""
 MOST = 3
@@ -482,10 +482,10 @@ def causes(
                 (time_unit, FEW),
             )
         )
-        (plain,) = _tried(fit, problem, [_Start(-1, thetas[1])], 0)
-        if plain.error <= quiet(problem):
+        if _tried(fit, problem, [_Start(-1, thetas[1])], 0)[0].error <= quiet(problem):
             continue
-        before, found = _explained(fit, (problem, short, few), thetas, quiet)
+        plain, moved = _moved(fit, short, few, thetas, quiet)
+        before, found = _explained(fit, problem, short, plain, moved)
         if before * min((one.ratio for one in found), default=1.0) > POOR or not found:
             signals = _signals(
                 make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit
@@ -502,28 +502,30 @@ def causes(
     return tuple(one for one in found if one.ratio <= ALIKE * least)[:MOST]
 
 
-def _explained(
+def _moved(
     fit: _FactorFit,
-    windows: tuple[Shooting, Shooting, Shooting],
+    short: Shooting,
+    few: Shooting,
     thetas: Sequence[Array],
     quiet: Callable[[Shooting], float],
-) -> tuple[float, list[Cause]]:
-    """Error of free runs without a factor, and the terms whose factor explains it.
+) -> tuple[list[_Start], list[_Start]]:
+    """Starts without a factor, and with those that help over short windows, from where trial fits over these end.
+
+    Long windows have more optima.
 
     Args:
         fit: Parameters with the factor.
-        windows: Those by which explanations are judged, short ones, and a few short ones.
+        short: Short windows.
+        few: A few of them.
         thetas: Parameters to start from.
         quiet: Error of windows up to which little is left but the sensors' noise.
     """
-    problem, short, few = windows
     terms = range(len(fit.term_names))
     begun = [_Start(-1, theta) for theta in thetas]
-    # over short windows first: long windows have more optima
     plain = _best(begun, tried := _tried(fit, short, begun, STEPS, held=True), len(begun))
     enough = BETTER * min(one.error for one in tried)
     enough = math.inf if enough <= quiet(short) else enough
-    moved = []
+    moved: list[_Start] = []
     for begun, held, each in (
         ([_Start(k, plain[0].theta) for k in terms], False, 1),
         ([_Start(k, np.append(theta[:-1], -1.0)) for k in terms for theta in thetas], True, 1),
@@ -531,6 +533,13 @@ def _explained(
     ):
         tried = _tried(fit, short, begun, STEPS, held=held)
         moved += _best(begun, [one for one in tried if one.error <= enough], each)
+    return plain, sorted(moved, key=lambda one: one.error)[:TRIED]
+
+
+def _explained(
+    fit: _FactorFit, problem: Shooting, short: Shooting, plain: Sequence[_Start], moved: Sequence[_Start]
+) -> tuple[float, list[Cause]]:
+    """Error of free runs without a factor, and the terms whose factor explains it."""
     before = min(one.error for one in _tried(fit, problem, plain, STEPS, held=True))
     trials = _fitted(fit, problem, moved)
     least = min((one.error for one in trials.values()), default=math.inf)
@@ -609,14 +618,17 @@ def _with_mended(make: Callable[..., Prior], term: int, value: float) -> type[Pr
 
 @dataclass(frozen=True)
 class _Start:
-    """A start of a trial fit: the term that has the factor (-1: none), and ``theta`` with the factor behind it."""
+    """A start of a trial fit: the term that has the factor (-1: none), ``theta`` with the factor behind it, and the
+    error over short windows.
+    """
 
     term: int
     theta: Array
+    error: float = math.inf
 
 
 def _tried(
-    fit: _FactorFit, problem: Shooting, begun: Sequence[_Start], steps: int, most: int = 0, held: bool = False
+    fit: _FactorFit, problem: Shooting, begun: Sequence[_Start], steps: int, held: bool = False
 ) -> list[Trial]:
     """Trial fits from starts, by their numbers.
 
@@ -625,7 +637,6 @@ def _tried(
         problem: Windows.
         begun: Starts.
         steps: Pairs of Gauss-Newton steps; without any, first states alone are fitted.
-        most: About how many fits go on to the end. Default 0: all.
         held: Whether factors stay as they are.
     """
     groups: dict[int, list[int]] = {}
@@ -634,11 +645,10 @@ def _tried(
         groups.setdefault(substeps.bit_length(), []).append(i)
     found = []
     for own in groups.values():
-        size = math.ceil(most * len(own) / len(begun)) if most else len(own)
         every = problem.several(
             np.stack([begun[i].theta for i in own]),
             lambda numbers, own=own: fit.choosing([begun[own[i]].term for i in numbers]),  # type: ignore[misc]
-            [max(size, len(own) // 2**i) for i in range(steps)],
+            [len(own)] * steps,
             -1 if held else None,
         )
         found += [replace(one, start=own[one.start]) for one in every]
@@ -663,7 +673,7 @@ def _best(begun: Sequence[_Start], trials: Sequence[Trial], each: int) -> list[_
         own = begun[one.start]
         count[own.term] += 1
         if count[own.term] <= each:
-            found.append(replace(own, theta=one.theta))
+            found.append(replace(own, theta=one.theta, error=one.error))
     return found
 
 
@@ -684,7 +694,7 @@ def _cause(
     begun = [_Start(term, np.append(fit.nominal[:-1], value)) for value in values]
     begun = _best(begun, _tried(fit, short, begun, STEPS, held=True), len(values))
     begun += [_Start(term, np.append(free.theta[:-1], value)) for value in values]
-    held = _tried(fit, problem, begun, STEPS, len(values), held=True)
+    held = _tried(fit, problem, begun, STEPS, held=True)
     least = min(free.error, *(one.error for one in held))
     alike = [one for one in held if one.error <= least / BETTER]
     if not alike:
@@ -706,7 +716,7 @@ def _needed(fit: _FactorFit, problem: Shooting, term: int, trial: Trial) -> bool
 def _fitted(fit: _FactorFit, problem: Shooting, begun: Sequence[_Start]) -> dict[int, Trial]:
     """For each term the best of the fits with a free factor that went on to the end."""
     found: dict[int, Trial] = {}
-    for one in sorted(_tried(fit, problem, begun, 2 * STEPS, TRIED), key=lambda trial: trial.error):
+    for one in sorted(_tried(fit, problem, begun, 2 * STEPS), key=lambda trial: trial.error):
         other = found.setdefault(begun[one.start].term, one)
         turned = one.theta[-1] < 0.0 and abs(one.theta[-1] + 1.0) < abs(other.theta[-1] + 1.0)
         if turned and other.theta[-1] < 0.0 and other.error > BETTER * one.error:
