@@ -47,7 +47,7 @@ from hybrid_mpc.identify.sound import (
     trial_length,
 )
 from hybrid_mpc.identify.step import PriorStep, Scaling
-from hybrid_mpc.identify.structure import causes, named, run_length
+from hybrid_mpc.identify.structure import causes, causes_of_refusal, named
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.check import rests_no_more
 from hybrid_mpc.job.context import Context
@@ -287,10 +287,15 @@ def examined_prior(context: Context) -> PriorResult:
     longest = spec.free_run or max(
         ((len(t.t) - context.warm) * spec.dt for t in (*valid, *test)), default=None
     )
-    fit = fit_prior(
-        make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay, time_unit=context.time_unit,
-        on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
-    )  # fmt: skip
+    try:
+        fit = fit_prior(
+            make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay,
+            time_unit=context.time_unit,
+            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+        )  # fmt: skip
+    except InputError as error:
+        wrong = named(causes_of_refusal(make, train, spec.dt, longest or math.inf, context.time_unit))
+        raise InputError(f"{error}. In doubt: {wrong}" if wrong else str(error)) from error
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
     fitted = make(fit.values)
     smoother = fit.smoother(fitted, spec.dt)
@@ -327,7 +332,7 @@ def examined_prior(context: Context) -> PriorResult:
     compared = baselines if not told else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
     acting, unit = shifted(train, fit.delay), context.time_unit
-    length = run_length(make, fit.values, acting, spec.dt, longest_run or longest or trial, unit)
+    length = longest_run or longest or trial
     context.progress.update("free runs", 1, 1, "looking for wrong terms")
     off = zip(errors["phy"].rmse.items(), smoother.sizes.y, strict=True)
     reasons = [
