@@ -108,7 +108,7 @@ def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str
     prior = context.scenario.prior()
     console.print(_fitted_parameters(prior, found))
     console.print(_free_runs(prior, found))
-    return stops(found), found.fit.warnings, found.in_doubt
+    return stops(found, cause=False), found.fit.warnings, found.in_doubt
 
 
 def _fitted_parameters(prior: Prior, found: PriorResult) -> Table:
