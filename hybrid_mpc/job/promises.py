@@ -74,8 +74,9 @@ MODULUS = 0.5
 Hagglund, *Advanced PID Control*, 2006, section 4.6)."""
 SOFTER = "Larger weights of changes (r_delta), or less process noise; hybrid-mpc analyze shows more."
 BY_NETWORK = (
-    "The network's slope at the set-point takes the margin: control with the prior (hybrid-mpc control --controller "
-    "prior_observer), or record small motions about the set-point and run again."
+    "The network's slope at the set-point takes this margin: record small motions about the set-point and run again. "
+    "Start on the machine with small steps, and compare with the prior's loop (hybrid-mpc control --controller "
+    "prior_observer --controller hybrid_observer)."
 )
 """What to do about small margins: of any loop, and of a hybrid's where the prior's are larger."""
 HALF = 0.5
