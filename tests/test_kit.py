@@ -27,8 +27,8 @@ from hybrid_mpc import (
     set_process_noise,
     simulate,
 )
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 from hybrid_mpc.kit.assembly import SOLVERS, first_deviations
+from hybrid_mpc.kit.parts import loop_settings, read_description, write_description
 
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")

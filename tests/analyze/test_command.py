@@ -40,7 +40,7 @@ from hybrid_mpc.job.analyze import (
     state_range,
 )
 from hybrid_mpc.job.analyze_page import _draw_measured, tables_of, write_analysis
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
+from hybrid_mpc.kit.parts import loop_settings, read_description, write_description
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
 

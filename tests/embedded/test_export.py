@@ -27,8 +27,8 @@ from hybrid_mpc.embedded.scalar import c_function, comment
 from hybrid_mpc.embedded.watch import Watched
 from hybrid_mpc.errors import StorageError
 from hybrid_mpc.files import write_document
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 from hybrid_mpc.kit.assembly import make_controller
+from hybrid_mpc.kit.parts import loop_settings, read_description, write_description
 
 STRICT = [
     "-std=c11",

@@ -28,7 +28,7 @@ from hybrid_mpc import (
     load_scenario,
 )
 from hybrid_mpc.embedded.generate import CORE, make_sources, sources_of
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
+from hybrid_mpc.kit.parts import loop_settings, read_description, write_description
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
 from golden_parts import Parts, faults_of, machine

@@ -124,8 +124,8 @@ def freeze(name, run):
     from hybrid_mpc import ModelInfo, load, load_scenario, make_estimator, make_monitor, make_ocp
     from hybrid_mpc.files import sha256
     from hybrid_mpc.job.controllers import no_surer_than_prior
-    from hybrid_mpc.kit.artifact import read_description, write_description
     from hybrid_mpc.kit.assembly import first_controller, sensor_steps
+    from hybrid_mpc.kit.parts import read_description, write_description
 
     folder, run = HERE / name, Path(run)
     folder.mkdir(exist_ok=True)

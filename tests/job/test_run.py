@@ -16,7 +16,7 @@ from patience import HANGS
 
 from hybrid_mpc import InputError, load
 from hybrid_mpc.job.stages.results import read_results
-from hybrid_mpc.kit.artifact import BENCHMARK_NOTE, read_description, write_description
+from hybrid_mpc.kit.parts import BENCHMARK_NOTE, read_description, write_description
 
 
 def results(folder):

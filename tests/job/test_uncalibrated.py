@@ -31,7 +31,7 @@ from hybrid_mpc.job.stages.report import guard_tables, guard_words
 from hybrid_mpc.job.stages.residuals import put_residuals, residuals_stage
 from hybrid_mpc.job.stages.results import _guard as guard_results
 from hybrid_mpc.job.stages.results import _monitor as monitor_results
-from hybrid_mpc.kit.artifact import read_description, set_residuals, write_description
+from hybrid_mpc.kit.parts import read_description, set_residuals, write_description
 
 AXIS = """
 from hybrid_mpc import MechanicalPrior, Parameter, Signal

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,9 @@ from hybrid_mpc.job.stages.monitor import (
     RecordedAlarm,
     clean_windows,
 )
-from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
+from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import energy_is_watched
+from hybrid_mpc.kit.parts import GuardLimits, read_parts, write_guard
 from hybrid_mpc.loop.faults import Fault, install
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, Calibration, stretches
@@ -351,7 +352,7 @@ def guard_stage(context: Context) -> GuardResult | Absent:
         )  # fmt: skip
     except InputError as none:
         reason = f"no detector could be learned from {data.source}: {none}"
-    set_calibration(context.out / "model", replace(calibration, detector=detector))
+    _write(context, detector, reason)
     kit = context.kit
     test, shown, arrays = _recorded(context, kit, detector)
     if detector is not None and scenario.plant is not None and any(not t.faults for t in scenario.tasks):
@@ -363,13 +364,14 @@ def guard_stage(context: Context) -> GuardResult | Absent:
 
 
 def put_detector(context: Context, found: GuardResult) -> str:
-    """Write the detector into the artifact."""
-    held = read_description(context.out / "model").calibration
-    if held is None:
-        return "the artifact holds no calibration"
-    if held.detector != found.detector:
-        set_calibration(context.out / "model", replace(held, detector=found.detector))
+    """Write ``guard.json``."""
+    _write(context, found.detector, found.reason)
     return ""
+
+
+def _write(context: Context, detector: Detector | None, reason: str) -> None:
+    folder = context.out / "model"
+    write_guard(folder, GuardLimits(detector, reason, read_parts(folder).observer("hybrid")))
 
 
 def learned(

@@ -17,8 +17,9 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
-from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
+from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import energy_is_watched, make_monitor
+from hybrid_mpc.kit.parts import EnergyLimits, read_parts, write_energy
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.model.model import HybridModel
@@ -214,10 +215,9 @@ def clean_alarms(
 
 
 def put_calibration(context: Context, found: MonitorResult) -> str:
-    """Write the calibration into the artifact, unless it is there with a detector."""
-    held = read_description(context.out / "model").calibration
-    if held is None or replace(held, detector=None) != found.calibration:
-        set_calibration(context.out / "model", found.calibration)
+    """Write ``watch/energy.json``."""
+    folder = context.out / "model"
+    write_energy(folder, EnergyLimits(found.calibration, read_parts(folder).observer("hybrid")))
     return ""
 
 

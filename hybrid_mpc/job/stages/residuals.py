@@ -30,8 +30,9 @@ from hybrid_mpc.job.stages.monitor import (
     inside,
     rates,
 )
-from hybrid_mpc.kit.artifact import Kit, read_description, set_residuals
+from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import energy_is_watched
+from hybrid_mpc.kit.parts import ChannelLimits, read_parts, write_residuals
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.replay import along
@@ -119,7 +120,7 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
         except InputError as none:
             return Absent(f"no limits of residuals could be learned: {none}")
         limits[name] = found
-    set_residuals(context.out / "model", limits)
+    _write(context, limits)
     alarms, clean = _on_recordings(
         context, ResidualMonitor(kit.models[name], limits=found), recordings, traces
     )
@@ -131,10 +132,15 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
 
 
 def put_residuals(context: Context, found: ResidualsResult) -> str:
-    """Write the limits into the artifact, unless they are there."""
-    if read_description(context.out / "model").residuals != found.limits:
-        set_residuals(context.out / "model", found.limits)
+    """Write ``watch/residuals.json``."""
+    _write(context, found.limits)
     return ""
+
+
+def _write(context: Context, limits: Mapping[str, ResidualLimits]) -> None:
+    folder = context.out / "model"
+    parts = read_parts(folder)
+    write_residuals(folder, ChannelLimits(limits, {model: parts.observer(model) for model in limits}))
 
 
 def _learned(

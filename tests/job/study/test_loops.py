@@ -21,7 +21,7 @@ from hybrid_mpc import (
 from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.loops import run_loops
 from hybrid_mpc.job.study_run import TIMING, load_inputs, load_models
-from hybrid_mpc.kit.artifact import read_description, write_description
+from hybrid_mpc.kit.parts import read_description, write_description
 
 GOLF = load_scenario("golf_robot")
 SIGMA = dict.fromkeys(("prior", "hybrid"), (1e-3, 1e-1))
