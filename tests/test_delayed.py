@@ -9,6 +9,7 @@ import pytest
 from online_models import pendulum_model
 
 from hybrid_mpc import InputError, load, save_artifact, with_input_delay
+from hybrid_mpc.kit.parts import KIT
 from hybrid_mpc.model.delay import MOST_DELAY_STATES
 
 DT = 0.02

@@ -18,8 +18,9 @@ EXAMPLES = (
 )
 
 app = typer.Typer(
-    help="Write a trained controller for other machines, or an old kit in the present format.", no_args_is_help=True, rich_markup_mode=None
-)
+    help="Write a trained controller for other machines, or an old kit in the present format.",
+    no_args_is_help=True, rich_markup_mode=None,
+)  # fmt: skip
 
 
 @app.command("kit", epilog="Example:\n\n  hybrid-mpc export kit runs/old --out kit")

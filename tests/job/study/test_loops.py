@@ -174,7 +174,7 @@ def test_what_does_not_fit_is_refused_before_the_first_run(run_folder, golf_arti
     note = read_description(folder)
     write_description(folder, replace(note, provenance=Provenance("torque_pendulum")))
     refused("made for scenario torque_pendulum, not for golf_robot", folder)
-    write_description(folder, replace(note, calibration=None))
+    write_description(folder, note)
     set_process_noise(folder, SIGMA)
     refused("holds no thresholds", folder, controllers=["hybrid"], monitors=["energy"])
     with pytest.raises(InputError, match="has no plant"):
