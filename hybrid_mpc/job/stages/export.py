@@ -52,9 +52,12 @@ class ExportResult:
 
 @dataclass(frozen=True)
 class NoiseResult:
-    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator."""
+    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator, and the
+    digest of the models that it was estimated with.
+    """
 
     process_noise: Mapping[str, tuple[float, ...]]
+    of: str = ""
 
 
 @dataclass(frozen=True)
@@ -143,11 +146,12 @@ def artifact_is_there(context: Context, found: ExportResult) -> str:
 
 def noise_stage(context: Context) -> NoiseResult | Absent:
     """Tune the estimators on training recordings, by maximum likelihood."""
+    of = read_parts(context.out / "model").models
     if context.scenario.control is None:
-        put_noise(context, NoiseResult({}))
+        put_noise(context, NoiseResult({}, of))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     found = noise_of(context.scenario, context.kit, context.commanded("train"))
-    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()})
+    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()}, of)
     put_noise(context, result)
     return result
 
@@ -159,7 +163,7 @@ def put_noise(context: Context, found: NoiseResult) -> str:
         folder,
         ObserverSettings(
             scenario.sensor_sigma, scenario.first_sigma, found.process_noise, scenario.disturbance_model,
-            read_parts(folder).models,
+            found.of,
         ),
     )  # fmt: skip
     return ""

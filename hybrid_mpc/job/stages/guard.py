@@ -317,6 +317,7 @@ class GuardResult:
         faults: Loops in which something breaks; None without a plant or without a calm task.
         shown: Name of the recording whose trace is kept; empty for none.
         arrays: Traces, see :func:`read_trace`.
+        of: Digest of the observer that it was learned with.
     """
 
     source: str
@@ -327,6 +328,7 @@ class GuardResult:
     faults: tuple[FaultedLoop, ...] | None = None
     shown: str = ""
     arrays: Mapping[str, Array] = field(default_factory=dict)
+    of: str = ""
 
 
 def guard_stage(context: Context) -> GuardResult | Absent:
@@ -352,7 +354,9 @@ def guard_stage(context: Context) -> GuardResult | Absent:
         )  # fmt: skip
     except InputError as none:
         reason = f"no detector could be learned from {data.source}: {none}"
-    _write(context, detector, reason)
+    folder = context.out / "model"
+    of = read_parts(folder).observer("hybrid")
+    write_guard(folder, GuardLimits(detector, reason, of))
     kit = context.kit
     test, shown, arrays = _recorded(context, kit, detector)
     if detector is not None and scenario.plant is not None and any(not t.faults for t in scenario.tasks):
@@ -360,18 +364,13 @@ def guard_stage(context: Context) -> GuardResult | Absent:
         bench, s = Bench(scenario, {MODEL: kit}), context.settings
         faults, more = faulted(bench, s.scenario, s.seed, scenario.causes)
         arrays |= more
-    return GuardResult(data.source, data.loops, test, detector, reason, faults, shown, arrays)
+    return GuardResult(data.source, data.loops, test, detector, reason, faults, shown, arrays, of)
 
 
 def put_detector(context: Context, found: GuardResult) -> str:
     """Write ``guard.json``."""
-    _write(context, found.detector, found.reason)
+    write_guard(context.out / "model", GuardLimits(found.detector, found.reason, found.of))
     return ""
-
-
-def _write(context: Context, detector: Detector | None, reason: str) -> None:
-    folder = context.out / "model"
-    write_guard(folder, GuardLimits(detector, reason, read_parts(folder).observer("hybrid")))
 
 
 def learned(

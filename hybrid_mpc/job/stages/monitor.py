@@ -127,6 +127,7 @@ class MonitorResult:
         clean: Alarms where nothing disturbs the machine; None where nothing could be calibrated.
         load: The loop with an unknown load; None without a plant.
         arrays: ``"RECORDING/SIGNAL"``, and ``"load/SIGNAL"`` of the loop.
+        of: Digest of the observer that it was calibrated with.
     """
 
     calibration: Calibration
@@ -136,6 +137,7 @@ class MonitorResult:
     clean: CleanAlarms | None = None
     load: UnknownLoad | None = None
     arrays: Mapping[str, Array] = field(default_factory=dict)
+    of: str = ""
 
 
 def monitor_stage(context: Context) -> MonitorResult | Absent:
@@ -147,6 +149,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         return Absent(NO_PROBLEM)
     context.read(NOISE)
     kit, whole = context.kit, context.dataset.whole
+    of = read_parts(context.out / "model").observer("hybrid")
     model, reason, rest = kit.models["hybrid"], "", None
     if not energy_is_watched(model):
         return Absent(NO_ENERGY.format(scenario=context.scenario.name))
@@ -176,7 +179,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     except InputError as none:
         reason = reason or f"the monitor could not be calibrated: {none}"
     if reason:
-        result = MonitorResult(Calibration.without(reason, rest), covered, reason)
+        result = MonitorResult(Calibration.without(reason, rest), covered, reason, of=of)
         put_calibration(context, result)
         return result
     alarms, arrays, on = [], {}, []
@@ -192,7 +195,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     if context.scenario.plant is not None and context.scenario.tasks:
         load, loop = _load_loop(context, replace(kit, calibration=calibration))
         arrays |= {f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "y")}
-    result = MonitorResult(calibration, covered, "", tuple(alarms), clean, load, arrays)
+    result = MonitorResult(calibration, covered, "", tuple(alarms), clean, load, arrays, of)
     put_calibration(context, result)
     return result
 
@@ -216,8 +219,7 @@ def clean_alarms(
 
 def put_calibration(context: Context, found: MonitorResult) -> str:
     """Write ``watch/energy.json``."""
-    folder = context.out / "model"
-    write_energy(folder, EnergyLimits(found.calibration, read_parts(folder).observer("hybrid")))
+    write_energy(context.out / "model", EnergyLimits(found.calibration, found.of))
     return ""
 
 

@@ -23,9 +23,10 @@ from hybrid_mpc.scenario import Task
 
 @dataclass(frozen=True)
 class PromisesResult:
-    """The table "What this kit promises": its rows in their order."""
+    """The table "What this kit promises": its rows in their order, and the digest of what it was made of."""
 
     rows: tuple[Promise, ...]
+    of: str = ""
 
 
 def promises_stage(context: Context) -> PromisesResult | Absent:
@@ -47,7 +48,7 @@ def promises_stage(context: Context) -> PromisesResult | Absent:
         tested=_tested(context, controller, kit.models[kit.recommended].n_y),
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
-    result = PromisesResult(found)
+    result = PromisesResult(found, kit.identity)
     put_promises(context, result)
     return result
 
@@ -87,7 +88,7 @@ def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
 
 def put_promises(context: Context, found: PromisesResult) -> str:
     """Write the table beside the models, unless it is there."""
-    folder, table = context.out / "model", PromiseTable(context.kit.identity, found.rows)
+    folder, table = context.out / "model", PromiseTable(found.of, found.rows)
     try:
         there = read_promises(folder) == table
     except InputError:  # damaged, or of another version: it is written anew

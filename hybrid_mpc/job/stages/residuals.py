@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -96,6 +96,7 @@ class ResidualsResult:
         alarms: Alarms of the recommended model on the recordings that were replayed.
         clean: Alarms where nothing disturbs the machine.
         faults: Loops in which something breaks; None where the energy is watched, or without a plant.
+        of: Digests of the observers that they were learned with, by model.
     """
 
     limits: Mapping[str, ResidualLimits]
@@ -103,6 +104,7 @@ class ResidualsResult:
     alarms: tuple[ChannelAlarm, ...]
     clean: CleanAlarms
     faults: tuple[FaultedChannel, ...] | None = None
+    of: Mapping[str, str] = field(default_factory=dict)
 
 
 def residuals_stage(context: Context) -> ResidualsResult | Absent:
@@ -120,7 +122,10 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
         except InputError as none:
             return Absent(f"no limits of residuals could be learned: {none}")
         limits[name] = found
-    _write(context, limits)
+    folder = context.out / "model"
+    parts = read_parts(folder)
+    of = {model: parts.observer(model) for model in limits}
+    write_residuals(folder, ChannelLimits(limits, of))
     alarms, clean = _on_recordings(
         context, ResidualMonitor(kit.models[name], limits=found), recordings, traces
     )
@@ -128,19 +133,13 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
     calm = [task for task in scenario.tasks if not task.faults]
     if scenario.plant is not None and calm and not energy_is_watched(kit.models["hybrid"]):
         faults = _faulted(context, context.kit, calm[0].name)
-    return ResidualsResult(limits, source, alarms, clean, faults)
+    return ResidualsResult(limits, source, alarms, clean, faults, of)
 
 
 def put_residuals(context: Context, found: ResidualsResult) -> str:
     """Write ``watch/residuals.json``."""
-    _write(context, found.limits)
+    write_residuals(context.out / "model", ChannelLimits(found.limits, found.of))
     return ""
-
-
-def _write(context: Context, limits: Mapping[str, ResidualLimits]) -> None:
-    folder = context.out / "model"
-    parts = read_parts(folder)
-    write_residuals(folder, ChannelLimits(limits, {model: parts.observer(model) for model in limits}))
 
 
 def _learned(
