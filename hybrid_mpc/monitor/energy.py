@@ -238,8 +238,8 @@ class EnergyMonitor:
         if self.detector is not None or self.resolution or (c is not None and c.threshold_w is not None):
             return ""
         return (
-            "it has no limits, so nothing alarms but missing readings; the run's stage monitor learns thresholds of the "
-            "energy, its stage guard a detector, and kit.monitor() has them"
+            "it has no limits, so nothing alarms but missing readings; the run's stage monitor learns thresholds of "
+            "the energy, its stage guard a detector, and kit.monitor() has them"
         )
 
     def initial(self) -> MonitorState:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import poisson
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.errors import InputError
@@ -47,6 +48,8 @@ LEARNED_FROM: Mapping[tuple[str, ...], str] = {
 """What limits or a detector are learned from, in words."""
 FAULT_SEED = 600
 """Number of the loops in which something breaks, away from those that a detector is learned from."""
+UNLIKELY = 0.05
+"""Alarms of which so many or more are less likely than this are more than the limits were learned for."""
 LOAD_SHARE = 0.2
 """Unknown load of the demonstration, as a share of half the input's range."""
 MARGIN = 1.5
@@ -94,6 +97,32 @@ class CleanAlarms:
     alarms: int = 0
     test_seconds: float = 0.0
     test_alarms: int = 0
+
+    def too_many(self, per_hour: float) -> bool:
+        """Whether limits that were learned for a rate of false alarms [1/h] keep it: so many alarms or more have a
+        probability below 5 % (Poisson).
+
+        Example:
+            >>> [CleanAlarms(300.0, alarms).too_many(10.0) for alarms in (0, 1, 2, 3)]
+            [False, False, False, True]
+        """
+        return self.alarms > 0 and float(poisson.sf(self.alarms - 1, self.expected(per_hour))) < UNLIKELY
+
+    def expected(self, per_hour: float) -> float:
+        """Alarms that a rate of false alarms [1/h] lets expect in that time."""
+        return per_hour * self.seconds / 3600.0
+
+    def words(self, per_hour: float) -> str:
+        """The alarms beside those that the limits were learned for.
+
+        Example:
+            >>> CleanAlarms(300.0, 1).words(10.0)
+            '1 in 300 s known to be undisturbed, where 10 false alarms an hour let expect 0.83'
+        """
+        return (
+            f"{self.alarms} in {self.seconds:.0f} s known to be undisturbed, where {per_hour:g} false alarms an hour "
+            f"let expect {self.expected(per_hour):.2g}"
+        )
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ from hybrid_mpc.job.stages.results import (
     OnModel,
     Promises,
     Residuals,
+    ResidualsDetails,
     Results,
     Timing,
     collect,
@@ -326,10 +327,11 @@ def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     if p99 is not None:
         comment = f"period: {period:g} ms"
         yield KeyFigure("Controller step, 99th percentile", p99, "ms", comment, _verdict(p99 / period))
-    alarms, clean = results.monitor.alarms, results.monitor.details.clean
-    if alarms is not None and clean is not None:
-        comment = f"{clean.alarms} of them in {clean.seconds:.0f} s known to be undisturbed"
-        verdict: Verdict = "good" if clean.alarms == 0 else "bad"
+    alarms, held = results.monitor.alarms, results.monitor.details
+    if alarms is not None and held.clean is not None and held.calibration is not None:
+        rate = held.calibration.false_alarms_per_hour
+        comment = f"of them {held.clean.words(rate)}"
+        verdict: Verdict = "bad" if held.clean.too_many(rate) else "good"
         yield KeyFigure("Alarms of the energy monitor", len(alarms), "", comment, verdict)
 
 
@@ -391,7 +393,7 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     after["residuals"] = (
         (f"No alarms here: {watched.reason.rstrip('.')}.",)
         if watched.alarms is None
-        else (f"Limits are from {watched.details.source}.",)
+        else (f"Limits are from {watched.details.source}.", *_clean_words(watched.details))
     )
     monitor = results.monitor
     if monitor.details.calibration is None:
@@ -409,6 +411,15 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
             f"{name}: {m.fixed_point_reason}" for name, m in models.items() if m.fixed_point_reason
         )
     return instead, after
+
+
+def _clean_words(found: ResidualsDetails) -> tuple[str, ...]:
+    """Alarms where nothing disturbs the machine, beside the rate that the limits were learned for."""
+    if found.clean is None or not found.limits:
+        return ()
+    rate = tuple(found.limits.values())[-1].false_alarms_per_hour
+    verdict = "more than they promise" if found.clean.too_many(rate) else "within what they promise"
+    return (f"Alarms there: {found.clean.words(rate)}: {verdict}.",)
 
 
 def _prior_replay_text(weight: float) -> tuple[str, ...]:
