@@ -52,6 +52,7 @@ from hybrid_mpc.job.stages.results import (
     ratio,
     recordings,
 )
+from hybrid_mpc.job.stages.watching import watching_table
 from hybrid_mpc.job.step_response import step_responses
 from hybrid_mpc.job.summary import Summary
 from hybrid_mpc.job.tasks import tasks_of
@@ -81,7 +82,7 @@ LIBRARY = Path(__file__).parents[2]
 DRAWN_IN = ("plots", "report")
 """Rooms whose files decide what the report looks like, its templates among them."""
 DRAWN_BY = (
-    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report", "results")),
+    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report", "results", "watching")),
     *(f"job/{name}.py" for name in ("loop_figures", "sequential", "step_response", "summary")),
 )
 """Modules that do, too."""
@@ -258,7 +259,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "on_model": _on_model_tables(results.on_model),
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
-        "residuals": _residual_tables(results.residuals),
+        "residuals": [_watching(context), *_residual_tables(results.residuals)],
         "monitor": [_alarm_table(context, results.monitor)],
         "guard": guard_tables(results.guard),
         "analysis": [_pole_table(results.analysis)],
@@ -742,6 +743,13 @@ def _residual_tables(found: Residuals) -> list[Table | None]:
         columns = ("fault", "at [s]", "alarm after [s]", "alarms before", "channels", "taken for")
         tables.append(Table(columns, broken, "Loops in which something breaks."))
     return tables
+
+
+def _watching(context: Context) -> Table | None:
+    """The table of all channels; its faults stand in the tables behind it."""
+    monitor, guard, residuals = context.find(MONITOR), context.find(GUARD), context.find(RESIDUALS)
+    unit = "" if isinstance(monitor, Absent) else force_unit(context.kit.models["prior"])
+    return watching_table(monitor, guard, residuals, unit)
 
 
 def _alarm_table(context: Context, monitor: Monitor) -> Table | None:

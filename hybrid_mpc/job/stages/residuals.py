@@ -97,6 +97,8 @@ class ResidualsResult:
         clean: Alarms where nothing disturbs the machine.
         faults: Loops in which something breaks; None where the energy is watched, or without a plant.
         of: Digests of the observers that they were learned with, by model.
+        by_channel: Alarms of the recommended model's channels where nothing disturbs the machine.
+        units: Units of these channels.
     """
 
     limits: Mapping[str, ResidualLimits]
@@ -105,6 +107,8 @@ class ResidualsResult:
     clean: CleanAlarms
     faults: tuple[FaultedChannel, ...] | None = None
     of: Mapping[str, str] = field(default_factory=dict)
+    by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
+    units: tuple[str, ...] = ()
 
 
 def residuals_stage(context: Context) -> ResidualsResult | Absent:
@@ -126,14 +130,13 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
     parts = read_parts(folder)
     of = {model: parts.observer(model) for model in limits}
     write_residuals(folder, ChannelLimits(limits, of))
-    alarms, clean = _on_recordings(
-        context, ResidualMonitor(kit.models[name], limits=found), recordings, traces
-    )
+    monitor = ResidualMonitor(kit.models[name], limits=found)
+    alarms, clean, by_channel = _on_recordings(context, monitor, recordings, traces)
     faults = None
     calm = [task for task in scenario.tasks if not task.faults]
     if scenario.plant is not None and calm and not energy_is_watched(kit.models["hybrid"]):
         faults = _faulted(context, context.kit, calm[0].name)
-    return ResidualsResult(limits, source, alarms, clean, faults, of)
+    return ResidualsResult(limits, source, alarms, clean, faults, of, by_channel, monitor.units)
 
 
 def put_residuals(context: Context, found: ResidualsResult) -> str:
@@ -180,9 +183,10 @@ def _on_recordings(
     monitor: ResidualMonitor,
     recordings: Sequence[Trajectory],
     traces: Sequence[ResidualTrace],
-) -> tuple[tuple[ChannelAlarm, ...], CleanAlarms]:
+) -> tuple[tuple[ChannelAlarm, ...], CleanAlarms, dict[str, CleanAlarms]]:
     alarms: list[ChannelAlarm] = []
     on: list[NDArray[np.bool_]] = []
+    by_channel: list[NDArray[np.bool_]] = []
     for recording, levels in zip(recordings, traces, strict=True):
         trace = with_alarms(monitor, levels, recording.y)
         alarms += [
@@ -190,7 +194,12 @@ def _on_recordings(
             for start, end in trace.intervals()
         ]
         on.append(trace.alarm)
-    return tuple(alarms), clean_alarms(context, recordings, on)
+        by_channel.append(trace.on)
+    each = {
+        channel: clean_alarms(context, recordings, [rows[:, i] for rows in by_channel])
+        for i, channel in enumerate(monitor.channels)
+    }
+    return tuple(alarms), clean_alarms(context, recordings, on), each
 
 
 def broken(model: HybridModel, start: float) -> list[Fault]:
