@@ -104,17 +104,17 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         StudyResults as StudyResults, write_study_report as write_study_report,
     )
     from hybrid_mpc.job.study_run import dry_run as dry_run, run_study as run_study
-    from hybrid_mpc.kit.artifact import (
-        Kit as Kit, LoopSettings as LoopSettings, ModelInfo as ModelInfo, Provenance as Provenance,
-        load as load, save_artifact as save_artifact, set_calibration as set_calibration,
-        set_process_noise as set_process_noise,
-    )
+    from hybrid_mpc.kit.artifact import Kit as Kit, load as load, save_artifact as save_artifact
     from hybrid_mpc.kit.assembly import (
         make_adaptive_guard as make_adaptive_guard, make_controller as make_controller,
         make_estimator as make_estimator, make_monitor as make_monitor, make_ocp as make_ocp,
         make_resting_guard as make_resting_guard,
     )
     from hybrid_mpc.kit.export_c import generate_controller as generate_controller
+    from hybrid_mpc.kit.parts import (
+        LoopSettings as LoopSettings, ModelInfo as ModelInfo, Provenance as Provenance,
+        set_calibration as set_calibration, set_process_noise as set_process_noise,
+    )
     from hybrid_mpc.kit.promises import Promise as Promise
     from hybrid_mpc.loop.faults import (
         Fault as Fault, check_plant_faults as check_plant_faults, corrupt_input as corrupt_input,
@@ -228,15 +228,13 @@ _ROOMS = {
     "job.study": ("FaultKind", "RandomFaults", "Study"),
     "job.study_results": ("StudyResults", "write_study_report"),
     "job.study_run": ("dry_run", "run_study"),
-    "kit.artifact": (
-        "Kit", "LoopSettings", "ModelInfo", "Provenance", "load", "save_artifact", "set_calibration",
-        "set_process_noise",
-    ),
+    "kit.artifact": ("Kit", "load", "save_artifact"),
     "kit.assembly": (
         "make_adaptive_guard", "make_controller", "make_estimator", "make_monitor", "make_ocp",
         "make_resting_guard",
     ),
     "kit.export_c": ("generate_controller",),
+    "kit.parts": ("LoopSettings", "ModelInfo", "Provenance", "set_calibration", "set_process_noise"),
     "kit.promises": ("Promise",),
     "loop.faults": ("Fault", "check_plant_faults", "corrupt_input", "corrupt_measurement"),
     "loop.guard": ("Guard", "Mode"),

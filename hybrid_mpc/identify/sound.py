@@ -179,7 +179,7 @@ def bound_costs(
     if not (low | high).any():
         return ()
     sizes = np.array(fit.smoother(make(fit.values), dt).sizes.x)
-    problem, found = _windows(own, smoothed, sizes, length), []
+    problem, found = shooting(own, smoothed, sizes, length), []
     bounded = problem.solve(theta, ITERATIONS).theta  # over these windows, as without the bound
     (before,) = problem.explained([bounded])
     for i in np.flatnonzero(low | high):
@@ -187,7 +187,7 @@ def bound_costs(
         free.points = own.points
         free.lower[i] -= span[i] * low[i]
         free.upper[i] += span[i] * high[i]
-        problem = _windows(free, smoothed, sizes, length)
+        problem = shooting(free, smoothed, sizes, length)
         try:
             solved = problem.solve(bounded, ITERATIONS).theta
             (after,) = problem.explained([solved])
@@ -200,12 +200,13 @@ def bound_costs(
     return tuple(found)
 
 
-def _windows(fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float) -> Shooting:
-    """Windows of ``length`` [s], or as long as the recordings hold."""
+def shooting(
+    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = WINDOWS // 2
+) -> Shooting:
+    """At most so many windows of ``length`` [s], or as long as the recordings hold."""
     longest = max(len(t.t) for t in known) - 1
     periods = min(scales.periods(length, fit.dt, 2), longest)
-    windows = cut_outputs(known, periods, 0, WINDOWS // 2, fit.prior.states)
-    return Shooting(fit, windows, sizes)
+    return Shooting(fit, cut_outputs(known, periods, 0, most, fit.prior.states), sizes)
 
 
 def constant_runs(train: Sequence[Trajectory], test: Sequence[Trajectory], warm: int) -> list[Array]:

@@ -17,7 +17,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.fit import (
@@ -25,16 +24,15 @@ from hybrid_mpc.identify.fit import (
     LENGTHS,
     POOR,
     QUIET,
-    WINDOWS,
     OutputFit,
     Shooting,
     Trial,
     check_observable,
-    cut_outputs,
     with_states,
 )
 from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, required_substeps, visited
 from hybrid_mpc.identify.smooth import rough_smoother
+from hybrid_mpc.identify.sound import shooting
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 
 Array = NDArray[np.float64]
@@ -60,8 +58,8 @@ UNITS = tuple(v for one in (10.0, 60.0, 1e3, 1e5) for v in (one, 1 / one))
 """Factors from which trial fits start, beside 1 and -1: mistakes of a unit are too far from these. From each the values
 of ``READINGS`` within ``TAKEN`` are tried at the end.
 """
-FEW = 4
-"""Windows by which such starts are compared: a mistake of a unit is large."""
+TRIALS, FEW = 12, 4
+"""Windows of a trial fit, and of those by which mistakes of a unit, which are large, are compared."""
 TAKEN = 30.0
 """What parameters may take of a mistake at most."""
 EACH = 2
@@ -424,15 +422,6 @@ def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[fl
     return [shorter, longest] if shorter < SHORTER * longest else [longest]
 
 
-def _cut(
-    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = WINDOWS // 4
-) -> Shooting:
-    """At most so many windows of ``length`` [s], or as long as the recordings hold."""
-    longest = max(len(t.t) for t in known) - 1
-    periods = min(scales.periods(length, fit.dt, 2), longest)
-    return Shooting(fit, cut_outputs(known, periods, 0, most, fit.prior.states), sizes)
-
-
 def named(found: Sequence[Cause]) -> str:
     """What is said of causes that explain equally much; empty without any."""
     return "; or, as likely, ".join(str(one) for one in found)
@@ -475,10 +464,10 @@ def causes(
     found: list[Cause] = []
     for length in lengths:
         problem, short, few = (
-            _cut(fit, known, sizes, min(own, length), most)
+            shooting(fit, known, sizes, min(own, length), most)
             for own, most in (
-                (length, WINDOWS // 4),
-                (LENGTHS[1] * time_unit, WINDOWS // 4),
+                (length, TRIALS),
+                (LENGTHS[1] * time_unit, TRIALS),
                 (time_unit, FEW),
             )
         )
@@ -585,7 +574,7 @@ def causes_of_refusal(
             best = _with_mended(make, usable[0].term, float(usable[0].theta[-1]))
             known = _smoothed(best, recorded, dt, time_unit)
         fit.points = visited(known[0])
-        short = _cut(fit, known[0], known[1], min(LENGTHS[1] * time_unit, longest))
+        short = shooting(fit, known[0], known[1], min(LENGTHS[1] * time_unit, longest), TRIALS)
         tried = sorted(_tried(fit, short, usable, steps, held=True), key=lambda one: one.error)
     alike = [one for one in tried if one.error <= min(GUESSED, ALIKE * tried[0].error)]
     alike.sort(key=lambda one: _off_nominal(fit, one.theta))
@@ -762,7 +751,7 @@ def _signals(
         known, sizes, _ = _smoothed(make, [change(t) for t in recorded], dt, time_unit)
         fit = _Lenient(make, dt)
         fit.points = visited(known)
-        problem = _cut(fit, known, sizes, length)
+        problem = shooting(fit, known, sizes, length, TRIALS)
         found = problem.several(np.stack(starts), lambda numbers, own=fit: own, [len(starts)] * STEPS)  # type: ignore[misc]
         yield Cause(what, why, min(t.error for t in found) / before)
 

@@ -69,8 +69,9 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import SwitchingFilter
 from hybrid_mpc.job.controllers import OBSERVERS, find_noise
-from hybrid_mpc.kit.artifact import FILE, Kit, artifact_folder, load
+from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import MODES, make_ocp
+from hybrid_mpc.kit.parts import KIT, artifact_folder
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel, positions_of
@@ -283,7 +284,7 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     """Read what is analyzed, with notes on where it came from."""
     folder = artifact_folder(settings.folder)
     kit = load(folder)
-    scenario = scenario_of(kit.provenance.scenario, folder / FILE, settings.scenario)
+    scenario = scenario_of(kit.provenance.scenario, folder / KIT, settings.scenario)
     if scenario is None and settings.data:
         raise InputError("--data needs --scenario, which names the columns of the recordings")
     model = next(iter(kit.models.values()))

@@ -29,9 +29,10 @@ MEND = "Correct the prior first: docs/prior-wrong.md says how to read each reaso
 
 @dataclass(frozen=True)
 class PromisesResult:
-    """The table "What this kit promises": its rows in their order."""
+    """The table "What this kit promises": its rows in their order, and the digest of what it was made of."""
 
     rows: tuple[Promise, ...]
+    of: str = ""
 
 
 def promises_stage(context: Context) -> PromisesResult | Absent:
@@ -53,7 +54,7 @@ def promises_stage(context: Context) -> PromisesResult | Absent:
         tested=_tested(context, controller, kit.models[kit.recommended].n_y),
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
-    result = PromisesResult((structure(context.prior), *found))
+    result = PromisesResult((structure(context.prior), *found), kit.identity)
     put_promises(context, result)
     return result
 
@@ -107,7 +108,7 @@ def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
 
 def put_promises(context: Context, found: PromisesResult) -> str:
     """Write the table beside the models, unless it is there."""
-    folder, table = context.out / "model", PromiseTable(context.kit.identity, found.rows)
+    folder, table = context.out / "model", PromiseTable(found.of, found.rows)
     try:
         there = read_promises(folder) == table
     except InputError:  # damaged, or of another version: it is written anew
