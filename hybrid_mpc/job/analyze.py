@@ -304,8 +304,8 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
         notes.append(f"filters' noise: {source}")
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
-        kit.models, load_programs(folder / MODELS), state_range(model, control), input_range(model, control), speed, ocp,
-        filters, plant, _recordings(settings.data, scenario, model), state_range(model),
+        kit.models, load_programs(folder / MODELS), state_range(model, control), input_range(model, control), speed,
+        ocp, filters, plant, _recordings(settings.data, scenario, model), state_range(model),
     ), tuple(notes)  # fmt: skip
 
 
