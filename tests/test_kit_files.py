@@ -45,7 +45,9 @@ ROOT = Path(__file__).parents[1]
 GOLF = load_scenario("golf_robot")
 GOLF = replace(GOLF, tasks=tuple(task for task in GOLF.tasks if task.name in ("track_sine", "track_step")))
 STEP = next(task.control for task in GOLF.tasks if task.control is not None)
-DETECTOR = Detector(0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (), 2.0, 4.0, rest_speed=(0.2,))
+DETECTOR = Detector(
+    0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (1e-5, 0.0, 0.0, 1e-5), 2.0, 4.0, 4.0, rest_speed=(0.2,)
+)
 CALIBRATION = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, rest_speed=(0.2,))
 LIMITS = hm.ResidualLimits(
     ("phi", "energy", "free run of phi"), 0.02, ((1.0, 1.0),) * 3, ((0.5, 0.5),) * 3, (1.0,), (3,), 1.0, 1.0
