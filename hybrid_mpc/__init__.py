@@ -93,6 +93,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.identify.train import train as train
     from hybrid_mpc.identify.tune import SearchSpace as SearchSpace, tune as tune
     from hybrid_mpc.job.check import check_scenario as check_scenario
+    from hybrid_mpc.job.check_fit import check_fit as check_fit
     from hybrid_mpc.job.controllers import find_noise as find_noise
     from hybrid_mpc.job.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
     from hybrid_mpc.job.run import run as run
@@ -218,6 +219,7 @@ _ROOMS = {
     "identify.train": ("train",),
     "identify.tune": ("SearchSpace", "tune"),
     "job.check": ("check_scenario",),
+    "job.check_fit": ("check_fit",),
     "job.controllers": ("find_noise",),
     "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
     "job.run": ("run",),

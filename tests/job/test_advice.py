@@ -65,9 +65,12 @@ def test_each_finding_is_told_with_what_to_do(results):
     ))  # fmt: skip
     assert bad(warned) == ["Recordings: monday.csv is nearly constant"]
     found = results.identification
-    poor = replace(results, identification=replace(
+    follows = replace(results, identification=replace(
         found, fit_percent={**found.fit_percent, "phy": {"phi [rad]": 41.0}}
     ))  # fmt: skip
+    assert bad(follows) == []  # its windows with free first states are explained
+    stages = ({"stage": "nominal", "validation_error": 0.5},)
+    poor = changed(follows, prior_parameters=replace(found.details.prior_parameters, stages=stages))
     assert bad(poor) == ["The fitted prior has a FIT of 41 % on phi: it lacks much."]
     bands = found.details.bands
     thin = changed(results, bands={**bands, "pgrnn": replace(bands["pgrnn"], coverage=0.6)})

@@ -125,7 +125,7 @@ def context(machine, samples, out, warm_up):
     made.keep(NOISE, {}, NoiseResult(found))
     train = made.trajectories("train")
     states = {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")}
-    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, {}, (), (), {}, None, states))
+    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, {}, (), (), {}, "", {}, None, states))
     return made
 
 

@@ -17,7 +17,7 @@ from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.loops import DRAWN_PRIOR, ON_MODEL
 from hybrid_mpc.job.sequential import SAME, hardest
 from hybrid_mpc.job.stage import Absent, Stage, source_of
-from hybrid_mpc.job.stages.advice import advice
+from hybrid_mpc.job.stages.advice import advice, doubt_of
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -199,7 +199,8 @@ def report_so_far(context: Context) -> None:
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
     going = "This run goes on: the page is written anew after the first stages and at the end. Load it again."
     s, title = context.scenario, f"hybrid-mpc: {context.scenario.name}"
-    page = Report(title, s.title, s.description, command(context), (), sections, going)
+    doubt = doubt_of(context.prior.in_doubt)
+    page = Report(title, s.title, s.description, command(context), (), sections, going, doubt=doubt)
     write_report(context.out / "report.html", page)
 
 
@@ -291,6 +292,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
         advice(results),
+        doubt_of(found.details.prior_parameters.in_doubt),
     )
 
 
