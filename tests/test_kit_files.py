@@ -425,3 +425,12 @@ def test_a_kit_of_the_former_format_is_migrated_or_refused_with_the_line(tmp_pat
     with pytest.raises(InputError, match="train the models anew"):
         migrate_kit(old, tmp_path / "again")
     assert not (tmp_path / "again").exists()
+
+
+def test_a_run_of_an_older_version_leaves_nothing_of_its_kit_behind(tmp_path, sources):
+    """Resumed by this version: the stage export writes the present files, and the old ones go."""
+    folder = old_kit(tmp_path / "model")
+    shutil.copytree(sources[0] / MODELS, folder / MODELS)
+    write_description(folder, read_description(sources[0]))
+    assert sorted(path.name for path in folder.iterdir()) == ["kit.json", MODELS]
+    assert set(hm.load(folder).models) == {"hybrid", "prior"}

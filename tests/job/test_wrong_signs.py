@@ -129,7 +129,9 @@ def test_a_run_says_first_that_the_prior_is_in_doubt(ran, checked):
     assert first in row.evidence
 
 
-def test_a_hybrid_on_a_doubted_prior_is_recommended_with_that_sentence_alone(words, checked, tmp_path, jobs_here):
+def test_a_hybrid_on_a_doubted_prior_is_recommended_with_that_sentence_alone(
+    words, checked, tmp_path, jobs_here
+):
     """Also where the user asks for it."""
     settings_ = replace(settings(words["wrong load"]), deploy="pgrnn")
     assert run(settings_, tmp_path / "run", only=("data", "prior", "training", "choice")) is None
