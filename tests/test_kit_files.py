@@ -45,7 +45,9 @@ ROOT = Path(__file__).parents[1]
 GOLF = load_scenario("golf_robot")
 GOLF = replace(GOLF, tasks=tuple(task for task in GOLF.tasks if task.name in ("track_sine", "track_step")))
 STEP = next(task.control for task in GOLF.tasks if task.control is not None)
-DETECTOR = Detector(0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (), 2.0, 4.0, rest_speed=(0.2,))
+DETECTOR = Detector(
+    0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (1e-5, 0.0, 0.0, 1e-5), 2.0, 4.0, 4.0, rest_speed=(0.2,)
+)
 CALIBRATION = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, rest_speed=(0.2,))
 LIMITS = hm.ResidualLimits(
     ("phi", "energy", "free run of phi"), 0.02, ((1.0, 1.0),) * 3, ((0.5, 0.5),) * 3, (1.0,), (3,), 1.0, 1.0
@@ -423,3 +425,12 @@ def test_a_kit_of_the_former_format_is_migrated_or_refused_with_the_line(tmp_pat
     with pytest.raises(InputError, match="train the models anew"):
         migrate_kit(old, tmp_path / "again")
     assert not (tmp_path / "again").exists()
+
+
+def test_a_run_of_an_older_version_leaves_nothing_of_its_kit_behind(tmp_path, sources):
+    """Resumed by this version: the stage export writes the present files, and the old ones go."""
+    folder = old_kit(tmp_path / "model")
+    shutil.copytree(sources[0] / MODELS, folder / MODELS)
+    write_description(folder, read_description(sources[0]))
+    assert sorted(path.name for path in folder.iterdir()) == ["kit.json", MODELS]
+    assert set(hm.load(folder).models) == {"hybrid", "prior"}

@@ -71,7 +71,7 @@ from hybrid_mpc.estimate.switching import SwitchingFilter
 from hybrid_mpc.job.controllers import OBSERVERS, find_noise
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import MODES, make_ocp
-from hybrid_mpc.kit.parts import KIT, artifact_folder
+from hybrid_mpc.kit.parts import KIT, MODELS, artifact_folder
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel, positions_of
@@ -304,8 +304,8 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
         notes.append(f"filters' noise: {source}")
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
-        kit.models, load_programs(folder), state_range(model, control), input_range(model, control), speed, ocp,
-        filters, plant, _recordings(settings.data, scenario, model), state_range(model),
+        kit.models, load_programs(folder / MODELS), state_range(model, control), input_range(model, control), speed,
+        ocp, filters, plant, _recordings(settings.data, scenario, model), state_range(model),
     ), tuple(notes)  # fmt: skip
 
 

@@ -413,7 +413,7 @@ class Kit:
         Raises:
             InputError: If there is no such task, or no control problem.
         """
-        if _named(task, "task"):
+        if _named(task, "task") and (self.loop.control or TASKS not in self.lacks):
             known(task, sorted({*self.loop.tasks, *self.loop.control} - {""}), "task")
         found = self.loop.control.get(task, self.control)
         if found is None:

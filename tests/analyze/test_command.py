@@ -58,8 +58,8 @@ def noisy(model, tmp_path):
 def prior_alone(golf_artifact):
     artifact = load(golf_artifact)
     return AnalysisInput(
-        {"prior": artifact.models["prior"]}, load_programs(golf_artifact), np.array([[-0.85, 0.85], [-2.5, 2.5]]),
-        np.array([[-0.5, 0.5]]), np.array([0.25]), plant=scenario.plant(),
+        {"prior": artifact.models["prior"]}, load_programs(golf_artifact / "models"),
+        np.array([[-0.85, 0.85], [-2.5, 2.5]]), np.array([[-0.5, 0.5]]), np.array([0.25]), plant=scenario.plant(),
     )  # fmt: skip
 
 
