@@ -37,8 +37,8 @@ from hybrid_mpc import (
     save_artifact,
 )
 from hybrid_mpc.identify.prior_model import prior_programs
-from hybrid_mpc.kit.artifact import loop_settings
 from hybrid_mpc.kit.assembly import make_ocp, make_resting_guard
+from hybrid_mpc.kit.parts import loop_settings
 
 
 def of_prior(name, **scenario):

@@ -41,7 +41,7 @@ from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.sound import bound_costs, trial_length
-from hybrid_mpc.identify.structure import causes, named, run_length
+from hybrid_mpc.identify.structure import causes, named
 
 MACHINES = (*PROCESSES, *MOTION)
 WITHIN = 1.05
@@ -93,8 +93,7 @@ def said(make: type[Prior], found: PriorFit, parts: Parts, dt: float, longest: f
     reasons = list(found.warnings)
     reasons += [str(one) for one in bound_costs(make, found, known, dt, length) if one.costs]
     acting = shifted(parts[0], found.delay)
-    length = run_length(make, found.values, acting, dt, longest, unit)
-    wrong = named(causes(make, found.values, acting, dt, length, unit))
+    wrong = named(causes(make, found.values, acting, dt, longest, unit))
     return [*reasons, *([wrong] if wrong else [])]
 
 

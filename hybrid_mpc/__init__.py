@@ -93,6 +93,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.identify.train import train as train
     from hybrid_mpc.identify.tune import SearchSpace as SearchSpace, tune as tune
     from hybrid_mpc.job.check import check_scenario as check_scenario
+    from hybrid_mpc.job.check_fit import check_fit as check_fit
     from hybrid_mpc.job.controllers import find_noise as find_noise
     from hybrid_mpc.job.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
     from hybrid_mpc.job.run import run as run
@@ -103,17 +104,17 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         StudyResults as StudyResults, write_study_report as write_study_report,
     )
     from hybrid_mpc.job.study_run import dry_run as dry_run, run_study as run_study
-    from hybrid_mpc.kit.artifact import (
-        Kit as Kit, LoopSettings as LoopSettings, ModelInfo as ModelInfo, Provenance as Provenance,
-        load as load, save_artifact as save_artifact, set_calibration as set_calibration,
-        set_process_noise as set_process_noise,
-    )
+    from hybrid_mpc.kit.artifact import Kit as Kit, load as load, save_artifact as save_artifact
     from hybrid_mpc.kit.assembly import (
         make_adaptive_guard as make_adaptive_guard, make_controller as make_controller,
         make_estimator as make_estimator, make_monitor as make_monitor, make_ocp as make_ocp,
         make_resting_guard as make_resting_guard,
     )
     from hybrid_mpc.kit.export_c import generate_controller as generate_controller
+    from hybrid_mpc.kit.parts import (
+        LoopSettings as LoopSettings, ModelInfo as ModelInfo, Provenance as Provenance,
+        set_calibration as set_calibration, set_process_noise as set_process_noise,
+    )
     from hybrid_mpc.kit.promises import Promise as Promise
     from hybrid_mpc.loop.faults import (
         Fault as Fault, check_plant_faults as check_plant_faults, corrupt_input as corrupt_input,
@@ -219,6 +220,7 @@ _ROOMS = {
     "identify.train": ("train",),
     "identify.tune": ("SearchSpace", "tune"),
     "job.check": ("check_scenario",),
+    "job.check_fit": ("check_fit",),
     "job.controllers": ("find_noise",),
     "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
     "job.run": ("run",),
@@ -227,15 +229,13 @@ _ROOMS = {
     "job.study": ("FaultKind", "RandomFaults", "Study"),
     "job.study_results": ("StudyResults", "write_study_report"),
     "job.study_run": ("dry_run", "run_study"),
-    "kit.artifact": (
-        "Kit", "LoopSettings", "ModelInfo", "Provenance", "load", "save_artifact", "set_calibration",
-        "set_process_noise",
-    ),
+    "kit.artifact": ("Kit", "load", "save_artifact"),
     "kit.assembly": (
         "make_adaptive_guard", "make_controller", "make_estimator", "make_monitor", "make_ocp",
         "make_resting_guard",
     ),
     "kit.export_c": ("generate_controller",),
+    "kit.parts": ("LoopSettings", "ModelInfo", "Provenance", "set_calibration", "set_process_noise"),
     "kit.promises": ("Promise",),
     "loop.faults": ("Fault", "check_plant_faults", "corrupt_input", "corrupt_measurement"),
     "loop.guard": ("Guard", "Mode"),

@@ -9,7 +9,7 @@ import pytest
 from online_models import pendulum_model
 
 from hybrid_mpc import InputError, load, save_artifact, with_input_delay
-from hybrid_mpc.kit.artifact import FILE
+from hybrid_mpc.kit.parts import KIT
 from hybrid_mpc.model.delay import MOST_DELAY_STATES
 
 DT = 0.02
@@ -115,7 +115,7 @@ def test_an_artifact_keeps_the_delay(tmp_path):
     programs, info = {"prior": trace_model(PriorStep(prior, 0.01))}, model_info(prior, 0.01)
     for name, delay in (("none", 0.0), ("late", 0.0125), ("years", 1e9)):
         save_artifact(tmp_path / name, programs, replace(info, input_delay=delay))
-    assert json.loads((tmp_path / "none" / FILE).read_text())["model"]["input_delay"] == 0.0
+    assert json.loads((tmp_path / "none" / KIT).read_text())["model"]["input_delay"] == 0.0
     at_once, late = (load(tmp_path / name).models["prior"] for name in ("none", "late"))
     assert (at_once.delay_states, late.delay_states) == (0, 2)
     x, u = np.array([0.2, 0.1]), np.array([4.0, 8.0, 9.0])  # the last one comes too late for this period

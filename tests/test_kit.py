@@ -27,8 +27,8 @@ from hybrid_mpc import (
     set_process_noise,
     simulate,
 )
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 from hybrid_mpc.kit.assembly import SOLVERS, first_deviations
+from hybrid_mpc.kit.parts import loop_settings, read_description, read_parts, save_loop
 
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")
@@ -44,7 +44,7 @@ def run(golf_artifact, tmp_path_factory):
     """The folder of a run, as far as loops read it."""
     folder = tmp_path_factory.mktemp("run")
     model = shutil.copytree(golf_artifact, folder / "model")
-    write_description(model, replace(read_description(model), loop=loop_settings(GOLF)))
+    save_loop(model, loop_settings(GOLF))
     set_process_noise(model, NOISE)
     set_calibration(model, CALIBRATION)
     return folder
@@ -104,7 +104,7 @@ def test_a_monitor_that_cannot_alarm_is_refused(run):
 
 def test_a_kit_is_printed_short(run):
     text = repr(hm.load(run))
-    assert "name='hybrid'" in text
+    assert "<models prior, hybrid>" in text or "<models hybrid, prior>" in text
     assert len(text) < 2000  # the signals of two models take 1,000 characters, one program some 10,000
 
 
@@ -199,8 +199,7 @@ def test_expressions_go_along(run, tmp_path):
     price = ca.Function("price", [x, u], [ca.tanh(u * x[1]) ** 2])
     model = shutil.copytree(run / "model", tmp_path / "model")
     problem = GOLF.control.changed(soft=(power,), economic=price)
-    note = read_description(model)
-    write_description(model, replace(note, loop=replace(note.loop, control={"": problem})))
+    save_loop(model, replace(read_parts(model).loop, control={"": problem}))
     assert hm.load(model).problem() == problem
 
 
@@ -228,8 +227,7 @@ def test_expressions_go_along(run, tmp_path):
 )
 def test_what_is_missing_is_named(run, tmp_path, change, use, told):
     model = shutil.copytree(run / "model", tmp_path / "model")
-    note = read_description(model)
-    write_description(model, replace(note, loop=replace(note.loop, **change)))
+    save_loop(model, replace(read_parts(model).loop, **change))
     with pytest.raises(hm.InputError, match=told):
         use(hm.load(model))
 

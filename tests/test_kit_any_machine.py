@@ -10,7 +10,7 @@ from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.job import monitor as monitor_job
 from hybrid_mpc.job.loops import LoopSpec, excess, limits_used, row_of
 from hybrid_mpc.job.tasks import repeated
-from hybrid_mpc.kit.artifact import loop_settings, set_residuals
+from hybrid_mpc.kit.parts import loop_settings, set_residuals
 
 DT = 10.0
 

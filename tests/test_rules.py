@@ -14,7 +14,7 @@ import hybrid_mpc as hm
 from hybrid_mpc import OCP, DataSpec, HardBound, InputError, Parameter, Scenario, Signal, SoftBound, Task
 from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.job.study import FaultKind, Study
-from hybrid_mpc.kit.artifact import BalanceInfo, LoopSettings, ModelInfo
+from hybrid_mpc.kit.parts import BalanceInfo, LoopSettings, ModelInfo
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.prior import Balance, OperatingPoint
 from hybrid_mpc.machine.specification import BenchmarkBudget, BenchmarkSpec, Window

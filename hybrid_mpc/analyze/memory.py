@@ -170,7 +170,7 @@ def gru_weights(program: Program) -> GruWeights:
         InputError: If the program has none, or several.
 
     Example:
-        ``gru_weights(nn_export.load_programs(folder)["hybrid/step"])``
+        ``gru_weights(nn_export.load_programs(folder / "models")["hybrid/step"])``
     """
     found = []
     for argument in _cell(program).args[2:]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from hybrid_mpc.job.check import Preflight, Rest
+    from hybrid_mpc.job.context import Context
+    from hybrid_mpc.job.stages.identify import PriorResult
     from hybrid_mpc.machine.prior import Prior
     from hybrid_mpc.machine.signals import Signal
     from hybrid_mpc.machine.specification import DataSpec
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc check my_machine.py\n\n"
-    "  hybrid-mpc check my_machine.py --data monday.csv --data tuesday.csv"
+    "  hybrid-mpc check my_machine.py --data monday.csv --data tuesday.csv\n\n"
+    "  hybrid-mpc check my_machine.py --data monday.csv --data tuesday.csv --fit"
 )
 WRONG = 2
 """Exit code where something must be mended."""
@@ -38,10 +41,18 @@ def check(
     time_column: TimeColumn = "",
     input_column: InputColumns = None,
     output_column: OutputColumns = None,
+    fit: Annotated[
+        bool,
+        typer.Option(
+            "--fit", help="Fit the prior too, compare it with simpler models, and name wrong terms."
+        ),
+    ] = False,
 ) -> None:
     """Say what is understood of a machine and its recordings, and all that is wrong with them; compute nothing.
 
-    The same is asked first by 'run', 'tune' and 'benchmark'. Exit code 2 if something must be mended.
+    The same is asked first by 'run', 'tune' and 'benchmark'. With --fit the prior is fitted as a run does it, and what
+    puts its structure in doubt is named. Nothing is trained, no file is written. Exit code 2 if something must be
+    mended.
     """
     from hybrid_mpc.job.check import preflight
     from hybrid_mpc.job.context import Context
@@ -58,20 +69,93 @@ def check(
     found = preflight(machine, None, (lambda: context.dataset) if data else None)
     console = Console(highlight=False)
     _tell(console, found, context.spec)
+    problems, warnings = found.problems, (*found.warnings, *found.doubts)
+    in_doubt: tuple[str, ...] = ()
+    if fit and not problems:
+        problems, told, in_doubt = _fit(console, context)
+        warnings += told
     left = left_to_decide(Path(scenario)) if scenario.endswith(".py") else []
     for texts, style, title in (
-        (left, "cyan", "left to decide"),
-        ((*found.warnings, *found.doubts), "yellow", "doubtful"), (found.problems, "bold red", "to be mended"),
+        (left, "cyan", "left to decide"), (warnings, "yellow", "doubtful"),
+        (in_doubt, "bold yellow", "in doubt: the structure of the prior"), (problems, "bold red", "to be mended"),
     ):  # fmt: skip
         if texts:
             console.print(f"\n{len(texts)} {title}", style=style)
         for number, text in enumerate(texts, 1):
             console.print(printable(f"{number:3}. {text}"), markup=False, soft_wrap=True)
-    if found.problems:
+    if problems:
         raise typer.Exit(WRONG)
+    if in_doubt:
+        console.print("\nCorrect the prior before a run: docs/prior-wrong.md says how to read each doubt.")
+        return
     console.print(
-        "\nNothing to be mended." if not data else "\nNothing to be mended; 'hybrid-mpc run' may start."
+        "\nNothing to be mended; 'hybrid-mpc run' may start." if data or fit else "\nNothing to be mended."
     )
+
+
+def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Fit the prior and print what was found; what must be mended, warnings, and doubts about the structure."""
+    from dataclasses import replace
+
+    from hybrid_mpc.cli.progress import Unwarned, make_progress
+    from hybrid_mpc.errors import InputError
+    from hybrid_mpc.job.check_fit import fit_of
+    from hybrid_mpc.job.stages.identify import stops
+
+    with make_progress() as progress:
+        try:
+            found = fit_of(replace(context, progress=Unwarned(progress)))
+        except InputError as error:
+            return error.problems, (), ()
+    prior = context.scenario.prior()
+    console.print(_fitted_parameters(prior, found))
+    console.print(_free_runs(prior, found))
+    return stops(found, cause=False), found.fit.warnings, found.in_doubt
+
+
+def _fitted_parameters(prior: Prior, found: PriorResult) -> Table:
+    """Values before and after the fit, with standard errors and bounds."""
+    table = _table("fitted parameters", "name", "nominal", "fitted", "standard error", "unit", "bounds", "")
+    ends = {one.parameter: f"at its bound {one.value:.4g}" for one in found.bounds}
+    for one in prior.parameters:
+        if not one.fixed:
+            table.add_row(
+                one.name, f"{one.value:.4g}", f"{found.fit.values[one.name]:.4g}",
+                f"{found.fit.standard_errors[one.name]:.2g}", one.unit, f"{one.lower:g} to {one.upper:g}",
+                ends.get(one.name, ""),
+            )  # fmt: skip
+    if found.fit.delay:
+        table.add_row("delay of the inputs", "", f"{found.fit.delay:.4g}", "", "s", "", "")
+    return table
+
+
+def _free_runs(prior: Prior, found: PriorResult) -> Table:
+    """Errors of the prior and of simpler models."""
+    length = "" if found.longest_run is None else f" of {found.longest_run:.3g} s"
+    columns = [text for s in prior.outputs for text in (f"RMSE {s.label}", f"FIT {s.name} [%]")]
+    table = _table(f"free runs{length} on the test recordings", "model", "error [spreads]", *columns)
+    names = {"phy_nominal": "prior, nominal", "phy": "prior, fitted"}
+    simpler = {name: one.errors for name, one in found.baselines.items()}
+    for name, errors in {**found.errors, **simpler}.items():
+        if errors is None:
+            table.add_row(name, f"none: {found.baselines[name].reason}")
+            continue
+        cells = [
+            text
+            for s in prior.outputs
+            for text in (
+                _number(errors.rmse.get(s.label), "4g"),
+                _number(errors.fit_percent.get(s.label), "0f"),
+            )
+        ]
+        table.add_row(names.get(name, name), _number(errors.error, "3g"), *cells)
+    return table
+
+
+def _number(value: float | None, spec: str) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.{spec}}" if np.isfinite(value) else "diverged"
 
 
 def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:

@@ -1,8 +1,9 @@
-"""``hybrid-mpc export``: a trained controller for other machines."""
+"""``hybrid-mpc export``: a trained controller for other machines, a kit of the former format in the present one."""
 
 from __future__ import annotations
 
 import shlex
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -17,8 +18,23 @@ EXAMPLES = (
 )
 
 app = typer.Typer(
-    help="Write a trained controller for other machines.", no_args_is_help=True, rich_markup_mode=None
-)
+    help="Write a trained controller for other machines, or an old kit in the present format.",
+    no_args_is_help=True, rich_markup_mode=None,
+)  # fmt: skip
+
+
+@app.command("kit", epilog="Example:\n\n  hybrid-mpc export kit runs/old --out kit")
+def kit(
+    old: Annotated[
+        Path, typer.Argument(help="Kit of the former format (model.json), or the folder of its run.")
+    ],
+    out: EmptyFolder,
+) -> None:
+    """Write a kit of the former format in the present one, into a new folder; nothing is computed again."""
+    from hybrid_mpc.kit.migrate import migrate_kit
+
+    folder = migrate_kit(old, out)
+    print(f"kit in {folder.resolve()}. Load it with hm.load, or name the folder in place of the old one.")
 
 
 @app.command("c", epilog=EXAMPLES)

@@ -64,7 +64,7 @@ def monitor(
     from hybrid_mpc.files import check_folder
     from hybrid_mpc.job.monitor import learn as learn_job
     from hybrid_mpc.job.monitor import prepared, watch
-    from hybrid_mpc.kit.artifact import FILE, artifact_folder, read_description
+    from hybrid_mpc.kit.parts import KIT, artifact_folder, read_description
     from hybrid_mpc.scenario import scenario_of
 
     check_folder(out)
@@ -72,9 +72,9 @@ def monitor(
     held = read_description(folder)
     machine = None
     if scenario or held.predicting is None:  # else the folder has all that is needed
-        machine = scenario_of(held.provenance.scenario, folder / FILE, scenario)
+        machine = scenario_of(held.provenance.scenario, folder / KIT, scenario)
         if machine is None:
-            raise InputError(f"{folder / FILE} does not say whose model it is; give --scenario")
+            raise InputError(f"{folder / KIT} does not say whose model it is; give --scenario")
     job = prepared(
         machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration, residuals=residuals,

@@ -99,6 +99,13 @@ class Lines(Progress):
         say(f"  {text or 'done'} after {time.monotonic() - self._stage:.1f} s")
 
 
+class Unwarned(Progress):
+    """Passes on how far a job is; its warnings are printed behind its results."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.start, self.update, self.finish = progress.start, progress.update, progress.finish  # type: ignore[method-assign]
+
+
 def say(text: str) -> None:
     """Print a text of anybody's, a finding or the name of a file, so that it cannot change the terminal."""
     print(printable(text), flush=True)

@@ -93,10 +93,12 @@ def run(
 
 def summary(results: Results) -> list[str]:
     """The figures of a run that are worth a line on the terminal."""
+    from hybrid_mpc.job.stages.advice import doubt_of
     from hybrid_mpc.kit.promises import promise_lines
 
     found = results.identification
-    lines = errors_table(found)
+    doubt = doubt_of(found.details.prior_parameters.in_doubt)
+    lines = [*([doubt] if doubt else []), *errors_table(found)]
     lines.append(found.details.choice.reason)
     for name in ("prior", "hybrid", "oracle"):
         loop = getattr(results.control, name)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status
-from hybrid_mpc.control.targets import Steady
 from hybrid_mpc.embedded.generate import SOURCES, Sources, bound_names, make_sources, template
 from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.model import HybridModel
 from nn_export.codegen import compile_library
 

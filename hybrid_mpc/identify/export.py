@@ -16,7 +16,8 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.step import PriorStep, Step
-from hybrid_mpc.kit.artifact import INPUTS, OUTPUTS, ModelInfo, build_model
+from hybrid_mpc.kit.artifact import INPUTS, OUTPUTS, build_model
+from hybrid_mpc.kit.parts import ModelInfo
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, step_symbols
 
 

@@ -422,6 +422,10 @@ class OutputFit:
         """Sub-steps a period that the stiffness at ``theta`` asks for, at rest and where the recordings go."""
         return max(self.least, required_substeps(self.make(self.values(theta)), self.dt, self.points))
 
+    def most_substeps(self, thetas: Array) -> int:
+        """As many as the stiffest of several ``thetas`` ``(m, k)`` needs."""
+        return max(self.substeps(one) for one in thetas)
+
     def reach(self, theta: Array) -> float:
         """Time [s] over which a small error grows by the larger of ``GROWN`` at ``theta``, where the recordings go."""
         rate = 0.0 if self.points is None else growth_rate(self.make(self.values(theta)), self.points)
@@ -832,7 +836,8 @@ class Shooting:
 
         problem = many(alive)
         begun = problem._states(problem.start(thetas, problem.windows.x, "x"))
-        found = dict(zip(alive, parts(problem._at(begun, thetas, begun.x, "all")), strict=True))
+        point = problem._at(begun, thetas, begun.x, "all") if keep else begun
+        found = dict(zip(alive, parts(point), strict=True))
         for left in keep:
             for _ in range(2):
                 steps = []
@@ -917,7 +922,7 @@ class Shooting:
     def start(self, theta: Array, x: Array, slopes: Slopes) -> _Point:
         """Errors at ``theta`` from ``x``, each output's over its spread."""
         nothing = np.zeros(0)
-        substeps = max(self.own.substeps(one) for one in np.atleast_2d(theta))
+        substeps = self.own.most_substeps(np.atleast_2d(theta))
         empty = _Point(theta, x, substeps, self.spread, nothing, nothing, LOOSELY**2)
         return self._at(empty, theta, x, slopes)
 

@@ -9,7 +9,8 @@ import casadi as ca
 
 import nn_export
 from hybrid_mpc.identify.simulation import required_substeps, stepped
-from hybrid_mpc.kit.artifact import INPUTS, OUTPUTS, BalanceInfo, ModelInfo
+from hybrid_mpc.kit.artifact import INPUTS, OUTPUTS
+from hybrid_mpc.kit.parts import BalanceInfo, ModelInfo
 from hybrid_mpc.machine.prior import POINT, Prior
 
 

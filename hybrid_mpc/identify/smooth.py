@@ -473,7 +473,8 @@ def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
         rate = float(np.linalg.eigvals(a).real.max(initial=0.0))
         periods = max(2, round(min(time_unit, math.log(GROWN) / rate if rate > 0 else math.inf) / dt))
         skip = max(1, periods // 50)  # fifty instants tell as much as a thousand
-        step, rows, at = expm(a * dt * skip), [], np.eye(len(x))
+        with np.errstate(over="ignore", invalid="ignore"):  # a mode that runs away hides all others
+            step, rows, at = expm(a * dt * skip), [], np.eye(len(x))
         with np.errstate(over="ignore", invalid="ignore"):  # what runs away is cut off below
             for _ in range(0, periods, skip):
                 at = at @ step

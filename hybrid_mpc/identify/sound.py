@@ -16,6 +16,7 @@ from hybrid_mpc.identify.fit import (
     AT_BOUND,
     GROWN,
     LENGTHS,
+    POOR,
     WINDOWS,
     OutputFit,
     Shooting,
@@ -34,6 +35,10 @@ NEAR = 1e-3
 CLEARLY = 0.75
 """Error of a linear model over the fitted prior's below which the prior lacks something: two models of the same
 structure, fitted to the same recordings, differ by less."""
+BOUNDED = 0.5
+"""Share of the fitted parameters at bounds from which on the prior lacks something that they stand for."""
+NEGATIVE = -25.0
+"""FIT [%] of an output below which the prior says less of it than its mean would."""
 COSTLY = 0.95
 """Error without a bound over the error with it below which the bound costs something."""
 ITERATIONS = 12
@@ -174,7 +179,7 @@ def bound_costs(
     if not (low | high).any():
         return ()
     sizes = np.array(fit.smoother(make(fit.values), dt).sizes.x)
-    problem, found = _windows(own, smoothed, sizes, length), []
+    problem, found = shooting(own, smoothed, sizes, length), []
     bounded = problem.solve(theta, ITERATIONS).theta  # over these windows, as without the bound
     (before,) = problem.explained([bounded])
     for i in np.flatnonzero(low | high):
@@ -182,7 +187,7 @@ def bound_costs(
         free.points = own.points
         free.lower[i] -= span[i] * low[i]
         free.upper[i] += span[i] * high[i]
-        problem = _windows(free, smoothed, sizes, length)
+        problem = shooting(free, smoothed, sizes, length)
         try:
             solved = problem.solve(bounded, ITERATIONS).theta
             (after,) = problem.explained([solved])
@@ -195,12 +200,13 @@ def bound_costs(
     return tuple(found)
 
 
-def _windows(fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float) -> Shooting:
-    """Windows of ``length`` [s], or as long as the recordings hold."""
+def shooting(
+    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = WINDOWS // 2
+) -> Shooting:
+    """At most so many windows of ``length`` [s], or as long as the recordings hold."""
     longest = max(len(t.t) for t in known) - 1
     periods = min(scales.periods(length, fit.dt, 2), longest)
-    windows = cut_outputs(known, periods, 0, WINDOWS // 2, fit.prior.states)
-    return Shooting(fit, windows, sizes)
+    return Shooting(fit, cut_outputs(known, periods, 0, most, fit.prior.states), sizes)
 
 
 def constant_runs(train: Sequence[Trajectory], test: Sequence[Trajectory], warm: int) -> list[Array]:
@@ -232,3 +238,77 @@ def structure_doubt(error: float, baselines: Mapping[str, float]) -> str:
     if name != "constant" and baselines[name] >= CLEARLY * error:
         return ""
     return f"{model} has an error of {baselines[name]:.3g} on unseen recordings, the fitted prior {error:.3g}"
+
+
+def bounds_doubt(bounds: Sequence[BoundCost], fitted: int) -> str:
+    """Why parameters at bounds put the structure of the fitted prior in doubt; empty where they do not.
+
+    Args:
+        bounds: What each bound costs (:func:`bound_costs`).
+        fitted: Number of fitted parameters.
+
+    Example:
+        >>> own = [BoundCost("k", 2.0, 2.6, 0.9), BoundCost("d", 0.0, 0.0, 1.0)]
+        >>> bounds_doubt(own, 3)
+        '2 of 3 fitted parameters end at a bound: k at 2, d at 0'
+        >>> bounds_doubt(own, 6)
+        ''
+        >>> bounds_doubt([BoundCost("k", 2.0, 2.6, 0.5)], 6)
+        'k ends at its bound 2; with a wider one it is 2.6, and the error falls to 50 %'
+    """
+    if len(bounds) > 1 and len(bounds) >= BOUNDED * fitted:
+        ends = ", ".join(f"{one.parameter} at {one.value:.4g}" for one in bounds)
+        return f"{len(bounds)} of {fitted} fitted parameters end at a bound: {ends}"
+    return "; ".join(str(one) for one in bounds if one.ratio < CLEARLY)
+
+
+def fit_doubt(fit_percent: Mapping[str, float], share: Mapping[str, float]) -> str:
+    """Which outputs the fitted prior predicts worse than their means would; empty where there is none.
+
+    Args:
+        fit_percent: FIT [%] of each output, ``"phi [rad]"``, in free runs on unseen recordings.
+        share: Error over the spread of each output in all recordings [-]: one that hardly moves in a run may have a
+            poor FIT and little error.
+
+    Example:
+        >>> fit_doubt({"phi [rad]": -60.0, "level [m]": -40.0}, {"phi [rad]": 1.4, "level [m]": 0.1})
+        'free runs of phi have a FIT of -60 % on unseen recordings: its mean has less error'
+    """
+    poor = [name for name, fit in fit_percent.items() if fit < NEGATIVE and share[name] > POOR]
+    return "; ".join(
+        f"free runs of {name.partition(' [')[0]} have a FIT of {fit_percent[name]:.0f} % on unseen recordings: its "
+        "mean has less error"
+        for name in poor
+    )
+
+
+def no_gain(unseen: Mapping[str, float], training: Mapping[str, float]) -> str:
+    """Why nothing may be built on a fitted prior: a constant or the nominal parameters are better; empty otherwise.
+
+    A constant must be better on both kinds of recordings: a machine that is held still in one of them says little.
+
+    Args:
+        unseen: Errors of free runs on unseen recordings, over the outputs' spread, of the fitted prior (``"phy"``), of
+            the prior with nominal parameters (``"phy_nominal"``) and of the training mean (``"constant"``).
+        training: Those of ``"phy"`` and ``"constant"`` on the training recordings.
+
+    Example:
+        >>> no_gain({"phy": 1.2, "phy_nominal": 2.0, "constant": 0.8}, {"phy": 1.1, "constant": 1.0})
+        'on unseen recordings a constant has an error of 0.8, the fitted prior 1.2; on the training ones 1 and 1.1'
+        >>> no_gain({"phy": 0.5, "phy_nominal": 0.3, "constant": 1.0}, {})
+        'on unseen recordings the nominal parameters have an error of 0.3, the fitted ones 0.5'
+        >>> no_gain({"phy": 0.05, "phy_nominal": 0.03, "constant": 1.0}, {})
+        ''
+    """
+    error, nominal, constant = (unseen[name] for name in ("phy", "phy_nominal", "constant"))
+    if error >= constant and training["phy"] >= training["constant"]:
+        return (
+            f"on unseen recordings a constant has an error of {constant:.3g}, the fitted prior {error:.3g}; on the "
+            f"training ones {training['constant']:.3g} and {training['phy']:.3g}"
+        )
+    if error > POOR and nominal < CLEARLY * error:
+        return (
+            f"on unseen recordings the nominal parameters have an error of {nominal:.3g}, the fitted ones "
+            f"{error:.3g}"
+        )
+    return ""

@@ -17,7 +17,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.fit import (
@@ -25,15 +24,15 @@ from hybrid_mpc.identify.fit import (
     LENGTHS,
     POOR,
     QUIET,
-    WINDOWS,
     OutputFit,
     Shooting,
     Trial,
-    cut_outputs,
+    check_observable,
     with_states,
 )
-from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, visited
+from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, required_substeps, visited
 from hybrid_mpc.identify.smooth import rough_smoother
+from hybrid_mpc.identify.sound import shooting
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 
 Array = NDArray[np.float64]
@@ -55,6 +54,16 @@ READINGS = (
     *((10.0**-k, f"it is 1e{k} times too large, as between units") for k in (1, 2, 3, 5, 6)),
 )
 """Factors that say what the mistake is."""
+UNITS = tuple(v for one in (10.0, 60.0, 1e3, 1e5) for v in (one, 1 / one))
+"""Factors from which trial fits start, beside 1 and -1: mistakes of a unit are too far from these. From each the values
+of ``READINGS`` within ``TAKEN`` are tried at the end.
+"""
+TRIALS, FEW = 12, 4
+"""Windows of a trial fit, and of those by which mistakes of a unit, which are large, are compared."""
+TAKEN = 30.0
+"""What parameters may take of a mistake at most."""
+EACH = 2
+"""Mistakes of a unit that are tried of a term."""
 NEAR = 0.2
 """Relative distance of a factor from such a value that counts as the same: parameters take a part of a mistake."""
 SMALL = 0.1
@@ -69,10 +78,12 @@ mistake is, and where it says no more than that something is wrong.
 """
 BETTER = 0.95
 """Ratio of two errors from which on the smaller counts."""
-ALIKE = 1.25
-"""Ratio of two errors up to which their explanations count as equal."""
+ALIKE, TOLD = 1.25, 2.0
+"""Ratio of two errors up to which their explanations count as equal; and up to which one whose factor says what the
+mistake is counts for more than one whose factor may be anything.
+"""
 TRIED = 16
-"""Trial fits at least that go on to the end."""
+"""Trial fits over long windows at most."""
 STEPS = 3
 """Pairs of Gauss-Newton steps of a trial fit; it shows the size of an error, no more."""
 MOST = 3
@@ -97,6 +108,8 @@ class Cause:
         why: What is wrong with it.
         ratio: Error of free runs with the mistake mended over the error without [-].
         factor: Factor that the recordings give the term; NaN where there is none.
+        before: Whether there is an error without the mistake mended; where the prior cannot be fitted with it, the
+            ratio is over the outputs' spread.
 
     Example:
         >>> print(Cause("k * u in the rate of v", "its sign seems wrong", 0.1, -1.02))
@@ -107,6 +120,7 @@ class Cause:
     why: str
     ratio: float
     factor: float = math.nan
+    before: bool = True
 
     @property
     def exact(self) -> bool:
@@ -115,7 +129,9 @@ class Cause:
 
     def __str__(self) -> str:
         factor = "" if math.isnan(self.factor) else f" (factor {self.factor:.3g})"
-        return f"{self.what}: {self.why}{factor}; mended, the error of free runs falls to {100 * self.ratio:.0f} %"
+        left = f"{100 * self.ratio:.0f} %"
+        told = f"falls to {left}" if self.before else f"is {left} of the outputs' spread"
+        return f"{self.what}: {self.why}{factor}; mended, the error of free runs {told}"
 
 
 def reading_of(factor: float, needed: bool = True) -> str:
@@ -343,8 +359,11 @@ class _Lenient(OutputFit):
 
     def substeps(self, theta: Array) -> int:
         """As many as are needed, or the most that there may be: a model that is stiffer runs away and is not named."""
+        return self._enough(self.values(theta))
+
+    def _enough(self, values: Mapping[str, float]) -> int:
         try:
-            return super().substeps(theta)
+            return max(self.least, required_substeps(self.make(values), self.dt, self.points))
         except InputError:
             return MAX_SUBSTEPS
 
@@ -356,8 +375,8 @@ class _FactorFit(_Lenient):
     """
 
     def __init__(self, make: Callable[..., Prior], dt: float) -> None:
-        super().__init__(make, dt)
-        self.terms = sum(p.name.startswith("chosen ") for p in self.prior.parameters)
+        super().__init__(with_factor(make), dt)
+        self.term_names = terms_of(make())
         self.chosen: Sequence[int] = ()
 
     def choosing(self, chosen: Sequence[int]) -> _FactorFit:
@@ -366,38 +385,41 @@ class _FactorFit(_Lenient):
         other.chosen = chosen
         return other
 
+    def most_substeps(self, thetas: Array) -> int:
+        """With each factor on its term."""
+        return max(
+            self._enough({**self.values(theta), **({f"chosen {k}": 1.0} if k >= 0 else {})})
+            for theta, k in zip(thetas, self.chosen, strict=True)
+        )
+
     def _every(self, thetas: Array) -> list[list[float]]:
-        chosen = np.array(self.chosen)[:, None] == np.arange(self.terms)
+        terms = len(self.term_names)
+        chosen = np.array(self.chosen)[:, None] == np.arange(terms)
         rows = []
         for one, own in zip(thetas, chosen, strict=True):
             *constants, late = self._constants(one)
-            rows.append([*constants[: -self.terms], *own.astype(float), late])
+            rows.append([*constants[:-terms], *own.astype(float), late])
         return rows
 
 
-def run_length(
-    make: Callable[..., Prior],
-    values: Mapping[str, float],
-    recorded: Sequence[Trajectory],
-    dt: float,
-    longest: float,
-    time_unit: float,
-) -> float:
-    """Length [s] of the free runs by which explanations are compared: that of the runs by which models are judged, less
-    where small errors grow faster. There it is twice the time in which they grow tenfold: first states are free.
+def _off_nominal(fit: OutputFit, theta: Array) -> float:
+    """How far parameters are off their nominal values over half their ranges: by ratios where none may be negative."""
+    ratio = (fit.lower > 0.0) & (fit.upper > fit.lower)
+    low, high, own, nominal = (np.where(ratio, v, 1.0) for v in (fit.lower, fit.upper, theta, fit.nominal))
+    relative = np.log(own / nominal) / np.where(ratio, 0.5 * np.log(high / low), 1.0)
+    linear = (theta - fit.nominal) / np.where(fit.half > 0.0, fit.half, 1.0)
+    return float(np.square(np.where(ratio, relative, linear)).sum())
+
+
+def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[float]:
+    """Lengths [s] of the free runs by which explanations are compared: less than the longest where small errors grow
+    faster, and the longest too, since a mistake may be what lets them grow.
+
+    The shorter is twice the time in which they grow tenfold: first states are free.
     """
-    fit = OutputFit(make, dt)
-    fit.points = visited(_smoothed(make, recorded, dt, time_unit)[0])
     tenfold = math.log(GROWN[0]) / math.log(GROWN[-1])
-    reach = min(fit.reach(theta) for theta in (fit.nominal, fit.scaled(values))) * tenfold
-    return max(4 * dt, min(longest, 2 * reach))
-
-
-def _cut(fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float) -> Shooting:
-    """Windows of ``length`` [s], or as long as the recordings hold."""
-    longest = max(len(t.t) for t in known) - 1
-    periods = min(scales.periods(length, fit.dt, 2), longest)
-    return Shooting(fit, cut_outputs(known, periods, 0, WINDOWS // 4, fit.prior.states), sizes)
+    shorter = max(4 * fit.dt, 2 * tenfold * min(fit.reach(theta) for theta in thetas))
+    return [shorter, longest] if shorter < SHORTER * longest else [longest]
 
 
 def named(found: Sequence[Cause]) -> str:
@@ -410,14 +432,14 @@ def causes(
     values: Mapping[str, float],
     recorded: Sequence[Trajectory],
     dt: float,
-    length: float,
+    longest: float,
     time_unit: float,
 ) -> tuple[Cause, ...]:
     """Mistakes in a prior that explain why it does not follow recordings; the likeliest first, equal ones behind it.
 
-    Each term of its equations and each signal gets a factor, which is fitted with all parameters, from 1 and from -1
-    on. Where no factor explains the error, outputs are counted the other way, signals of a kind are exchanged, and
-    angles are turned by quarters of a turn.
+    Each term of its equations and each signal gets a factor, which is fitted with all parameters: from 1, from -1, and
+    from the mistakes of a unit that explain short runs best. Where no factor explains the error, outputs are counted
+    the other way, signals of a kind are exchanged, and angles are turned by quarters of a turn.
     A mistake is named where mending it takes the error of free runs to less than ``NAMED``, or ``GUESSED`` where its
     factor does not say what is wrong (:func:`reading_of`).
 
@@ -426,80 +448,269 @@ def causes(
         values: Fitted values [their units] by name.
         recorded: Training trajectories as recorded, with the inputs that act.
         dt: Model period [s].
-        length: Length [s] of the free runs.
+        longest: Length [s] of the free runs by which models are judged; shorter ones are taken where small errors grow.
         time_unit: The machine's second [s].
     """
     known, sizes, noise = _smoothed(make, recorded, dt, time_unit)
-    fit = _FactorFit(with_factor(make), dt)
+    fit = _FactorFit(make, dt)
     fit.points = visited(known)
-    problem, names = _cut(fit, known, sizes, length), terms_of(make())
-    thetas = fit.nominal, fit.scaled({**fit.prior.values, **values})
-    begun = [(-1, theta) for theta in thetas]
-    begun += [
-        (k, np.append(theta[:-1], one)) for k in range(len(names)) for theta in thetas for one in (-1.0, 1.0)
-    ]
-    (plain,) = problem.several(thetas[1][None], lambda numbers: fit.choosing([-1] * len(numbers)), [])
-    if plain.error <= QUIET * float(np.sqrt(np.mean(np.square(noise / problem.spread)))):
-        return ()  # little is left but the sensors' noise
-    short = _cut(fit, known, sizes, min(LENGTHS[1] * time_unit, length))
-    before, terms = _fitted(fit, problem, _moved(fit, short, begun))
-    found = [
-        Cause(names[k], why, trial.error / before, float(trial.theta[-1]))
-        for k, trial in terms.items()
-        if (why := reading_of(float(trial.theta[-1]), _needed(fit, problem, k, trial)))
-    ]
-    found = [one for one in found if one.ratio <= (NAMED if one.exact else GUESSED)]
+    thetas = [fit.nominal, fit.scaled({**fit.prior.values, **values})]
+    lengths = _lengths(fit, thetas, longest)
+
+    def quiet(windows: Shooting) -> float:
+        """Error up to which little is left but the sensors' noise."""
+        return QUIET * float(np.sqrt(np.mean(np.square(noise / windows.spread))))
+
+    found: list[Cause] = []
+    for length in lengths:
+        problem, short, few = (
+            shooting(fit, known, sizes, min(own, length), most)
+            for own, most in (
+                (length, TRIALS),
+                (LENGTHS[1] * time_unit, TRIALS),
+                (time_unit, FEW),
+            )
+        )
+        if _tried(fit, problem, [_Start(-1, thetas[1])], 0)[0].error <= quiet(problem):
+            continue
+        plain, moved = _moved(fit, short, few, thetas, quiet)
+        before, found = _explained(fit, problem, short, plain, moved)
+        if before * min((one.ratio for one in found), default=1.0) > POOR or not found:
+            signals = _signals(
+                make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit
+            )
+            found += [one for one in signals if one.ratio <= NAMED]
+        if length > lengths[0]:  # of a machine that does run away, another model may only run away later
+            found = [one for one in found if before * one.ratio <= POOR]
+        if found:
+            break
     least = min((one.ratio for one in found), default=1.0)
-    if before * least > POOR or not found:
-        signals = _signals(make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit)
-        found += [one for one in signals if one.ratio <= NAMED]
+    found = [one for one in found if one.exact and one.ratio <= TOLD * least] or found
+    least = min((one.ratio for one in found), default=1.0)
     found.sort(key=lambda one: one.ratio)
-    return tuple(one for one in found if one.ratio <= ALIKE * found[0].ratio)[:MOST]
+    return tuple(one for one in found if one.ratio <= ALIKE * least)[:MOST]
 
 
-def _moved(fit: _FactorFit, short: Shooting, begun: Sequence[tuple[int, Array]]) -> list[tuple[int, Array]]:
-    """Starts to which a few steps over short windows lead, with factors held: long windows have more optima."""
-    chosen = [k for k, _ in begun]
-    every = short.several(
-        np.stack([theta for _, theta in begun]), lambda numbers: fit.choosing([chosen[i] for i in numbers]),
-        [len(begun)] * STEPS, -1,
-    )  # fmt: skip
-    return [(chosen[one.start], one.theta) for one in every]
+def _moved(
+    fit: _FactorFit,
+    short: Shooting,
+    few: Shooting,
+    thetas: Sequence[Array],
+    quiet: Callable[[Shooting], float],
+) -> tuple[list[_Start], list[_Start]]:
+    """Starts without a factor, and with those that help over short windows, from where trial fits over these end.
+
+    Long windows have more optima.
+
+    Args:
+        fit: Parameters with the factor.
+        short: Short windows.
+        few: A few of them.
+        thetas: Parameters to start from.
+        quiet: Error of windows up to which little is left but the sensors' noise.
+    """
+    terms = range(len(fit.term_names))
+    begun = [_Start(-1, theta) for theta in thetas]
+    plain = _best(begun, tried := _tried(fit, short, begun, STEPS, held=True), len(begun))
+    enough = BETTER * min(one.error for one in tried)
+    enough = math.inf if enough <= quiet(short) else enough
+    moved: list[_Start] = []
+    for begun, held, each in (
+        ([_Start(k, plain[0].theta) for k in terms], False, 1),
+        ([_Start(k, np.append(theta[:-1], -1.0)) for k in terms for theta in thetas], True, 1),
+        (_units(fit, few), True, EACH),
+    ):
+        tried = _tried(fit, short, begun, STEPS, held=held)
+        moved += _best(begun, [one for one in tried if one.error <= enough], each)
+    return plain, sorted(moved, key=lambda one: one.error)[:TRIED]
 
 
-def _needed(fit: _FactorFit, problem: Shooting, k: int, trial: Trial) -> bool:
+def _explained(
+    fit: _FactorFit, problem: Shooting, short: Shooting, plain: Sequence[_Start], moved: Sequence[_Start]
+) -> tuple[float, list[Cause]]:
+    """Error of free runs without a factor, and the terms whose factor explains it."""
+    before = min(one.error for one in _tried(fit, problem, plain, STEPS, held=True))
+    trials = _fitted(fit, problem, moved)
+    least = min((one.error for one in trials.values()), default=math.inf)
+    found = [
+        _cause(fit, problem, short, k, one, before)
+        for k, one in trials.items()
+        if one.error <= min(TOLD * least, NAMED * before)
+    ]
+    return before, [one for one in found if one.why and one.ratio <= (NAMED if one.exact else GUESSED)]
+
+
+def causes_of_refusal(
+    make: Callable[..., Prior], recorded: Sequence[Trajectory], dt: float, longest: float, time_unit: float
+) -> tuple[Cause, ...]:
+    """Mistakes of a unit, or of a sign, with which a prior is refused: too stiff for the period, or not observable.
+
+    Each term that would make the prior fit for use gets such a factor, and its parameters are fitted to short runs. A
+    ratio is the error of free runs with the mistake mended over the outputs' spread.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        recorded: Training trajectories as recorded.
+        dt: Model period [s].
+        longest: Length [s] of the free runs by which models are judged.
+        time_unit: The machine's second [s].
+    """
+    if _fits(make, dt, time_unit):
+        return ()
+    fit = _FactorFit(make, dt)
+    usable, known = [], None
+    for k in range(len(fit.term_names)):
+        for value in (value for value, _ in READINGS if value not in (0.5, 2.0)):
+            one = _with_mended(make, k, value)
+            if _fits(one, dt, time_unit):
+                known = known or _smoothed(one, recorded, dt, time_unit)
+                usable.append(_Start(k, np.append(fit.nominal[:-1], value)))
+    if known is None:
+        return ()
+    tried: list[Trial] = []
+    for steps in (0, STEPS):
+        if tried:  # first states as the best of them smooths them
+            usable = [usable[one.start] for one in tried[:TRIED]]
+            best = _with_mended(make, usable[0].term, float(usable[0].theta[-1]))
+            known = _smoothed(best, recorded, dt, time_unit)
+        fit.points = visited(known[0])
+        short = shooting(fit, known[0], known[1], min(LENGTHS[1] * time_unit, longest), TRIALS)
+        tried = sorted(_tried(fit, short, usable, steps, held=True), key=lambda one: one.error)
+    alike = [one for one in tried if one.error <= min(GUESSED, ALIKE * tried[0].error)]
+    alike.sort(key=lambda one: _off_nominal(fit, one.theta))
+    values = [
+        (fit.term_names[usable[one.start].term], float(one.theta[-1]), one.error) for one in alike[:MOST]
+    ]
+    return tuple(Cause(name, reading_of(value), error, value, before=False) for name, value, error in values)
+
+
+def _fits(make: Callable[..., Prior], dt: float, time_unit: float) -> bool:
+    """Whether a prior is observable, and not too stiff for the period."""
+    try:
+        check_observable(make(), dt, time_unit)
+        required_substeps(make(), dt)
+    except InputError:
+        return False
+    return True
+
+
+def _with_mended(make: Callable[..., Prior], term: int, value: float) -> type[Prior]:
+    """The prior as a class of its own whose factor on one term is ``value``."""
+    base = with_factor(make)
+    fixed = {"factor": value, f"chosen {term}": 1.0}
+    own = (
+        Parameter(p.name, fixed[p.name], p.unit, fixed[p.name], fixed[p.name]) if p.name in fixed else p
+        for p in base.parameters
+    )
+    return type(base.__name__, (base,), {"parameters": tuple(own), "__module__": __name__})
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A start of a trial fit: the term that has the factor (-1: none), ``theta`` with the factor behind it, and the
+    error over short windows.
+    """
+
+    term: int
+    theta: Array
+    error: float = math.inf
+
+
+def _tried(
+    fit: _FactorFit, problem: Shooting, begun: Sequence[_Start], steps: int, held: bool = False
+) -> list[Trial]:
+    """Trial fits from starts, by their numbers.
+
+    Args:
+        fit: Parameters with the factor, which is held where ``held`` says so.
+        problem: Windows.
+        begun: Starts.
+        steps: Pairs of Gauss-Newton steps; without any, first states alone are fitted.
+        held: Whether factors stay as they are.
+    """
+    groups: dict[int, list[int]] = {}
+    for i, one in enumerate(begun):  # a stiff one does not slow the others down
+        substeps = fit.choosing([one.term]).most_substeps(one.theta[None])
+        groups.setdefault(substeps.bit_length(), []).append(i)
+    found = []
+    for own in groups.values():
+        every = problem.several(
+            np.stack([begun[i].theta for i in own]),
+            lambda numbers, own=own: fit.choosing([begun[own[i]].term for i in numbers]),  # type: ignore[misc]
+            [len(own)] * steps,
+            -1 if held else None,
+        )
+        found += [replace(one, start=own[one.start]) for one in every]
+    return found
+
+
+def _units(fit: _FactorFit, few: Shooting) -> list[_Start]:
+    """Mistakes of a unit that explain a few short windows best at the nominal values, ``EACH`` of a term at most."""
+    (before,) = _tried(fit, few, [_Start(-1, fit.nominal)], 0)
+    terms = len(fit.term_names)
+    begun = [_Start(k, np.append(fit.nominal[:-1], unit)) for k in range(terms) for unit in UNITS]
+    slow = [one for one in begun if fit.choosing([one.term]).most_substeps(one.theta[None]) < MAX_SUBSTEPS]
+    better = [one for one in _tried(fit, few, slow, 0) if one.error < BETTER * before.error]
+    return _best(slow, better, EACH)[: max(TRIED, terms)]
+
+
+def _best(begun: Sequence[_Start], trials: Sequence[Trial], each: int) -> list[_Start]:
+    """Starts from where trial fits ended, ``each`` of a term at most; the best come first."""
+    count: Counter[int] = Counter()
+    found = []
+    for one in sorted(trials, key=lambda trial: trial.error):
+        own = begun[one.start]
+        count[own.term] += 1
+        if count[own.term] <= each:
+            found.append(replace(own, theta=one.theta, error=one.error))
+    return found
+
+
+def _cause(
+    fit: _FactorFit, problem: Shooting, short: Shooting, term: int, free: Trial, before: float
+) -> Cause:
+    """What a term's factor says: a value that says what the mistake is where that explains as much as any other, those
+    with parameters nearest to their nominal values where several do.
+    """
+    name = fit.term_names[term]
+    why = reading_of(float(free.theta[-1]), _needed(fit, problem, term, free))
+    plain = Cause(name, why, free.error / before, float(free.theta[-1]))
+    if not why or not free.theta[-1]:
+        return plain
+    values = [value for value, _ in READINGS if 1 / TAKEN < value / free.theta[-1] < TAKEN]
+    if not values:
+        return plain
+    begun = [_Start(term, np.append(fit.nominal[:-1], value)) for value in values]
+    begun = _best(begun, _tried(fit, short, begun, STEPS, held=True), len(values))
+    begun += [_Start(term, np.append(free.theta[:-1], value)) for value in values]
+    held = _tried(fit, problem, begun, STEPS, held=True)
+    least = min(free.error, *(one.error for one in held))
+    alike = [one for one in held if one.error <= least / BETTER]
+    if not alike:
+        return plain
+    alike.sort(key=lambda one: _off_nominal(fit, one.theta))
+    said = list(dict.fromkeys(reading_of(float(one.theta[-1])) for one in alike))
+    chosen = alike[0]
+    return Cause(name, ", or ".join(said[:2]), chosen.error / before, float(chosen.theta[-1]))
+
+
+def _needed(fit: _FactorFit, problem: Shooting, term: int, trial: Trial) -> bool:
     """Whether free runs need a term whose factor is small."""
     if abs(trial.theta[-1]) > SMALL:
         return True
-    without = np.append(trial.theta[:-1], 0.0)[None]
-    (nothing,) = problem.several(without, lambda numbers: fit.choosing([k] * len(numbers)), [])
+    (nothing,) = _tried(fit, problem, [_Start(term, np.append(trial.theta[:-1], 0.0))], 0)
     return trial.error < BETTER * nothing.error
 
 
-def _fitted(
-    fit: _FactorFit, problem: Shooting, begun: Sequence[tuple[int, Array]]
-) -> tuple[float, dict[int, Trial]]:
-    """Error without a factor, and for each term what is best of the fits that went on to the end."""
-
-    def choosing(numbers: Sequence[int]) -> _FactorFit:
-        return fit.choosing([begun[i][0] for i in numbers])
-
-    plain = [theta for k, theta in begun if k < 0]
-    before = min(
-        t.error
-        for t in problem.several(np.stack(plain), lambda n: fit.choosing([-1] * len(n)), [len(plain)] * STEPS)
-    )
-    keep = [max(TRIED, len(begun) // 2**i) for i in range(2 * STEPS)]
+def _fitted(fit: _FactorFit, problem: Shooting, begun: Sequence[_Start]) -> dict[int, Trial]:
+    """For each term the best of the fits with a free factor that went on to the end."""
     found: dict[int, Trial] = {}
-    every = problem.several(np.stack([theta for _, theta in begun]), choosing, keep)
-    for one in sorted(every, key=lambda t: t.error):
-        k = begun[one.start][0]
-        other = found.setdefault(k, one)
+    for one in sorted(_tried(fit, problem, begun, 2 * STEPS), key=lambda trial: trial.error):
+        other = found.setdefault(begun[one.start].term, one)
         turned = one.theta[-1] < 0.0 and abs(one.theta[-1] + 1.0) < abs(other.theta[-1] + 1.0)
         if turned and other.theta[-1] < 0.0 and other.error > BETTER * one.error:
-            found[k] = one  # where its size is unknown, its sign alone counts
-    found.pop(-1, None)
-    return before, found
+            found[begun[one.start].term] = one  # where its size is unknown, its sign alone counts
+    return found
 
 
 def _smoothed(
@@ -540,7 +751,7 @@ def _signals(
         known, sizes, _ = _smoothed(make, [change(t) for t in recorded], dt, time_unit)
         fit = _Lenient(make, dt)
         fit.points = visited(known)
-        problem = _cut(fit, known, sizes, length)
+        problem = shooting(fit, known, sizes, length, TRIALS)
         found = problem.several(np.stack(starts), lambda numbers, own=fit: own, [len(starts)] * STEPS)  # type: ignore[misc]
         yield Cause(what, why, min(t.error for t in found) / before)
 

@@ -69,8 +69,9 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import SwitchingFilter
 from hybrid_mpc.job.controllers import OBSERVERS, find_noise
-from hybrid_mpc.kit.artifact import FILE, Kit, artifact_folder, load
+from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import MODES, make_ocp
+from hybrid_mpc.kit.parts import KIT, MODELS, artifact_folder
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.equilibrium import hidden_equilibrium, holding_input
@@ -284,7 +285,7 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     """Read what is analyzed, with notes on where it came from."""
     folder = artifact_folder(settings.folder)
     kit = load(folder)
-    scenario = scenario_of(kit.provenance.scenario, folder / FILE, settings.scenario)
+    scenario = scenario_of(kit.provenance.scenario, folder / KIT, settings.scenario)
     if scenario is None and settings.data:
         raise InputError("--data needs --scenario, which names the columns of the recordings")
     model = next(iter(kit.models.values()))
@@ -304,8 +305,8 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
         notes.append(f"filters' noise: {source}")
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
-        kit.models, load_programs(folder), state_range(model, control), input_range(model, control), speed, ocp,
-        filters, plant, _recordings(settings.data, scenario, model), state_range(model),
+        kit.models, load_programs(folder / MODELS), state_range(model, control), input_range(model, control), speed,
+        ocp, filters, plant, _recordings(settings.data, scenario, model), state_range(model),
     ), tuple(notes)  # fmt: skip
 
 

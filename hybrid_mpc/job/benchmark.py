@@ -45,7 +45,7 @@ from hybrid_mpc.job.context import Progress, versions
 from hybrid_mpc.job.folder import JobNote, write_note
 from hybrid_mpc.job.stages.choose import CANDIDATES
 from hybrid_mpc.job.stages.identify import PARTS, load_trained, save_trained, train_kinds
-from hybrid_mpc.kit.artifact import BENCHMARK_NOTE
+from hybrid_mpc.kit.parts import BENCHMARK_NOTE
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import plain, record

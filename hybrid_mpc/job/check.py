@@ -20,8 +20,9 @@ from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of
 from hybrid_mpc.job.check_prior import DRIFT, Report, check_prior
 from hybrid_mpc.job.default_tasks import default_tasks
-from hybrid_mpc.kit.artifact import build_model, loop_settings
+from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import make_controller, make_estimator
+from hybrid_mpc.kit.parts import loop_settings
 from hybrid_mpc.loop.faults import check_channels, install
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.loop.plant import Plant

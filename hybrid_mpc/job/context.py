@@ -16,11 +16,12 @@ from hybrid_mpc import __version__
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest, sha256
+from hybrid_mpc.files import digest
 from hybrid_mpc.job.settings import RunSettings
 from hybrid_mpc.job.stage import Absent, Stage, Stored, read_stage, write_stage
 from hybrid_mpc.job.tasks import ready
 from hybrid_mpc.kit.artifact import Kit, load
+from hybrid_mpc.kit.parts import artifact_digest
 from hybrid_mpc.machine.specification import DataSpec, Role
 from hybrid_mpc.scenario import Budget, Scenario
 
@@ -164,10 +165,10 @@ class Context:
     def kit(self) -> Kit:
         """The run's artifact as it is now, with the control problems that the scenario now states.
 
-        It is read again only where its description has changed: that names the programs by their contents.
+        It is read again only where one of its files has changed.
         """
         folder = self.out / "model"
-        content = sha256(folder / "model.json")
+        content = artifact_digest(folder)
         if content not in self._kits:
             self._kits.clear()
             self._kits[content] = load(folder).on(self.scenario)

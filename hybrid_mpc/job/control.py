@@ -21,7 +21,7 @@ from hybrid_mpc.job.study_log import NoiseNote
 from hybrid_mpc.job.study_run import StudyModel, load_models
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.job.tasks import tasks_of
-from hybrid_mpc.kit.artifact import Provenance
+from hybrid_mpc.kit.parts import Provenance
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.faults import fault_text
 from hybrid_mpc.loop.realtime import percentiles

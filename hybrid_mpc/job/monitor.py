@@ -16,8 +16,9 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json, write_text
 from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.controllers import find_noise
-from hybrid_mpc.kit.artifact import Kit, artifact_folder, load
+from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import energy_is_watched, make_monitor, sensor_steps
+from hybrid_mpc.kit.parts import artifact_folder
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import Calibration

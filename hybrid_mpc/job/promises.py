@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.analyze.linearize import linearize
-from hybrid_mpc.analyze.margins import mpc_loop, solved_gain, steady_filter
+from hybrid_mpc.analyze.margins import Margins, mpc_loop, solved_gain, steady_filter
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
@@ -73,6 +73,13 @@ CARRIES = 0.95
 MODULUS = 0.5
 """Least distance of the Nyquist curve from -1: peak sensitivity 2, gain margin 2, phase margin 29 degrees (Astrom and
 Hagglund, *Advanced PID Control*, 2006, section 4.6)."""
+SOFTER = "Larger weights of changes (r_delta), or less process noise; hybrid-mpc analyze shows more."
+BY_NETWORK = (
+    "The network's slope at the set-point takes this margin: record small motions about the set-point and run again. "
+    "Start on the machine with small steps, and compare with the prior's loop (hybrid-mpc control --controller "
+    "prior_observer --controller hybrid_observer)."
+)
+"""What to do about small margins: of any loop, and of a hybrid's where the prior's are larger."""
 HALF = 0.5
 """Share of the period that 99 of 100 steps may take: the rest is for sensors, for the actuator and for other work."""
 NEAR = 0.05
@@ -629,34 +636,60 @@ def _left_costs(point: SetPoint) -> Array:
     return np.array(found) / found[0]
 
 
-def margins(points: Sequence[SetPoint]) -> Promise:
-    """Stability margins of the loop of observer and controller, linearized at the set-points, broken at each input."""
+def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Promise:
+    """Stability margins of the loop of observer and controller, linearized at the set-points, broken at each input.
+
+    Args:
+        points: Set-points of the recommended model.
+        of_prior: The same of the fitted prior, if that is not recommended: they say whether the network takes the
+            margin.
+    """
     name = "stability margins"
-    remedy = "Larger weights of changes (r_delta), or less process noise; hybrid-mpc analyze shows more."
-    worst: tuple[float, str, bool] | None = None
-    lacks = []
+    worst: tuple[SetPoint, Signal, Margins] | None = None
+    lacks, good = [], True
     for point in points:
-        model, (x, u) = point.model, point.rest
         try:
-            h = hidden_fixed_point(model, x, u, w=point.w)
-            gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.w)
-            system = linearize(model, x, u, h)
-            loop = mpc_loop(gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system)
-            for j, signal in enumerate(model.inputs):
-                own = loop.margins(j)
-                late = f"{own.delay_periods} period" + "s" * (own.delay_periods != 1)
-                told = (
-                    f"at {signal.name} in {point.title}: gain {own.gain_down:.2g} to {own.gain_up:.3g} times, phase "
-                    f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay"
-                )
-                good = own.modulus >= MODULUS and own.delay_periods >= 1
-                if worst is None or own.modulus < worst[0]:
-                    worst = own.modulus, told, good and (worst is None or worst[2])
+            for signal, own in _margins_at(point):
+                good &= own.modulus >= MODULUS and own.delay_periods >= 1
+                if worst is None or own.modulus < worst[2].modulus:
+                    worst = point, signal, own
         except InputError as error:
             lacks.append(f"{point.title}: {error}")
     if lacks or worst is None:
-        return Promise(name, "not promised", "; ".join(lacks), remedy)
-    return Promise(name, "shown" if worst[2] else "doubted", worst[1], "" if worst[2] else remedy)
+        return Promise(name, "not promised", "; ".join(lacks), SOFTER)
+    point, signal, own = worst
+    late = f"{own.delay_periods} period" + "s" * (own.delay_periods != 1)
+    told = (
+        f"at {signal.name} in {point.title}: gain {own.gain_down:.2g} to {own.gain_up:.3g} times, phase "
+        f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay"
+    )
+    if good:
+        return Promise(name, "shown", told)
+    told += f": beyond these the linearized loop is unstable (a distance of {MODULUS:g} is good)"
+    other = _distance(of_prior, signal)
+    if other is None:
+        return Promise(name, "doubted", told, SOFTER)
+    told += f"; with the fitted prior as model and controller the distance is {other:.2g}"
+    return Promise(name, "doubted", told, BY_NETWORK if other > 2 * own.modulus else SOFTER)
+
+
+def _margins_at(point: SetPoint) -> list[tuple[Signal, Margins]]:
+    """Margins of a set-point's loop by input."""
+    model, (x, u) = point.model, point.rest
+    h = hidden_fixed_point(model, x, u, w=point.w)
+    gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.w)
+    system = linearize(model, x, u, h)
+    loop = mpc_loop(gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system)
+    return [(signal, loop.margins(j)) for j, signal in enumerate(model.inputs)]
+
+
+def _distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
+    """Least distance from -1 at an input over set-points; None where there is none."""
+    try:
+        found = [own.modulus for point in points for s, own in _margins_at(point) if s == signal]
+    except InputError:  # the prior's loop has no linearization there
+        return None
+    return min(found, default=None)
 
 
 # Limits.
@@ -900,12 +933,17 @@ def examine(
         tasks_end(ends, where),
         step_time(own, 1e3 * points[0].model.dt),
         horizon(points),
-        margins(points),
+        margins(points, _of_prior(kit, tasks)),
         limits(points, own, given_way or {}),
         process_noise(kit),
         innovations(tested),
         disturbance_model(points, [trials[0] for trials in every]),
     )
+
+
+def _of_prior(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
+    """Set-points of the fitted prior; none where it is what the kit recommends."""
+    return [] if kit.recommended == "prior" else set_points(replace(kit, recommended="prior"), tasks)
 
 
 def _needed(longer: Trial) -> str:

@@ -19,7 +19,7 @@ from hybrid_mpc.job.stages.choose import CANDIDATES, CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION
 from hybrid_mpc.job.stages.evaluate import EVALUATION
-from hybrid_mpc.job.stages.export import EXPORT, NOISE
+from hybrid_mpc.job.stages.export import EXPORT, NOISE, TASKS
 from hybrid_mpc.job.stages.guard import GUARD
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
 from hybrid_mpc.job.stages.monitor import MONITOR
@@ -32,13 +32,16 @@ from hybrid_mpc.records import known
 from hybrid_mpc.scenario import load_scenario
 
 STAGES: tuple[Stage[Any], ...] = (
-    DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES,
+    DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, TASKS, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES,
     RESIDUALS, MONITOR, GUARD, ANALYSIS, REPORT,
 )  # fmt: skip
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
+ALWAYS = (TASKS.name, REPORT.name)
+"""Stages that ``only`` does not leave out: they copy what the scenario and the other stages say."""
 SECONDS = {
-    "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4, "control": 42,
+    "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4, "tasks": 1,
+    "control": 42,
     "on_model": 14, "estimation": 1, "promises": 6, "residuals": 6, "monitor": 6, "guard": 20, "analysis": 1,
     "report": 9,
 }  # fmt: skip
@@ -70,7 +73,8 @@ def run(
         settings: What to compute.
         out: Folder to make; it must be new or empty unless ``resume``.
         resume: Go on with the run that ``out`` holds.
-        only: Names of the stages that may run, and the report; the others are taken as they are. Default: all.
+        only: Names of the stages that may run; the others are taken as they are. ``tasks`` and ``report``
+            always run. Default: all.
         skip: Names of stages after the export that are not to run. Default: none.
         progress: Where to report; default: nowhere.
 
@@ -105,7 +109,7 @@ def run(
             ]
             context.progress.start(stage.title + remaining(took, ahead))
             begun = time.monotonic()
-            if only and stage.name not in (*only, REPORT.name):
+            if only and stage.name not in (*only, *ALWAYS):
                 context.progress.finish(_as_it_is(context, stage, only))
             else:
                 said = bring_up_to_date(context, stage, stage.name in skip)
@@ -161,7 +165,7 @@ def _end(context: Context, only: Sequence[str]) -> Stage[Any] | None:
     if not only:
         return None
     for i, stage in enumerate(STAGES):
-        if stage.optional or stage.name in (*only, REPORT.name):
+        if stage.optional or stage.name in (*only, *ALWAYS):
             continue
         stored = context.stored(stage)
         if stored is not None and not stored.unfit:

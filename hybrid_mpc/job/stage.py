@@ -37,7 +37,7 @@ LIBRARY = ("hybrid_mpc", "nn_export")
 """Packages whose source counts as a whole, see :func:`program`."""
 LOOK = (
     "cli", "plots", "report",
-    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report")),
+    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report", "watching")),
     *(f"job/{name}.py" for name in ("loop_figures", "step_response")),
 )  # fmt: skip
 """Folders and modules of ``hybrid_mpc`` that no result depends on but the report, which reads them by itself."""

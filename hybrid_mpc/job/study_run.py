@@ -42,8 +42,9 @@ from hybrid_mpc.job.study_log import (
     study_note,
 )
 from hybrid_mpc.job.tasks import ready, selected_tasks
-from hybrid_mpc.kit.artifact import FILES, Kit, artifact_folder, load
+from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import adaptable
+from hybrid_mpc.kit.parts import artifact_files, artifact_folder
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import Scenario, load_scenario
 
@@ -202,12 +203,13 @@ def local_folder(model: ModelInput) -> Path:
         )
     unpacked = Path(tempfile.mkdtemp(prefix="hybrid-mpc-model-"))
     for name, content in model.files:
+        (unpacked / name).parent.mkdir(parents=True, exist_ok=True)
         (unpacked / name).write_bytes(content)
     return unpacked
 
 
 def _files(folder: Path) -> tuple[tuple[str, bytes], ...]:
-    return tuple((name, read_bytes(folder / name, MOST_CONTENT)) for name in sorted(FILES))
+    return tuple((name, read_bytes(folder / name, MOST_CONTENT)) for name in sorted(artifact_files(folder)))
 
 
 def _digest(files: Sequence[tuple[str, bytes]]) -> str:

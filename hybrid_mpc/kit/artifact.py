@@ -1,7 +1,7 @@
 """The artifact: a folder of deployed models as data, and the kit of a loop's parts that is made of it.
 
-``model.json`` describes, ``programs.json`` and ``weights.safetensors`` hold the models' functions. Loading needs no
-torch and executes nothing from the folder.
+The folder is composed of files that :mod:`hybrid_mpc.kit.parts` describes. Loading needs no torch and executes nothing
+from the folder.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
-from hybrid_mpc.files import digest, is_file, read_document, read_object, reason, sha256, write_document
+from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.kit.assembly import (
     energy_is_watched,
     make_adaptive_guard,
@@ -30,13 +30,36 @@ from hybrid_mpc.kit.assembly import (
     sensor_steps,
 )
 from hybrid_mpc.kit.at_use import ModelsAtUse
+from hybrid_mpc.kit.parts import (
+    AGAIN,
+    BALANCE,
+    ENERGY,
+    GUARD,
+    HYBRID,
+    KIT,
+    MODELS,
+    OBSERVER,
+    PROGRAMS,
+    RESIDUALS,
+    TASKS,
+    Description,
+    LoopSettings,
+    ModelInfo,
+    Provenance,
+    artifact_folder,
+    loop_settings,
+    read_parts,
+    save_loop,
+    set_calibration,
+    tuples,
+    write_description,
+)
 from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.kit.promises import Promise, PromiseTable, none_made, read_promises
 from hybrid_mpc.loop.guard import Guard
-from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
-from hybrid_mpc.model.limits import check_flag, numbers
+from hybrid_mpc.model.limits import check_flag
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
 from hybrid_mpc.monitor.calibrate import Calibration
 from hybrid_mpc.monitor.detector import Detector
@@ -44,24 +67,10 @@ from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.monitor.lengths import SHARE
 from hybrid_mpc.monitor.residuals import ResidualLimits, ResidualMonitor
-from hybrid_mpc.records import Fields, known, plain, record
-from hybrid_mpc.rules import Duration, Line, Name, NameOrNone, NotNegative, Number, Positive, Seconds, Unit
+from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Scenario
 
-SCHEMA_VERSION = 4
-FILE, PROGRAMS = "model.json", "programs.json"
-BENCHMARK_NOTE = "benchmark_model.json"
-"""File of a benchmark's model, which is no artifact."""
-FILES = (FILE, PROGRAMS, "weights.safetensors")
-"""All files of an artifact; others in its folder do not belong to it."""
-MOST_MODELS = 16
-"""Models that an artifact may hold: prior, hybrid, and a few to compare them with."""
-HYBRID = "hybrid"
-MOST_MEMBERS = 32
-"""Other networks of the hybrid's training that an artifact may hold."""
 FUNCTIONS = ("step", "xdot", "output")
-BALANCE = "balance"
-"""Function of a balance: its program is ``<model>/balance/<name of the balance>``."""
 INPUTS = {
     "step": STEP_INPUTS,
     "xdot": STEP_INPUTS,
@@ -80,205 +89,6 @@ WITHOUT = (
 )
 
 
-@dataclass(frozen=True)
-class BalanceInfo:
-    """Name and units of a :class:`~hybrid_mpc.model.model.Balance`: of the storage, of its rate and of the residual."""
-
-    name: Name
-    unit: Unit
-    rate_unit: Unit
-
-    def __post_init__(self) -> None:
-        Fields(self, f"balance {self.name!r}").refuse()
-
-    @property
-    def program(self) -> str:
-        """Name of its program among those of a model."""
-        return f"{BALANCE}/{self.name}"
-
-
-@dataclass(frozen=True)
-class ModelInfo:
-    """What the models' programs do not say themselves; the same for all models of an artifact.
-
-    Args:
-        dt: Model period [s].
-        states: Signals of x.
-        inputs: Signals of u.
-        outputs: Signals of y.
-        parameters: The prior's parameters with their fitted values, in the order of p. Default: none.
-        input_delay: Time [s] from a command to the input that the programs take. Default: none.
-        time_unit: The machine's second [s], see :class:`~hybrid_mpc.model.model.HybridModel`. Default 1.
-        disturbances: Signals of w. Default: none.
-        nominal_w: What is taken for w where none is given. Default: zeros.
-        covariance: Rows of the covariance of the fitted values. Default: unknown.
-        balances: Balances that have programs. Default: none.
-        nominal_x: State of the operating point. Default: zeros.
-        nominal_u: Input of the operating point. Default: zeros.
-        state_spread: Spread of the states in the training recordings; 0 where one does not move. Default: not known.
-        output_spread: Likewise of the outputs.
-
-    Raises:
-        InputError: If a field is of another kind, the period or the machine's second is not positive, the delay
-            negative, or two signals of one kind, parameters or balances have one name; all of it together.
-    """
-
-    dt: Seconds
-    states: tuple[Signal, ...]
-    inputs: tuple[Signal, ...]
-    outputs: tuple[Signal, ...]
-    parameters: tuple[Parameter, ...] = ()
-    input_delay: Duration = 0.0
-    time_unit: Positive = 1.0
-    disturbances: tuple[Signal, ...] = ()
-    nominal_w: tuple[Number, ...] = ()
-    covariance: tuple[tuple[float, ...], ...] = ()
-    balances: tuple[BalanceInfo, ...] = ()
-    nominal_x: tuple[Number, ...] = ()
-    nominal_u: tuple[Number, ...] = ()
-    state_spread: tuple[NotNegative, ...] = ()
-    output_spread: tuple[NotNegative, ...] = ()
-
-    def __post_init__(self) -> None:
-        own = Fields(self, "model")
-        for role in ("states", "inputs", "outputs", "disturbances", "parameters", "balances"):
-            own.distinct(role, partial(_names, self, role), f"{role}: the name")
-        own.refuse()
-
-
-def _names(info: ModelInfo, role: str) -> list[str]:
-    return [one.name for one in getattr(info, role)]
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """What an artifact was made from. None of it is a path, and nothing of it is ever executed.
-
-    Args:
-        scenario: Name of the scenario.
-        seed: Seed of data and training.
-        budget: Name of the budget.
-        data_hash: Hash of the recordings.
-        versions: Versions of the packages.
-        prior_parameters: Fitted values [SI] of the prior's parameters by name.
-    """
-
-    scenario: Line = ""
-    seed: int = 0
-    budget: Line = ""
-    data_hash: Line = ""
-    versions: Mapping[Line, Line] = field(default_factory=dict)
-    prior_parameters: Mapping[Name, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class LoopSettings:
-    """What loops need beside the models.
-
-    Args:
-        control: Control problems by task; under ``""`` the one of all tasks that have none of their own. Default: none.
-        sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them.
-        first_sigma: Those of the states that no output shows alone, at an estimator's start. Default: by the sensors'
-            and the states' ranges.
-        process_noise: Standard deviations per period ``(n_x,)`` [state units] by model, and by model with ``_observer``
-            behind it where the estimator follows an unknown load.
-        causes: What may break, by name: the parameters that change together then.
-        safe_input: Input ``(n_u,)`` that the machine may be left with. Default: none is declared.
-        tasks: Names of the tasks, with or without a control problem of their own. Default: those of ``control``.
-        disturbance_model: What unmeasured disturbances are added to. Default: one at each input.
-
-    Raises:
-        InputError: If a field is of another kind, a deviation is negative or not finite, a task has two problems of one
-            name, or the safe input is outside a problem's limits; all of it together.
-    """
-
-    control: Mapping[NameOrNone, OCP] = field(default_factory=dict)
-    sensor_sigma: tuple[NotNegative, ...] = ()
-    first_sigma: tuple[NotNegative, ...] | None = None
-    process_noise: Mapping[Name, tuple[NotNegative, ...]] = field(default_factory=dict)
-    causes: Mapping[Name, tuple[Name, ...]] = field(default_factory=dict)
-    safe_input: tuple[Number, ...] | None = None
-    tasks: tuple[Name, ...] = ()
-    disturbance_model: tuple[Disturbance, ...] | None = None
-
-    def __post_init__(self) -> None:
-        own = Fields(self, "loop")
-        own.distinct("tasks", lambda: self.tasks, "tasks: the name")
-        own.need(
-            "safe_input control",
-            lambda: (
-                self.safe_input is None or all(_within(self.safe_input, p) for p in self.control.values())
-            ),
-            f"safe_input {self.safe_input} is outside the limits of a control problem",
-        )
-        own.refuse()
-
-
-def _within(u: tuple[float, ...], problem: OCP) -> bool:
-    """Whether an input fits a problem's number of inputs and their limits."""
-    return len(u) == problem.n_u and all(
-        low <= value <= high for value, low, high in zip(u, problem.u_min, problem.u_max, strict=True)
-    )
-
-
-def loop_settings(
-    scenario: Scenario, process_noise: Mapping[str, tuple[float, ...]] | None = None
-) -> LoopSettings:
-    """What a scenario's loops need beside the models; process noise by estimator, unless it is estimated later."""
-    problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
-    safe = scenario.safe_input
-    return LoopSettings(
-        {name: problem for name, problem in problems.items() if problem is not None},
-        scenario.sensor_sigma,
-        scenario.first_sigma,
-        dict(process_noise or {}),
-        dict(scenario.causes),
-        None if safe is None else tuple(numbers(safe, "safe_input").tolist()),
-        tuple(task.name for task in scenario.tasks),
-        scenario.disturbance_model,
-    )
-
-
-@dataclass(frozen=True)
-class Description:
-    """What ``model.json`` holds beside its schema version and its hash.
-
-    ``recommended`` is the model that a loop is made of where none is named; empty: the hybrid. ``residuals`` are the
-    limits of the monitor of residuals, by model. ``members`` is how many networks the hybrid is the mean of, each
-    held alone beside it, the best first (none: it is a single one); ``predicting`` what predictions of recordings need
-    beside the models.
-
-    Raises:
-        InputError: If there are no models, too many, or two of one name.
-    """
-
-    models: tuple[Name, ...]
-    programs_sha256: Line
-    model: ModelInfo
-    calibration: Calibration | None
-    provenance: Provenance
-    loop: LoopSettings = field(default_factory=LoopSettings)
-    recommended: NameOrNone = ""
-    residuals: Mapping[Name, ResidualLimits] = field(default_factory=dict)
-    members: int = 0
-    predicting: Predicting | None = None
-
-    def __post_init__(self) -> None:
-        Fields(self, "artifact").refuse()
-        if not 0 <= self.members <= (MOST_MEMBERS if HYBRID in self.models else 0):
-            raise InputError(
-                f"members: 0 to {MOST_MEMBERS} networks beside a model {HYBRID!r} are needed, got {self.members}"
-            )
-        if strange := [name for name in self.residuals if name not in self.models]:
-            raise InputError(f"residuals: no model {strange[0]!r}; there are: {', '.join(self.models)}")
-        if self.recommended and self.recommended not in self.models:
-            raise InputError(
-                f"recommended: no model {self.recommended!r}; there are: {', '.join(self.models)}"
-            )
-        if not 0 < len(set(self.models)) == len(self.models) <= MOST_MODELS:
-            raise InputError(f"models: 1 to {MOST_MODELS} different names are needed, got {len(self.models)}")
-
-
 def save_artifact(
     folder: Path,
     programs: Mapping[str, Mapping[str, nn_export.Program]],
@@ -291,16 +101,16 @@ def save_artifact(
     members: Sequence[Mapping[str, nn_export.Program]] = (),
     predicting: Predicting | None = None,
 ) -> None:
-    """Write models to ``folder``; ``model.json`` comes last.
+    """Write models to ``folder``, and what loops on them need.
 
     Args:
         folder: Made if missing.
         programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``, and of each of its
             balances, ``programs["hybrid"]["balance/energy"]``.
         info: Period and signals, the same for all models.
-        calibration: Calibration of the monitor.
+        calibration: Thresholds of the energy, and the guard's detector. Default: none are written.
         provenance: What the models were made from.
-        loop: What loops need beside the models.
+        loop: What loops need beside the models. Default: nothing is written.
         recommended: Model that a loop is made of where none is named. Default: the hybrid.
         members: ``step`` and ``xdot`` of each network that the hybrid is the mean of, the best first. Default: none.
         predicting: What predictions of recordings need beside the models. Default: there can be none.
@@ -308,98 +118,45 @@ def save_artifact(
     Raises:
         InputError: If an expression of a control problem cannot be stated as a program.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    save_models(
+        folder,
+        programs,
+        info,
+        provenance=provenance,
+        recommended=recommended,
+        members=members,
+        predicting=predicting,
+    )
+    if loop is not None:
+        save_loop(folder, loop)
+    if calibration is not None:
+        set_calibration(folder, calibration)
+
+
+def save_models(
+    folder: Path,
+    programs: Mapping[str, Mapping[str, nn_export.Program]],
+    info: ModelInfo,
+    *,
+    provenance: Provenance | None = None,
+    recommended: str = "",
+    members: Sequence[Mapping[str, nn_export.Program]] = (),
+    predicting: Predicting | None = None,
+) -> str:
+    """Write ``models/`` and then ``kit.json``, as :func:`save_artifact`; returns the hash of the programs."""
     flat = {f"{model}/{name}": p for model, functions in programs.items() for name, p in functions.items()}
     for name, own in zip(member_names(len(members)), members, strict=True):
         flat |= {f"{name}/{key}": own[key] for key in OWN}
-    nn_export.save_programs(folder, flat)
-    digest, origin = sha256(folder / PROGRAMS), provenance or Provenance()
+    (folder / MODELS).mkdir(parents=True, exist_ok=True)
+    nn_export.save_programs(folder / MODELS, flat)
+    hashed = sha256(folder / PROGRAMS)
     write_description(
         folder,
         Description(
-            tuple(programs), digest, info, calibration, origin, loop or LoopSettings(), recommended,
-            members=len(members), predicting=predicting,
+            tuple(programs), hashed, info, provenance or Provenance(), recommended, len(members), predicting
         ),
-    )  # fmt: skip
-
-
-def set_calibration(folder: Path, calibration: Calibration) -> None:
-    """Put the monitor's calibration into an artifact.
-
-    Raises:
-        InputError: If the folder holds no artifact.
-        StorageError: If it cannot be written.
-    """
-    write_description(folder, replace(read_description(folder), calibration=calibration))
-
-
-def set_residuals(folder: Path, residuals: Mapping[str, ResidualLimits]) -> None:
-    """Put the limits of the monitor of residuals, by model, into an artifact.
-
-    Raises:
-        InputError: If the folder holds no artifact, or no such model.
-        StorageError: If it cannot be written.
-    """
-    write_description(folder, replace(read_description(folder), residuals=dict(residuals)))
-
-
-def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
-    """Put the process noise of the estimators into an artifact: standard deviations per period ``(n_x,)``, by
-    estimator.
-
-    Raises:
-        InputError: If the folder holds no artifact.
-        StorageError: If it cannot be written.
-    """
-    found = read_description(folder)
-    write_description(folder, replace(found, loop=replace(found.loop, process_noise=_tuples(noise))))
-
-
-def _tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:
-    return {name: tuple(np.asarray(sigma, dtype=float).tolist()) for name, sigma in noise.items()}
-
-
-def write_description(folder: Path, description: Description) -> None:
-    """Write ``model.json`` with the hash of its content."""
-    write_document(folder / FILE, {"schema_version": SCHEMA_VERSION, **plain(description)})
-
-
-def read_description(folder: Path) -> Description:
-    """What an artifact says of itself; InputError if it is missing, damaged, changed by hand, or of another schema."""
-    path = folder / FILE
-    if read_object(path).get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            f"{path} is no artifact of schema version {SCHEMA_VERSION} (field schema_version): this version of "
-            "hybrid-mpc reads no other; train it anew"
-        )
-    document = read_document(path, "take the folder from its run again, or train it anew")
-    del document["schema_version"]
-    return record(Description, document, str(path))
-
-
-def artifact_folder(folder: Path) -> Path:
-    """The artifact's folder, given it or the folder of a run that holds it as ``model``; InputError if neither holds
-    one.
-    """
-    for place in (folder, folder / "model"):
-        if is_file(place / FILE):
-            return place
-    for place in (folder, folder / "model"):
-        if is_file(place / BENCHMARK_NOTE):
-            raise InputError(
-                f"{folder} is the folder of a benchmark: its model ({place / BENCHMARK_NOTE}) predicts and has no "
-                f"controller. Evaluate it with: hybrid-mpc benchmark SCENARIO --model {folder} --test FILE. For loops "
-                "make an artifact of the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER"
-            )
-    try:
-        state = (
-            "holds no model.json" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
-        )
-    except OSError as error:
-        state = f"cannot be looked into ({reason(error)})"
-    raise InputError(
-        f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
     )
+    return hashed
 
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
@@ -466,11 +223,14 @@ def _built(
 def load(folder: str | Path) -> Kit:
     """The kit of an artifact: models, and all that loops on them need.
 
+    It is composed of the files in the folder (docs/kit.md). What is not there, or was made for other models or another
+    observer, is left out; :attr:`Kit.lacks` names it, and what needs it raises.
+
     Args:
         folder: The run's folder, or its ``model``.
 
     Raises:
-        InputError: If there is none, or a file is missing, damaged, of another schema, or does not fit the others.
+        InputError: If there is none, or a file is damaged or of another version, or the models are not there.
 
     Example:
         ``kit = hm.load("runs/mine")``
@@ -478,23 +238,25 @@ def load(folder: str | Path) -> Kit:
     if not isinstance(folder, str | Path):
         raise InputError(f"load: the path of a folder is needed, got {type(folder).__name__}")
     folder = artifact_folder(Path(folder))
-    found = read_description(folder)
+    parts = read_parts(folder)
+    found = parts.description
     if sha256(folder / PROGRAMS) != found.programs_sha256:
         raise InputError(
-            f"{folder}: {PROGRAMS} is not the one that {FILE} was saved with; take the folder from its run again"
+            f"{folder}: {PROGRAMS} is not the one that {KIT} was saved with: the stage export ended in between, or a "
+            f"file was changed; {AGAIN}, or take the folder from its run"
         )
     try:
-        programs = nn_export.load_programs(folder)
-        models = _at_use(found.models, programs, found.model, found.loop.disturbance_model)
+        programs = nn_export.load_programs(folder / MODELS)
+        models = _at_use(found.models, programs, found.model, parts.loop.disturbance_model)
         members = member_models(programs, found.model, found.members)
     except KeyError as error:
-        raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {FILE} names") from error
+        raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {KIT} names") from error
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
     return Kit(
-        models, found.calibration, found.provenance, found.model.input_delay, found.loop,
-        found.recommended or ("hybrid" if "hybrid" in models else found.models[0]), found.residuals,
-        members, found.predicting, found.programs_sha256, read_promises(folder),
+        models, parts.calibration, found.provenance, found.model.input_delay, parts.loop,
+        found.recommended or (HYBRID if HYBRID in models else found.models[0]), parts.residuals,
+        members, found.predicting, found.programs_sha256, read_promises(folder), parts.lacks,
     )  # fmt: skip
 
 
@@ -529,6 +291,8 @@ class Kit:
         predicting: What :func:`hybrid_mpc.predict` needs beside the models. Default: there can be no predictions.
         programs_sha256: Hash of the models' programs. Default: not known.
         promised: The table that the run left beside the models (:attr:`promises`). Default: there is none.
+        lacks: What the folder does not hold, and which stage of the run writes it, by file. Default: nothing is known
+            to be missing.
 
     Example: the whole way from a folder to a loop::
 
@@ -547,6 +311,7 @@ class Kit:
     predicting: Predicting | None = field(default=None, repr=False)
     programs_sha256: str = field(default="", repr=False)
     promised: PromiseTable | None = field(default=None, repr=False)
+    lacks: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     @property
     def promises(self) -> tuple[Promise, ...]:
@@ -632,7 +397,7 @@ class Kit:
             raise InputError(
                 f"noise: numbers by the name of an estimator are needed, got {type(noise).__name__}"
             )
-        return replace(self, loop=replace(self.loop, process_noise=_tuples(noise)))
+        return replace(self, loop=replace(self.loop, process_noise=tuples(noise)))
 
     def on(self, scenario: Scenario) -> Kit:
         """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now."""
@@ -648,13 +413,13 @@ class Kit:
         Raises:
             InputError: If there is no such task, or no control problem.
         """
-        if _named(task, "task"):
+        if _named(task, "task") and (self.loop.control or TASKS not in self.lacks):
             known(task, sorted({*self.loop.tasks, *self.loop.control} - {""}), "task")
         found = self.loop.control.get(task, self.control)
         if found is None:
             raise InputError(
                 f"{self._whose} was saved without a control problem: define one in the scenario (control=OCP(...)) "
-                "and run it again"
+                f"and run it again{self._lack(TASKS)}"
             )
         return found
 
@@ -670,7 +435,7 @@ class Kit:
         if _named(estimator, "estimator") not in self.loop.process_noise:
             raise InputError(
                 f"{self._whose} was saved without process noise for {estimator}; run the scenario again (its stage "
-                "control estimates it)"
+                f"noise estimates it){self._lack(OBSERVER)}"
             )
         sigma, n_x = np.array(self.loop.process_noise[estimator]), next(iter(self.models.values())).n_x
         if sigma.shape != (n_x,):
@@ -682,8 +447,8 @@ class Kit:
         found = None if self.calibration is None else self.calibration.detector
         if found is None:
             raise InputError(
-                f"{self._whose} holds no detector for the guard: its run had too little nominal data, or did not come "
-                "to the stage guard (its report says why); run the main job again"
+                f"{self._whose} holds no detector for the guard, which the run's stage guard learns; run the main job "
+                f"again with it{self._lack(GUARD)}"
             )
         return found
 
@@ -755,9 +520,8 @@ class Kit:
             limits = self.residuals.get(model or self.recommended)
             if kind != "own" and limits is None:
                 raise InputError(
-                    f"{self._whose} holds no limits of residuals of {watched.name}: its run did not come to the stage "
-                    "residuals (its report says why), or learned them of another model; run the main job again, take "
-                    f"learn_residuals, or {WITHOUT}"
+                    f"{self._whose} holds no limits of residuals of {watched.name}, which the run's stage residuals "
+                    f"learns: run the main job again with it, take learn_residuals, or {WITHOUT}{self._lack(RESIDUALS)}"
                 )
             return ResidualMonitor(watched, limits=None if kind == "own" else limits)
         if kind == "energy":
@@ -765,7 +529,7 @@ class Kit:
                 why = f" ({learned.method.rstrip('.')})" if learned is not None and learned.method else ""
                 raise InputError(
                     f"{self._whose} holds no thresholds of the energy{why}: run the main job again with its stage "
-                    f"monitor, or {WITHOUT}"
+                    f"monitor, or {WITHOUT}{self._lack(ENERGY)}"
                 )
             return make_monitor(watched, learned)
         if kind == "own":
@@ -797,6 +561,11 @@ class Kit:
             return make_resting_guard(hybrid)
         noise, problem = self.noise("hybrid_observer"), self.problem(task)
         return make_adaptive_guard(hybrid, self._model("prior"), self, noise, problem)
+
+    def _lack(self, file: str) -> str:
+        """What is known of a missing file, to put behind a message."""
+        why = self.lacks.get(file)
+        return f" ({why})" if why else ""
 
     @property
     def _whose(self) -> str:

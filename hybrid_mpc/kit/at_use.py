@@ -40,3 +40,6 @@ class ModelsAtUse(Mapping[str, HybridModel]):
 
     def __len__(self) -> int:
         return len(self._names)
+
+    def __repr__(self) -> str:
+        return f"<models {', '.join(self._names)}>"

@@ -85,7 +85,7 @@ class Runner:
         measure_w: ``() -> w (n_w,)``, measured disturbances, or None where no sample has come. Default: nobody measures
             them, and they are those of the operating point.
         w: Forecast of them, as in :class:`~hybrid_mpc.loop.loop.Loop`.
-        monitor: Default: none.
+        monitor: One that has limits to alarm by. Default: none.
         deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
         safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's; one of the two
             must be declared.
@@ -97,8 +97,8 @@ class Runner:
         keep: Periods whose rows the report keeps, the last ones. Default 100 000.
 
     Raises:
-        InputError: If models, deadline, safe input, delays or ``keep`` do not fit, no safe input is declared, or the
-            estimator wants the truth.
+        InputError: If models, deadline, safe input, delays or ``keep`` do not fit, no safe input is declared, the
+            monitor has no limits, or the estimator wants the truth.
 
     Example: see ``docs/control.md``; in short::
 
@@ -136,6 +136,8 @@ class Runner:
             check_part(clock, "Runner: clock", "a clock", "now", "sleep_until")
         if sees_truth(estimator):
             raise InputError("Runner: a machine does not give its true state; give a filter, not TrueState")
+        if why := getattr(monitor, "cannot_alarm", ""):
+            raise InputError(f"Runner: monitor: {why}; or leave monitor out, then nothing is watched")
         dt = estimator.model.dt
         due = dt if deadline is None else float(sampled(deadline, (), "Runner: deadline"))
         if not 0 < due <= dt * (1 + 1e-9):

@@ -231,6 +231,17 @@ class EnergyMonitor:
         """Time [s] from the moment a violation speaks of to the sample at which it is read."""
         return 0.5 * (self.window - 1) * self.model.dt
 
+    @property
+    def cannot_alarm(self) -> str:
+        """Why no reading could raise an alarm, and what would give it limits; empty if one could."""
+        c = self.calibration
+        if self.detector is not None or self.resolution or (c is not None and c.threshold_w is not None):
+            return ""
+        return (
+            "it has no limits, so nothing alarms but missing readings; the run's stage monitor learns thresholds of "
+            "the energy, its stage guard a detector, and kit.monitor() has them"
+        )
+
     def initial(self) -> MonitorState:
         """State before the first sample."""
         empty = np.full(self.model.n_x, np.nan), np.full(self.model.n_h, np.nan)

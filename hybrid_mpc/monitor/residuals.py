@@ -253,6 +253,16 @@ class ResidualMonitor:
             self._threshold, self._release = np.array(limits.threshold), np.array(limits.release)
         self._function = BufferedFunction(_residuals(model))
 
+    @property
+    def cannot_alarm(self) -> str:
+        """Why no reading could raise an alarm, and what would give it limits; empty if one could."""
+        if self.limits is not None or np.isfinite(self.frozen_travel).any():
+            return ""
+        return (
+            "it has no limits, so nothing alarms but missing readings; the run's stage residuals learns them, and "
+            "kit.monitor() has them"
+        )
+
     def initial(self) -> ResidualState:
         """State before the first sample."""
         m, n = self.model, len(self.channels)

@@ -99,7 +99,8 @@ class Section:
 class Report:
     """A page: titles, a paragraph about the machine, the command that made it, key figures, hints, sections.
 
-    ``remark`` is a line under the title: seed, budget, versions.
+    ``remark`` is a line under the title: seed, budget, versions. ``doubt`` stands above it: what a reader must know
+    before anything else on the page; empty: nothing.
     """
 
     title: str
@@ -110,6 +111,7 @@ class Report:
     sections: Sequence[Section] = ()
     remark: str = ""
     hints: Sequence[Hint] = ()
+    doubt: str = ""
 
 
 def write_report(path: str | Path, report: Report) -> Path:

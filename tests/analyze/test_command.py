@@ -40,7 +40,7 @@ from hybrid_mpc.job.analyze import (
     state_range,
 )
 from hybrid_mpc.job.analyze_page import _draw_measured, tables_of, write_analysis
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
+from hybrid_mpc.kit.parts import loop_settings, read_description, save_loop, write_description
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
 
@@ -58,8 +58,8 @@ def noisy(model, tmp_path):
 def prior_alone(golf_artifact):
     artifact = load(golf_artifact)
     return AnalysisInput(
-        {"prior": artifact.models["prior"]}, load_programs(golf_artifact), np.array([[-0.85, 0.85], [-2.5, 2.5]]),
-        np.array([[-0.5, 0.5]]), np.array([0.25]), plant=scenario.plant(),
+        {"prior": artifact.models["prior"]}, load_programs(golf_artifact / "models"),
+        np.array([[-0.85, 0.85], [-2.5, 2.5]]), np.array([[-0.5, 0.5]]), np.array([0.25]), plant=scenario.plant(),
     )  # fmt: skip
 
 
@@ -135,8 +135,8 @@ def test_recordings_are_taken_before_the_simulated_machine(golf_artifact, prior_
 def test_a_folder_alone_has_loops_where_it_holds_what_they_need(golf_artifact, tmp_path):
     folder = shutil.copytree(golf_artifact, tmp_path / "bare")
     note = read_description(folder)
-    anonymous = replace(note, loop=loop_settings(scenario), provenance=replace(note.provenance, scenario=""))
-    write_description(folder, anonymous)
+    write_description(folder, replace(note, provenance=replace(note.provenance, scenario="")))
+    save_loop(folder, loop_settings(scenario))
     given, notes = analysis_input(AnalysisSettings(folder))
     assert given.filters == {}
     assert "holds no process noise" in notes[1]

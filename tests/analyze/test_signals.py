@@ -177,7 +177,7 @@ def test_a_network_with_two_points_of_rest_is_not_certified():
 
 
 def test_weights_and_features_are_read_from_an_artifact(golf_artifact):
-    program = nn_export.load_programs(golf_artifact)["hybrid/step"]
+    program = nn_export.load_programs(golf_artifact / "models")["hybrid/step"]
     cell = gru_weights(program)
     low, high = feature_box(program, [(-0.5, 0.5), (-1.0, 2.0)], [(-0.1, 0.3)])
     assert low.size == cell.w.shape[1] == 4
@@ -191,7 +191,7 @@ def test_weights_and_features_are_read_from_an_artifact(golf_artifact):
         after = f(s[:2], h, s[2], [], np.zeros(8))[1].full().ravel()
         assert np.all(np.abs(after) <= contraction(cell, low, high).reach)
     with pytest.raises(InputError, match="0 GRU cells"):
-        gru_weights(nn_export.load_programs(golf_artifact)["prior/step"])
+        gru_weights(nn_export.load_programs(golf_artifact / "models")["prior/step"])
 
 
 def test_exponent_of_the_logistic_map_is_log_two():

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -27,8 +26,9 @@ from hybrid_mpc.embedded.scalar import c_function, comment
 from hybrid_mpc.embedded.watch import Watched
 from hybrid_mpc.errors import StorageError
 from hybrid_mpc.files import write_document
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
 from hybrid_mpc.kit.assembly import make_controller
+from hybrid_mpc.kit.migrate import migrate_kit
+from hybrid_mpc.kit.parts import KIT, TASKS, loop_settings, read_parts, save_loop
 
 STRICT = [
     "-std=c11",
@@ -263,8 +263,7 @@ def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     assert "without a control problem" in err
     golf = hm.load_scenario("golf_robot")
     run = shutil.copytree(noisy_artifact, tmp_path / "model")
-    found = read_description(run)
-    write_description(run, replace(found, loop=loop_settings(golf, found.loop.process_noise)))
+    save_loop(run, loop_settings(golf, read_parts(run).loop.process_noise))
     kit, folder = hm.load(run), tmp_path / "controller"
     with pytest.raises(InputError, match="not empty"):
         hm.generate_controller(kit, run)
@@ -320,24 +319,27 @@ HOSTILE = (
 HARMLESS_UNITS = ("../../x", ".hidden", "-rf", "%n%s")
 """No file is called after a unit, and none is a format."""
 PLACES = (
-    *((("model", role, 0), key) for role in ("states", "inputs", "outputs", "parameters") for key in ("name", "unit")),
-    (("model", "balances", 0), "name"), (("model", "balances", 0), "rate_unit"), (("models",), 0),
-    (("loop", "tasks"), 0),
+    *(
+        (KIT, ("model", role, 0), key)
+        for role in ("states", "inputs", "outputs", "parameters")
+        for key in ("name", "unit")
+    ),
+    (KIT, ("model", "balances", 0), "name"), (KIT, ("model", "balances", 0), "rate_unit"), (KIT, ("models",), 0),
+    (TASKS, ("tasks",), 0),
 )  # fmt: skip
 
 
 def test_no_artifact_carries_code_in_a_name(tmp_path):
     """Whatever it is the name of, and whoever wrote the folder: its hash is right."""
-    shipped = Path(__file__).parents[1] / "golden" / "golf_robot"
-    for file in ("model.json", "programs.json", "weights.safetensors"):
-        shutil.copy(shipped / file, tmp_path)
-    path = tmp_path / "model.json"
-    whole = path.read_text()
-    for place, key in PLACES:
+    kit = migrate_kit(Path(__file__).parents[1] / "golden" / "golf_robot", tmp_path / "kit")
+    for file, place, key in PLACES:
+        path = kit / file
+        whole = path.read_text()
         for name in HOSTILE:
             document = json.loads(whole)
             del document["sha256"]
-            document["loop"]["tasks"] = ["hold"]
+            if file == TASKS:
+                document["tasks"] = ["hold"]
             inner = document
             for step in place:
                 inner = inner[step]
@@ -346,9 +348,9 @@ def test_no_artifact_carries_code_in_a_name(tmp_path):
                 continue
             write_document(path, document)
             with pytest.raises(InputError):
-                hm.load(tmp_path)
-    path.write_text(whole)
-    hm.load(tmp_path)
+                hm.load(kit)
+        path.write_text(whole)
+    hm.load(kit)
 
 
 def test_c_comments_hold_nothing_but_text():

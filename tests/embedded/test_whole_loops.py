@@ -28,7 +28,7 @@ from hybrid_mpc import (
     load_scenario,
 )
 from hybrid_mpc.embedded.generate import CORE, make_sources, sources_of
-from hybrid_mpc.kit.artifact import loop_settings, read_description, write_description
+from hybrid_mpc.kit.parts import loop_settings, read_parts, save_loop
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
 from golden_parts import Parts, faults_of, machine
@@ -248,8 +248,7 @@ def test_a_kits_monitor_and_guard(noisy_artifact, tmp_path, call):
     """Of a run's folder: its monitor by default, its guard where it is asked for."""
     run = shutil.copytree(noisy_artifact, tmp_path / "model")
     golf = load_scenario("golf_robot")
-    description = read_description(run)
-    write_description(run, replace(description, loop=loop_settings(golf, description.loop.process_noise)))
+    save_loop(run, loop_settings(golf, read_parts(run).loop.process_noise))
     code, _, err = call("export", "c", run, "--guard", "--out", tmp_path / "early")
     assert code == 2
     assert "detector" in err

@@ -12,6 +12,7 @@ import pytest
 import hybrid_mpc as hm
 from hybrid_mpc import Calibration, Detector, InputError, set_calibration, set_process_noise
 from hybrid_mpc.files import HASH, digest
+from hybrid_mpc.kit.parts import ENERGY, GUARD, KIT, PROGRAMS, WEIGHTS
 from tests.fuzz.forked import cheap, command, refused
 
 ODD = [
@@ -53,7 +54,7 @@ def changed(document, path, new):
 
 @pytest.fixture(scope="module")
 def whole(golf_artifact):
-    document = json.loads((golf_artifact / "model.json").read_text())
+    document = json.loads((golf_artifact / KIT).read_text())
     document.pop(HASH)
     return document
 
@@ -69,11 +70,11 @@ def ways(folder, tmp_path):
 
 @pytest.mark.parametrize("name", RAW)
 def test_what_is_no_description(folder, tmp_path, name):
-    (folder / "model.json").write_bytes(RAW[name])
+    (folder / KIT).write_bytes(RAW[name])
     refused(command(*ways(folder, tmp_path)), name)
 
 
-@pytest.mark.parametrize("file", ["model.json", "programs.json", "weights.safetensors"])
+@pytest.mark.parametrize("file", [KIT, PROGRAMS, WEIGHTS])
 def test_what_is_no_file(folder, tmp_path, file):
     for make in (os.mkdir, os.mkfifo, lambda p: os.symlink("/dev/zero", p), lambda p: os.symlink(p, p), None):
         (folder / file).unlink(missing_ok=True) if not (folder / file).is_dir() else (folder / file).rmdir()
@@ -96,7 +97,7 @@ def test_fields_that_do_not_fit(folder, whole, tmp_path, seed):
         if document == whole:
             continue
         content = {**document, HASH: digest(document)} if isinstance(document, dict) else document
-        (folder / "model.json").write_text(json.dumps(content))
+        (folder / KIT).write_text(json.dumps(content))
         what = f"{path}: {str(new)[:80]}"
         mark = folder / "executed"
         (folder / "trap.py").write_text(f"open({str(mark)!r}, 'w')")
@@ -143,14 +144,15 @@ def test_a_good_calibration_is_watched_with(watched):
 @pytest.mark.parametrize("seed", range(2))
 def test_calibrations_that_do_not_fit(watched, folder, seed):
     """Numbers that fit may be watched with, however odd; all else is refused."""
-    document = json.loads((folder / "model.json").read_text())
+    rng, file = random.Random(seed), (ENERGY, GUARD)[seed]
+    document = json.loads((folder / file).read_text())
     document.pop(HASH)
-    rng, paths = random.Random(seed), [p for p in places(document) if p[:1] == ("calibration",)]
+    paths = [p for p in places(document) if p[:1] in (("calibration",), ("detector",))]
     refusals = 0
     for i in range(60):
         path, new = rng.choice(paths), rng.choice([*ODD, ...])
         odd = changed(document, path, new)
-        (folder / "model.json").write_text(json.dumps({**odd, HASH: digest(odd)}))
+        (folder / file).write_text(json.dumps({**odd, HASH: digest(odd)}))
         ended, what = command(*watched(f"out{i}")), f"{path}: {str(new)[:80]}"
         if ended.code == 2:
             refused(ended, what)
@@ -161,7 +163,7 @@ def test_calibrations_that_do_not_fit(watched, folder, seed):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("file", ["model.json", "programs.json", "weights.safetensors"])
+@pytest.mark.parametrize("file", [KIT, PROGRAMS, WEIGHTS])
 def test_damage_is_refused(folder, tmp_path, file):
     """Bytes that were changed, lost, doubled or moved."""
     content, rng = (folder / file).read_bytes(), random.Random(7)
@@ -180,8 +182,8 @@ def test_damage_is_refused(folder, tmp_path, file):
 
 @pytest.mark.full
 def test_files_of_two_models_are_refused(folder, golf_artifact, tmp_path):
-    programs = json.loads((folder / "programs.json").read_text())
-    (folder / "programs.json").write_text(json.dumps(programs, indent=4))  # the same programs, another file
+    programs = json.loads((folder / PROGRAMS).read_text())
+    (folder / PROGRAMS).write_text(json.dumps(programs, indent=4))  # the same programs, another file
     refused(command(*ways(folder, tmp_path)), "programs.json of another saving")
 
 

@@ -4,7 +4,6 @@ make_golden.py freeze MACHINE RUN     the folder MACHINE from the folder of a fi
 make_golden.py arrays MACHINE [FILE]  arrays.npz and loops.json: replays, kernels and closed loops
 make_golden.py costs MACHINE [FILE]   costs.json: ten seeds of every closed loop
 make_golden.py keys RUN               results_keys.txt
-make_golden.py artifact MACHINE       model.json anew, from golden.json, in the artifact's present form
 make_golden.py compare FILE FILE      largest differences between two arrays.npz
 """
 
@@ -15,7 +14,6 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -122,20 +120,17 @@ RUNNER = {
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
     from hybrid_mpc import ModelInfo, load, load_scenario, make_estimator, make_monitor, make_ocp
-    from hybrid_mpc.files import sha256
     from hybrid_mpc.job.controllers import no_surer_than_prior
-    from hybrid_mpc.kit.artifact import read_description, write_description
     from hybrid_mpc.kit.assembly import first_controller, sensor_steps
+    from hybrid_mpc.kit.parts import read_description
 
     folder, run = HERE / name, Path(run)
     folder.mkdir(exist_ok=True)
     scenario, artifact = load_scenario(name), load(run / "model")
-    description = read_description(run / "model")
-    shutil.copy(run / "model" / "weights.safetensors", folder)
-    programs = json.loads((run / "model" / "programs.json").read_text())
+    balances = read_description(run / "model").model.balances
+    shutil.copy(run / "model" / "models" / "weights.safetensors", folder)
+    programs = json.loads((run / "model" / "models" / "programs.json").read_text())
     (folder / "programs.json").write_text(json.dumps(programs, separators=(",", ":")) + "\n")
-
-    write_description(folder, replace(description, programs_sha256=sha256(folder / "programs.json")))
     noise = json.loads((run / "checkpoints" / "control.json").read_text())["sigma_x"]
     noise = {key: np.asarray(values) for key, values in noise.items()}
     sigma_x = no_surer_than_prior(scenario, noise)["hybrid_observer"]
@@ -174,7 +169,7 @@ def freeze(name, run):
         "model": plain(
             ModelInfo(
                 hybrid.dt, hybrid.states, hybrid.inputs, hybrid.outputs, hybrid.parameters, artifact.input_delay,
-                hybrid.time_unit, hybrid.disturbances, hybrid.nominal_w, hybrid.covariance, description.balances,
+                hybrid.time_unit, hybrid.disturbances, hybrid.nominal_w, hybrid.covariance, balances,
             )
         ),
         "models": list(artifact.models),
@@ -268,18 +263,6 @@ def make_keys(run):
     (HERE / "results_keys.txt").write_text("\n".join(parts.key_lines(results)) + "\n")
 
 
-def make_artifact(name):
-    """The artifact's files anew from the plain form, for when the artifact's schema has changed."""
-    import nn_export
-    from hybrid_mpc import save_artifact
-
-    m, programs = machine(name), {}
-    for key, program in nn_export.load_programs(m.folder).items():
-        model, _, function = key.partition("/")
-        programs.setdefault(model, {})[function] = program
-    save_artifact(m.folder, programs, m.info, calibration=m.calibration)
-
-
 def compare(first, second):
     """Largest difference of every array, as a share of its largest value."""
     a, b = (np.load(path, allow_pickle=False) for path in (first, second))
@@ -317,7 +300,7 @@ def commit():
 
 
 COMMANDS = {
-    "freeze": freeze, "arrays": make_arrays, "costs": make_costs, "keys": make_keys, "artifact": make_artifact,
+    "freeze": freeze, "arrays": make_arrays, "costs": make_costs, "keys": make_keys,
     "compare": compare,
 }  # fmt: skip
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from simulated_pendulum import DT, Pendulum, record
 
-from hybrid_mpc import MechanicalPrior, Parameter, Prior, Signal, fit_prior
+from hybrid_mpc import InputError, MechanicalPrior, Parameter, Prior, Signal, fit_prior
 from hybrid_mpc.identify.structure import (
     Cause,
     causes,
+    causes_of_refusal,
     named,
     reading_of,
-    run_length,
     terms_of,
     with_factor,
 )
@@ -166,8 +166,7 @@ def runs():
 def found_of(make, runs):
     *train, valid = runs
     fit = fit_prior(make, train, [replace(valid, role="valid")], dt=DT, time_unit=SECONDS)
-    length = run_length(make, fit.values, train, DT, 4.0, SECONDS)
-    return causes(make, fit.values, train, DT, length, SECONDS)
+    return causes(make, fit.values, train, DT, 4.0, SECONDS)
 
 
 def test_a_sound_prior_is_left_alone(runs):
@@ -180,6 +179,40 @@ def test_a_wrong_sign_is_named(runs):
     assert "sign" in found[0].why
     assert found[0].ratio < 0.1
     assert str(found[0]) in named(found)
+
+
+class Degrees(Pendulum):
+    """Its torque is taken a thousand times too large, as N mm for N m."""
+
+    def force(self, q, v, u, w, p):
+        return (1e3 * u.torque,)
+
+
+def test_a_wrong_unit_is_named(runs):
+    first = found_of(Degrees, runs)[0]
+    assert "force" in first.what or "input" in first.what
+    assert first.factor == pytest.approx(1e-3)
+    assert first.exact
+
+
+class Stiff(Pendulum):
+    """Its friction is a million times too large: no period is short enough."""
+
+    def friction(self, q, v, p):
+        return (1e6 * p.d * v.phi_dot,)
+
+
+def test_a_unit_that_makes_a_prior_too_stiff_is_named(runs):
+    with pytest.raises(InputError):
+        fit_prior(Stiff, runs, runs, dt=DT)
+    first = causes_of_refusal(Stiff, runs, DT, 4.0, SECONDS)[0]
+    assert "friction" in first.what
+    assert first.factor in (1e-5, 1e-6)  # what is left of it hardly acts
+    assert "spread" in str(first)
+
+
+def test_a_prior_that_is_not_refused_has_no_such_cause(runs):
+    assert causes_of_refusal(Pendulum, runs, DT, 4.0, SECONDS) == ()
 
 
 @pytest.mark.parametrize("key", ["y", "u"])

@@ -54,17 +54,23 @@ def test_each_finding_is_told_with_what_to_do(results):
     assert "30.7 ms" in said
     assert "period is 20 ms" in said
     noisy = replace(results, monitor=replace(
-        results.monitor, details=replace(results.monitor.details, clean=CleanAlarms(250.0, 1))
+        results.monitor, details=replace(results.monitor.details, clean=CleanAlarms(250.0, 4))
     ))  # fmt: skip
-    assert bad(noisy) == ["Alarms of the energy monitor: 1 in 250 s known to be undisturbed."]
+    (said,) = bad(noisy)
+    assert "Alarms of the energy monitor: 4 in 250 s" in said
+    within = replace(noisy.monitor.details, clean=CleanAlarms(250.0, 1))  # 0.35 are to be expected
+    assert bad(replace(noisy, monitor=replace(noisy.monitor, details=within))) == []
     warned = replace(results, data=replace(
         results.data, details=replace(results.data.details, warnings=("monday.csv is nearly constant",))
     ))  # fmt: skip
     assert bad(warned) == ["Recordings: monday.csv is nearly constant"]
     found = results.identification
-    poor = replace(results, identification=replace(
+    follows = replace(results, identification=replace(
         found, fit_percent={**found.fit_percent, "phy": {"phi [rad]": 41.0}}
     ))  # fmt: skip
+    assert bad(follows) == []  # its windows with free first states are explained
+    stages = ({"stage": "nominal", "validation_error": 0.5},)
+    poor = changed(follows, prior_parameters=replace(found.details.prior_parameters, stages=stages))
     assert bad(poor) == ["The fitted prior has a FIT of 41 % on phi: it lacks much."]
     bands = found.details.bands
     thin = changed(results, bands={**bands, "pgrnn": replace(bands["pgrnn"], coverage=0.6)})

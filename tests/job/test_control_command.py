@@ -191,11 +191,11 @@ def test_bad_models(call, run_folder, tmp_path):
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "a.txt").write_text("dear")
     code, _, error = call("golf_robot", "--model", tmp_path / "letters", "--out", tmp_path / "o")
-    assert (code, "holds no model.json" in error) == (2, True)
+    assert (code, "holds no kit.json" in error) == (2, True)
     for name, damage in (
-        ("weights.safetensors", lambda b: b[: len(b) // 2]),
-        ("programs.json", lambda b: b[:-100]),
-        ("model.json", lambda b: b.replace(b"schema_version", b"version")),
+        ("models/weights.safetensors", lambda b: b[: len(b) // 2]),
+        ("models/programs.json", lambda b: b[:-100]),
+        ("kit.json", lambda b: b.replace(b"schema_version", b"version")),
     ):
         folder = tmp_path / name
         shutil.copytree(run_folder / "model", folder)

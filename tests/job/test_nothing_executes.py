@@ -8,7 +8,7 @@ import pytest
 
 from hybrid_mpc import InputError, Provenance, run_study
 from hybrid_mpc.job.study import read_study
-from hybrid_mpc.kit.artifact import read_description, write_description
+from hybrid_mpc.kit.parts import read_description, write_description
 from tests.trivial_runs import stand_in, study, trivial
 
 

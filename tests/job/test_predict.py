@@ -12,7 +12,7 @@ import pytest
 from patience import HANGS
 
 from hybrid_mpc import InputError, load, load_trajectories, predict
-from hybrid_mpc.kit.artifact import read_description, write_description
+from hybrid_mpc.kit.parts import read_description, write_description
 
 
 @pytest.fixture(scope="module")

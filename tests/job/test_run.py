@@ -16,7 +16,15 @@ from patience import HANGS
 
 from hybrid_mpc import InputError, load
 from hybrid_mpc.job.stages.results import read_results
-from hybrid_mpc.kit.artifact import BENCHMARK_NOTE, read_description, write_description
+from hybrid_mpc.kit.parts import (
+    BENCHMARK_NOTE,
+    KIT,
+    OWNERS,
+    PROGRAMS,
+    WEIGHTS,
+    read_description,
+    write_description,
+)
 
 
 def results(folder):
@@ -96,9 +104,7 @@ def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp
     done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=HANGS)
     assert done.returncode == 0, done.stdout + done.stderr
     assert without_timing(out) == without_timing(finished)
-    assert (out / "model" / "weights.safetensors").read_bytes() == (
-        finished / "model" / "weights.safetensors"
-    ).read_bytes()
+    assert (out / "model" / WEIGHTS).read_bytes() == (finished / "model" / WEIGHTS).read_bytes()
 
 
 @pytest.mark.full
@@ -151,21 +157,16 @@ def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
 @pytest.mark.parametrize(
     ("file", "damage", "words"),
     [
-        ("model.json", lambda b: b[: len(b) // 2], "damaged"),
-        (
-            "model.json",
-            lambda b: b.replace(b'"schema_version": 4', b'"schema_version": 99'),
-            "schema version",
-        ),
-        ("programs.json", lambda b: b[: len(b) // 2], "programs.json"),
-        ("weights.safetensors", lambda b: b[:-8], "weights.safetensors"),
-        ("weights.safetensors", lambda b: b[:-8] + bytes(8), "weights.safetensors"),
-        ("programs.json", None, "programs.json"),
+        (KIT, lambda b: b[: len(b) // 2], "damaged"),
+        (KIT, lambda b: b.replace(b'"schema_version": 5', b'"schema_version": 99'), "schema_version"),
+        (PROGRAMS, lambda b: b[: len(b) // 2], "programs.json"),
+        (WEIGHTS, lambda b: b[:-8], "weights.safetensors"),
+        (WEIGHTS, lambda b: b[:-8] + bytes(8), "weights.safetensors"),
+        (PROGRAMS, None, "programs.json"),
     ],
 )
 def test_damaged_artifact_is_refused(golf_artifact, tmp_path, file, damage, words):
-    for path in golf_artifact.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(golf_artifact, tmp_path, dirs_exist_ok=True)
     if damage is None:
         (tmp_path / file).unlink()
     else:
@@ -175,8 +176,9 @@ def test_damaged_artifact_is_refused(golf_artifact, tmp_path, file, damage, word
 
 
 def test_artifact_holds_data_only(finished):
-    names = {path.name for path in (finished / "model").iterdir()}
-    assert names == {"model.json", "programs.json", "promises.json", "weights.safetensors"}
+    folder = finished / "model"
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert names == {name for name in OWNERS if "*" not in name}  # no task has a control problem of its own
     artifact = load(finished / "model")
     assert set(artifact.models) == {"hybrid", "prior"}
     assert artifact.models["prior"].n_h == 0

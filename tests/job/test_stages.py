@@ -66,7 +66,17 @@ def own(machine, finished, arguments, tmp_path, monkeypatch):
         pytest.param(
             r"q=\(",
             "q=(2.0 * ",
-            ["control", "on_model", "promises", "residuals", "monitor", "guard", "analysis", "report"],
+            [
+                "tasks",
+                "control",
+                "on_model",
+                "promises",
+                "residuals",
+                "monitor",
+                "guard",
+                "analysis",
+                "report",
+            ],
             marks=pytest.mark.full,
         ),
         ("$", "\n# a remark\n", []),
@@ -151,11 +161,11 @@ def test_only_control_after_an_edit_takes_the_edited_problem_and_keeps_the_monit
     assert after.residuals == before.residuals
     # limits of the input are the observer's too: with them a stage that control needs is out of date
     source.write_text(source.read_text().replace("changed(", "changed(u_max=[0.5], ", 1))
-    kept = (out / "model" / "model.json").read_bytes()
+    kept = (out / "model" / "tasks.json").read_bytes()
     code, _, message = call(*command, "--only", "control")
     assert code == 2
     assert "limits of the input has changed" in message
-    assert (out / "model" / "model.json").read_bytes() == kept
+    assert (out / "model" / "tasks.json").read_bytes() == kept
     code, said, message = call(*command, "--only", "noise", "--only", "control")
     assert code == 0, said + message
     assert load(out / "model").control.u_max == (0.5,)
@@ -180,7 +190,7 @@ def test_only_the_first_stages_of_a_new_run(own, call, tmp_path):
 @pytest.mark.full
 def test_what_lies_outside_the_stage_s_file_is_missed(own, call):
     _, out, command = own
-    (out / "model" / "programs.json").write_text("{}")
+    (out / "model" / "models" / "programs.json").write_text("{}")
     (out / "report.html").unlink()
     before = stamps(out)
     code, said, message = call(*command)

@@ -1,5 +1,6 @@
 """Stages monitor and guard on linear axes: slow ones are calibrated, and where nothing can be, the run goes on."""
 
+import shutil
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +32,8 @@ from hybrid_mpc.job.stages.report import guard_tables, guard_words
 from hybrid_mpc.job.stages.residuals import put_residuals, residuals_stage
 from hybrid_mpc.job.stages.results import _guard as guard_results
 from hybrid_mpc.job.stages.results import _monitor as monitor_results
-from hybrid_mpc.kit.artifact import read_description, set_residuals, write_description
+from hybrid_mpc.kit.parts import ENERGY, set_residuals
+from hybrid_mpc.kit.parts import GUARD as GUARD_FILE
 
 AXIS = """
 from hybrid_mpc import MechanicalPrior, Parameter, Signal
@@ -123,7 +125,7 @@ def context(machine, samples, out, warm_up):
     made.keep(NOISE, {}, NoiseResult(found))
     train = made.trajectories("train")
     states = {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")}
-    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, {}, (), (), {}, None, states))
+    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, {}, (), (), {}, "", {}, None, states))
     return made
 
 
@@ -224,16 +226,16 @@ def test_the_guard_copes_without_a_calibration(short):
 
 @pytest.mark.parametrize("stored", ["without thresholds", "none"])
 def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_path, monkeypatch, stored):
-    description = read_description(short.out / "model")
+    model = shutil.copytree(short.out / "model", tmp_path / "model")
     if stored == "none":
-        write_description(short.out / "model", replace(description, calibration=None))
+        (model / ENERGY).unlink()
+        (model / GUARD_FILE).unlink()
     write_csv(tmp_path / "long.csv", QUICK.recording(5, 900))
     monkeypatch.setattr("hybrid_mpc.scenario.scenario_of", lambda *given: short.scenario)
     done = CliRunner().invoke(
-        app, ["monitor", str(short.out / "model"), str(tmp_path / "long.csv"), "--scenario", "axis",
+        app, ["monitor", str(model), str(tmp_path / "long.csv"), "--scenario", "axis",
               "--out", str(tmp_path / "out")],
     )  # fmt: skip
-    write_description(short.out / "model", description)
     assert done.exit_code == 0, done.output
     assert "the artifact holds no detector and no thresholds" in done.output
     warm_up = 2 * round(0.15 * short.time_unit / QUICK.dt) * QUICK.dt

@@ -9,7 +9,16 @@ import pytest
 from closed_loop_parts import DT, FakeClock, LateRig, Rig, make_ekf, make_runner, make_safe, run, sine
 from online_models import pendulum_model
 
-from hybrid_mpc import DelayCompensation, EnergyMonitor, Fault, Runner, SafeController
+from hybrid_mpc import (
+    Calibration,
+    DelayCompensation,
+    EnergyMonitor,
+    Fault,
+    InputError,
+    ResidualMonitor,
+    Runner,
+    SafeController,
+)
 from hybrid_mpc.loop.realtime import RealClock
 
 N = 30
@@ -30,6 +39,27 @@ class Slow:
         return self._controller.solve(*arguments)
 
 
+def watching(model):
+    """A monitor that could alarm."""
+    limits = Calibration(1e9, 1e8, 1.0, 1, 1.0, "by hand")
+    return EnergyMonitor(model, window=5, average=3, calibration=limits)
+
+
+def test_a_monitor_without_limits_is_refused_and_the_stages_that_give_them_are_named(model, safe):
+    limits = Calibration.without("too little data")
+    for monitor, stages in (
+        (EnergyMonitor(model, window=5, average=3), ("monitor", "guard")),
+        (EnergyMonitor(model, window=5, average=3, calibration=limits), ("monitor", "guard")),
+        (ResidualMonitor(model), ("residuals",)),
+    ):
+        with pytest.raises(InputError) as refused:
+            make_runner(model, safe, Rig(), monitor=monitor)
+        for stage in stages:
+            assert f"stage {stage}" in str(refused.value)
+    make_runner(model, safe, Rig(), monitor=watching(model))
+    make_runner(model, safe, Rig(), monitor=ResidualMonitor(model, resolution=[1e-3]))
+
+
 def same(report, want, names=("y", "u", "x_hat")):
     for name in names:
         np.testing.assert_array_equal(getattr(report, name), getattr(want, name), name)
@@ -38,8 +68,8 @@ def same(report, want, names=("y", "u", "x_hat")):
 
 def test_without_missed_deadlines_it_is_simulate(model, safe):
     rig = Rig()
-    report = make_runner(model, safe, rig, monitor=EnergyMonitor(model, window=5, average=3)).run(N * DT)
-    want = run(model, safe, monitor=EnergyMonitor(model, window=5, average=3))
+    report = make_runner(model, safe, rig, monitor=watching(model)).run(N * DT)
+    want = run(model, safe, monitor=watching(model))
     same(report, want)
     np.testing.assert_array_equal(report.t, want.t)
     np.testing.assert_array_equal(report.alarm, want.alarm)
@@ -62,7 +92,7 @@ def test_missing_samples_are_nan_samples(model, safe):
 
 
 def test_delays_known_to_the_estimator_are_those_of_simulate(model, safe):
-    monitors = [EnergyMonitor(model, window=5, average=3) for _ in range(2)]
+    monitors = [watching(model) for _ in range(2)]
     ekf = DelayCompensation(make_ekf(model), input_delay=2)
 
     rig = LateRig(delay=2)

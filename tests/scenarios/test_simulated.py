@@ -13,7 +13,7 @@ from hybrid_mpc.identify.export import Parity, check_parity, trace_model
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.train import Trained
-from hybrid_mpc.kit.artifact import loop_settings
+from hybrid_mpc.kit.parts import loop_settings
 from hybrid_mpc.scenario import Scenario
 from scenarios.simulated import cart_pole, dc_motor, lever, two_heaters, two_link_arm, two_tanks
 from scenarios.simulated.plant import windows

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+from hybrid_mpc.identify.fit import POOR
 from hybrid_mpc.job.sequential import hardest
 from hybrid_mpc.job.stages.compare import REPORTED
+from hybrid_mpc.job.stages.promises import STRUCTURE
 from hybrid_mpc.job.stages.results import Identification, Results
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
@@ -50,22 +52,50 @@ def _recordings(results: Results) -> Iterator[Hint]:
         )
 
 
+def doubt_of(in_doubt: Sequence[str]) -> str:
+    """What the terminal and the report say of doubts about the prior before all else; empty without any.
+
+    Example:
+        >>> doubt_of(["k * u in the rate of v: its sign seems wrong", "ARX has less error"])
+        'The structure of the prior is in doubt: k * u in the rate of v: its sign seems wrong (and 1 more reason).'
+        >>> doubt_of([])
+        ''
+    """
+    if not in_doubt:
+        return ""
+    n = len(in_doubt) - 1
+    more = f" (and {n} more reason{'s' * (n > 1)})" if n else ""
+    return f"The structure of the prior is in doubt: {in_doubt[0]}{more}."
+
+
 def _doubt(found: Identification) -> Iterator[Hint]:
     for doubt in found.details.prior_parameters.in_doubt:
         yield Hint(
             "bad", f"The structure of the prior is in doubt: {doubt}.",
-            "Correct the prior first (docs/prior-fit.md#is-the-prior-sound): a state, a delay or an input that is "
-            "missing, or a sign. A network or an observer on top of it only hides the fault.",
+            "Correct the prior first (docs/prior-wrong.md): a sign, a unit, or a state, a delay or an input that is "
+            "missing. A network or an observer on top of it only hides the fault.",
         )  # fmt: skip
 
 
 def _prior(found: Identification) -> Iterator[Hint]:
     for warning in found.details.prior_parameters.warnings[:MOST]:
         yield Hint("plain", f"Fit of the prior: {warning}", "docs/prior-fit.md says what to do.")
+    windows = min(
+        (row["validation_error"] for row in found.details.prior_parameters.stages), default=math.inf
+    )
     for label, fit in _by_output(found.fit_percent.get("phy")).items():
-        if fit < EXPLAINED:
+        if fit >= EXPLAINED:
+            continue
+        what = f"The fitted prior has a FIT of {fit:.0f} % on {label.partition(' [')[0]}"
+        if windows <= POOR:
             yield Hint(
-                "bad", f"The fitted prior has a FIT of {fit:.0f} % on {label.partition(' [')[0]}: it lacks much.",
+                "plain", f"{what}, but an error of only {windows:.2g} of the spread over the windows of the fit, whose "
+                "initial states are free.",
+                "Errors of initial states grow (docs/unstable.md), or the test data differ from the training data.",
+            )  # fmt: skip
+        else:
+            yield Hint(
+                "bad", f"{what}: it lacks much.",
                 "Look at signs, units, and a term that is missing, in the sensor too; a network is for what is small.",
             )  # fmt: skip
 
@@ -146,7 +176,7 @@ def _promises(results: Results) -> Iterator[Hint]:
     """What the kit does not promise, in one hint."""
     rows = results.promises.rows or ()
     for verdict, say in (("doubted", "Doubted"), ("not promised", "Not promised")):
-        names = [one.name for one in rows if one.verdict == verdict]
+        names = [one.name for one in rows if one.verdict == verdict and one.name != STRUCTURE]  # said first
         if names:
             yield Hint(
                 "bad" if verdict == "doubted" else "plain", f"{say} of this kit: {', '.join(names)}.",
@@ -181,13 +211,18 @@ def _loops(results: Results) -> Iterator[Hint]:
 
 
 def _watching(results: Results) -> Iterator[Hint]:
-    for what, clean in (
-        ("Alarms of the energy monitor", results.monitor.details.clean),
-        ("Alarms of the monitor of residuals", results.residuals.details.clean),
+    energy, limits = results.monitor.details, tuple(results.residuals.details.limits.values())
+    promised = None if energy.calibration is None else energy.calibration.false_alarms_per_hour
+    for what, clean, rate in (
+        ("Alarms of the energy monitor", energy.clean, promised),
+        (
+            "Alarms of the monitor of residuals", results.residuals.details.clean,
+            limits[-1].false_alarms_per_hour if limits else None,
+        ),
     ):  # fmt: skip
-        if clean is not None and clean.alarms:
+        if clean is not None and rate is not None and clean.too_many(rate):
             yield Hint(
-                "bad", f"{what}: {clean.alarms} in {clean.seconds:.0f} s known to be undisturbed.",
+                "bad", f"{what}: {clean.words(rate)}.",
                 "Recordings that it learned from are too few or too unlike: look where it alarms before you act on it.",
             )  # fmt: skip
 

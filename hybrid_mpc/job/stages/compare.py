@@ -33,7 +33,8 @@ from hybrid_mpc.job.stage import UNKNOWN, Absent, Stage, program, source_of
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.summary import by_task
 from hybrid_mpc.job.tasks import tasks_of
-from hybrid_mpc.kit.artifact import LoopSettings, load, loop_settings, read_description
+from hybrid_mpc.kit.artifact import load
+from hybrid_mpc.kit.parts import LoopSettings, artifact_digest, loop_settings, read_parts
 from hybrid_mpc.loop.loop import Loop
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 
@@ -217,13 +218,13 @@ def run_specs(
     Loops whose monitors alarm by nothing that was learned run as in a run's first pass, which has learned nothing yet.
     """
     learned = any(spec.monitor not in ("own", "none") for spec in specs)
-    bench = _bench(scenario, folder, (folder / "model.json").stat().st_mtime_ns, learned)
+    bench = _bench(scenario, folder, artifact_digest(folder), learned)
     return list(run_loops(bench, specs, report))
 
 
 @lru_cache(maxsize=1)
-def _bench(scenario: str, folder: Path, changed: int, learned: bool) -> Bench:
-    """A bench with a run's model, as the folder was when it ``changed``, with what its monitors have learned or not."""
+def _bench(scenario: str, folder: Path, content: str, learned: bool) -> Bench:
+    """A bench with a run's model, of the folder with this ``content``, with what its monitors have learned or not."""
     kit = load(folder)
     return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, calibration=None)})
 
@@ -261,12 +262,13 @@ def run_or_read(
 
 def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
     """Digest of all that decides what loops of a run compute: specifications, machine, tasks, model and program."""
-    model = read_description(context.out / "model")
-    rest = None if model.calibration is None else model.calibration.rest_speed
+    parts = read_parts(context.out / "model")
+    model = parts.description
+    rest = None if parts.calibration is None else parts.calibration.rest_speed
     of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
     scenario = context.ready
     tasks = {task.name: task for task in scenario.tasks}
-    loop = loop_settings(scenario, model.loop.process_noise)
+    loop = loop_settings(scenario, parts.loop.process_noise)
     oracle = source_of(scenario.oracle) if any(spec.controller in ORACLES for spec in specs) else None
     contents = [task_content(tasks[spec.task], context.spec.dt, loop) for spec in specs]
     read = contents, source_of(scenario.plant), oracle

@@ -1,4 +1,4 @@
-"""Stages export and noise: the artifact of the hybrid and the fitted prior, and what their estimators assume."""
+"""Stages export, noise and tasks: the models of an artifact, what their estimators assume, and the control problems."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import nn_export
 from hybrid_mpc.data.scales import robust_spread
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import sha256
+from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.identify.export import check_parity, trace_model
 from hybrid_mpc.identify.prior_model import model_info
 from hybrid_mpc.identify.step import PriorStep, RecurrentStep
@@ -20,14 +20,17 @@ from hybrid_mpc.job.controllers import noise_of
 from hybrid_mpc.job.stage import Absent, Stage, source_of
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, trained_models
-from hybrid_mpc.kit.artifact import (
+from hybrid_mpc.kit.artifact import member_names, save_models
+from hybrid_mpc.kit.parts import (
     MOST_MEMBERS,
+    PROGRAMS,
+    ObserverSettings,
     Provenance,
     loop_settings,
-    member_names,
     read_description,
-    save_artifact,
-    write_description,
+    read_parts,
+    write_observer,
+    write_tasks,
 )
 from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.machine.prior import Prior
@@ -49,9 +52,19 @@ class ExportResult:
 
 @dataclass(frozen=True)
 class NoiseResult:
-    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator."""
+    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator, and the
+    digest of the models that it was estimated with.
+    """
 
     process_noise: Mapping[str, tuple[float, ...]]
+    of: str = ""
+
+
+@dataclass(frozen=True)
+class TasksResult:
+    """Digest of the control problems, safe input and causes that the artifact holds."""
+
+    digest: str
 
 
 def export_stage(context: Context) -> ExportResult:
@@ -89,15 +102,15 @@ def export_stage(context: Context) -> ExportResult:
     )  # fmt: skip
     folder = context.out / "model"
     beside = [programs.pop(name) for name in members]
-    save_artifact(
-        folder, programs, deployed, provenance=provenance, loop=loop_settings(context.scenario),
+    programs_sha256 = save_models(
+        folder, programs, deployed, provenance=provenance,
         recommended="prior" if chosen.choice.recommended == "phy" else "hybrid", members=beside,
         predicting=predicting(context, phy),
     )  # fmt: skip
     return ExportResult(
         max(p.max_abs_error for p in parities),
         max(p.jacobian_max_abs_error for p in parities),
-        read_description(folder).programs_sha256,
+        programs_sha256,
     )
 
 
@@ -125,7 +138,7 @@ def artifact_is_there(context: Context, found: ExportResult) -> str:
     """Whether the artifact lies where the run left it; a text if not."""
     folder = context.out / "model"
     try:
-        held = {read_description(folder).programs_sha256, sha256(folder / "programs.json")}
+        held = {read_description(folder).programs_sha256, sha256(folder / PROGRAMS)}
     except InputError as damaged:
         return str(damaged)
     return "" if held == {found.programs_sha256} else "the artifact was changed"
@@ -133,22 +146,39 @@ def artifact_is_there(context: Context, found: ExportResult) -> str:
 
 def noise_stage(context: Context) -> NoiseResult | Absent:
     """Tune the estimators on training recordings, by maximum likelihood."""
+    of = read_parts(context.out / "model").models
     if context.scenario.control is None:
-        put_noise(context, NoiseResult({}))
+        put_noise(context, NoiseResult({}, of))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     found = noise_of(context.scenario, context.kit, context.commanded("train"))
-    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()})
+    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()}, of)
     put_noise(context, result)
     return result
 
 
 def put_noise(context: Context, found: NoiseResult) -> str:
-    """Write the scenario's control problems and the noise into the artifact."""
-    folder = context.out / "model"
-    held = read_description(folder)
-    loop = loop_settings(context.scenario, found.process_noise)
-    if loop != held.loop:
-        write_description(folder, replace(held, loop=loop))
+    """Write ``observer.json``: the noise, and what the scenario says of its sensors and disturbances."""
+    folder, scenario = context.out / "model", context.scenario
+    write_observer(
+        folder,
+        ObserverSettings(
+            scenario.sensor_sigma, scenario.first_sigma, found.process_noise, scenario.disturbance_model,
+            found.of,
+        ),
+    )  # fmt: skip
+    return ""
+
+
+def tasks_stage(context: Context) -> TasksResult:
+    """Write the control problems that the scenario states now."""
+    found = TasksResult(digest(loop_settings(context.scenario)))
+    put_tasks(context, found)
+    return found
+
+
+def put_tasks(context: Context, found: TasksResult) -> str:
+    """Write ``tasks.json`` and ``tasks/``."""
+    write_tasks(context.out / "model", loop_settings(context.scenario))
     return ""
 
 
@@ -173,4 +203,8 @@ EXPORT = Stage(
 NOISE = Stage(
     "noise", "tuning the observers", NoiseResult, noise_stage, observed, (DATA, PRIOR, EXPORT), optional=True,
     restore=put_noise,
+)  # fmt: skip
+TASKS = Stage(
+    "tasks", "writing the control problems", TasksResult, tasks_stage,
+    lambda context: {"control problems": loop_settings(context.scenario)}, (EXPORT,), restore=put_tasks,
 )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,9 @@ from hybrid_mpc.job.stages.monitor import (
     RecordedAlarm,
     clean_windows,
 )
-from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
+from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import energy_is_watched
+from hybrid_mpc.kit.parts import GuardLimits, read_parts, write_guard
 from hybrid_mpc.loop.faults import Fault, install
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, Calibration, stretches
@@ -316,6 +317,7 @@ class GuardResult:
         faults: Loops in which something breaks; None without a plant or without a calm task.
         shown: Name of the recording whose trace is kept; empty for none.
         arrays: Traces, see :func:`read_trace`.
+        of: Digest of the observer that it was learned with.
     """
 
     source: str
@@ -326,6 +328,7 @@ class GuardResult:
     faults: tuple[FaultedLoop, ...] | None = None
     shown: str = ""
     arrays: Mapping[str, Array] = field(default_factory=dict)
+    of: str = ""
 
 
 def guard_stage(context: Context) -> GuardResult | Absent:
@@ -351,7 +354,9 @@ def guard_stage(context: Context) -> GuardResult | Absent:
         )  # fmt: skip
     except InputError as none:
         reason = f"no detector could be learned from {data.source}: {none}"
-    set_calibration(context.out / "model", replace(calibration, detector=detector))
+    folder = context.out / "model"
+    of = read_parts(folder).observer("hybrid")
+    write_guard(folder, GuardLimits(detector, reason, of))
     kit = context.kit
     test, shown, arrays = _recorded(context, kit, detector)
     if detector is not None and scenario.plant is not None and any(not t.faults for t in scenario.tasks):
@@ -359,16 +364,12 @@ def guard_stage(context: Context) -> GuardResult | Absent:
         bench, s = Bench(scenario, {MODEL: kit}), context.settings
         faults, more = faulted(bench, s.scenario, s.seed, scenario.causes)
         arrays |= more
-    return GuardResult(data.source, data.loops, test, detector, reason, faults, shown, arrays)
+    return GuardResult(data.source, data.loops, test, detector, reason, faults, shown, arrays, of)
 
 
 def put_detector(context: Context, found: GuardResult) -> str:
-    """Write the detector into the artifact."""
-    held = read_description(context.out / "model").calibration
-    if held is None:
-        return "the artifact holds no calibration"
-    if held.detector != found.detector:
-        set_calibration(context.out / "model", replace(held, detector=found.detector))
+    """Write ``guard.json``."""
+    write_guard(context.out / "model", GuardLimits(found.detector, found.reason, found.of))
     return ""
 
 

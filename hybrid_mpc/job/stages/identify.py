@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from numpy.typing import NDArray
@@ -25,23 +27,27 @@ from hybrid_mpc.identify.evaluate import (
     score,
     stacked_free_runs,
 )
-from hybrid_mpc.identify.fit import beyond_ranges, fit_prior, smoothed
+from hybrid_mpc.identify.fit import POOR, beyond_ranges, fit_prior, smoothed
 from hybrid_mpc.identify.linear import BASELINES, LinearModel
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
+from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.sound import (
     BoundCost,
     bound_costs,
+    bounds_doubt,
     constant_runs,
     correlation_of_errors,
+    fit_doubt,
     growth_time,
+    no_gain,
     problems,
     structure_doubt,
     trial_length,
 )
 from hybrid_mpc.identify.step import PriorStep, Scaling
-from hybrid_mpc.identify.structure import causes, named, run_length
+from hybrid_mpc.identify.structure import causes, causes_of_refusal, named
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.job.check import rests_no_more
 from hybrid_mpc.job.context import Context
@@ -58,6 +64,13 @@ MODELS = ("phy_nominal", "phy", *KINDS)
 """Models that may be evaluated; those of a prior: :func:`models_of`."""
 PARTS = 4
 """Parts of the training data at least: a network that leaves one out still sees three quarters."""
+REMEDY = (
+    "Correct the prior: a sign, a unit, or a term or state that is missing (docs/prior-wrong.md). Fix parameters that "
+    "the recordings do not tell. 'hybrid-mpc check MACHINE --data FILE --fit' shows the fit"
+)
+"""What to do about a fit that nothing may be built on."""
+IN_DOUBT = "the structure of the prior is in doubt"
+"""Said before each reason for it."""
 ERRORS = {"error": "E_sim", "output": "RMSE over the spread"}
 """What the validation of a training is called, by its first objective."""
 
@@ -119,7 +132,10 @@ class PriorResult:
         baselines: Errors on the test recordings of simpler models, by name: ``"constant"`` (the training mean) and
             linear models of inputs and outputs.
         bounds: Parameters at a bound, and what each bound costs.
-        in_doubt: Why the prior's structure is in doubt.
+        in_doubt: Why the prior's structure is in doubt, what names the cause first.
+        errors: Errors on the test recordings of the prior with nominal (``"phy_nominal"``) and fitted (``"phy"``)
+            parameters.
+        no_gain: Why nothing may be built on this fit: a constant or the nominal parameters are better. Empty: it may.
         error_correlation: Correlation of the smoother's one-step errors with those of the sample before, by output;
             zero is white.
         longest_run: Length [s] of the free runs that models are judged by; None: whole recordings.
@@ -132,6 +148,8 @@ class PriorResult:
     baselines: Mapping[str, BaselineScores]
     bounds: tuple[BoundCost, ...]
     in_doubt: tuple[str, ...]
+    errors: Mapping[str, OutputErrors]
+    no_gain: str
     error_correlation: Mapping[str, float]
     longest_run: float | None
     arrays: Mapping[str, Array]
@@ -242,7 +260,26 @@ def prior_stage(context: Context) -> PriorResult:
     """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it.
 
     Raises:
-        InputError: If the fit is impossible, or what it gives is of no use to later stages
+        InputError: If the fit is impossible, or what it gives is of no use to later stages.
+    """
+    found = examined_prior(context)
+    refuse(stops(found))
+    return found
+
+
+def stops(found: PriorResult, *, cause: bool = True) -> tuple[str, ...]:
+    """What must be mended before anything is built on a fitted prior, with the likeliest ``cause``."""
+    if not found.no_gain:
+        return ()
+    why = f". In doubt: {found.in_doubt[0]}" if found.in_doubt and cause else ""
+    return (f"fit of the prior: {found.no_gain}{why}. {REMEDY}",)
+
+
+def examined_prior(context: Context) -> PriorResult:
+    """:func:`prior_stage` without its end: a fit that nothing may be built on is told in ``no_gain``.
+
+    Raises:
+        InputError: If the fit is impossible, or what it gives is not finite or has run away
             (:func:`~hybrid_mpc.identify.sound.problems`).
     """
     make, spec = context.scenario.prior, context.spec
@@ -250,10 +287,15 @@ def prior_stage(context: Context) -> PriorResult:
     longest = spec.free_run or max(
         ((len(t.t) - context.warm) * spec.dt for t in (*valid, *test)), default=None
     )
-    fit = fit_prior(
-        make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay, time_unit=context.time_unit,
-        on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
-    )  # fmt: skip
+    try:
+        fit = fit_prior(
+            make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay,
+            time_unit=context.time_unit,
+            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+        )  # fmt: skip
+    except InputError as error:
+        wrong = named(causes_of_refusal(make, train, spec.dt, longest or math.inf, context.time_unit))
+        raise InputError(f"{error}. In doubt: {wrong}" if wrong else str(error)) from error
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
     fitted = make(fit.values)
     smoother = fit.smoother(fitted, spec.dt)
@@ -266,41 +308,48 @@ def prior_stage(context: Context) -> PriorResult:
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     unseen = every[len(train) + len(valid) :]
-    step = PriorStep(fitted, spec.dt, fit.substeps)
-    linear = _linear_models(context)
-
-    def judged(length: float | None) -> tuple[float, dict[str, BaselineScores]]:
-        """Errors of free runs of this length, of the fitted prior and of simpler models."""
-        runs = evaluation_trajectories(unseen, smoother, context.warm, length)
-        own = score(free_runs(step, fitted, runs, context.warm), fitted, smoother.sizes.y).error
-        return own, _baselines(context, linear, fitted, smoother.sizes.y, runs)
-
+    judge, linear = _Judge(context, fitted, fit, smoother), _linear_models(context)
     longest_run = spec.free_run
-    error, baselines = judged(longest_run)
-    told = ()
-    if longest_run is None and (shorter := growth_time(make, fit, every, spec.dt)) < (longest or 0.0):
-        constant = baselines["constant"].errors
-        if (
-            constant is not None and error > constant.error
-        ):  # whole runs say nothing of a machine that runs away
-            longest_run = max(shorter, 2 * spec.dt)
-            error, baselines = judged(longest_run)
-            told = (
-                f"small errors grow tenfold in {shorter:.2g} s, so long free runs say nothing of a model: models are "
-                "trained and judged by free runs of that length; free_run of the DataSpec sets another",
-            )
-            context.progress.warn(told[0])
+    errors, baselines = judge.errors(unseen, longest_run, linear)
+    told, shorter = (), growth_time(make, fit, every, spec.dt)
+    grows = shorter < (longest or 0.0)
+    if longest_run is None and grows and errors["phy"].error > _error_of(baselines["constant"]):
+        # whole runs say nothing of a machine that runs away
+        longest_run = max(shorter, 2 * spec.dt)
+        errors, baselines = judge.errors(unseen, longest_run, linear)
+        told = (
+            f"small errors grow tenfold in {shorter:.2g} s, so long free runs say nothing of a model: models are "
+            "trained and judged by free runs of that length; free_run of the DataSpec sets another",
+        )
+        context.progress.warn(told[0])
     fit = replace(fit, warnings=(*fit.warnings, *told))
+    own = {name: one.error for name, one in errors.items()} | {"constant": _error_of(baselines["constant"])}
+    training: dict[str, float] = {}
+    if own["phy"] >= own["constant"]:
+        seen, mean = judge.errors(every[: len(train)], longest_run)
+        training = {"phy": seen["phy"].error, "constant": _error_of(mean["constant"])}
     # of a machine that runs away, recorded under its controller, inputs tell linear models what outputs will be
     compared = baselines if not told else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
     acting, unit = shifted(train, fit.delay), context.time_unit
-    length = run_length(make, fit.values, acting, spec.dt, longest_run or longest or trial, unit)
+    length = longest_run or longest or trial
     context.progress.update("free runs", 1, 1, "looking for wrong terms")
-    wrong = named(causes(make, fit.values, acting, spec.dt, length, unit))
-    in_doubt = tuple(one for one in (structure_doubt(error, simpler), wrong) if one)
+    off = zip(errors["phy"].rmse.items(), smoother.sizes.y, strict=True)
+    reasons = [
+        named(causes(make, fit.values, acting, spec.dt, length, unit)),
+        bounds_doubt(bounds, len(fit.standard_errors)),
+    ]
+    # where small errors grow, those of first states do: free runs with fitted ones tell whether the equations are right
+    short = grows and longest_run is not None
+    follows = short and min(row["validation_error"] for row in fit.stages) <= POOR
+    if not follows:
+        reasons += [
+            structure_doubt(own["phy"], simpler),
+            fit_doubt(errors["phy"].fit_percent, {name: e / size for (name, e), size in off}),
+        ]
+    in_doubt = tuple(one for one in reasons if one)
     for doubt in in_doubt:
-        context.progress.warn(f"the structure of the prior is in doubt: {doubt}")
+        context.progress.warn(f"{IN_DOUBT}: {doubt}")
     one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
     return PriorResult(
         fit,
@@ -309,10 +358,17 @@ def prior_stage(context: Context) -> PriorResult:
         baselines,
         bounds,
         in_doubt,
+        errors,
+        "" if follows else no_gain(own, training),
         {s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)},
         longest_run,
         {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )
+
+
+def _error_of(baseline: BaselineScores) -> float:
+    """Error of a baseline; infinite where there is none."""
+    return math.inf if baseline.errors is None else baseline.errors.error
 
 
 def _linear_models(context: Context) -> dict[str, LinearModel | str]:
@@ -327,29 +383,53 @@ def _linear_models(context: Context) -> dict[str, LinearModel | str]:
     return found
 
 
-def _baselines(
-    context: Context,
-    linear: Mapping[str, LinearModel | str],
-    fitted: Prior,
-    spread: Sequence[float],
-    runs: Sequence[Trajectory],
-) -> dict[str, BaselineScores]:
-    """Errors of simpler models over the same trajectories, from the same warm-up as the prior's."""
-    warm = context.warm + 1  # the prior starts from a state that knows this sample
+@dataclass(frozen=True)
+class _Judge:
+    """Free runs of a prior and of simpler models over the same trajectories, from the same warm-up."""
 
-    def scored(y_hat: Sequence[Array], chosen: str) -> BaselineScores:
-        shown = [measured_as(fitted, own) for own in y_hat]
-        return BaselineScores(
-            output_errors(shown, [t.y[warm:] for t in runs], fitted.outputs, spread), chosen
-        )
+    context: Context
+    fitted: Prior
+    fit: PriorFit
+    smoother: Smoother
 
-    found = {"constant": scored(constant_runs(context.trajectories("train"), runs, warm), "")}
-    for name, model in linear.items():
-        if isinstance(model, str):
-            found[name] = BaselineScores(reason=model)
-        else:
-            found[name] = scored(model.free_runs(runs, warm), model.chosen.text)
-    return found
+    def errors(
+        self,
+        trajectories: Sequence[Trajectory],
+        length: float | None,
+        linear: Mapping[str, LinearModel | str] = MappingProxyType({}),
+    ) -> tuple[dict[str, OutputErrors], dict[str, BaselineScores]]:
+        """Errors of the nominal and the fitted prior, and of a constant and linear models, by name.
+
+        Args:
+            trajectories: Smoothed trajectories.
+            length: Length [s] of the runs; None: whole trajectories.
+            linear: Linear models, or why there is none.
+        """
+        context, fitted = self.context, self.fitted
+        runs = evaluation_trajectories(trajectories, self.smoother, context.warm, length)
+        dt, own = context.spec.dt, {}
+        for name, step in (
+            ("phy_nominal", PriorStep(context.scenario.prior(), dt)),
+            ("phy", PriorStep(fitted, dt, self.fit.substeps)),
+        ):
+            found = score(free_runs(step, fitted, runs, context.warm), fitted, self.smoother.sizes.y)
+            own[name] = OutputErrors(found.error, found.rmse, found.fit_percent)
+        warm = context.warm + 1  # the prior starts from a state that knows this sample
+        simpler = {
+            "constant": self._scored(constant_runs(context.trajectories("train"), runs, warm), runs, warm)
+        }
+        for name, model in linear.items():
+            if isinstance(model, str):
+                simpler[name] = BaselineScores(reason=model)
+            else:
+                scored = self._scored(model.free_runs(runs, warm), runs, warm)
+                simpler[name] = replace(scored, chosen=model.chosen.text)
+        return own, simpler
+
+    def _scored(self, y_hat: Sequence[Array], runs: Sequence[Trajectory], warm: int) -> BaselineScores:
+        shown = [measured_as(self.fitted, own) for own in y_hat]
+        measured = [t.y[warm:] for t in runs]
+        return BaselineScores(output_errors(shown, measured, self.fitted.outputs, self.smoother.sizes.y))
 
 
 def what_training_reads(context: Context) -> dict[str, object]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import poisson
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.errors import InputError
@@ -17,8 +18,9 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import what_loops_read
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
 from hybrid_mpc.job.stages.identify import DATA
-from hybrid_mpc.kit.artifact import Kit, read_description, set_calibration
+from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import energy_is_watched, make_monitor
+from hybrid_mpc.kit.parts import EnergyLimits, read_parts, write_energy
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.loop.simulate import ClosedLoopResult
 from hybrid_mpc.model.model import HybridModel
@@ -46,6 +48,8 @@ LEARNED_FROM: Mapping[tuple[str, ...], str] = {
 """What limits or a detector are learned from, in words."""
 FAULT_SEED = 600
 """Number of the loops in which something breaks, away from those that a detector is learned from."""
+UNLIKELY = 0.05
+"""Alarms of which so many or more are less likely than this are more than the limits were learned for."""
 LOAD_SHARE = 0.2
 """Unknown load of the demonstration, as a share of half the input's range."""
 MARGIN = 1.5
@@ -94,6 +98,32 @@ class CleanAlarms:
     test_seconds: float = 0.0
     test_alarms: int = 0
 
+    def too_many(self, per_hour: float) -> bool:
+        """Whether limits that were learned for a rate of false alarms [1/h] keep it: so many alarms or more have a
+        probability below 5 % (Poisson).
+
+        Example:
+            >>> [CleanAlarms(300.0, alarms).too_many(10.0) for alarms in (0, 1, 2, 3)]
+            [False, False, False, True]
+        """
+        return self.alarms > 0 and float(poisson.sf(self.alarms - 1, self.expected(per_hour))) < UNLIKELY
+
+    def expected(self, per_hour: float) -> float:
+        """Alarms that a rate of false alarms [1/h] lets expect in that time."""
+        return per_hour * self.seconds / 3600.0
+
+    def words(self, per_hour: float) -> str:
+        """The alarms beside those that the limits were learned for.
+
+        Example:
+            >>> CleanAlarms(300.0, 1).words(10.0)
+            '1 in 300 s known to be undisturbed, where 10 false alarms an hour let expect 0.83'
+        """
+        return (
+            f"{self.alarms} in {self.seconds:.0f} s known to be undisturbed, where {per_hour:g} false alarms an hour "
+            f"let expect {self.expected(per_hour):.2g}"
+        )
+
 
 @dataclass(frozen=True)
 class UnknownLoad:
@@ -126,6 +156,7 @@ class MonitorResult:
         clean: Alarms where nothing disturbs the machine; None where nothing could be calibrated.
         load: The loop with an unknown load; None without a plant.
         arrays: ``"RECORDING/SIGNAL"``, and ``"load/SIGNAL"`` of the loop.
+        of: Digest of the observer that it was calibrated with.
     """
 
     calibration: Calibration
@@ -135,6 +166,7 @@ class MonitorResult:
     clean: CleanAlarms | None = None
     load: UnknownLoad | None = None
     arrays: Mapping[str, Array] = field(default_factory=dict)
+    of: str = ""
 
 
 def monitor_stage(context: Context) -> MonitorResult | Absent:
@@ -146,6 +178,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
         return Absent(NO_PROBLEM)
     context.read(NOISE)
     kit, whole = context.kit, context.dataset.whole
+    of = read_parts(context.out / "model").observer("hybrid")
     model, reason, rest = kit.models["hybrid"], "", None
     if not energy_is_watched(model):
         return Absent(NO_ENERGY.format(scenario=context.scenario.name))
@@ -175,7 +208,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     except InputError as none:
         reason = reason or f"the monitor could not be calibrated: {none}"
     if reason:
-        result = MonitorResult(Calibration.without(reason, rest), covered, reason)
+        result = MonitorResult(Calibration.without(reason, rest), covered, reason, of=of)
         put_calibration(context, result)
         return result
     alarms, arrays, on = [], {}, []
@@ -191,7 +224,7 @@ def monitor_stage(context: Context) -> MonitorResult | Absent:
     if context.scenario.plant is not None and context.scenario.tasks:
         load, loop = _load_loop(context, replace(kit, calibration=calibration))
         arrays |= {f"load/{key}": getattr(loop, key) for key in ("t", "violation", "level", "alarm", "y")}
-    result = MonitorResult(calibration, covered, "", tuple(alarms), clean, load, arrays)
+    result = MonitorResult(calibration, covered, "", tuple(alarms), clean, load, arrays, of)
     put_calibration(context, result)
     return result
 
@@ -214,10 +247,8 @@ def clean_alarms(
 
 
 def put_calibration(context: Context, found: MonitorResult) -> str:
-    """Write the calibration into the artifact, unless it is there with a detector."""
-    held = read_description(context.out / "model").calibration
-    if held is None or replace(held, detector=None) != found.calibration:
-        set_calibration(context.out / "model", found.calibration)
+    """Write ``watch/energy.json``."""
+    write_energy(context.out / "model", EnergyLimits(found.calibration, found.of))
     return ""
 
 

@@ -16,7 +16,7 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import run_or_read, task_content
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.job.tasks import tasks_of
-from hybrid_mpc.kit.artifact import loop_settings
+from hybrid_mpc.kit.parts import loop_settings
 
 Array = NDArray[np.float64]
 

@@ -15,17 +15,24 @@ from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.compare import CONTROL, what_loops_read
 from hybrid_mpc.job.stages.estimate import ESTIMATION
 from hybrid_mpc.job.stages.export import EXPORT, NOISE
+from hybrid_mpc.job.stages.identify import PRIOR, PriorResult
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, what_on_model_reads
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.kit.promises import Promise, PromiseTable, read_promises, write_promises
 from hybrid_mpc.scenario import Task
 
+STRUCTURE = "structure of the prior"
+"""Name of the row about the prior on which all models stand."""
+MEND = "Correct the prior first: docs/prior-wrong.md says how to read each reason."
+"""What to do about a prior whose structure is in doubt."""
+
 
 @dataclass(frozen=True)
 class PromisesResult:
-    """The table "What this kit promises": its rows in their order."""
+    """The table "What this kit promises": its rows in their order, and the digest of what it was made of."""
 
     rows: tuple[Promise, ...]
+    of: str = ""
 
 
 def promises_stage(context: Context) -> PromisesResult | Absent:
@@ -47,9 +54,23 @@ def promises_stage(context: Context) -> PromisesResult | Absent:
         tested=_tested(context, controller, kit.models[kit.recommended].n_y),
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
-    result = PromisesResult(found)
+    result = PromisesResult((structure(context.prior), *found), kit.identity)
     put_promises(context, result)
     return result
+
+
+def structure(prior: PriorResult) -> Promise:
+    """Whether the structure of the fitted prior, on which all models stand, is in doubt."""
+    errors = {
+        "the fitted prior": prior.errors["phy"].error,
+        "the nominal one": prior.errors["phy_nominal"].error,
+    }
+    errors |= {name: one.errors.error for name, one in prior.baselines.items() if one.errors is not None}
+    figures = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
+    evidence = f"error of free runs on unseen recordings over the outputs' spread: {figures}"
+    if not prior.in_doubt:
+        return Promise(STRUCTURE, "shown", f"no term, signal or bound is in doubt; {evidence}")
+    return Promise(STRUCTURE, "doubted", f"{'; '.join(prior.in_doubt)}; {evidence}", MEND)
 
 
 def _tasks(context: Context) -> tuple[Task, ...]:
@@ -87,7 +108,7 @@ def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
 
 def put_promises(context: Context, found: PromisesResult) -> str:
     """Write the table beside the models, unless it is there."""
-    folder, table = context.out / "model", PromiseTable(context.kit.identity, found.rows)
+    folder, table = context.out / "model", PromiseTable(found.of, found.rows)
     try:
         there = read_promises(folder) == table
     except InputError:  # damaged, or of another version: it is written anew
@@ -104,5 +125,5 @@ def what_promises_read(context: Context) -> Mapping[str, object]:
 
 PROMISES = Stage(
     "promises", "examining what the kit promises", PromisesResult, promises_stage, what_promises_read,
-    (EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
+    (PRIOR, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
 )  # fmt: skip

@@ -17,7 +17,7 @@ from hybrid_mpc.job.controllers import CONTROLLERS
 from hybrid_mpc.job.loops import DRAWN_PRIOR, ON_MODEL
 from hybrid_mpc.job.sequential import SAME, hardest
 from hybrid_mpc.job.stage import Absent, Stage, source_of
-from hybrid_mpc.job.stages.advice import advice
+from hybrid_mpc.job.stages.advice import advice, doubt_of
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL
@@ -43,6 +43,7 @@ from hybrid_mpc.job.stages.results import (
     OnModel,
     Promises,
     Residuals,
+    ResidualsDetails,
     Results,
     Timing,
     collect,
@@ -51,6 +52,7 @@ from hybrid_mpc.job.stages.results import (
     ratio,
     recordings,
 )
+from hybrid_mpc.job.stages.watching import watching_table
 from hybrid_mpc.job.step_response import step_responses
 from hybrid_mpc.job.summary import Summary
 from hybrid_mpc.job.tasks import tasks_of
@@ -80,7 +82,7 @@ LIBRARY = Path(__file__).parents[2]
 DRAWN_IN = ("plots", "report")
 """Rooms whose files decide what the report looks like, its templates among them."""
 DRAWN_BY = (
-    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report", "results")),
+    *(f"job/stages/{name}.py" for name in ("advice", "figures", "report", "results", "watching")),
     *(f"job/{name}.py" for name in ("loop_figures", "sequential", "step_response", "summary")),
 )
 """Modules that do, too."""
@@ -197,7 +199,8 @@ def report_so_far(context: Context) -> None:
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
     going = "This run goes on: the page is written anew after the first stages and at the end. Load it again."
     s, title = context.scenario, f"hybrid-mpc: {context.scenario.name}"
-    page = Report(title, s.title, s.description, command(context), (), sections, going)
+    doubt = doubt_of(context.prior.in_doubt)
+    page = Report(title, s.title, s.description, command(context), (), sections, going, doubt=doubt)
     write_report(context.out / "report.html", page)
 
 
@@ -257,7 +260,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "on_model": _on_model_tables(results.on_model),
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
-        "residuals": _residual_tables(results.residuals),
+        "residuals": [_watching(context), *_residual_tables(results.residuals)],
         "monitor": [_alarm_table(context, results.monitor)],
         "guard": guard_tables(results.guard),
         "analysis": [_pole_table(results.analysis)],
@@ -289,6 +292,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
         advice(results),
+        doubt_of(found.details.prior_parameters.in_doubt),
     )
 
 
@@ -326,10 +330,11 @@ def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     if p99 is not None:
         comment = f"period: {period:g} ms"
         yield KeyFigure("Controller step, 99th percentile", p99, "ms", comment, _verdict(p99 / period))
-    alarms, clean = results.monitor.alarms, results.monitor.details.clean
-    if alarms is not None and clean is not None:
-        comment = f"{clean.alarms} of them in {clean.seconds:.0f} s known to be undisturbed"
-        verdict: Verdict = "good" if clean.alarms == 0 else "bad"
+    alarms, held = results.monitor.alarms, results.monitor.details
+    if alarms is not None and held.clean is not None and held.calibration is not None:
+        rate = held.calibration.false_alarms_per_hour
+        comment = f"of them {held.clean.words(rate)}"
+        verdict: Verdict = "bad" if held.clean.too_many(rate) else "good"
         yield KeyFigure("Alarms of the energy monitor", len(alarms), "", comment, verdict)
 
 
@@ -391,7 +396,7 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     after["residuals"] = (
         (f"No alarms here: {watched.reason.rstrip('.')}.",)
         if watched.alarms is None
-        else (f"Limits are from {watched.details.source}.",)
+        else (f"Limits are from {watched.details.source}.", *_clean_words(watched.details))
     )
     monitor = results.monitor
     if monitor.details.calibration is None:
@@ -409,6 +414,15 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
             f"{name}: {m.fixed_point_reason}" for name, m in models.items() if m.fixed_point_reason
         )
     return instead, after
+
+
+def _clean_words(found: ResidualsDetails) -> tuple[str, ...]:
+    """Alarms where nothing disturbs the machine, beside the rate that the limits were learned for."""
+    if found.clean is None or not found.limits:
+        return ()
+    rate = tuple(found.limits.values())[-1].false_alarms_per_hour
+    verdict = "more than they promise" if found.clean.too_many(rate) else "within what they promise"
+    return (f"Alarms there: {found.clean.words(rate)}: {verdict}.",)
 
 
 def _prior_replay_text(weight: float) -> tuple[str, ...]:
@@ -731,6 +745,13 @@ def _residual_tables(found: Residuals) -> list[Table | None]:
         columns = ("fault", "at [s]", "alarm after [s]", "alarms before", "channels", "taken for")
         tables.append(Table(columns, broken, "Loops in which something breaks."))
     return tables
+
+
+def _watching(context: Context) -> Table | None:
+    """The table of all channels; its faults stand in the tables behind it."""
+    monitor, guard, residuals = context.find(MONITOR), context.find(GUARD), context.find(RESIDUALS)
+    unit = "" if isinstance(monitor, Absent) else force_unit(context.kit.models["prior"])
+    return watching_table(monitor, guard, residuals, unit)
 
 
 def _alarm_table(context: Context, monitor: Monitor) -> Table | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,8 +30,9 @@ from hybrid_mpc.job.stages.monitor import (
     inside,
     rates,
 )
-from hybrid_mpc.kit.artifact import Kit, read_description, set_residuals
+from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import energy_is_watched
+from hybrid_mpc.kit.parts import ChannelLimits, read_parts, write_residuals
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.monitor.replay import along
@@ -95,6 +96,9 @@ class ResidualsResult:
         alarms: Alarms of the recommended model on the recordings that were replayed.
         clean: Alarms where nothing disturbs the machine.
         faults: Loops in which something breaks; None where the energy is watched, or without a plant.
+        of: Digests of the observers that they were learned with, by model.
+        by_channel: Alarms of the recommended model's channels where nothing disturbs the machine.
+        units: Units of these channels.
     """
 
     limits: Mapping[str, ResidualLimits]
@@ -102,6 +106,9 @@ class ResidualsResult:
     alarms: tuple[ChannelAlarm, ...]
     clean: CleanAlarms
     faults: tuple[FaultedChannel, ...] | None = None
+    of: Mapping[str, str] = field(default_factory=dict)
+    by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
+    units: tuple[str, ...] = ()
 
 
 def residuals_stage(context: Context) -> ResidualsResult | Absent:
@@ -119,21 +126,22 @@ def residuals_stage(context: Context) -> ResidualsResult | Absent:
         except InputError as none:
             return Absent(f"no limits of residuals could be learned: {none}")
         limits[name] = found
-    set_residuals(context.out / "model", limits)
-    alarms, clean = _on_recordings(
-        context, ResidualMonitor(kit.models[name], limits=found), recordings, traces
-    )
+    folder = context.out / "model"
+    parts = read_parts(folder)
+    of = {model: parts.observer(model) for model in limits}
+    write_residuals(folder, ChannelLimits(limits, of))
+    monitor = ResidualMonitor(kit.models[name], limits=found)
+    alarms, clean, by_channel = _on_recordings(context, monitor, recordings, traces)
     faults = None
     calm = [task for task in scenario.tasks if not task.faults]
     if scenario.plant is not None and calm and not energy_is_watched(kit.models["hybrid"]):
         faults = _faulted(context, context.kit, calm[0].name)
-    return ResidualsResult(limits, source, alarms, clean, faults)
+    return ResidualsResult(limits, source, alarms, clean, faults, of, by_channel, monitor.units)
 
 
 def put_residuals(context: Context, found: ResidualsResult) -> str:
-    """Write the limits into the artifact, unless they are there."""
-    if read_description(context.out / "model").residuals != found.limits:
-        set_residuals(context.out / "model", found.limits)
+    """Write ``watch/residuals.json``."""
+    write_residuals(context.out / "model", ChannelLimits(found.limits, found.of))
     return ""
 
 
@@ -175,9 +183,10 @@ def _on_recordings(
     monitor: ResidualMonitor,
     recordings: Sequence[Trajectory],
     traces: Sequence[ResidualTrace],
-) -> tuple[tuple[ChannelAlarm, ...], CleanAlarms]:
+) -> tuple[tuple[ChannelAlarm, ...], CleanAlarms, dict[str, CleanAlarms]]:
     alarms: list[ChannelAlarm] = []
     on: list[NDArray[np.bool_]] = []
+    by_channel: list[NDArray[np.bool_]] = []
     for recording, levels in zip(recordings, traces, strict=True):
         trace = with_alarms(monitor, levels, recording.y)
         alarms += [
@@ -185,7 +194,12 @@ def _on_recordings(
             for start, end in trace.intervals()
         ]
         on.append(trace.alarm)
-    return tuple(alarms), clean_alarms(context, recordings, on)
+        by_channel.append(trace.on)
+    each = {
+        channel: clean_alarms(context, recordings, [rows[:, i] for rows in by_channel])
+        for i, channel in enumerate(monitor.channels)
+    }
+    return tuple(alarms), clean_alarms(context, recordings, on), each
 
 
 def broken(model: HybridModel, start: float) -> list[Fault]:

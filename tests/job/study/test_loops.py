@@ -21,7 +21,7 @@ from hybrid_mpc import (
 from hybrid_mpc.job.context import Progress
 from hybrid_mpc.job.loops import run_loops
 from hybrid_mpc.job.study_run import TIMING, load_inputs, load_models
-from hybrid_mpc.kit.artifact import read_description, write_description
+from hybrid_mpc.kit.parts import read_description, write_description
 
 GOLF = load_scenario("golf_robot")
 SIGMA = dict.fromkeys(("prior", "hybrid"), (1e-3, 1e-1))
@@ -174,7 +174,7 @@ def test_what_does_not_fit_is_refused_before_the_first_run(run_folder, golf_arti
     note = read_description(folder)
     write_description(folder, replace(note, provenance=Provenance("torque_pendulum")))
     refused("made for scenario torque_pendulum, not for golf_robot", folder)
-    write_description(folder, replace(note, calibration=None))
+    write_description(folder, note)
     set_process_noise(folder, SIGMA)
     refused("holds no thresholds", folder, controllers=["hybrid"], monitors=["energy"])
     with pytest.raises(InputError, match="has no plant"):
