@@ -53,8 +53,8 @@ import hybrid_mpc as hm
 from hybrid_mpc.files import read_json
 from hybrid_mpc.loop.faults import corrupt_input
 from hybrid_mpc.loop.plant import SimulatedMachine
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.model import output_with_jacobian
-from hybrid_mpc.model.riccati import hidden_fixed_point
 from scenarios.race_car.prior import WHEELBASE
 
 MACHINES = ("two_tanks", "dc_motor", "lever", "two_heaters", "two_link_arm", "cart_pole")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 # fmt: off
 if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says that a name is public
     from hybrid_mpc import plots as plots
-    from hybrid_mpc.analyze.equilibria import equilibria as equilibria, holding_input as holding_input
+    from hybrid_mpc.analyze.equilibria import equilibria as equilibria
     from hybrid_mpc.analyze.linearize import (
         friction_slopes as friction_slopes, jacobians as jacobians, linearize as linearize,
         linearize_along as linearize_along, linearize_at_speed as linearize_at_speed,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.control.safeguard import SafeController as SafeController
     from hybrid_mpc.control.soft import HardBound as HardBound, SoftBound as SoftBound
     from hybrid_mpc.control.sqp import SQPController as SQPController
-    from hybrid_mpc.control.targets import Steady as Steady, Targets as Targets
+    from hybrid_mpc.control.targets import Targets as Targets
     from hybrid_mpc.data.differentiate import (
         CausalPolynomial as CausalPolynomial, LocalPolynomial as LocalPolynomial,
         SmoothingSpline as SmoothingSpline, ZeroPhaseFilter as ZeroPhaseFilter,
@@ -139,6 +139,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.model.buffered import BufferedFunction as BufferedFunction
     from hybrid_mpc.model.delay import with_input_delay as with_input_delay
     from hybrid_mpc.model.disturbance import Disturbance as Disturbance
+    from hybrid_mpc.model.equilibrium import Steady as Steady, holding_input as holding_input
     from hybrid_mpc.model.model import (
         HybridModel as HybridModel, kinematics as kinematics, longer_period as longer_period,
     )
@@ -167,7 +168,7 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 _ROOMS = {
-    "analyze.equilibria": ("equilibria", "holding_input"),
+    "analyze.equilibria": ("equilibria",),
     "analyze.linearize": (
         "friction_slopes", "jacobians", "linearize", "linearize_along", "linearize_at_speed", "linearize_secant",
     ),
@@ -187,7 +188,7 @@ _ROOMS = {
     "control.safeguard": ("SafeController",),
     "control.soft": ("HardBound", "SoftBound"),
     "control.sqp": ("SQPController",),
-    "control.targets": ("Steady", "Targets"),
+    "control.targets": ("Targets",),
     "data.differentiate": (
         "CausalPolynomial", "LocalPolynomial", "SmoothingSpline", "ZeroPhaseFilter", "differentiate",
     ),
@@ -250,6 +251,7 @@ _ROOMS = {
     "model.buffered": ("BufferedFunction",),
     "model.delay": ("with_input_delay",),
     "model.disturbance": ("Disturbance",),
+    "model.equilibrium": ("Steady", "holding_input"),
     "model.model": ("HybridModel", "kinematics", "longer_period"),
     "model.riccati": ("dare", "lqr"),
     "monitor.calibrate": ("Calibration", "count_alarms"),

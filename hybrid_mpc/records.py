@@ -26,8 +26,6 @@ NUMBERS = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 """How numbers are written that JSON does not know."""
 LARGEST = 2**63
 """Whole numbers of this size or more are refused: no array, seed or count can hold them."""
-MOST_SEED = 2**31 - 1
-"""Largest seed: a thousand times it, as loops number theirs, still fits 64 bits."""
 LONGEST = 40
 """Characters of a text that a message shows."""
 LONGEST_WHAT = 100

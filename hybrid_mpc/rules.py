@@ -21,6 +21,8 @@ MOST_NAME = 100
 MOST_UNIT = 50
 MOST_LINE, MOST_TEXT = 1_000, 100_000
 """Longest title and longest description [characters]."""
+MOST_SEED = 2**31 - 1
+"""Largest seed: a thousand times it, as loops number theirs, still fits 64 bits."""
 LARGEST = 1e30
 """Largest size of a number in any unit. Nothing that is measured is larger, and cost functions, whose terms have up to
 the eighth power of such numbers, stay finite."""

@@ -36,7 +36,7 @@ ROOMS = {
     "job": "nn_export errors rules records files machine data model estimate control loop scenario monitor analyze kit "
     "identify plots report",
     "cli": "errors rules records files machine data scenario kit identify job",
-    "scenarios.paper": "errors records files machine data scenario identify plots job cli",
+    "scenarios.paper": "errors rules records files machine data scenario identify plots job cli",
     "scenarios.golf_robot.monitor_study": "errors records files loop scenario monitor kit plots report job cli",
     "scenarios": "nn_export",
 }
@@ -282,6 +282,7 @@ def test_help_and_version_load_nothing_that_computes(option):
     told, _, loaded = done.stdout.partition("LOADED ")
     assert "hybrid-mpc" in told or "reproduce" in told
     heavy = {
+        "numpy",
         "scipy",
         "casadi",
         "torch",
@@ -294,3 +295,30 @@ def test_help_and_version_load_nothing_that_computes(option):
         "jinja2",
     }
     assert not heavy & set(loaded.split())
+
+
+HEAVY = ("torch", "scipy.stats", "scipy.signal", "matplotlib", "pandas", "control", "jinja2", "joblib")
+
+
+def loaded_by(code, *arguments):
+    """Modules that a process of its own has loaded at the end of ``code``."""
+    code += "\nimport sys; print('LOADED', *sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.partition("LOADED ")[2].split())
+
+
+def test_the_list_of_scenarios_needs_nothing_that_computes_on_recordings():
+    listed = "from hybrid_mpc.cli.scenarios import scenarios; scenarios()"
+    assert not loaded_by(listed).intersection((*HEAVY, "scipy.interpolate", "scipy.io"))
+
+
+def test_a_kit_loads_no_solver_and_its_loop_nothing_that_plots_or_trains(golf_artifact):
+    load = "import sys, hybrid_mpc as hm; kit = hm.load(sys.argv[1])"
+    assert not loaded_by(load, str(golf_artifact)).intersection((*HEAVY, "scipy", "hybrid_mpc.control.rti"))
+    made = "from hybrid_mpc import load_scenario, make_controller; golf = load_scenario('golf_robot').control"
+    made += "; make_controller(kit.models['hybrid'], kit.models['prior'], golf)"
+    used = loaded_by(f"{load}; {made}", str(golf_artifact))
+    assert "hybrid_mpc.control.rti" in used
+    assert not used.intersection((*HEAVY, "hybrid_mpc.embedded.generate", "hybrid_mpc.control.nlp"))

@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.analyze.equilibria import hidden_equilibrium
 from hybrid_mpc.errors import InputError, named_extra
+from hybrid_mpc.model.equilibrium import hidden_equilibrium
+from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel, positions_of
-from hybrid_mpc.model.riccati import vector
 
 Array = NDArray[np.float64]
 Kind: TypeAlias = Literal["secant", "harmonic"]

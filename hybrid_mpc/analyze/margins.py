@@ -27,8 +27,9 @@ from hybrid_mpc.control.rti import CondensedController, propagate
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
+from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import dare, vector
+from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.analyze.linearize import linearize_along
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import vector
 from nn_export import Node, Port, Program, build
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hybrid_mpc.cli.options import ScenarioName
-from hybrid_mpc.records import MOST_SEED
+from hybrid_mpc.rules import MOST_SEED
 
 EXAMPLES = (
     "Examples:\n\n"

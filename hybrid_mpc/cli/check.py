@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -14,6 +14,8 @@ from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, Scen
 from hybrid_mpc.rules import printable
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from hybrid_mpc.job.check import Preflight, Rest
     from hybrid_mpc.job.context import Context
     from hybrid_mpc.job.stages.identify import PriorResult
@@ -108,7 +110,7 @@ def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str
     prior = context.scenario.prior()
     console.print(_fitted_parameters(prior, found))
     console.print(_free_runs(prior, found))
-    return stops(found), found.fit.warnings, found.in_doubt
+    return stops(found, cause=False), found.fit.warnings, found.in_doubt
 
 
 def _fitted_parameters(prior: Prior, found: PriorResult) -> Table:
@@ -217,13 +219,17 @@ def _signals(found: Preflight, prior: Prior, spec: DataSpec) -> Table:
 
 def _range(signal: Signal) -> str:
     return (
-        f"{signal.lower:g} to {signal.upper:g}" if np.isfinite([signal.lower, signal.upper]).any() else "any"
+        f"{signal.lower:g} to {signal.upper:g}"
+        if any(map(math.isfinite, (signal.lower, signal.upper)))
+        else "any"
     )
 
 
 def _span(found: Preflight, key: str, j: int) -> str:
     if not key or found.dataset is None:
         return ""
+    import numpy as np
+
     every = np.concatenate([getattr(t, key)[:, j] for t in found.dataset.whole])
     known = every[np.isfinite(every)]
     return f"{known.min():.4g} to {known.max():.4g}" if len(known) else "never"
@@ -263,6 +269,8 @@ def _rest_lines(prior: Prior, rest: Rest, dt: float) -> list[tuple[str, str]]:
 
 def _times(modes: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> str:
     """The slowest and the fastest time constant, and how many modes integrate or run away."""
+    import numpy as np
+
     size = float(np.abs(modes).max(initial=0.0))
     rates = np.sort(-modes.real[modes.real < -1e-9 * size])
     told = [f"{1 / rates[0]:.3g} s"] if len(rates) else []

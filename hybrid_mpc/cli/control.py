@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybrid_mpc.cli.options import ScenarioName
-from hybrid_mpc.records import MOST_SEED
+from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
     from hybrid_mpc.job.control import ControlResults

@@ -13,9 +13,7 @@ import typer
 
 from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import check_folder, write_text
-from hybrid_mpc.records import MOST_SEED
-from hybrid_mpc.rules import markdown
+from hybrid_mpc.rules import MOST_SEED, markdown
 
 if TYPE_CHECKING:
     from hybrid_mpc.scenario import Scenario
@@ -56,6 +54,8 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
         raise InputError(f"{scenario.name} has no budget {budget!r}; it has: {', '.join(scenario.budgets)}")
     if data_set and "data_set" not in inspect.signature(make).parameters:
         raise InputError(f"{scenario.name} has one data set only; leave --set {data_set} out")
+    from hybrid_mpc.files import check_folder, write_text
+
     check_folder(out)
     options = {"data_set": data_set} if data_set else {}
     files = make(out, seed, budget, **options)

@@ -39,7 +39,6 @@ from hybrid_mpc.cli import (
     tune,
 )
 from hybrid_mpc.errors import InputError, StorageError, named_extra, no_exit
-from hybrid_mpc.files import reason
 from hybrid_mpc.rules import printable
 
 BAD_INPUT, CTRL_C = 2, 130
@@ -151,6 +150,8 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(BAD_INPUT)
     except OSError as error:
+        from hybrid_mpc.files import reason
+
         place = f" {error.filename}" if error.filename is not None else ""
         errors.print(f"[bold red]error:[/] the file system refused{_escape(place)}: {_escape(reason(error))}")
         _say_what_is_saved(errors)

@@ -13,7 +13,7 @@ from hybrid_mpc.control.ocp import Limits, input_plan
 from hybrid_mpc.control.problem import Controller, Solution
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import START_LIMIT, Estimate
-from hybrid_mpc.model.riccati import hidden_fixed_point
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 
 Array = NDArray[np.float64]
 Start = Callable[[Estimate], Array]

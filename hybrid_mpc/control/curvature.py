@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh, solve_triangular
@@ -9,7 +11,7 @@ from scipy.linalg import eigh, solve_triangular
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import SoftRows
 from hybrid_mpc.control.rti import condense_all, condense_hessians
-from hybrid_mpc.model.stages import Linearization
+from hybrid_mpc.model.stages import Linearization, Slopes
 
 Array = NDArray[np.float64]
 
@@ -39,9 +41,17 @@ class StageCurvature:
         n_h, self._hidden_shift = hidden.size, SHIFT * hidden
         self._soft = soft if soft is not None and soft.functions else None
         self._shift = SHIFT * np.concatenate([sizes, ocp.input_scale])
-        self._by_few = stages.slopes(self._shift.size)
+        self._stages = stages
         self._group = min(n_h, max(1, AT_ONCE // ocp.horizon))
-        self._by_hidden = stages.slopes(self._group, hidden=True) if n_h else None
+
+    @cached_property
+    def _by_few(self) -> Slopes:
+        """Built with the first plan: a loop's start is no part of a kit's."""
+        return self._stages.slopes(self._shift.size)
+
+    @cached_property
+    def _by_hidden(self) -> Slopes:
+        return self._stages.slopes(self._group, hidden=True)
 
     @property
     def size(self) -> int:
@@ -93,7 +103,6 @@ class StageCurvature:
 
     def _hidden(self, z: Array, u: Array, a_t: Array, b: Array, adjoint: Array) -> Array:
         """The rows of the hidden states ``(N, n_h, n_x + n_u + n_h)``."""
-        assert self._by_hidden is not None
         n, n_x, m = len(b), self._n_x, self._group
         by_z = (a_t @ adjoint[:, :, None])[:, :, 0]
         here = np.hstack([by_z[:, :n_x], (adjoint[:, None, :] @ b)[:, 0], by_z[:, n_x:]])

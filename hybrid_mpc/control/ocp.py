@@ -23,9 +23,9 @@ from hybrid_mpc.control.soft import (
     tightest,
 )
 from hybrid_mpc.errors import Collected, InputError
-from hybrid_mpc.model.limits import input_limits, numbers
+from hybrid_mpc.model.limits import input_limits, numbers, vector
 from hybrid_mpc.model.model import output_with_jacobian
-from hybrid_mpc.model.riccati import coming_back, dare, linearization, unmoved, vector
+from hybrid_mpc.model.riccati import coming_back, dare, linearization, unmoved
 from hybrid_mpc.records import known
 from hybrid_mpc.rules import LARGEST
 

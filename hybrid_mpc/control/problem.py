@@ -5,22 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits, input_plan
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.control.soft import GIVES_WAY, HIGHER, HardBound, fixed, output_bounds, state_bounds
-from hybrid_mpc.control.targets import Steady, Targets
+from hybrid_mpc.control.targets import Targets
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import free_run, stage_step
+
+if TYPE_CHECKING:  # BLAS takes long to import
+    from hybrid_mpc.control.active_set import Active
 
 Array = NDArray[np.float64]
 KEPT = 1e-7

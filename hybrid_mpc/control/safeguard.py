@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,9 +14,10 @@ from hybrid_mpc.control.problem import Controller, Solution, SplitController, St
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
-from hybrid_mpc.model.limits import check_part, whole
-from hybrid_mpc.model.model import Expression, HybridModel
-from hybrid_mpc.model.riccati import dare, vector
+from hybrid_mpc.model.equilibrium import equilibrium_input
+from hybrid_mpc.model.limits import check_part, vector, whole
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ class SafeController:
             gain = dare(*ocp.linear_quadratic(fallback))[1]
             self._gain = gain[:, : ocp.n_x]
             self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
-            self._rest_input = equilibrium_input(fallback, ocp)
+            self._rest_input = equilibrium_input(fallback, Sizes(fallback, ocp).states, ocp.input_scale)
             self._rest_input(fallback.x0, fallback.w)  # a CasADi function's first call is slow
 
     def initial(
@@ -245,22 +245,3 @@ def checked_safe_input(given: ArrayLike, ocp: OCP) -> Array:
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
         raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
     return u
-
-
-def equilibrium_input(model: HybridModel, ocp: OCP) -> ca.Function:
-    """``(x, w) -> u`` that holds a state best; see :func:`holding`."""
-    x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
-    rates = model.xdot(x, ca.DM.zeros(model.n_h, 1), u, w, model.p)
-    return ca.Function("equilibrium_input", [x, w], [holding(rates, u, model, ocp)])
-
-
-def holding(rates: Expression, u: Expression, model: HybridModel, ocp: OCP) -> Expression:
-    """The input that holds a state best, of ``rates`` ``(n_x,)`` of the state with the symbol ``u``: one Newton step of
-    least squares from the operating point's input. Rates count in the sizes of their states, inputs in their scales.
-    """
-    scale, rates = ca.DM(ocp.input_scale), rates / ca.DM(Sizes(model, ocp).states)
-    slope = ca.jacobian(rates, u) @ ca.diag(scale)
-    square = slope.T @ slope
-    damping = (1e-12 * ca.trace(square) + 1e-300) * ca.DM.eye(model.n_u)
-    best = u - scale * ca.solve(square + damping, slope.T @ rates)
-    return ca.densify(ca.substitute(best, u, ca.DM(model.u0)))

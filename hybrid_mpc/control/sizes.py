@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import hidden_fixed_point
 from hybrid_mpc.model.stages import free_run
 
 if TYPE_CHECKING:

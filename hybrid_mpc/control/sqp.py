@@ -396,6 +396,9 @@ class SQPController(Controller):
         iterations: Most linearizations; the plan then reached has the status STOPPED and may be applied.
         compiled: As in :class:`~hybrid_mpc.control.rti.CondensedController`.
 
+        inner: A real-time iteration of the same model and problem, whose functions are used: half the time to build.
+            Default: one is made.
+
     Raises:
         InputError: As :class:`~hybrid_mpc.control.rti.CondensedController`, or if an option is not positive.
 
@@ -414,11 +417,12 @@ class SQPController(Controller):
         tolerance: float = 1e-10,
         iterations: int = 100,
         compiled: bool = False,
+        inner: CondensedController | None = None,
     ) -> None:
         if not (isinstance(tolerance, int | float) and tolerance > 0):
             raise InputError(f"tolerance must be positive, got {tolerance!r:.80}")
         iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
-        inner = CondensedController(model, ocp, compiled=compiled)
+        inner = CondensedController(model, ocp, compiled=compiled) if inner is None else inner
         self.problem, self._cost = inner.problem, ReducedCost(inner)
         self._tolerance, self._iterations = tolerance, iterations
 

@@ -11,9 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline, make_smoothing_spline
-from scipy.optimize import minimize_scalar
-from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
 
 from hybrid_mpc.data.files import real_numbers
 from hybrid_mpc.errors import InputError
@@ -155,6 +152,8 @@ def local_polynomial(y: Array, dt: float, length: float, order: int = 4) -> Deri
 
     Source: A. Savitzky and M. J. E. Golay, Analytical Chemistry 36 (1964) 1627.
     """
+    from scipy.signal import savgol_filter  # half a second to import, which listing scenarios need not take
+
     n = window_samples(length, dt, order)
     if n > len(y):
         raise InputError(
@@ -217,6 +216,8 @@ class CausalPolynomial(Differentiator):
 
     def derivatives(self, y: Array, dt: float) -> Derivatives:
         """Estimates from the window that ends with each row."""
+        from scipy.signal import savgol_coeffs
+
         n, back = self._samples(dt)
         if len(y) < n:
             raise InputError(_too_short(n, len(y)))
@@ -278,6 +279,8 @@ class SmoothingSpline(Differentiator):
             )
         k = np.arange(len(y), dtype=float)
         lam = ROOM * _spline_ratio(np.array(2 * np.pi * self.cutoff * dt)).item()
+        from scipy.interpolate import make_smoothing_spline
+
         columns = [make_smoothing_spline(k, column, lam=lam) for column in y.reshape(len(y), -1).T]
         value, first, second = (
             np.column_stack([np.asarray(s.derivative(i)(k) if i else s(k)) for s in columns]).reshape(y.shape)
@@ -315,6 +318,9 @@ class ZeroPhaseFilter(Differentiator):
     def derivatives(self, y: Array, dt: float) -> Derivatives:
         """Filtered signal with its spline's derivatives."""
         _check_cutoff(self.cutoff, dt, len(y))
+        from scipy.interpolate import CubicSpline
+        from scipy.signal import butter, sosfiltfilt
+
         sos = butter(self.order, self._run(dt), output="sos")
         pad = min(len(y) - 1, self.reach(dt))  # so far that the recursion's start has died away
         spline = CubicSpline(dt * np.arange(len(y)), sosfiltfilt(sos, y, axis=0, padlen=pad))
@@ -323,6 +329,8 @@ class ZeroPhaseFilter(Differentiator):
 
     def reach(self, dt: float) -> int:
         """Until the slowest pole has died away, or the interpolating spline's, ``sqrt(3) - 2``."""
+        from scipy.signal import butter
+
         _, poles, _ = butter(self.order, self._run(dt), output="zpk")
         slowest = max(float(np.abs(poles).max()), 2 - math.sqrt(3))
         return math.ceil(DECAYS / -math.log(slowest))
@@ -363,6 +371,8 @@ def gcv_cutoff(y: Array, dt: float) -> float:
     grid = np.log(np.geomspace(max(2 / n, SLOWEST) / dt, 0.45 / dt, 40))
     scores = [score(point) for point in grid]
     k = min(max(int(np.argmin(scores)), 1), len(grid) - 2)
+    from scipy.optimize import minimize_scalar
+
     found = minimize_scalar(score, bounds=(grid[k - 1], grid[k + 1]), method="bounded")
     return math.exp(float(found.x))
 

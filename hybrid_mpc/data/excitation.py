@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import max_len_seq
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
@@ -224,6 +223,8 @@ def prbs(
         )
     length = 2**bits - 1
     first = shift % length
+    from scipy.signal import max_len_seq
+
     sequence, _ = max_len_seq(bits, length=min(length, first + int(ticks[-1]) + 1))
     return np.where(sequence[(ticks + first) % length] > 0, float(upper), float(lower))
 

@@ -23,8 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
-from scipy.io import loadmat
-from scipy.io.matlab import MatlabObject, MatlabOpaque, MatReadWarning
 
 import nn_export.files
 from hybrid_mpc.data.mat_structure import check_structure, version
@@ -786,6 +784,9 @@ def _npz(path: Path) -> Source:
 
 
 def _mat(path: Path) -> Source:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatlabOpaque, MatReadWarning
+
     content = _content(path)
     if version(content) == "7.3":
         raise InputError(
@@ -830,6 +831,8 @@ def _mat(path: Path) -> Source:
 
 def _unread(value: Any) -> str:
     """What kind of variable this is if it is of a kind that is not read."""
+    from scipy.io.matlab import MatlabObject, MatlabOpaque
+
     if isinstance(value, MatlabOpaque | MatlabObject):
         return OBJECTS
     if isinstance(value, np.ndarray) and value.dtype.names is not None and value.size != 1:

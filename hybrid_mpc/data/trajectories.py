@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
 from hybrid_mpc.data.findings import findings_of
@@ -397,6 +396,8 @@ def _smoothed(t: Array, y: Array, grid: Array, period: float, spec: DataSpec) ->
             continue
         smooth = local_polynomial(np.interp(fine, t[rows], y[rows]), period, spec.smoothing)
         inside = (grid >= start - NEAR * spec.dt) & (grid <= end + NEAR * spec.dt)
+        from scipy.interpolate import CubicSpline
+
         for array, z in ((value, smooth.value), (first, smooth.first), (second, smooth.second)):
             array[inside] = CubicSpline(fine, z)(grid[inside])
     return value, first, second

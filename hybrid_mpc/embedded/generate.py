@@ -10,12 +10,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.control import targets
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import KEPT, KNOTS, Problem, SoftRows
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
-from hybrid_mpc.control.safeguard import holding
 from hybrid_mpc.control.sizes import Sizes
+from hybrid_mpc.control.targets import Targets
 from hybrid_mpc.embedded.cut import Cut, cut, reduced
 from hybrid_mpc.embedded.scalar import c_function, comment, number, table
 from hybrid_mpc.embedded.watch import (
@@ -31,6 +30,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import NEGLIGIBLE, Filter, SwitchingFilter
 from hybrid_mpc.loop.guard import Guard
+from hybrid_mpc.model import equilibrium
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
 from nn_export.errors import last_line
@@ -46,13 +46,16 @@ GENERATED = ("hmpc_config.h", "hmpc_tables.h", "hmpc_expressions.h")
 FIRST = 25
 """Iterations of the first plan: an RTI step halves what is left, or better."""
 SEARCH: Mapping[str, tuple[str, str]] = {
-    "STEADY": (repr(targets.STEADY), "1e-5"), "STILL": (repr(targets.STILL), "1e-4"),
-    "NEAR": (repr(targets.NEAR), "1e-3"), "REACHED": (repr(targets.REACHED), "1e-3"),
-    "RANK": (repr(targets.RANK), "1e-5"), "FREE": (repr(targets.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
-    "STALLED": (repr(targets.STALLED), repr(targets.STALLED)), "VIOLATED": ("1e-12", "1e-6"),
+    "STEADY": (repr(equilibrium.STEADY), "1e-5"), "STILL": (repr(equilibrium.STILL), "1e-4"),
+    "NEAR": (repr(equilibrium.NEAR), "1e-3"), "REACHED": (repr(equilibrium.REACHED), "1e-3"),
+    "RANK": (repr(equilibrium.RANK), "1e-5"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
+    **{name: (repr(value), repr(value)) for name, value in (
+        ("STALLED", equilibrium.STALLED), ("CONTRACTS", equilibrium.CONTRACTS), ("FOLLOWED", equilibrium.FOLLOWED),
+        ("LEAST_PART", equilibrium.LEAST_PART), ("EQUAL", equilibrium.EQUAL),
+    )}, "VIOLATED": ("1e-12", "1e-6"),
     "ROUNDING": ("1e-15", "1e-7"),
 }  # fmt: skip
-"""What the search for steady states goes by, in double and in single precision; see ``hybrid_mpc.control.targets``."""
+"""What the search for steady states goes by, in double and in single precision: ``hybrid_mpc.model.equilibrium``."""
 MAX_AGE = 5
 """Periods a plan is followed without a successful solve, as :class:`~hybrid_mpc.control.safeguard.SafeController`."""
 
@@ -124,9 +127,8 @@ def make_sources(
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
         "NP": ocp.n_p, "HARD": int(np.any(soft.hard)), "OUTPUT_COST": int(ocp.n_y > 0), "TARGET_KNOTS": KNOTS,
         "SOFT_D": int(any(np.any(np.array(f.jac_sparsity(0, 2).get_triplet()[1]) < model.n_d) for f in soft.functions)),
-        "TARGET_ITERATIONS": targets.ITERATIONS, "TARGET_SETTLING": targets.SETTLING, "TARGET_WITHIN": targets.WITHIN,
-        "TARGET_PARTS_LEAST": targets.PARTS[0], "TARGET_PARTS_MOST": targets.PARTS[-1], "TARGET_STARTS": len(aims),
-        "TARGET_FOLLOWED": targets.FOLLOWED,
+        "TARGET_ITERATIONS": equilibrium.ITERATIONS, "TARGET_SETTLING": equilibrium.SETTLING,
+        "TARGET_WITHIN": equilibrium.WITHIN, "TARGET_PARTS": equilibrium.MOST_PARTS, "TARGET_STARTS": len(aims),
         "TARGET_NEAREST": len(aims) - 1 if problem.targets is not None and problem.targets.run_out else 0,
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
@@ -375,7 +377,7 @@ def _expressions(
         )
     if fallback is not None:
         rates = _scalar("the prior", fallback.xdot)(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
-        best = holding(rates, u, fallback, ocp)
+        best = equilibrium.holding(rates, u, fallback.u0, Sizes(fallback, ocp).states, ocp.input_scale)
         outs = [(f"best[{i}]", best[i]) for i in range(n_u)]
         add("equilibrium", ["const real *x", "const real *w", "real *best"], {"x": x, "w": w}, outs)
     guard = "HMPC_EXPRESSIONS_H"
@@ -390,7 +392,7 @@ def _scalar(what: str, f: ca.Function) -> ca.Function:
         raise InputError(f"no C for this controller: {what} is no scalar code: {last_line(error)}") from error
 
 
-def target_starts(own: targets.Targets | None) -> Array:
+def target_starts(own: Targets | None) -> Array:
     """Where descents of the target calculator begin, a row each: the operating point first, the run's end last."""
     return np.zeros((0, 0)) if own is None else np.array([*own.beside, *own.run_out])
 
@@ -430,7 +432,7 @@ def _tables(
             "target_scale": own.scale, "target_heed": own.scale[: own.heed.size] * own.heed,
             "target_root": np.sqrt(ocp.q_y), "target_starts": target_starts(own),
             "target_x_range": np.array(own.x_range).T, "target_y_range": np.array(own.y_range).T,
-            "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
+            "target_begun": own.begun[1], "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
         }  # fmt: skip
     if estimator is not None:
         modes = _modes(estimator)

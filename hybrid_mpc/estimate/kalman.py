@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.buffered import BufferedFunction
-from hybrid_mpc.model.limits import sampled
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
+from hybrid_mpc.model.limits import sampled, vector
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
-from hybrid_mpc.model.riccati import hidden_fixed_point, vector
 
 Array = NDArray[np.float64]
 START_LIMIT = 25

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
+from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
-from hybrid_mpc.model.riccati import coming_back, hidden_fixed_point, unmoved, vector
+from hybrid_mpc.model.riccati import coming_back, unmoved
 
 Array = NDArray[np.float64]
 AROUND = 5

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import START_LIMIT, Estimate, ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import dare, hidden_fixed_point
+from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 BESIDE = 0.1

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.analyze.equilibria import Equilibria, equilibria, hidden_equilibrium, holding_input
+from hybrid_mpc.analyze.equilibria import Equilibria, equilibria
 from hybrid_mpc.analyze.linearize import (
     FrictionSlopes,
     control_toolbox,
@@ -74,6 +74,7 @@ from hybrid_mpc.kit.assembly import MODES, make_ocp
 from hybrid_mpc.kit.parts import KIT, MODELS, artifact_folder
 from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.equilibrium import hidden_equilibrium, holding_input
 from hybrid_mpc.model.model import HybridModel, positions_of
 from hybrid_mpc.monitor.lengths import machine_second
 from hybrid_mpc.scenario import Scenario, scenario_of

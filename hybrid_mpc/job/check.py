@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import root
 
 from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.control.ocp import OCP
@@ -30,6 +29,7 @@ from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
+from hybrid_mpc.model.equilibrium import Range, RateEquations, rate_search
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.scenario import Budget, Scenario, Task
 
@@ -238,9 +238,11 @@ def rests_no_more(prior: Prior, second: float) -> tuple[str, ...]:
 
 def _nearest(prior: Prior, x: Array, u: Array, w: Array) -> str:
     """The equilibrium that Newton's method finds from a point, to be copied; nothing where it finds none."""
-    found = root(lambda at: prior.equations.xdot(at, u, w, prior.p).full().ravel(), x)
-    inside = all(s.lower <= v <= s.upper for s, v in zip(prior.states, found.x, strict=True))
-    return f": x = {[float(f'{v:.6g}') for v in found.x]}" if found.success and inside else ""
+    n_x, scale = len(x), np.concatenate([_sizes(prior.states, x), np.ones(len(u))])
+    equations, near = RateEquations(prior.equations.xdot, w, prior.p), np.concatenate([x, u])
+    found = rate_search(equations, scale, near, np.zeros(n_x), free=np.arange(n_x)).descend(near, x)
+    inside = all(s.lower <= v <= s.upper for s, v in zip(prior.states, found.v[:n_x], strict=True))
+    return f": x = {[float(f'{v:.6g}') for v in found.v[:n_x]]}" if found.steady and inside else ""
 
 
 def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[Equilibrium, ...]:
@@ -549,33 +551,27 @@ def _check_set_point(
     tied = weights > 0
     if np.ptp(last, axis=0)[tied].any() or not tied.any():
         return
-    from scipy.optimize import least_squares  # takes longer to import than the search takes
-
     target, sizes, wanted = last[-1], _sizes(prior.states, rest.x), _sizes(signals, last[-1])
     first = np.concatenate([rest.x, np.clip(rest.u, control.u_min, control.u_max)])
     if not by_output:
         sizes, first[:n_x] = wanted, np.where(tied, target, rest.x)
-    low = np.concatenate([np.full(n_x, -np.inf), control.u_min])
-    high = np.concatenate([np.full(n_x, np.inf), control.u_max])
-    span = np.concatenate([sizes, control.input_range])
-    fastest = float(np.abs(rest.modes).max(initial=0.0))
-    second = 1.0 / fastest if fastest > 0 else 1.0
-
-    def misses(z: Array) -> Array:
-        rates = prior.equations.xdot(z[:n_x], z[n_x:], rest.w, prior.p).full().ravel()
-        return np.concatenate([1e3 * second * rates / sizes, ((shown(z) - target) / wanted)[tied]])
-
-    def shown(z: Array) -> Array:
-        if not by_output:
-            return z[:n_x]
-        y: Array = prior.equations.output(z[:n_x], z[n_x:], rest.w, prior.p).full().ravel()
-        return y
-
-    found = least_squares(misses, first, bounds=(low, high), x_scale=span)
-    nearest, what = shown(found.x), "y" if by_output else "x"
+    equations = RateEquations(
+        prior.equations.xdot, rest.w, prior.p, prior.equations.output if by_output else None
+    )
+    none = Range.none(n_x + n_u, len(signals))
+    low = np.concatenate([none.lower[:n_x], control.u_min])
+    high = np.concatenate([none.upper[:n_x], control.u_max])
+    search = rate_search(
+        equations, np.concatenate([sizes, control.input_range]), first, np.where(tied, 1.0 / wanted, 0.0),
+        bounds=replace(none, lower=low, upper=high),
+    )  # fmt: skip
+    found = search.descend(first, target)
+    if not found.steady:
+        found = search.follow(first, equations.shown(first)[0], target, sure=False) or found
+    nearest, what = found.y, "y" if by_output else "x"
     if (np.abs(nearest - target)[tied] / wanted[tied] > REACHED).any():
         report.warn(
             f"task {task.name}: its reference comes to rest at {what} = {target.round(6).tolist()}, which no input "
             f"within its limits holds; the nearest point of rest is {what} = {(nearest.round(4) + 0.0).tolist()} under "
-            f"u = {found.x[n_x:].round(4).tolist()}"
+            f"u = {found.v[n_x:].round(4).tolist()}"
         )

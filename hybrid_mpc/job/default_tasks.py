@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from hybrid_mpc.identify.simulation import rest_of
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.equilibrium import RateEquations, rate_search
 from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
@@ -26,12 +26,8 @@ ROOM, PUSH = 0.5, 0.2
 """Share of the room from the operating point to a limit that a step, and that a disturbance at an input, may take."""
 HOLD, LEAD, LASTS = 3, 0.5, 6
 """Horizons that a set-point is held, that the machine rests before the first change, and that holding lasts."""
-TURNS = 20
-"""Newton steps to a point of rest at most."""
 RESTS = 0.1
 """Largest rate, in sizes of the states a horizon, at an operating point that is given."""
-STILL = 1e-6
-"""Largest rate, in sizes of the states a horizon, that counts as rest where one is looked for."""
 
 
 @dataclass(frozen=True)
@@ -55,19 +51,9 @@ class _Rest:
         """Weights of what references are of."""
         return self.control.q_y if self.control.n_y else self.control.q
 
-    @cached_property
-    def linearized(self) -> ca.Function:
-        """Rates, their slopes by ``(x, u)``, what references are of, and the slopes of that; of ``x`` and ``u``."""
-        x, u = ca.SX.sym("x", len(self.x)), ca.SX.sym("u", len(self.u))
-        equations, rest = self.prior.equations, (self.w, self.prior.p)
-        tracked = equations.output(x, u, *rest) if self.control.n_y else x
-        values = equations.xdot(x, u, *rest), tracked
-        pairs = [(v, ca.densify(ca.jacobian(v, ca.vertcat(x, u)))) for v in values]
-        return ca.Function("linearized", [x, u], [*pairs[0], *pairs[1]])
-
     def tracked(self, x: Array, u: Array) -> Array:
         """What references are of, at a point."""
-        return np.asarray(self.linearized(x, u)[2].full().ravel())
+        return self.equations.shown(np.concatenate([x, u]))[0]
 
     def sizes(self) -> Array:
         """Sizes of ``(x, u)``: ranges, else what the weights tolerate, else 1."""
@@ -75,31 +61,30 @@ class _Rest:
         tolerated = 1.0 / np.sqrt(np.where(self.control.q > 0, self.control.q, 1.0))
         return np.concatenate([np.where(np.isfinite(ranges), ranges, tolerated), self.control.input_range])
 
-    def slopes(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Rates ``(n_x,)`` in sizes of the states a horizon, and their slopes by ``(x, u)`` in sizes."""
-        sizes = self.sizes()
-        value, matrix = (m.full() for m in self.linearized(x, u)[:2])
-        scale = self.horizon / sizes[: len(x)]
-        return value.ravel() * scale, matrix * scale[:, None] * sizes
+    def rates(self) -> Array:
+        """Rates ``(n_x,)`` in sizes of the states a horizon."""
+        rates = self.equations.rest(np.concatenate([self.x, self.u]))[0]
+        return rates * self.horizon / self.sizes()[: len(self.x)]
+
+    @cached_property
+    def equations(self) -> RateEquations:
+        """Rates of the prior, and what references are of."""
+        equations = self.prior.equations
+        return RateEquations(
+            equations.xdot, self.w, self.prior.p, equations.output if self.control.n_y else None
+        )
 
     def moved(self, j: Sequence[int], by: float, unit: Array) -> tuple[Array, Array] | None:
-        """The point of rest at which tracked signals ``j`` are off by ``by``, the inputs changed least; None: none is.
+        """The steady state at which tracked signals ``j`` are off by ``by``, nearest to this one; None: there is none.
 
         They are met to a millionth of ``unit`` ``(len(j),)``.
         """
-        sizes, n_x, own = self.sizes(), len(self.x), list(j)
-        z, goal = np.concatenate([self.x, self.u]), self.tracked(self.x, self.u)[own] + by
-        for _ in range(TURNS):
-            rates, matrix = self.slopes(z[:n_x], z[n_x:])
-            tracked, slopes = (m.full() for m in self.linearized(z[:n_x], z[n_x:])[2:])
-            missed = np.append(rates, (tracked.ravel()[own] - goal) / unit)
-            if not np.all(np.isfinite(matrix)):
-                return None
-            if np.abs(missed).max() < STILL:
-                return z[:n_x], z[n_x:]
-            rows = np.vstack([matrix, slopes[own] * sizes / unit[:, None]])
-            z = z - sizes * np.linalg.lstsq(rows, missed, rcond=1e-9)[0]
-        return None
+        own, start = list(j), np.concatenate([self.x, self.u])
+        goal, root = self.tracked(self.x, self.u), np.zeros(len(self.signals))
+        goal[own] += by
+        root[own] = 1.0 / unit
+        found = rate_search(self.equations, self.sizes(), start, root).descend(start, goal)
+        return (found.v[: len(self.x)], found.v[len(self.x) :]) if found.reached else None
 
     def settled(self) -> _Rest:
         """The point of rest with what is weighed as it is, as many signals as there are inputs; itself if none is.
@@ -169,10 +154,10 @@ def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None)
     length = control.horizon * dt
     rest = _Rest(prior, control, length, *rest_of(prior))
     why = f"scenario {scenario.name} declares no tasks, and default ones cannot be made: "
-    rates = rest.slopes(rest.x, rest.u)[0]
+    rates = rest.rates()
     if values is not None and not np.all(np.abs(rates) < RESTS):
         rest = rest.settled()
-        rates = rest.slopes(rest.x, rest.u)[0]
+        rates = rest.rates()
     if not np.all(np.abs(rates) < RESTS):
         moving = ", ".join(s.name for s, r in zip(prior.states, rates, strict=True) if not abs(r) < RESTS)
         raise InputError(

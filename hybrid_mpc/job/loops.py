@@ -26,9 +26,9 @@ from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.plant import ModelPlant, Plant
 from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.loop.simulate import ClosedLoopResult, Step, simulate
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel, kinematics
-from hybrid_mpc.model.riccati import hidden_fixed_point
 from hybrid_mpc.monitor.calibrate import alarm_intervals
 from hybrid_mpc.monitor.energy import EnergyMonitor
 from hybrid_mpc.monitor.residuals import ResidualMonitor

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.analyze.linearize import linearize
 from hybrid_mpc.analyze.margins import Margins, mpc_loop, solved_gain, steady_filter
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.control.safeguard import SafeController, Source, equilibrium_input
+from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
@@ -30,8 +30,9 @@ from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.plant import ModelPlant, ModelState
 from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.equilibrium import equilibrium_input, hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
-from hybrid_mpc.model.riccati import dare, hidden_fixed_point
+from hybrid_mpc.model.riccati import dare
 from hybrid_mpc.scenario import Task
 
 Array = NDArray[np.float64]
@@ -74,8 +75,9 @@ MODULUS = 0.5
 Hagglund, *Advanced PID Control*, 2006, section 4.6)."""
 SOFTER = "Larger weights of changes (r_delta), or less process noise; hybrid-mpc analyze shows more."
 BY_NETWORK = (
-    "The network's slope at the set-point takes the margin: control with the prior (hybrid-mpc control --controller "
-    "prior_observer), or record small motions about the set-point and run again."
+    "The network's slope at the set-point takes this margin: record small motions about the set-point and run again. "
+    "Start on the machine with small steps, and compare with the prior's loop (hybrid-mpc control --controller "
+    "prior_observer --controller hybrid_observer)."
 )
 """What to do about small margins: of any loop, and of a hybrid's where the prior's are larger."""
 HALF = 0.5
@@ -151,7 +153,8 @@ class SetPoint:
         if self.problem.n_y and (target.steady is None or not target.steady.steady):
             raise InputError(f"the set-point {self.reference.tolist()} of {self.title} has no steady state")
         if not self.problem.n_y:
-            best = equilibrium_input(m, self.problem)(x, self.w).full().ravel()
+            sizes = self.controller.controller.problem.sizes.states
+            best = equilibrium_input(m, sizes, self.problem.input_scale)(x, self.w).full().ravel()
             u = np.clip(best, self.problem.u_min, self.problem.u_max)
         return x, u
 

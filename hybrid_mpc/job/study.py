@@ -23,8 +23,8 @@ from hybrid_mpc.job.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec
 from hybrid_mpc.job.tasks import ready, selected_tasks
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault, parsed_fault
-from hybrid_mpc.records import MOST_SEED, Fields, known, plain, record
-from hybrid_mpc.rules import Duration, Label, Name, NameOrNone, Number, Seconds, name_problem
+from hybrid_mpc.records import Fields, known, plain, record
+from hybrid_mpc.rules import MOST_SEED, Duration, Label, Name, NameOrNone, Number, Seconds, name_problem
 from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
 
 LATE = "late"

@@ -6,7 +6,7 @@ from the folder.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from hybrid_mpc.kit.assembly import (
     make_resting_guard,
     sensor_steps,
 )
+from hybrid_mpc.kit.at_use import ModelsAtUse
 from hybrid_mpc.kit.parts import (
     AGAIN,
     BALANCE,
@@ -188,33 +189,35 @@ def member_names(count: int) -> list[str]:
     return [f"{HYBRID}_{i + 1}" for i in range(count)]
 
 
-class Members(Mapping[str, HybridModel]):
-    """Models of the networks that the hybrid is the mean of by name, the best first; each is built when it is asked
-    for: no loop on the machine needs them.
-    """
+def member_models(
+    programs: Mapping[str, nn_export.Program], info: ModelInfo, count: int
+) -> Mapping[str, HybridModel]:
+    """Models of the networks that the hybrid is the mean of by name, the best first."""
+    shared = (*(f for f in FUNCTIONS if f not in OWN), *(b.program for b in info.balances))
+    names = member_names(count)
+    own = {f"{name}/{key}": programs[f"{name}/{key}"] for name in names for key in OWN}
+    own |= {f"{name}/{key}": programs[f"{HYBRID}/{key}"] for name in names for key in shared}
+    return _at_use(names, own, info, None)
 
-    def __init__(self, programs: Mapping[str, nn_export.Program], info: ModelInfo, count: int) -> None:
-        shared = (*(f for f in FUNCTIONS if f not in OWN), *(b.program for b in info.balances))
-        names = member_names(count)
-        self._programs = {f"{name}/{key}": programs[f"{name}/{key}"] for name in names for key in OWN}
-        self._programs |= {f"{name}/{key}": programs[f"{HYBRID}/{key}"] for name in names for key in shared}
-        self._info = info
-        self._built: dict[str, HybridModel | None] = dict.fromkeys(names)
 
-    def __getitem__(self, name: str) -> HybridModel:
-        built = self._built[name]
-        if built is None:
-            try:
-                built = self._built[name] = build_model(name, self._programs, self._info)
-            except nn_export.ExportError as error:
-                raise InputError(f"model {name}: {error}") from error
-        return built
+def _at_use(
+    names: Sequence[str], programs: Mapping[str, nn_export.Program], info: ModelInfo,
+    chosen: tuple[Disturbance, ...] | None,
+) -> ModelsAtUse:  # fmt: skip
+    """Models that are built at their first use, of programs that are all there; KeyError for one that is not."""
+    needed = (*FUNCTIONS, *(b.program for b in info.balances))
+    own = {f"{name}/{key}": programs[f"{name}/{key}"] for name in names for key in needed}
+    return ModelsAtUse(names, partial(_built, own, info, chosen))
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._built)
 
-    def __len__(self) -> int:
-        return len(self._built)
+def _built(
+    programs: Mapping[str, nn_export.Program], info: ModelInfo, chosen: tuple[Disturbance, ...] | None, name: str
+) -> HybridModel:  # fmt: skip
+    try:
+        model = build_model(name, programs, info)
+    except nn_export.ExportError as error:
+        raise InputError(f"model {name}: {error}") from error
+    return model if model.disturbance_model == chosen else replace(model, disturbance_model=chosen)
 
 
 def load(folder: str | Path) -> Kit:
@@ -244,9 +247,8 @@ def load(folder: str | Path) -> Kit:
         )
     try:
         programs = nn_export.load_programs(folder / MODELS)
-        built = {name: build_model(name, programs, found.model) for name in found.models}
-        models = _disturbed(built, parts.loop.disturbance_model)
-        members = Members(programs, found.model, found.members)
+        models = _at_use(found.models, programs, found.model, parts.loop.disturbance_model)
+        members = member_models(programs, found.model, found.members)
     except KeyError as error:
         raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {KIT} names") from error
     except nn_export.ExportError as error:
@@ -266,13 +268,11 @@ def _named(name: object, what: str) -> str:
 
 
 def _disturbed(
-    models: Mapping[str, HybridModel], chosen: tuple[Disturbance, ...] | None
-) -> dict[str, HybridModel]:
-    """The models with a disturbance model; as they are where they have it."""
-    return {
-        name: model if model.disturbance_model == chosen else replace(model, disturbance_model=chosen)
-        for name, model in models.items()
-    }
+    models: Mapping[str, HybridModel], chosen: tuple[Disturbance, ...] | None, name: str
+) -> HybridModel:
+    """A model with a disturbance model; as it is where it has it."""
+    model = models[name]
+    return model if model.disturbance_model == chosen else replace(model, disturbance_model=chosen)
 
 
 @dataclass(frozen=True)
@@ -403,7 +403,7 @@ class Kit:
         """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now."""
         if not isinstance(scenario, Scenario):
             raise InputError(f"on: a Scenario is needed, got {type(scenario).__name__}")
-        models = _disturbed(self.models, scenario.disturbance_model)
+        models = ModelsAtUse(tuple(self.models), partial(_disturbed, self.models, scenario.disturbance_model))
         return replace(self, models=models, loop=loop_settings(scenario, self.loop.process_noise))
 
     def problem(self, task: str = "") -> OCP:

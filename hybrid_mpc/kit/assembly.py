@@ -5,21 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybrid_mpc.control.best_of import BestOf
-from hybrid_mpc.control.nlp import IpoptController
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller
-from hybrid_mpc.control.rti import CondensedController
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
-from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.data.scales import evenly
-from hybrid_mpc.embedded.native import NativeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
@@ -35,7 +30,9 @@ from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
 from hybrid_mpc.records import known
 from nn_export.errors import CompileError
 
-if TYPE_CHECKING:  # reading recordings takes half a second to import, and no controller does
+if TYPE_CHECKING:  # what takes long to import is imported where it is made
+    from hybrid_mpc.control.best_of import BestOf
+    from hybrid_mpc.control.sqp import SQPController
     from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -78,6 +75,9 @@ def native(model: HybridModel, ocp: OCP) -> Controller:
     Raises:
         InputError: If something of model or problem has no C, by name.
     """
+    from hybrid_mpc.control.rti import CondensedController
+    from hybrid_mpc.embedded.native import NativeController
+
     try:
         return NativeController(model, ocp)
     except CompileError as error:
@@ -89,11 +89,30 @@ def native(model: HybridModel, ocp: OCP) -> Controller:
         return CondensedController(model, ocp)
 
 
+def _rti(model: HybridModel, ocp: OCP, **options: Any) -> Controller:
+    from hybrid_mpc.control.rti import CondensedController
+
+    return CondensedController(model, ocp, **options)
+
+
+def _sqp(model: HybridModel, ocp: OCP, **options: Any) -> Controller:
+    from hybrid_mpc.control.sqp import SQPController
+
+    return SQPController(model, ocp, **options)
+
+
+def _ipopt(model: HybridModel, ocp: OCP, **options: Any) -> Controller:
+    from hybrid_mpc.control.nlp import IpoptController
+
+    return IpoptController(model, ocp, **options)
+
+
+# solvers are imported when one is made: a kit that only estimates or watches loads none
 SOLVERS: Mapping[str, Callable[..., Controller]] = {
-    "rti": CondensedController,
+    "rti": _rti,
     "native": native,
-    "sqp": SQPController,
-    "ipopt": IpoptController,
+    "sqp": _sqp,
+    "ipopt": _ipopt,
 }
 """By the name that commands and settings take: the condensed real-time iteration; the same as compiled C; sequential
 quadratic programs to convergence; the same by IPOPT."""
@@ -352,13 +371,21 @@ def make_controller(
         )
     options = {} if iterations is None else {"iterations": iterations}
     controller = SOLVERS[known(solver, SOLVERS, "solver")](model, ocp, **options)
-    first = None if controller.converges else first_controller(model, ocp)
+    first = None if controller.converges else first_controller(model, ocp, controller)
     return SafeController(controller, prior, first=first, safe_input=safe_input)
 
 
-def first_controller(model: HybridModel, ocp: OCP) -> SQPController | BestOf:
-    """What makes the first plan: SQP, from each of the problem's starts if there are any."""
-    sqp = SQPController(model, ocp)
+def first_controller(
+    model: HybridModel, ocp: OCP, controller: Controller | None = None
+) -> SQPController | BestOf:
+    """What makes the first plan: SQP, from each of the problem's starts if there are any. It shares the functions of
+    the ``controller`` that goes on from there, if that is a real-time iteration in Python.
+    """
+    from hybrid_mpc.control.best_of import BestOf
+    from hybrid_mpc.control.rti import CondensedController
+    from hybrid_mpc.control.sqp import SQPController
+
+    sqp = SQPController(model, ocp, inner=controller if isinstance(controller, CondensedController) else None)
     return BestOf(sqp, starts=ocp.starts) if ocp.starts else sqp
 
 
@@ -499,7 +526,7 @@ def make_adaptive_guard(
     plain = make_ocp(prior, control)
     ocp = plain.changed(terminal=plain.terminal_weight(model))
     backup = SafeController(
-        CondensedController(adaptive, ocp), prior, first=first_controller(adaptive, ocp),
+        _rti(adaptive, ocp), prior, first=first_controller(adaptive, ocp),
         safe_input=scenario.safe_input,
     )  # fmt: skip
     first, unit = first_deviations(model, scenario), model.time_unit

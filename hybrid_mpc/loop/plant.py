@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.loop.faults import Fault, corrupt_input, corrupt_measurement
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import hidden_fixed_point
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Controller
 from hybrid_mpc.control.safeguard import Decision, SafeController
-from hybrid_mpc.control.targets import Steady
 from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.estimate.delay import whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
@@ -24,9 +23,9 @@ from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
 from hybrid_mpc.loop.plant import Plant, SimulatedMachine
 from hybrid_mpc.loop.preview import Preview, Previews
-from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
+from hybrid_mpc.model.equilibrium import Steady
+from hybrid_mpc.model.limits import check_function, check_part, sampled, vector, whole
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.model.riccati import vector
 
 if TYPE_CHECKING:
     import pandas as pd

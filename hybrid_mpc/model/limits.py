@@ -48,6 +48,16 @@ def numbers(values: ArrayLike, name: str, *, most: float = np.inf) -> Array:
     return array
 
 
+def vector(value: ArrayLike, size: int, name: str) -> Array:
+    """``value`` as a finite float vector ``(size,)``."""
+    array = numbers(value, name)
+    if array.shape != (size,):
+        raise InputError(f"{name}: {array.size} values given, {size} needed")
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"{name}: values must be finite, got {array}")
+    return array
+
+
 def _not_numbers(values: object) -> bool:
     """Whether a flag, a text or None stands in lists, which numpy would make numbers of."""
     if isinstance(values, list | tuple):

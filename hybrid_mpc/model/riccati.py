@@ -1,4 +1,4 @@
-"""Linearization of a model at a point: Riccati equation, LQR gain, hidden state at its fixed point."""
+"""Linearization of a model at a point: Riccati equation and LQR gain, the hidden state at its fixed point."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.model.limits import floats, numbers
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
+from hybrid_mpc.model.limits import floats, vector
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
-SETTLED = 1e-10
-"""Largest change in a step of a hidden state that counts as settled."""
 DOUBLINGS, REFINED = 60, 3
 """Doublings at most, which reach 2^60 periods ahead, and steps of Newton's method, whose error is squared by each."""
 ROUNDING = 1e-16
@@ -100,25 +99,6 @@ def _lyapunov(a: Array, q: Array) -> Array:
         if not np.max(np.abs(more)) > ROUNDING * np.max(np.abs(p)):
             break
     return p
-
-
-def hidden_fixed_point(
-    model: HybridModel, x: Array, u: Array, *, w: Array | None = None, limit: int = 2000
-) -> Array:
-    """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)``, ``u`` ``(n_u,)`` and ``w`` ``(n_w,)`` held.
-
-    The iteration starts at zero, delayed inputs at ``u``. It ends when no element moves by more than 1e-10, or after
-    ``limit`` steps with the last value.
-    """
-    h = np.zeros(model.n_h)
-    h[: model.delay_states] = np.resize(u, model.delay_states)
-    held = model.w if w is None else w
-    for _ in range(limit if model.n_h else 0):
-        h_next = model.step(x, h, u, held, model.p)[1].full().ravel()
-        moved, h = np.max(np.abs(h_next - h)), h_next
-        if not moved > SETTLED:
-            break
-    return h
 
 
 def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -215,13 +195,3 @@ def lqr(
     x, u = vector(x, model.n_x, "working_point x"), vector(u, model.n_u, "working_point u")
     a, b, _ = linearization(model, x, u)
     return dare(a, b, np.diag(np.concatenate([q_v, np.zeros(model.n_h)])), np.diag(r_v))[1]
-
-
-def vector(value: ArrayLike, size: int, name: str) -> Array:
-    """``value`` as a finite float vector ``(size,)``."""
-    array = numbers(value, name)
-    if array.shape != (size,):
-        raise InputError(f"{name}: {array.size} values given, {size} needed")
-    if not np.all(np.isfinite(array)):
-        raise InputError(f"{name}: values must be finite, got {array}")
-    return array

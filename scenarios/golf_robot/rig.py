@@ -8,8 +8,6 @@ from math import ceil, inf
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
-from scipy.optimize import brentq
 
 from hybrid_mpc import BufferedFunction, Fault, InputError, check_plant_faults
 from scenarios.golf_robot.dynamics import N_STATES, RigParameters
@@ -175,6 +173,8 @@ class Rig:
         ``restitution`` times the approach. The motor takes no part: its belt is soft over a millisecond.
         """
         p = self.parameters
+        from scipy.optimize import brentq  # a quarter of a second to import
+
         time = brentq(lambda tau: self._advance(z, q, tau)[0], 0.0, length, xtol=1e-12)
         hit = self._advance(z, q, time)
         club = (q[2] if len(q) > 1 else 1.0) * (p.J - p.rotor)
@@ -199,4 +199,6 @@ class Rig:
         t, phi, v = state.past.T
         if len(t) == 1 or state.t - delay <= t[0]:
             return float(phi[0])
+        from scipy.interpolate import CubicHermiteSpline
+
         return float(CubicHermiteSpline(t, phi, v)(state.t - delay))

@@ -21,7 +21,7 @@ from hybrid_mpc import (
     linearize_secant,
     load,
 )
-from hybrid_mpc.analyze.equilibria import fixed_point
+from hybrid_mpc.model.equilibrium import fixed_point
 from scenarios.golf_robot.nominal import GEAR
 from scenarios.golf_robot.nominal import PARAMETERS as GOLF
 

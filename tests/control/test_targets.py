@@ -324,8 +324,8 @@ def test_a_set_point_leaves_a_standstill_where_the_sensor_shows_no_slope():
 
 def test_a_search_for_what_does_not_exist_ends_soon():
     targets, points = pumped(lambda u: (u - 0.3) ** 2 + 0.01), []
-    evaluated = targets._point
-    targets._point = lambda *args: points.append(args) or evaluated(*args)
+    evaluated = targets._equations.rest
+    targets._equations.rest = lambda v: points.append(v) or evaluated(v)
     assert not targets.at([0.0]).steady
     assert len(points) < 150  # of 240 steps that four descents may make, each with a dozen points
 

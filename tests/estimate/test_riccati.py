@@ -5,7 +5,7 @@ import pytest
 from online_models import pendulum_model, random_linear
 
 from hybrid_mpc import InputError, dare, lqr
-from hybrid_mpc.model.riccati import hidden_fixed_point
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 
 
 def test_dare_solves_its_equation_and_its_matrix_is_the_cost_of_the_closed_loop():

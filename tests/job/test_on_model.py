@@ -13,7 +13,7 @@ from hybrid_mpc.job.default_tasks import default_tasks
 from hybrid_mpc.job.loops import DRAWN_PRIOR, drawn_prior, moves_otherwise, stand_in
 from hybrid_mpc.job.stages.results import read_results
 from hybrid_mpc.loop.plant import ModelPlant
-from hybrid_mpc.model.riccati import hidden_fixed_point
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from scenarios.simulated import cart_pole, two_heaters, two_tanks
 
 LABEL = "on the model, not the machine"

@@ -250,6 +250,10 @@ def test_a_loop_with_small_margins_is_a_doubt():
     row = p.margins([point_of(kit_of(wild, problem, noise=1e-4, sigma=0.5), hold(0.0))])
     assert row.verdict == "doubted"
     assert "at valve" in row.evidence
+    tame = point_of(kit_of(tank()), hold(0.0))  # a prior in whose place the network has other margins
+    by_network = p.margins([point_of(kit_of(wild, problem, noise=1e-4, sigma=0.5), hold(0.0))], [tame])
+    assert f"the distance is {p._margins_at(tame)[0][1].modulus:.2g}" in by_network.evidence
+    assert (row.remedy, by_network.remedy) == (p.SOFTER, p.BY_NETWORK)
     stuck = p.margins([point_of(kit_of(tank(), OCP(20, [10.0], [0.0], [0.1], [0.0], [1.0])), hold(0.0))])
     assert (stuck.verdict, "lies on a bound" in stuck.evidence) == ("not promised", True)
 

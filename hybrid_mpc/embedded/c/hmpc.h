@@ -128,13 +128,22 @@ typedef struct {
   hmpc_real v[HMPC_NT], rest[HMPC_NZ], slope[HMPC_NZ][HMPC_LJ], y[HMPC_NY], lacks, merit;
 } hmpc_point;
 
-/* Its memory, see hmpc_targets.c. */
+/* Where a descent ended: how far outputs are off in tolerated deviations, how far states and inputs are from the operating
+   point, whether another rounding ends there too, whether it missed where outputs do not answer to inputs. */
+typedef struct {
+  hmpc_steady at;
+  hmpc_real v[HMPC_NT], off, distance;
+  int sure, lost;
+} hmpc_descent;
+
+/* Its memory, see hmpc_targets.c; d are the disturbances under which it searches. */
 typedef struct {
   hmpc_point at, after, settled;
+  hmpc_descent tried[HMPC_TARGET_STARTS + 3];
+  hmpc_real d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)];
   hmpc_real a[HMPC_NZ][HMPC_NT], half[HMPC_NZ], diagonal[HMPC_NZ], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];
   hmpc_real h[HMPC_NT][HMPC_NT], gram[HMPC_NT][HMPC_NT];
   hmpc_real bound[HMPC_TARGET_ROWS][HMPC_NT], end[HMPC_TARGET_ROWS], seen[HMPC_TARGET_ROWS][HMPC_NT], answer;
-  int straight; /* whether the last descent took whole steps alone */
 } hmpc_search;
 #endif
 

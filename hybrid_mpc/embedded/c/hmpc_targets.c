@@ -25,11 +25,11 @@ static void look(const hmpc_state *s, const real *v, const real *goal, const rea
   memcpy(z, v, sizeof(real) * HMPC_NZ);
   for (int i = 0; i < HMPC_NU; ++i) {
     acts[i] = v[HMPC_NZ + i];
-    for (int j = 0; j < HMPC_ND; ++j) acts[i] += disturbs_u[i][j] * s->d[j];
+    for (int j = 0; j < HMPC_ND; ++j) acts[i] += disturbs_u[i][j] * s->search.d[j];
   }
   hmpc_model_slope(z, acts, w, next, p->slope[0]);
   for (int i = 0; i < HMPC_NX; ++i)
-    for (int j = 0; j < HMPC_ND; ++j) next[i] += disturbs_x[i][j] * s->d[j];
+    for (int j = 0; j < HMPC_ND; ++j) next[i] += disturbs_x[i][j] * s->search.d[j];
   p->lacks = R(0.0);
   for (int i = 0; i < HMPC_NZ; ++i) {
     p->rest[i] = next[i] - v[i];
@@ -37,7 +37,7 @@ static void look(const hmpc_state *s, const real *v, const real *goal, const rea
   }
   outputs(z, acts, w, p->y);
   for (int i = 0; i < HMPC_NY; ++i) {
-    for (int j = 0; j < HMPC_ND; ++j) p->y[i] += disturbs_y[i][j] * s->d[j];
+    for (int j = 0; j < HMPC_ND; ++j) p->y[i] += disturbs_y[i][j] * s->search.d[j];
     if (q_y[i] > R(0.0)) off += target_root[i] * target_root[i] * (p->y[i] - goal[i]) * (p->y[i] - goal[i]);
   }
   p->merit = R(100.0) * p->lacks + hmpc_sqrt(off);
@@ -404,13 +404,12 @@ static void place(const hmpc_steady *from, real *v) {
   memcpy(v + HMPC_NZ, from->u, sizeof from->u);
 }
 
-/* Gauss-Newton from v; bounded: within the bounds of states and outputs. Returns how far outputs are off. */
-static real descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_steady *found) {
+/* Gauss-Newton from v; bounded: within the bounds of states and outputs. */
+static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_descent *found) {
   hmpc_search *const work = &s->search;
   hmpc_point *const at = &work->at, *const after = &work->after;
-  real step[NT], there[NT], lacks[HMPC_TARGET_ITERATIONS + 1], off = R(0.0);
-  int done = 0;
-  work->straight = 1;
+  real step[NT], there[NT], lacks[HMPC_TARGET_ITERATIONS + 1], before = HMPC_HUGE, off = R(0.0), apart = R(0.0);
+  int done = 0, sure = 1;
   look(s, v, goal, w, at);
   lacks[0] = at->lacks;
   for (int k = 1; k <= HMPC_TARGET_ITERATIONS; ++k) {
@@ -421,11 +420,13 @@ static real descend(hmpc_state *s, const real *v, const real *goal, const real *
       done = at->lacks <= HMPC_TARGET_STILL;
       break;
     }
+    if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * before)) sure = 0;
+    before = size;
     for (int half = 0; half <= HALVINGS; ++half, share *= R(0.5)) {
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
       if (after->merit < at->merit) break;
-      if (!(size < HMPC_TARGET_NEAR)) work->straight = 0;
+      if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
     if (!(after->merit < at->merit)) { /* rounding is all that is left, or it gets nowhere */
       done = size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
@@ -438,74 +439,120 @@ static real descend(hmpc_state *s, const real *v, const real *goal, const real *
   }
   for (int i = 0; i < HMPC_NY; ++i)
     if (q_y[i] > R(0.0)) off = hmpc_max(off, target_root[i] * hmpc_abs(at->y[i] - goal[i]));
-  memcpy(found->x, at->v, sizeof found->x);
-  if (HMPC_NH > 0) memcpy(found->h, at->v + HMPC_NX, sizeof(real) * HMPC_NH);
-  for (int j = 0; j < HMPC_NU; ++j) found->u[j] = hmpc_clip(at->v[HMPC_NZ + j], u_min[j], u_max[j]);
-  memcpy(found->y, at->y, sizeof found->y);
-  found->steady = done;
-  found->reached = done && off <= HMPC_TARGET_REACHED;
-  return off;
-}
-
-/* Descents along set-points between the outputs at first, a point near rest, and y: least of them, then twice as many,
-   up to most. Returns whether they lead to a steady state. */
-static int approach(hmpc_state *s, const real *first, const real *y, const real *w, int least, int most,
-                    hmpc_steady *found) {
-  real begun[HMPC_NY], towards[HMPC_NY], v[NT];
-  look(s, first, y, w, &s->search.at);
-  memcpy(begun, s->search.at.y, sizeof begun);
-  for (int parts = least; parts <= most; parts *= 2) {
-    memcpy(v, first, sizeof v);
-    found->steady = 1;
-    for (int k = 1; k <= parts && found->steady; ++k) {
-      for (int i = 0; i < HMPC_NY; ++i) towards[i] = begun[i] + (real)k / (real)parts * (y[i] - begun[i]);
-      descend(s, v, towards, w, 1, found);
-      place(found, v);
-    }
-    if (found->steady) return 1;
+  for (int i = 0; i < HMPC_NX; ++i) {
+    const real far = (at->v[i] - x_rest[i]) / target_scale[i];
+    apart += far * far;
   }
-  return 0;
+  for (int j = 0; j < HMPC_NU; ++j) {
+    const real far = (at->v[HMPC_NZ + j] - u_rest[j]) / target_scale[HMPC_NZ + j];
+    apart += far * far;
+  }
+  memcpy(found->v, at->v, sizeof found->v);
+  memcpy(found->at.x, at->v, sizeof found->at.x);
+  if (HMPC_NH > 0) memcpy(found->at.h, at->v + HMPC_NX, sizeof(real) * HMPC_NH);
+  for (int j = 0; j < HMPC_NU; ++j) found->at.u[j] = hmpc_clip(at->v[HMPC_NZ + j], u_min[j], u_max[j]);
+  memcpy(found->at.y, at->y, sizeof found->at.y);
+  found->at.steady = done;
+  found->at.reached = done && off <= HMPC_TARGET_REACHED;
+  found->off = off;
+  found->distance = apart;
+  found->sure = done && sure;
+  found->lost = done && off > HMPC_TARGET_REACHED && work->answer < target_flat[0];
 }
 
-/* The steady state for outputs y, all finite where they are weighed: from a steady start by whole steps; else the one to
-   which set-points on the way from the operating point lead; then from the operating point, beside it, and where the
-   model's own run from there ends; at the operating point, too, where it misses the set-point because outputs do not
-   answer to inputs where it began. Where none leads to one, set-points on the way from the start are met first. Where
-   none keeps the bounds of states and outputs, these are left out. */
+/* The steady state to which set-points on the way to y lead, by parts that keep Newton's method contracting: from a steady
+   state v under the disturbances at hand, or with v = NULL from the operating point, or where its run ends, and with the
+   disturbances from none. Returns whether the way was gone to its end; sure = 0: by any steady states. */
+static int follow(hmpc_state *s, const real *v, const real *y, const real *w, int sure, hmpc_descent *found) {
+  hmpc_search *const work = &s->search;
+  real begun[HMPC_NY], towards[HMPC_NY], at[NT], done = R(0.0), part = R(HMPC_TARGET_FOLLOWED);
+  int arrived = 0;
+  memcpy(at, v ? v : target_starts[HMPC_TARGET_NEAREST], sizeof at);
+  memcpy(begun, target_begun, sizeof begun);
+  memcpy(work->w, w, sizeof(real) * HMPC_NW);
+  if (v) {
+    look(s, v, y, w, &work->at);
+    memcpy(begun, work->at.y, sizeof begun);
+  }
+  for (int tried = 0; tried < HMPC_TARGET_PARTS && part >= R(HMPC_TARGET_LEAST_PART) && !arrived; ++tried) {
+    const real to = done + part < R(1.0) ? done + part : R(1.0);
+    for (int j = 0; j < HMPC_ND && !v; ++j) work->d[j] = to * s->d[j];
+    for (int j = 0; j < HMPC_NW && !v; ++j) work->w[j] = w_rest[j] + to * (w[j] - w_rest[j]);
+    for (int i = 0; i < HMPC_NY; ++i) towards[i] = begun[i] + to * (y[i] - begun[i]);
+    descend(s, at, towards, work->w, 1, found);
+    if (found->at.steady && (found->sure || !sure)) {
+      arrived = to >= R(1.0);
+      memcpy(at, found->v, sizeof at);
+      done = to;
+      part *= R(2.0);
+    } else {
+      part *= R(0.25);
+    }
+  }
+  memcpy(work->d, s->d, sizeof(real) * HMPC_ND);
+  return arrived;
+}
+
+/* Of n descents that ended at a steady state, sure ones before others, that nearest to the set-point, and of those that are
+   equally near to it, to the operating point; -1 if there is none. */
+static int best(const hmpc_search *work, int n) {
+  int some = 0, chosen = -1;
+  real least = HMPC_HUGE;
+  for (int k = 0; k < n; ++k) some |= work->tried[k].sure;
+  for (int k = 0; k < n; ++k)
+    if (work->tried[k].at.steady && (work->tried[k].sure || !some)) least = hmpc_min(least, work->tried[k].off);
+  least = hmpc_max(least * (R(1.0) + HMPC_TARGET_EQUAL), HMPC_TARGET_REACHED);
+  for (int k = 0; k < n; ++k) {
+    const hmpc_descent *const one = &work->tried[k];
+    if (!one->at.steady || !(one->sure || !some) || !(one->off <= least)) continue;
+    if (chosen < 0 || one->distance < work->tried[chosen].distance) chosen = k;
+  }
+  return chosen;
+}
+
+/* The steady state for outputs y, all finite where they are weighed; the order of the search is that of Targets.at in
+   Python. Where none keeps the bounds of states and outputs, these are left out. */
 void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
                        hmpc_steady *found) {
-  hmpc_steady trial, other;
-  real given[NT];
-  const int known = start && start->steady;
-  int follows = wide;
-  if (known) place(start, given);
-  found->steady = 0;
-  for (int bounded = 1; bounded >= 0; --bounded) {
-    const int beside = wide && bounded ? HMPC_TARGET_STARTS : (wide || !known);
-    for (int k = known ? -1 : 0; k < beside; ++k) {
-      if (follows && k >= 0) {
-        follows = 0;
-        if (approach(s, target_starts[HMPC_TARGET_NEAREST], y, w, HMPC_TARGET_FOLLOWED, HMPC_TARGET_FOLLOWED, &trial)) {
-          *found = trial;
-          return;
-        }
-        if (found->steady) return;
-      }
-      const real off = descend(s, k < 0 ? given : target_starts[k], y, w, bounded, &trial);
-      if (follows && !s->search.straight) {
-        *found = trial;
-        continue;
-      }
-      if (k != 0 && trial.steady && !trial.reached && s->search.answer < target_flat[0]) {
-        const real nearer = descend(s, target_starts[0], y, w, bounded, &other);
-        if (other.steady && nearer < off) trial = other;
-      }
-      if (trial.steady || (bounded && k == (known ? -1 : 0))) *found = trial; /* the first answer if none is steady */
-      if (trial.steady) return;
+  hmpc_search *const work = &s->search;
+  hmpc_descent trial;
+  const int known = start && start->steady ? 1 : 0;
+  real first[NT];
+  int n = 0;
+  memcpy(work->d, s->d, sizeof(real) * HMPC_ND);
+  memcpy(first, target_starts[0], sizeof first);
+  if (known) place(start, first);
+  if (known || !wide) {
+    descend(s, first, y, w, 1, &work->tried[0]);
+    n = 1;
+    if (work->tried[0].lost && known) {
+      descend(s, target_starts[0], y, w, 1, &trial);
+      if (trial.at.steady && trial.off < work->tried[0].off) work->tried[0] = trial;
     }
-    if (wide && bounded && approach(s, known ? given : target_starts[HMPC_TARGET_NEAREST], y, w, HMPC_TARGET_PARTS_LEAST,
-                                      HMPC_TARGET_PARTS_MOST, &trial)) {
-      *found = trial;
+    *found = work->tried[0].at;
+    if (work->tried[0].sure || (found->steady && !wide)) return;
+  }
+  if (wide) {
+    for (int own = 0; own <= known; ++own) {
+      if (!follow(s, own ? first : NULL, y, w, 1, &work->tried[n])) continue;
+      if (!work->tried[n].lost) {
+        *found = work->tried[n].at;
+        return;
+      }
+      ++n;
+    }
+    for (int k = 0; k < HMPC_TARGET_STARTS; ++k) descend(s, target_starts[k], y, w, 1, &work->tried[n++]);
+    const int chosen = best(work, n);
+    if (chosen >= 0 || follow(s, known ? first : NULL, y, w, 0, &trial)) {
+      *found = chosen >= 0 ? work->tried[chosen].at : trial.at;
+      return;
+    }
+  }
+  *found = work->tried[0].at;
+  for (int k = 0; k <= (wide && known); ++k) {
+    descend(s, k ? target_starts[0] : first, y, w, 0, &trial);
+    if (trial.at.steady) {
+      *found = trial.at;
       return;
     }
   }

@@ -14,8 +14,8 @@ from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stage import Stage
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.kit.assembly import working_point
+from hybrid_mpc.model.equilibrium import fixed_point, hidden_fixed_point
 from hybrid_mpc.model.model import kinematics
-from hybrid_mpc.model.riccati import hidden_fixed_point
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,6 @@ class AnalysisResult:
 
 def analysis_stage(context: Context) -> AnalysisResult:
     """Linearize prior and hybrid at rest, mechanical ones at working speed too: poles, PBH tests, responses."""
-    from hybrid_mpc.analyze.equilibria import fixed_point
     from hybrid_mpc.analyze.linearize import linearize
     from hybrid_mpc.analyze.properties import frequency_response
 

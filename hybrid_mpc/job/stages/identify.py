@@ -267,12 +267,12 @@ def prior_stage(context: Context) -> PriorResult:
     return found
 
 
-def stops(found: PriorResult) -> tuple[str, ...]:
-    """What must be mended before anything is built on a fitted prior, with the likeliest cause."""
+def stops(found: PriorResult, *, cause: bool = True) -> tuple[str, ...]:
+    """What must be mended before anything is built on a fitted prior, with the likeliest ``cause``."""
     if not found.no_gain:
         return ()
-    cause = f". In doubt: {found.in_doubt[0]}" if found.in_doubt else ""
-    return (f"fit of the prior: {found.no_gain}{cause}. {REMEDY}",)
+    why = f". In doubt: {found.in_doubt[0]}" if found.in_doubt and cause else ""
+    return (f"fit of the prior: {found.no_gain}{why}. {REMEDY}",)
 
 
 def examined_prior(context: Context) -> PriorResult:

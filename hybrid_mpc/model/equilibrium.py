@@ -1,0 +1,725 @@
+"""Steady states of a model: the one search for them, and what else of a machine at rest is computed.
+
+A steady state solves ``0 = F(z, u, w, d) - z``, or ``0 = xdot``, with bounds and, where there is one, a set-point of
+outputs. Observers, the target calculator, the safeguard, analysis, pre-flight and default tasks all search here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.limits import vector
+from hybrid_mpc.model.model import Expression, HybridModel, output_with_jacobian, positions_of
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+SETTLED = 1e-10
+"""Largest change in a step of a hidden state that counts as settled."""
+SETTLING = 6
+"""Steps of Newton's method at most by which a hidden state is brought to rest."""
+ITERATIONS = 60
+STEADY = 1e-9
+"""Largest step, in scales of the unknowns, at which Newton's method has converged."""
+REACHED = 1e-6
+"""Largest deviation of an output that counts as reached, in tolerated deviations ``1 / sqrt(q_y)``."""
+RANK = 1e-9
+"""Singular values below this share of the largest count as zero."""
+FREE = 1e-6
+"""Weight of the distance from the operating point along directions that the outputs do not see."""
+STALLED, WITHIN = 0.9, 5
+"""A descent is given up whose lack of a steady state has not fallen to this share within so many steps, which those
+that arrive do many times over."""
+STILL = 1e-6
+"""Largest lack of a steady state, in the states' scales, that is rounding."""
+NEAR = 1e-5
+"""Largest step, in scales of the unknowns, that rounding may keep from helping."""
+CONTRACTS = 0.7
+"""Largest share of the step before that a step has along a descent whose end no rounding changes."""
+LEAST_SHARE = 1e-3
+"""Smallest share of a step that is tried."""
+FOLLOWED, LEAST_PART, MOST_PARTS = 0.125, 1 / 1024, 100
+"""First part of the way that a continuation goes at once, the least one, and descents at most."""
+RUN = 5000
+"""Periods of the model's own run at most."""
+NEARER = 1e-3
+"""Largest lack of a steady state, in the states' scales, at which a run has nearly come to rest."""
+EQUAL = 1e-3
+"""Share by which the deviations of steady states that do equally well may differ."""
+EXACT = 1e-12
+"""Largest step, in scales of the unknowns, at which an analysis has converged, and ..."""
+RESIDUAL = 1e-10
+"""... the largest residual at its steady states, in the units of the states."""
+REACHES = 0.01 * 2.0 ** np.arange(12)
+"""Distances from a guess at which the search for a holding input begins anew."""
+
+
+@dataclass(frozen=True)
+class Steady:
+    """A steady state.
+
+    Args:
+        x: States ``(n_x,)``.
+        h: Hidden states ``(n_h,)``.
+        u: Inputs ``(n_u,)`` that hold it.
+        y: Outputs ``(n_y,)`` there, with what unmeasured disturbances add.
+        reached: Whether the outputs that the problem weighs are the set-point's.
+        steady: Whether it is a steady state of the model; False: none was found, this is the last iterate.
+    """
+
+    x: Array
+    h: Array
+    u: Array
+    y: Array
+    reached: bool
+    steady: bool
+
+    @property
+    def unknowns(self) -> Array:
+        """``(x, h, u)`` in one vector."""
+        return np.concatenate([self.x, self.h, self.u])
+
+
+class Equations(Protocol):
+    """What is zero at a steady state, and what set-points are of, as functions of the unknowns ``v`` ``(n_v,)``."""
+
+    def rest(self, v: Array) -> tuple[Array, Array]:
+        """What changes ``(n_e,)``, and its Jacobian ``(n_e, n_v)``."""
+        ...
+
+    def shown(self, v: Array) -> tuple[Array, Array]:
+        """What set-points are of ``(n_y,)``, and its Jacobian ``(n_y, n_v)``."""
+        ...
+
+
+class StepEquations:
+    """A model's step and outputs over ``v = (x, h, u)``, under disturbances ``d`` and ``w`` that may be set anew."""
+
+    def __init__(self, model: HybridModel, w: ArrayLike | None = None) -> None:
+        assert model.with_jacobian is not None
+        self.model = model
+        self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
+        self._step.inputs[4][:] = model.p
+        self._on_u, self._on_x, self._on_y = model.disturbed
+        self._eye = np.eye(model.n_x + model.n_h)
+        self._hidden = np.zeros((model.n_y, model.n_h))
+        self.d: Array = np.zeros(model.n_d)
+        """Unmeasured disturbances ``(n_d,)``."""
+        self.w: Array = model.w if w is None else vector(w, model.n_w, "w")
+        """Measured ones ``(n_w,)``."""
+
+    def rest(self, v: Array) -> tuple[Array, Array]:
+        """``F(z, u) - z`` and its Jacobian ``(n_z, n_z + n_u)``."""
+        m, f, n_x = self.model, self._step, self.model.n_x
+        n_z = len(self._eye)
+        f.inputs[0][:], f.inputs[1][:] = v[:n_x], v[n_x:n_z]
+        f.inputs[2][:], f.inputs[3][:] = v[n_z:] + self._on_u @ self.d, self.w
+        f()
+        x, h, a, b = f.outputs
+        moved = np.concatenate([x + self._on_x @ self.d, h]) - v[:n_z]
+        return moved, np.hstack([a.reshape(n_z, n_z).T - self._eye, b.reshape(m.n_u, n_z).T])
+
+    def shown(self, v: Array) -> tuple[Array, Array]:
+        """Outputs and their Jacobian ``(n_y, n_z + n_u)``."""
+        m, f = self.model, self._output
+        f.inputs[0][:], f.inputs[2][:] = v[: m.n_x], self.w
+        f.inputs[1][:] = v[len(self._eye) :] + self._on_u @ self.d
+        f()
+        y, by_x, by_u = f.outputs
+        return y + self._on_y @ self.d, np.hstack(
+            [by_x.reshape(m.n_x, m.n_y).T, self._hidden, by_u.reshape(m.n_u, m.n_y).T]
+        )
+
+    def after(self, v: Array) -> Array:
+        """States and hidden states ``(n_z,)`` a period later."""
+        f, n_x, n_z = self._step, self.model.n_x, len(self._eye)
+        f.inputs[0][:], f.inputs[1][:], f.inputs[2][:], f.inputs[3][:] = v[:n_x], v[n_x:n_z], v[n_z:], self.w
+        f()
+        return np.concatenate(f.outputs[:2])
+
+
+class RateEquations:
+    """Rates ``xdot(x, u, w, p)`` over ``v = (x, u)`` at held ``w`` and ``p``; set-points are of ``shown(x, u, w, p)``,
+    of the states where there is none.
+    """
+
+    def __init__(self, xdot: ca.Function, w: Array, p: Array, shown: ca.Function | None = None) -> None:
+        x, u = ca.SX.sym("x", xdot.size1_in(0)), ca.SX.sym("u", xdot.size1_in(1))
+        v = ca.vertcat(x, u)
+        values = xdot(x, u, w, p), x if shown is None else shown(x, u, w, p)
+        pairs = [[ca.densify(value), ca.densify(ca.jacobian(value, v))] for value in values]
+        self._rest, self._shown = (ca.Function("equations", [v], pair) for pair in pairs)
+
+    def rest(self, v: Array) -> tuple[Array, Array]:
+        """Rates ``(n_x,)`` and their Jacobian."""
+        rates, slopes = (m.full() for m in self._rest(v))
+        return rates.ravel(), slopes
+
+    def shown(self, v: Array) -> tuple[Array, Array]:
+        """What set-points are of, and its Jacobian."""
+        values, slopes = (m.full() for m in self._shown(v))
+        return values.ravel(), slopes
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a search: ``lower``, ``upper`` ``(n_v,)`` of the unknowns and ``y_lower``, ``y_upper`` ``(n_y,)`` of
+    what set-points are of. Those of the unknowns ``kept`` hold in every search, the others in bounded ones alone.
+    """
+
+    lower: Array
+    upper: Array
+    kept: NDArray[np.bool_]
+    y_lower: Array
+    y_upper: Array
+
+    @classmethod
+    def none(cls, n_v: int, n_y: int) -> Range:
+        """No bounds."""
+        v, y = np.full(n_v, np.inf), np.full(n_y, np.inf)
+        return cls(-v, v, np.ones(n_v, dtype=bool), -y, y)
+
+
+class Descent(NamedTuple):
+    """Where a descent ended.
+
+    Args:
+        v: The unknowns.
+        y: What set-points are of, there.
+        off: Its largest deviation from the set-point, in tolerated ones.
+        slopes: How it answers to the unknowns that lean, along steady states.
+        steady: Whether it is a steady state.
+        sure: Whether all steps were whole ones, each of them shorter than the one before: then another rounding, and a
+            start nearby, end there too.
+    """
+
+    v: Array
+    y: Array
+    off: float
+    slopes: Array
+    steady: bool
+    sure: bool
+
+    @property
+    def reached(self) -> bool:
+        """Whether it is a steady state at the set-point."""
+        return self.steady and self.off <= REACHED
+
+
+class _Point(NamedTuple):
+    """What a descent needs to know of ``v``: ``rest`` and ``y`` with their Jacobians; ``lacks``, the size of ``rest``
+    in scales; and ``merit``, which a descent lowers: ``lacks``, and the weighted deviation of ``y``, less.
+    """
+
+    v: Array
+    rest: Array
+    rest_by_v: Array
+    y: Array
+    y_by_v: Array
+    lacks: float
+    merit: float
+
+
+class SteadySearch:
+    """Steady states as near to a set-point as bounds allow: ``min |y - goal|^2`` in weights over ``rest(v) = 0``.
+
+    Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. Of several
+    answers that do equally well the one nearest to the operating point is taken, in the scales of the unknowns that
+    lean towards it. All counts in scales, so that no answer depends on units.
+
+    Args:
+        equations: What is zero at a steady state, and what set-points are of.
+        scale: What 1 means of the unknowns ``(n_v,)``.
+        size: What 1 means of the equations ``(n_e,)``.
+        root: Roots of the set-point's weights ``(n_y,)``; 0: does not matter.
+        near: The operating point ``(n_v,)``.
+        leans: Places of the unknowns that stay near it.
+        bounds: Bounds. Default: none.
+        heed: Shares ``(n_e,)`` of ``size`` that count as much. Default: 1.
+        hidden: Places of hidden states, which are brought to rest on the way. Default: there are none.
+        free: Places of the unknowns that are sought; the others are held. Default: all.
+        steady: Largest step, in scales, at which a descent has converged. Default: 1e-9.
+
+    Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2017, section 1.5; Deuflhard, *Newton Methods for
+    Nonlinear Problems*, 2011, chapter 5, for the continuation.
+
+    Example:
+        >>> x, u = ca.SX.sym("x"), ca.SX.sym("u")
+        >>> empty = ca.SX.sym("w", 0), ca.SX.sym("p", 0)
+        >>> tank = RateEquations(ca.Function("xdot", [x, u, *empty], [u - x**2]), np.zeros(0), np.zeros(0))
+        >>> one = np.ones(1)
+        >>> search = SteadySearch(tank, np.ones(2), one, one, np.ones(2), np.array([1]))
+        >>> search.descend(np.ones(2), np.array([2.0])).v.round(6)
+        array([2., 4.])
+    """
+
+    def __init__(
+        self, equations: Equations, scale: Array, size: Array, root: Array, near: Array, leans: Places,
+        bounds: Range | None = None, *, heed: Array | None = None, hidden: slice = slice(0, 0),
+        free: Places | None = None, steady: float = STEADY,
+    ) -> None:  # fmt: skip
+        self.equations, self.scale, self.size, self.near = equations, scale, size, near
+        self._tracked = np.flatnonzero(root > 0)
+        self._root, self._free, self._steady = root[self._tracked], free, steady
+        self._hidden = hidden if scale[hidden].size else None
+        self._own = size if heed is None else size * heed
+        n_v = scale.size
+        self._sought = np.arange(n_v) if free is None else free
+        place = np.full(n_v, -1)
+        place[self._sought] = np.arange(self._sought.size)
+        self._leaning, self._leans = place[leans][place[leans] >= 0], leans[place[leans] >= 0]
+        bounds = Range.none(n_v, root.size) if bounds is None else bounds
+        self.bounds = bounds
+        finite = (np.isfinite(bounds.lower) | np.isfinite(bounds.upper)) & (place >= 0)
+        # which unknowns are bounded, their places among the free ones, and their bounds, in scales
+        self._always, self._all = (
+            (k, place[k], bounds.lower[k] / scale[k], bounds.upper[k] / scale[k])
+            for k in (
+                np.flatnonzero(finite & bounds.kept),
+                np.concatenate([np.flatnonzero(finite & bounds.kept), np.flatnonzero(finite & ~bounds.kept)]),
+            )
+        )
+        self._seen = np.flatnonzero(np.isfinite(bounds.y_lower) | np.isfinite(bounds.y_upper))
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    def descend(self, v: Array, goal: Array, bounded: bool = True) -> Descent:
+        """Gauss-Newton from ``v`` to the set-point ``goal`` ``(n_y,)``; not ``bounded``: within kept bounds alone."""
+        at, done, sure = self._point(v, goal), False, True
+        lacks, before = [at.lacks], np.inf
+        slopes = np.full((self._tracked.size, self._leans.size), np.nan)
+        for _ in range(ITERATIONS):
+            step, slopes = self._newton(at, goal, bounded)
+            if step is None or not np.all(np.isfinite(step)):
+                break
+            size = float(np.max(np.abs(step / self.scale), initial=0.0))
+            if size <= self._steady:
+                done = at.lacks <= STILL
+                break
+            sure = sure and (size < NEAR or size <= CONTRACTS * before)
+            before, share = size, 1.0
+            after = self._settled(at.v + step, goal)
+            while not after.merit < at.merit and share > LEAST_SHARE:
+                share, sure = 0.5 * share, sure and size < NEAR
+                after = self._settled(at.v + share * step, goal)
+            if not after.merit < at.merit:
+                done = size < NEAR and at.lacks <= STILL  # rounding is all that is left
+                break
+            at = after
+            lacks.append(at.lacks)
+            if len(lacks) > WITHIN and at.lacks > max(STALLED * lacks[-1 - WITHIN], STILL):
+                break
+        off = float(np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0))
+        return Descent(at.v, at.y, off, slopes, done, done and sure)
+
+    def follow(
+        self,
+        v: Array,
+        begun: Array,
+        goal: Array,
+        *,
+        sure: bool = True,
+        before: Callable[[float], None] | None = None,
+    ) -> Descent | None:
+        """The steady state to which set-points from ``begun``, that of ``v``, to ``goal`` lead; None: the branch ends.
+
+        Parts of the way shorten where Newton's method does not contract, and grow where it does, so that the branch is
+        not left, whatever the rounding. Without ``sure`` any steady state is gone on from. ``before`` is called with
+        the share of the way before each descent, for what else changes on it.
+        """
+        done, part, found = 0.0, FOLLOWED, None
+        for _ in range(MOST_PARTS):
+            to = min(1.0, done + part)
+            if before is not None:
+                before(to)
+            found = self.descend(v, begun + to * (goal - begun))
+            if found.steady and (found.sure or not sure):
+                if to >= 1.0:
+                    return found
+                v, done, part = found.v, to, 2.0 * part
+            else:
+                part *= 0.25
+                if part < LEAST_PART:
+                    break
+        return None
+
+    def best(self, found: list[Descent]) -> Descent | None:
+        """Of steady states that nearest to the set-point, and of those that are equally near, to the operating point.
+
+        Only if none is sure, the others count. None where there is no steady state.
+        """
+        steady = [f for f in found if f.sure] or [f for f in found if f.steady]
+        if not steady:
+            return None
+        least = max(min(f.off for f in steady) * (1.0 + EQUAL), REACHED)
+        return min((f for f in steady if f.off <= least), key=self.distance)
+
+    def distance(self, found: Descent) -> float:
+        """Distance from the operating point in scales, of all that is sought but hidden states."""
+        apart = ((found.v - self.near) / self.scale)[self._sought]
+        if self._hidden is not None:
+            apart = np.delete(
+                apart, np.flatnonzero(np.isin(self._sought, np.arange(self.scale.size)[self._hidden]))
+            )
+        return float(np.linalg.norm(apart))
+
+    def slopes(self, v: Array) -> Array:
+        """How outputs with weights answer to the unknowns that lean, along steady states ``(n, len(leans))``."""
+        at = self._point(v, np.zeros(self.bounds.y_lower.size))
+        return self._newton(at, at.y, False)[1]
+
+    def lacks(self, v: Array) -> float:
+        """How much of a steady state ``v`` lacks, in scales."""
+        return float(np.sum(np.abs(self.equations.rest(v)[0] / self.size)))
+
+    def _newton(self, at: _Point, goal: Array, bounded: bool) -> tuple[Array | None, Array]:
+        """The step that the linearization asks for, None where its QP has no answer; and :meth:`slopes` there."""
+        scale, v, y = self.scale, at.v, at.y
+        # rows have units, too: which rank they have must not depend on these
+        rest, e, j = at.rest / self._own, at.rest_by_v * scale / self._own[:, None], at.y_by_v * scale
+        if self._free is not None:
+            e, j = e[:, self._free], j[:, self._free]
+        if not (np.all(np.isfinite(e)) and np.all(np.isfinite(j)) and np.all(np.isfinite(rest))):
+            return None, np.full((self._tracked.size, self._leans.size), np.nan)
+        left, sizes, right = np.linalg.svd(e)
+        rank = int(np.sum(sizes > RANK * sizes[0])) if sizes.size else 0
+        onto = right[:rank].T @ ((left[:, :rank].T @ -rest) / sizes[:rank])  # to the steady states
+        along = right[rank:].T  # and along them
+        sees = self._root[:, None] * j[self._tracked] @ along
+        error = self._root * (goal - y - j @ onto)[self._tracked]
+        lean = self._leans
+        far = (self.near[lean] - v[lean]) / scale[lean] - onto[self._leaning]
+        _, s, vt = np.linalg.svd(sees)
+        size = max(float(s[0]) if s.size else 0.0, 1e-150)
+        unseen = vt[int(np.sum(s > RANK * size)) :]
+        move = along[self._leaning]
+        inward = unseen.T @ unseen
+        h = sees.T @ sees / size**2 + FREE * inward @ (move.T @ move) @ inward
+        g = -(sees.T @ error / size**2 + FREE * inward @ (move.T @ far))
+        h += 1e-12 * np.trace(h) * np.eye(len(h)) + 1e-14 * np.eye(len(h))
+        which, places, low, high = self._all if bounded else self._always
+        now = v[which] / scale[which] + onto[places]
+        rows, lower, upper = along[places], low - now, high - now
+        if bounded and self._seen.size:
+            k = self._seen
+            now = y[k] + j[k] @ onto
+            rows = np.vstack([j[k] @ along, rows])
+            lower = np.concatenate([self.bounds.y_lower[k] - now, lower])
+            upper = np.concatenate([self.bounds.y_upper[k] - now, upper])
+        eta = bounded_least_squares(h, g, rows, lower, upper)
+        if eta is None:
+            return None, sees @ move.T
+        moved = onto + along @ eta
+        if self._free is not None:
+            whole = np.zeros(scale.size)
+            whole[self._free] = moved
+            moved = whole
+        return moved * scale, sees @ move.T
+
+    def _settled(self, v: Array, goal: Array) -> _Point:
+        """The point with the hidden state at rest under its state and input, by Newton's method; as it is where that
+        does not end there. What a network does between two rests says nothing of how far the machine is from one.
+        """
+        plain = at = self._point(v, goal)
+        if self._hidden is None:
+            return plain
+        hidden = self._hidden
+        size = self.scale[hidden]
+        for _ in range(SETTLING):
+            off = at.rest[hidden] / size
+            if not np.all(np.isfinite(at.rest)) or np.max(np.abs(off)) < STEADY:
+                break
+            try:
+                move = size * np.linalg.solve(at.rest_by_v[hidden, hidden] * size / size[:, None], -off)
+            except np.linalg.LinAlgError:
+                return plain
+            v = at.v.copy()
+            v[hidden] += move
+            at = self._point(v, goal)
+        return at if at.merit < plain.merit else plain
+
+    def _point(self, v: Array, goal: Array) -> _Point:
+        """What descents need to know of ``v``; the merit is infinite where something is not finite."""
+        rest, rest_by_v = self.equations.rest(v)
+        y, y_by_v = self.equations.shown(v)
+        lacks = float(np.sum(np.abs(rest / self.size)))
+        merit = 100.0 * lacks + float(np.linalg.norm(self._root * (y - goal)[self._tracked]))
+        return _Point(v, rest, rest_by_v, y, y_by_v, lacks, merit if np.isfinite(merit) else np.inf)
+
+
+def natural_sizes(model: HybridModel) -> Array:
+    """Sizes ``(n_x + n_h,)`` of a model's states for an analysis: spread, else half the range, else the operating
+    point's value, else 1; 1 of a hidden state, of a delayed input that of the input.
+    """
+    half = np.array([0.5 * (s.upper - s.lower) for s in model.states])
+    spread = np.array(model.state_spread) if model.state_spread else np.zeros(model.n_x)
+    own = np.where(model.x0 != 0, np.abs(model.x0), 1.0)
+    x = np.where(spread > 0, spread, np.where(np.isfinite(half) & (half > 0), half, own))
+    return np.concatenate(
+        [x, np.resize(input_sizes(model), model.delay_states), np.ones(model.n_h - model.delay_states)]
+    )
+
+
+def input_sizes(model: HybridModel) -> Array:
+    """Sizes ``(n_u,)`` of inputs for an analysis: half the range, else the operating point's value, else 1."""
+    half = np.array([0.5 * (s.upper - s.lower) for s in model.inputs])
+    own = np.where(model.u0 != 0, np.abs(model.u0), 1.0)
+    return np.where(np.isfinite(half) & (half > 0), half, own)
+
+
+def rest_search(
+    model: HybridModel, scale: Array | None = None, *, free: Places | None = None, steady: float = EXACT
+) -> SteadySearch:
+    """A search for steady states ``v = (x, h, u)`` without a set-point; ``scale`` ``(n_z,)`` are sizes of ``(x, h)``.
+
+    ``free`` are the places that are sought. Default: states and hidden states, under a held input.
+    """
+    n_x, n_z = model.n_x, model.n_x + model.n_h
+    scale = natural_sizes(model) if scale is None else scale
+    return SteadySearch(
+        StepEquations(model), np.concatenate([scale, input_sizes(model)]), scale, np.zeros(model.n_y),
+        np.concatenate([model.x0, np.zeros(model.n_h), model.u0]), np.zeros(0, dtype=np.int64),
+        hidden=slice(n_x, n_z), free=np.arange(n_z) if free is None else free, steady=steady,
+    )  # fmt: skip
+
+
+def rate_search(
+    equations: RateEquations, scale: Array, near: Array, root: Array, *, bounds: Range | None = None,
+    free: Places | None = None,
+) -> SteadySearch:  # fmt: skip
+    """A search for steady states ``v = (x, u)`` of rates, which count by what a state or input of its size changes.
+
+    ``near`` is the operating point, which the inputs stay near; the rest is as in :class:`SteadySearch`.
+    """
+    slopes = equations.rest(near)[1]
+    size = np.linalg.norm(np.where(np.isfinite(slopes), slopes * scale, 0.0), axis=1)
+    size = np.where(size > 0, size, 1.0)
+    return SteadySearch(
+        equations, scale, size, root, near, np.arange(len(size), len(near)), bounds, free=free, steady=EXACT
+    )
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is no rest
+def run_to_rest(search: SteadySearch, v: Array) -> Array | None:
+    """Where a model's own run from ``v = (x, h, u)`` comes nearly to rest under its input; None where it does not."""
+    equations, v = search.equations, v.copy()
+    assert isinstance(equations, StepEquations)
+    n_z = search.size.size
+    for _ in range(RUN):
+        after = equations.after(v)
+        moved, v[:n_z] = np.max(np.abs((after - v[:n_z]) / search.size)), after
+        if not moved > STEADY:
+            break
+    return v if search.lacks(v) < NEARER else None
+
+
+def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[Array, Array]:
+    """The equilibrium ``x`` ``(n_x,)``, ``h`` ``(n_h,)`` under a held input, by Newton's method from a guess of ``x``.
+
+    Where it does not end there, it begins anew from where the model's own run has come to, which finds a rest that is
+    stable.
+
+    Raises:
+        InputError: If a size is wrong or none is found (largest residual above 1e-10 in the units of the state).
+    """
+    x0, u0 = vector(x_guess, model.n_x, "x_guess"), vector(u, model.n_u, "u")
+    search, none = rest_search(model), np.zeros(model.n_y)
+    start = np.concatenate([x0, hidden_fixed_point(model, x0, u0, limit=100), u0])
+    found = search.descend(start, none)
+    if not found.steady or residual_of(search, found.v) > RESIDUAL:
+        run = run_to_rest(search, start)
+        found = found if run is None else search.descend(run, none)
+    if not found.steady or (size := residual_of(search, found.v)) > RESIDUAL:
+        size = residual_of(search, found.v)
+        raise InputError(
+            f"model {model.name}: no fixed point found from x = {x0.tolist()} under u = {u0.tolist()} "
+            f"(residual {size:.2g}, needed {RESIDUAL:g}); give a nearer x_guess or an input it can rest under"
+        )
+    return found.v[: model.n_x], found.v[model.n_x : model.n_x + model.n_h]
+
+
+def residual_of(search: SteadySearch, v: Array) -> float:
+    """Largest residual of the equations, in their units; infinite if it is not finite."""
+    size = float(np.max(np.abs(search.equations.rest(v)[0]), initial=0.0))
+    return size if np.isfinite(size) else float("inf")
+
+
+def hidden_fixed_point(
+    model: HybridModel, x: Array, u: Array, *, w: Array | None = None, limit: int = 2000
+) -> Array:
+    """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)``, ``u`` ``(n_u,)`` and ``w`` ``(n_w,)`` held.
+
+    The iteration starts at zero, delayed inputs at ``u``. It ends when no element moves by more than 1e-10, or after
+    ``limit`` steps with the last value.
+    """
+    h = np.zeros(model.n_h)
+    h[: model.delay_states] = np.resize(u, model.delay_states)
+    held = model.w if w is None else w
+    for _ in range(limit if model.n_h else 0):
+        h_next = model.step(x, h, u, held, model.p)[1].full().ravel()
+        moved, h = np.max(np.abs(h_next - h)), h_next
+        if not moved > SETTLED:
+            break
+    return h
+
+
+def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
+    """Hidden state ``(n_h,)`` at rest while ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` are held, by Newton's method.
+
+    Raises:
+        InputError: If there is none.
+    """
+    x0, u0 = vector(x, model.n_x, "x"), vector(u, model.n_u, "u")
+    if model.n_h == 0:
+        return np.zeros(0)
+    n_x, n_z = model.n_x, model.n_x + model.n_h
+    hidden = np.arange(n_x, n_z)
+    search = _of_rows(model, hidden, hidden)
+    start = np.concatenate([x0, hidden_fixed_point(model, x0, u0, limit=100), u0])
+    found = search.descend(start, np.zeros(model.n_y))
+    size = residual_of(search, found.v)
+    if size > RESIDUAL:
+        raise InputError(
+            f"model {model.name}: the hidden state finds no rest at x = {x0.tolist()} (residual {size:.2g}); give h"
+        )
+    return found.v[n_x:n_z]
+
+
+class _Rows:
+    """Some rows of a step's equations: the others need not hold."""
+
+    def __init__(self, model: HybridModel, rows: Places) -> None:
+        self._all, self._rows = StepEquations(model), rows
+
+    def rest(self, v: Array) -> tuple[Array, Array]:
+        """Those rows of :meth:`StepEquations.rest`."""
+        rest, slopes = self._all.rest(v)
+        return rest[self._rows], slopes[self._rows]
+
+    def shown(self, v: Array) -> tuple[Array, Array]:
+        """As :meth:`StepEquations.shown`."""
+        return self._all.shown(v)
+
+
+def _of_rows(model: HybridModel, rows: Places, free: Places) -> SteadySearch:
+    scale = natural_sizes(model)
+    return SteadySearch(
+        _Rows(model, rows), np.concatenate([scale, input_sizes(model)]), scale[rows], np.zeros(model.n_y),
+        np.concatenate([model.x0, np.zeros(model.n_h), model.u0]), np.zeros(0, dtype=np.int64), free=free, steady=EXACT,
+    )  # fmt: skip
+
+
+def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None = None) -> Array:
+    """Input ``(n_u,)`` that holds a machine at rest at positions ``q`` ``(n_x / 2,)``, with its hidden state settled.
+
+    Where Newton's method from the guess finds none (a network that has learned how a machine sticks feels no input
+    there), it begins further and further away from it to both sides, and the nearest input counts.
+
+    Args:
+        model: The model, state ``[q, v]``, with as many inputs as positions.
+        q: The positions.
+        u_guess: Start ``(n_u,)``. Default: zero.
+
+    Raises:
+        InputError: If the numbers of inputs and positions differ, or no such input is found.
+
+    Example:
+        ``gain_schedule(model, [(np.append(q, 0.0), holding_input(model, [q])) for q in angles], weights, costs)``
+    """
+    n_q = positions_of(model)
+    if model.n_u != n_q:
+        raise InputError(
+            f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them"
+        )
+    x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
+    guess = np.zeros(model.n_u) if u_guess is None else vector(u_guess, model.n_u, "u_guess")
+    n_x, n_z = model.n_x, model.n_x + model.n_h
+    search = _of_rows(model, np.arange(n_q, n_z), np.arange(n_x, n_z + model.n_u))
+
+    def begun(u: Array) -> tuple[Array, float]:
+        start = np.concatenate([x, hidden_fixed_point(model, x, u, limit=100), u])
+        v = search.descend(start, np.zeros(model.n_y)).v
+        return v[n_z:], residual_of(search, v)
+
+    found, size = begun(guess)
+    if size > RESIDUAL:
+        aside = [
+            begun(guess + move) for reach in REACHES for e in reach * np.eye(model.n_u) for move in (e, -e)
+        ]
+        held = [u for u, left in aside if left <= RESIDUAL]
+        if not held:
+            raise InputError(
+                f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})"
+            )
+        found = min(held, key=lambda u: float(np.linalg.norm((u - guess) / input_sizes(model))))
+    return found
+
+
+def holding(rates: Expression, u: Expression, u0: Array, sizes: Array, scale: Array) -> Expression:
+    """The input that holds a state best, of ``rates`` ``(n_x,)`` of the state with the symbol ``u``: one Newton step of
+    least squares from the operating point's input ``u0``. Rates count in ``sizes``, inputs in ``scale``.
+
+    A fallback holds states that are no steady states in a period's time: a search has no answer for it. Of a machine
+    whose rates are linear in its inputs one step is exact, and in C it is a row of scalar code.
+    """
+    size, rates = ca.DM(scale), rates / ca.DM(sizes)
+    slope = ca.jacobian(rates, u) @ ca.diag(size)
+    square = slope.T @ slope
+    damping = (1e-12 * ca.trace(square) + 1e-300) * ca.DM.eye(u.numel())
+    best = u - size * ca.solve(square + damping, slope.T @ rates)
+    return ca.densify(ca.substitute(best, u, ca.DM(u0)))
+
+
+def equilibrium_input(model: HybridModel, sizes: Array, scale: Array) -> ca.Function:
+    """``(x, w) -> u`` that holds a state best; see :func:`holding`."""
+    x, u, w = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u), ca.MX.sym("w", model.n_w)
+    rates = model.xdot(x, ca.DM.zeros(model.n_h, 1), u, w, model.p)
+    return ca.Function("equilibrium_input", [x, w], [holding(rates, u, model.u0, sizes, scale)])
+
+
+def bounded_least_squares(h: Array, g: Array, rows: Array, lower: Array, upper: Array) -> Array | None:
+    """``min 1/2 s'hs + g's`` with ``lower <= rows s <= upper``, for a few unknowns; None where there is none.
+
+    The bounds' squared violation is the dual's non-negative least squares: exact, whatever the number of rows.
+    """
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+    from scipy.optimize import nnls
+
+    if not all(np.all(np.isfinite(m)) for m in (h, g, rows)):
+        return None
+    if not len(h):
+        inside = np.all(lower <= 1e-9) and np.all(upper >= -1e-9)
+        return np.zeros(0) if inside else None
+    try:
+        factor = cho_factor(h)
+    except LinAlgError:
+        return None
+    free = -cho_solve(factor, g)
+    sides = np.concatenate([rows[np.isfinite(upper)], -rows[np.isfinite(lower)]])
+    ends = np.concatenate([upper[np.isfinite(upper)], -lower[np.isfinite(lower)]])
+    size = np.maximum(np.linalg.norm(sides, axis=1), 1e-300)
+    sides, ends = sides / size[:, None], ends / size
+    gap = ends - sides @ free
+    if np.all(gap >= -1e-12):
+        return np.asarray(free)
+    # least distance programming: min |t| with G t >= b for t = L' (s - free)
+    root = np.linalg.cholesky(h)
+    over = -np.linalg.solve(root, sides.T).T
+    e = np.vstack([over.T, -gap[None]])
+    f = np.zeros(len(e))
+    f[-1] = 1.0
+    try:
+        multipliers, left = nnls(e, f, maxiter=30 * e.shape[1])
+    except RuntimeError:
+        return None
+    rest = e @ multipliers - f
+    if left <= 1e-10 or abs(rest[-1]) < 1e-300:
+        return None
+    t = -rest[:-1] / rest[-1]
+    return np.asarray(free + np.linalg.solve(root.T, t))
