@@ -99,11 +99,11 @@ class CleanAlarms:
     test_alarms: int = 0
 
     def too_many(self, per_hour: float) -> bool:
-        """Whether limits that were learned for a rate of false alarms [1/h] keep it: so many alarms or more have a
-        probability below 5 % (Poisson).
+        """Whether these are more than a rate of false alarms [1/h] explains: so many or more have a probability below
+        5 % (Poisson).
 
         Example:
-            >>> [CleanAlarms(300.0, alarms).too_many(10.0) for alarms in (0, 1, 2, 3)]
+            >>> [CleanAlarms(300.0, alarms).too_many(10.0) for alarms in (0, 1, 3, 4)]
             [False, False, False, True]
         """
         return self.alarms > 0 and float(poisson.sf(self.alarms - 1, self.expected(per_hour))) < UNLIKELY
