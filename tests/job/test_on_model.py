@@ -45,7 +45,7 @@ def test_every_task_runs_on_another_model_than_the_controller_s(bare_tanks):
 def test_report_terminal_and_figures_say_that_it_is_no_machine(bare_tanks):
     page = re.sub(r"<img[^>]*>", "", (bare_tanks / "run" / "report.html").read_text())
     section = re.search(r"Closed loops on the model, not the machine</h2>(.*?)<h2", page, re.DOTALL)[1]
-    tables = re.findall(r"<table.*?</table>", section, re.DOTALL)
+    tables = re.findall(r'<p class="caption">.*?</table>', section, re.DOTALL)
     assert len(tables) == 2
     assert all(("hybrid_1" in table) != ("on the model hybrid in" in table) for table in tables)
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", section, re.DOTALL)
