@@ -30,7 +30,7 @@ from hybrid_mpc.identify.fit import (
     check_observable,
     with_states,
 )
-from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, required_substeps, visited
+from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, Points, required_substeps, visited
 from hybrid_mpc.identify.smooth import rough_smoother
 from hybrid_mpc.identify.sound import shooting
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
@@ -143,12 +143,17 @@ def reading_of(factor: float, needed: bool = True) -> str:
     """
     if not needed:
         return "it seems not to exist"
-    off, text = min((abs(factor / value - 1.0), text) for value, text in READINGS)
-    if off <= NEAR:
-        return text
+    if texts := _readings(factor):
+        return ", or ".join(texts)
     if factor < 0.0:
         return VAGUE[0]
     return "" if 1 / SIZE < factor < SIZE else VAGUE[1]
+
+
+def _readings(factor: float) -> list[str]:
+    """What values near a factor say, the nearest first: 57.3 and 60 cannot be told apart."""
+    off = sorted((abs(factor / value - 1.0), text) for value, text in READINGS)
+    return [text for distance, text in off if distance <= NEAR]
 
 
 class _Editor:
@@ -223,7 +228,7 @@ class _Graph:
         self._roots: dict[str, Any] = {}
         self._uses: Counter[int] = Counter()
         met: set[int] = set()
-        for scalar in scalars:
+        for scalar in {one.element_hash(): one for one in scalars}.values():  # mirrored entries are one
             self._count(scalar, met)
 
     def _count(self, e: ca.SX, met: set[int]) -> None:
@@ -555,14 +560,18 @@ def causes_of_refusal(
         longest: Length [s] of the free runs by which models are judged.
         time_unit: The machine's second [s].
     """
-    if _fits(make, dt, time_unit):
-        return ()
+    known, points = None, None
+    if _fits(make, dt, time_unit):  # at rest; perhaps not where the recordings go
+        known = _smoothed(make, recorded, dt, time_unit)
+        points = visited(known[0])
+        if _fits(make, dt, time_unit, points):
+            return ()
     fit = _FactorFit(make, dt)
-    usable, known = [], None
+    usable = []
     for k in range(len(fit.term_names)):
         for value in (value for value, _ in READINGS if value not in (0.5, 2.0)):
             one = _with_mended(make, k, value)
-            if _fits(one, dt, time_unit):
+            if _fits(one, dt, time_unit, points):
                 known = known or _smoothed(one, recorded, dt, time_unit)
                 usable.append(_Start(k, np.append(fit.nominal[:-1], value)))
     if known is None:
@@ -584,11 +593,11 @@ def causes_of_refusal(
     return tuple(Cause(name, reading_of(value), error, value, before=False) for name, value, error in values)
 
 
-def _fits(make: Callable[..., Prior], dt: float, time_unit: float) -> bool:
-    """Whether a prior is observable, and not too stiff for the period."""
+def _fits(make: Callable[..., Prior], dt: float, time_unit: float, points: Points | None = None) -> bool:
+    """Whether a prior is observable, and not too stiff for the period at rest and at points."""
     try:
         check_observable(make(), dt, time_unit)
-        required_substeps(make(), dt)
+        required_substeps(make(), dt, points)
     except InputError:
         return False
     return True
@@ -689,7 +698,7 @@ def _cause(
     if not alike:
         return plain
     alike.sort(key=lambda one: _off_nominal(fit, one.theta))
-    said = list(dict.fromkeys(reading_of(float(one.theta[-1])) for one in alike))
+    said = list(dict.fromkeys(text for one in alike for text in _readings(float(one.theta[-1]))))
     chosen = alike[0]
     return Cause(name, ", or ".join(said[:2]), chosen.error / before, float(chosen.theta[-1]))
 
