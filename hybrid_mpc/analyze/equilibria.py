@@ -90,6 +90,7 @@ def equilibria(
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal
+        >>> import casadi as ca
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("cubic", 0.1, level, (Signal("u", "-"),), level,
         ...     x=x, u=u, x_next=x + 0.1 * (x - x**3), xdot=u, y=x)

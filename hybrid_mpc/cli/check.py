@@ -155,7 +155,7 @@ def _free_runs(prior: Prior, found: PriorResult) -> Table:
 def _number(value: float | None, spec: str) -> str:
     if value is None:
         return "–"
-    return f"{value:.{spec}}" if np.isfinite(value) else "diverged"
+    return f"{value:.{spec}}" if math.isfinite(value) else "diverged"
 
 
 def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:

@@ -75,6 +75,7 @@ class SafeController:
     Example:
         >>> from hybrid_mpc.estimate.kalman import TrueState
         >>> from hybrid_mpc.machine.signals import Signal
+        >>> import casadi as ca
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> ocp = OCP(5, [1.0], [1.0], [0.0], [-9.0], [9.0], du_max=[0.5])

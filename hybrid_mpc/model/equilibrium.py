@@ -256,7 +256,7 @@ class SteadySearch:
         >>> tank = RateEquations(ca.Function("xdot", [x, u, *empty], [u - x**2]), np.zeros(0), np.zeros(0))
         >>> one = np.ones(1)
         >>> search = SteadySearch(tank, np.ones(2), one, one, np.ones(2), np.array([1]))
-        >>> search.descend(np.ones(2), np.array([2.0])).v.round(6)
+        >>> search.descend(np.array([2.0, 3.0]), np.array([2.0])).v.round(6)
         array([2., 4.])
     """
 

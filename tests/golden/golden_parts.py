@@ -42,6 +42,7 @@ from hybrid_mpc import (
     with_parameter_states,
 )
 from hybrid_mpc.kit.artifact import build_model
+from hybrid_mpc.kit.migrate import migrate_kit
 from hybrid_mpc.records import record
 
 HERE = Path(__file__).parent
@@ -213,9 +214,11 @@ def machine(name):
     return Machine(name, HERE / name)
 
 
-def artifact_of(folder):
-    """Models by name and calibration as the library's own reader finds them in an artifact's folder."""
-    found = load(folder)
+def artifact_of(folder, out):
+    """Models by name and calibration as the library's own reader finds them once a kit of the former format is migrated
+    to the folder ``out``.
+    """
+    found = load(migrate_kit(folder, out))
     return found.models, found.calibration
 
 
