@@ -190,7 +190,7 @@ class Range:
 class Descent(NamedTuple):
     """Where a descent ended.
 
-    Args:
+    Attributes:
         v: The unknowns.
         y: What set-points are of, there.
         off: Its largest deviation from the set-point, in tolerated ones.
@@ -643,8 +643,19 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     search = _of_rows(model, np.arange(n_q, n_z), np.arange(n_x, n_z + model.n_u))
 
     def begun(u: Array) -> tuple[Array, float]:
-        start = np.concatenate([x, hidden_fixed_point(model, x, u, limit=100), u])
-        v = search.descend(start, np.zeros(model.n_y)).v
+        v = np.concatenate([x, hidden_fixed_point(model, x, u, limit=100), u])
+        scale = np.concatenate([natural_sizes(model), input_sizes(model)])[n_x:]
+        for _ in range(
+            ITERATIONS
+        ):  # whole steps: a network's curvature would shorten those that a merit guards
+            rest, slopes = search.equations.rest(v)
+            matrix = slopes[:, n_x:] * scale
+            if not (np.isfinite(matrix).all() and np.isfinite(rest).all()):
+                break
+            step = np.linalg.lstsq(matrix, -rest, rcond=None)[0]
+            v[n_x:] += scale * step
+            if np.max(np.abs(step), initial=0.0) <= EXACT:
+                break
         return v[n_z:], residual_of(search, v)
 
     found, size = begun(guess)
