@@ -645,17 +645,19 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     def begun(u: Array) -> tuple[Array, float]:
         v = np.concatenate([x, hidden_fixed_point(model, x, u, limit=100), u])
         scale = np.concatenate([natural_sizes(model), input_sizes(model)])[n_x:]
-        for _ in range(
-            ITERATIONS
-        ):  # whole steps: a network's curvature would shorten those that a merit guards
-            rest, slopes = search.equations.rest(v)
-            matrix = slopes[:, n_x:] * scale
-            if not (np.isfinite(matrix).all() and np.isfinite(rest).all()):
+        rest, slopes = search.equations.rest(v)
+        for _ in range(ITERATIONS):  # halved by the residual: a descent's merit shortens steps too much
+            if not (np.isfinite(slopes).all() and np.isfinite(rest).all()):
                 break
-            step = np.linalg.lstsq(matrix, -rest, rcond=None)[0]
-            v[n_x:] += scale * step
-            if np.max(np.abs(step), initial=0.0) <= EXACT:
+            step = scale * np.linalg.lstsq(slopes[:, n_x:] * scale, -rest, rcond=None)[0]
+            share, better = 1.0, False
+            while share > LEAST_SHARE and not better:
+                trial = np.concatenate([x, v[n_x:] + share * step])
+                after, by = search.equations.rest(trial)
+                share, better = 0.5 * share, bool(np.linalg.norm(after) < np.linalg.norm(rest))
+            if not better:
                 break
+            v, rest, slopes = trial, after, by
         return v[n_z:], residual_of(search, v)
 
     found, size = begun(guess)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from golden_parts import HERE, POINTS, artifact_of, held, under
 
+from hybrid_mpc import holding_input
+
 TOLERANCE = 1e-9
 """One and two threads give the same bits; other processors' sums change these by 1e-11 (README.md). A change of what is
 computed changes them by far more."""
@@ -97,3 +99,11 @@ def test_the_folders_are_small():
         assert sizes.pop("arrays.npz") < 500_000
         assert sum(sizes.values()) < 300_000
         assert json.loads((HERE / name / "golden.json").read_text())["made"]["commit"]
+
+
+def test_inputs_that_hold_the_arm_follow_its_angle():
+    """Newton's method stays on one branch although the network is curved: a whole step from zero leaves it at -0.7 rad."""
+    robot = parts.machine("golf_robot").models["hybrid"]
+    held = np.array([holding_input(robot, [q])[0] for q in np.linspace(-0.8, 0.8, 17)])
+    assert (np.diff(held) > 0.0).all()
+    assert np.abs(held).max() < 0.5  # the prior's is 0.44 N m
