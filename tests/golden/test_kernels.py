@@ -102,7 +102,7 @@ def test_the_folders_are_small():
 
 
 def test_inputs_that_hold_the_arm_follow_its_angle():
-    """Newton's method stays on one branch although the network is curved: a whole step from zero leaves it at -0.7 rad."""
+    """Newton's method stays on one branch although the network is curved: whole steps leave it at -0.7 rad."""
     robot = parts.machine("golf_robot").models["hybrid"]
     held = np.array([holding_input(robot, [q])[0] for q in np.linspace(-0.8, 0.8, 17)])
     assert (np.diff(held) > 0.0).all()
