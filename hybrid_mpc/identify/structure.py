@@ -36,8 +36,8 @@ from hybrid_mpc.identify.sound import shooting
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 
 Array = NDArray[np.float64]
-LARGEST = 1e4
-"""Largest factor: the largest mistake of a unit that is looked for is one of 3,600, hours for seconds."""
+LARGEST = 1e7
+"""Largest factor: the largest mistake of a unit that is looked for is one of 1e6."""
 READINGS = (
     (-1.0, "its sign seems wrong"),
     (180 / math.pi, "radians seem to stand for degrees"),
@@ -658,9 +658,9 @@ def _units(fit: _FactorFit, few: Shooting) -> list[_Start]:
     (before,) = _tried(fit, few, [_Start(-1, fit.nominal)], 0)
     terms = len(fit.term_names)
     begun = [_Start(k, np.append(fit.nominal[:-1], unit)) for k in range(terms) for unit in UNITS]
-    slow = [one for one in begun if fit.choosing([one.term]).most_substeps(one.theta[None]) < MAX_SUBSTEPS]
-    better = [one for one in _tried(fit, few, slow, 0) if one.error < BETTER * before.error]
-    return _best(slow, better, EACH)[: max(TRIED, terms)]
+    begun = [one for one in begun if fit.choosing([one.term]).most_substeps(one.theta[None]) < MAX_SUBSTEPS]
+    better = [one for one in _tried(fit, few, begun, 0) if one.error < BETTER * before.error]
+    return _best(begun, better, EACH)[: max(TRIED, terms)]
 
 
 def _best(begun: Sequence[_Start], trials: Sequence[Trial], each: int) -> list[_Start]:

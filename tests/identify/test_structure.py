@@ -181,17 +181,25 @@ def test_a_wrong_sign_is_named(runs):
     assert str(found[0]) in named(found)
 
 
-class Degrees(Pendulum):
+class Large(Pendulum):
     """Its torque is taken a thousand times too large, as N mm for N m."""
 
     def force(self, q, v, u, w, p):
         return (1e3 * u.torque,)
 
 
-def test_a_wrong_unit_is_named(runs):
-    first = found_of(Degrees, runs)[0]
+class Small(Pendulum):
+    """Its torque is taken a hundred thousand times too small, as Pa for bar."""
+
+    def force(self, q, v, u, w, p):
+        return (1e-5 * u.torque,)
+
+
+@pytest.mark.parametrize(("make", "factor"), [(Large, 1e-3), (Small, 1e5)])
+def test_a_wrong_unit_is_named(runs, make, factor):
+    first = found_of(make, runs)[0]
     assert "force" in first.what or "input" in first.what
-    assert first.factor == pytest.approx(1e-3)
+    assert first.factor == pytest.approx(factor)
     assert first.exact
 
 
