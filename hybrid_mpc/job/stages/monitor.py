@@ -109,7 +109,7 @@ class CleanAlarms:
         return self.alarms > 0 and float(poisson.sf(self.alarms - 1, self.expected(per_hour))) < UNLIKELY
 
     def expected(self, per_hour: float) -> float:
-        """Alarms that a rate of false alarms [1/h] lets expect in that time."""
+        """Alarms expected in that time at a rate of false alarms [1/h]."""
         return per_hour * self.seconds / 3600.0
 
     def words(self, per_hour: float) -> str:
@@ -117,11 +117,11 @@ class CleanAlarms:
 
         Example:
             >>> CleanAlarms(300.0, 1).words(10.0)
-            '1 in 300 s known to be undisturbed, where 10 false alarms an hour let expect 0.83'
+            '1 in 300 s without a disturbance; at 10 false alarms an hour 0.83 are expected'
         """
         return (
-            f"{self.alarms} in {self.seconds:.0f} s known to be undisturbed, where {per_hour:g} false alarms an hour "
-            f"let expect {self.expected(per_hour):.2g}"
+            f"{self.alarms} in {self.seconds:.0f} s without a disturbance; at {per_hour:g} false alarms an hour "
+            f"{self.expected(per_hour):.2g} are expected"
         )
 
 

@@ -333,7 +333,7 @@ def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     alarms, held = results.monitor.alarms, results.monitor.details
     if alarms is not None and held.clean is not None and held.calibration is not None:
         rate = held.calibration.false_alarms_per_hour
-        comment = f"of them {held.clean.words(rate)}"
+        comment = held.clean.words(rate)
         verdict: Verdict = "bad" if held.clean.too_many(rate) else "good"
         yield KeyFigure("Alarms of the energy monitor", len(alarms), "", comment, verdict)
 

@@ -44,15 +44,16 @@ def rate_words(alarms: int, seconds: float) -> str:
     Source: exact interval of a Poisson count (Garwood, 1936).
 
     Example:
-        >>> rate_words(1, 300.0), rate_words(0, 3600.0), rate_words(0, 0.0)
-        ('12 (0.3 to 67)', '0 (0 to 3.7)', 'not watched')
+        >>> rate_words(1, 300.0), rate_words(0, 76.0), rate_words(0, 0.0)
+        ('12 (0.3 to 67)', '0 (0 to 170)', 'not watched')
     """
     if not seconds > 0:
         return "not watched"
     hours = seconds / 3600.0
     low = 0.5 * float(chi2.ppf(0.025, 2 * alarms)) / hours if alarms else 0.0
     high = 0.5 * float(chi2.ppf(0.975, 2 * alarms + 2)) / hours
-    return f"{alarms / hours:.2g} ({low:.2g} to {high:.2g})"
+    rate, least, most = (f"{float(f'{one:.2g}'):g}" for one in (alarms / hours, low, high))  # 170, not 1.7e+02
+    return f"{rate} ({least} to {most})"
 
 
 def _after(delay_s: float | None) -> str:
