@@ -52,7 +52,9 @@ def rate_words(alarms: int, seconds: float) -> str:
     hours = seconds / 3600.0
     low = 0.5 * float(chi2.ppf(0.025, 2 * alarms)) / hours if alarms else 0.0
     high = 0.5 * float(chi2.ppf(0.975, 2 * alarms + 2)) / hours
-    rate, least, most = (f"{float(f'{one:.2g}'):g}" for one in (alarms / hours, low, high))  # 170, not 1.7e+02
+    rate, least, most = (
+        f"{float(f'{one:.2g}'):g}" for one in (alarms / hours, low, high)
+    )  # 170, not 1.7e+02
     return f"{rate} ({least} to {most})"
 
 
