@@ -182,7 +182,7 @@ def replay(whole, case):
     said = {Mode[name]: 0 for name in {*result.mode}}
     for k, step in enumerate(steps):
         rows, weight = preview(k * model.dt)
-        goal = parts.goal(rows[:, : ocp.columns - ocp.n_p], weight, ocp=ocp)
+        goal = parts.goal(rows, weight, ocp=ocp)
         w = step.estimate.w if model.n_w else np.zeros(1)
         if k == 0:
             whole.call("hmpc_start", step.y, w, None, goal)

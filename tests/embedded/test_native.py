@@ -53,6 +53,10 @@ PROBLEMS = {
     "tanks": parts.tanks,
     "delayed": parts.delayed,
     "heaters": parts.heaters,
+    "curved": parts.curved,
+    "priced": parts.priced,
+    "priced outputs": parts.priced_outputs,
+    "spare sensors": parts.spare,
 }
 
 
@@ -75,6 +79,8 @@ def test_small_machines_with_everything(name):
         reference = model.x0 + 0.5 * size * rng.standard_normal((k % 2 + 1, model.n_x))
         if ocp.n_y:
             reference = model.x0 + 6.0 * rng.standard_normal((k % 2 + 1, 2))
+        if ocp.n_p:
+            reference = np.hstack([reference, rng.uniform(0.2, 2.0, (k % 2 + 1, ocp.n_p))])
         weight = None if k % 4 else rng.uniform(0.2, 2.0, (ocp.horizon + 1, model.n_x))
         middle, half = model.u0, 0.3 * ocp.input_range
         limits = Limits(middle - half, middle + half) if k % 6 == 5 else None
@@ -107,7 +113,7 @@ def test_a_period_of_c_is_a_period_of_the_loop(name):
     c = CLoop(model, ocp, estimator, model, safe_input)
     z, size = np.concatenate([model.x0, np.zeros(model.n_h)]), python.controller.problem.sizes.states
     target, w, u = model.x0 + 0.5 * size, model.w, python.controller.problem.u_rest
-    target = python.controller.problem.standing()[0] + 2.0 if ocp.n_y else target
+    target = python.controller.problem.standing()[0] + 2.0 if ocp.n_y else np.append(target, np.ones(ocp.n_p))
     sources = set()
     for k in range(80):
         y = model.output(z[: model.n_x], u, w, model.p).full().ravel() + 0.003 * rng.standard_normal(
