@@ -15,6 +15,7 @@ from hybrid_mpc import (
     Disturbance,
     ExtendedKalmanFilter,
     HardBound,
+    HybridModel,
     Signal,
     SoftBound,
     SwitchingFilter,
@@ -148,6 +149,18 @@ def cart(hard, *, delay=0.0, horizon=25, **options):
     model = online_models.linear_model(a, b, np.eye(2)[:1], dt=0.1)
     model = with_input_delay(model, delay) if delay else model
     return model, OCP(horizon, [10.0, 0.1], [0.01], [0.0], [-3.0], [3.0], hard=hard, **options)
+
+
+def ways_round():
+    """A point that is driven along a plane round a hill: the way that a plan finds by itself costs more."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    place, speeds = tuple(Signal(n, "m") for n in "ab"), tuple(Signal(f"v{n}", "m/s") for n in "ab")
+    model = HybridModel.of("point", 0.1, place, speeds, place, x=x, u=u, x_next=x + 0.1 * u, xdot=u, y=x)
+    hill = 8.0 * ca.exp(-((x[0] - 0.5) ** 2 + (x[1] - 0.1) ** 2) / 0.04) + 1 / (1 + ca.exp(30 * (x[1] + 0.15)))
+    return model, OCP(
+        20, [4.0, 1.0], [0.05, 0.05], [0.05, 0.05], [-2.0, -2.0], [2.0, 2.0],
+        economic=ca.Function("hill", [x, u], [hill]),
+    )  # fmt: skip
 
 
 def delayed():
