@@ -15,7 +15,8 @@ from hybrid_mpc.control.problem import KEPT, KNOTS, Problem, SoftRows
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.control.targets import Targets
-from hybrid_mpc.embedded.cut import Cut, cut, reduced
+from hybrid_mpc.embedded.cut import Cut, cut, next_places, reduced
+from hybrid_mpc.embedded.layers import after_code, layer_code
 from hybrid_mpc.embedded.scalar import c_function, comment, number, table
 from hybrid_mpc.embedded.watch import (
     NOTHING,
@@ -279,22 +280,21 @@ def _expressions(
         texts.append(text)
 
     cell, units = parts.cell, 0 if parts.cell is None else parts.cell.units
-    g = ca.SX.sym("g", units)
+    layered = layer_code("layers", parts.layers, (z, u, w), places)
+    texts.append(layered.text if parts.layers else "")
+    operations |= layered.operations
+    g = ca.SX.sym("g", layered.products or units)
     x, h = z[:n_x], z[n_x:]
     z_next = parts.after(x, h, u, w, g)
     own: dict[int, int] = {}
-    sizes = {"UNITS": units}
+    sizes = {"UNITS": units, "PRODUCTS": layered.products, "THROUGH": layered.through}
     if cell is not None and parts.before is not None:
         seen = parts.before(x, h, u, w)
         slope = ca.jacobian(seen, ca.vertcat(z, u))
         rows, columns = slope.sparsity().get_triplet()
         values = [slope[i, j] for i, j in zip(rows, columns, strict=True)]
-        own = {i: k for i in range(n_z) for k in range(units) if ca.is_equal(z_next[i], g[k], 0)}
+        own = next_places(z_next, g)
         first = min(own, default=0)
-        if [own.get(first + k) for k in range(units)] != list(range(units)):
-            raise InputError(
-                f"no C for model {model.name}: its GRU's new state is not its next hidden state as it is"
-            )
         sizes |= {
             "FEATURES": seen.numel(), "SEEN_SLOPES": len(values), "HIDDEN": n_x + cell.first, "HIDDEN_NEXT": first,
         }  # fmt: skip
@@ -327,6 +327,12 @@ def _expressions(
     outs = [(f"z_next[{i}]", z_next[i]) for i in rest]
     add("model_after", [*point, "real *z_next"], inputs, outs)
     by_out, by_v = ca.jacobian(z_next, out), ca.jacobian(z_next, ca.vertcat(z, u))
+    passed: list[tuple[str, ca.SX]] = []
+    reached: list[int] = []
+    if parts.layers:
+        text, passed, reached = after_code("layers_after", z_next, out, layered)
+        texts.append(text)
+    outs, sizes["PASSED"] = outs + passed, len(passed)
     corrected = [i for i in rest if units and by_out[i, :].nnz()]
     outs += [
         (f"slope[{i * row + places[j]}]", by_v[i, j])
@@ -338,7 +344,7 @@ def _expressions(
         for k, i in enumerate(corrected)
         for j in range(len(head))
     ]
-    cleared = [f"memset(slope + {i * row}, 0, sizeof(real) * HMPC_LJ);" for i in corrected]
+    cleared = [f"memset(slope + {i * row}, 0, sizeof(real) * HMPC_LJ);" for i in (*corrected, *reached)]
     add("model_after_slope", [*point, "real *z_next", "real *slope", "real *by_out"], inputs, outs, cleared)
     sizes["CORRECTED"] = len(corrected)
     texts.append(table("corrected", np.array(corrected, dtype=float), "int"))
