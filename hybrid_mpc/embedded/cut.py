@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.embedded.layers import Layer, split
+from hybrid_mpc.embedded.layers import Layer, split, written_out
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, inlined
 from nn_export.errors import last_line
@@ -73,6 +73,7 @@ def cut(model: HybridModel, of: str = "step", *, layered: bool = False) -> Cut:
     sizes = model.n_x, model.n_h, model.n_u, model.n_w
     point = [ca.MX.sym(name, n) for name, n in zip("xhuw", sizes, strict=True)]
     z_next: Any = ca.vertcat(*inlined(getattr(model, of), [*point, ca.MX(ca.DM(model.p))]))
+    z_next = written_out(point, z_next, but="_cell")
     whole = ca.Function(of, point, [z_next])
     calls = [
         whole.instruction_MX(k)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,8 @@ def split(point: Sequence[ca.MX], value: ca.MX, what: str) -> tuple[tuple[Layer,
     Raises:
         InputError: If what lies between them is no scalar code.
     """
-    whole, products = _flat(point, value)
+    whole = written_out(point, value)
+    products = _products(point, whole)
     given: list[ca.MX] = []
     weights: list[Array] = []
     seen: list[ca.MX] = []
@@ -73,18 +74,28 @@ def _scalar(what: str, given: Sequence[ca.MX], value: ca.MX) -> ca.Function:
         raise InputError(f"{what} is no scalar code: {last_line(error)}") from error
 
 
-def _flat(point: Sequence[ca.MX], value: ca.MX) -> tuple[ca.MX, list[ca.MX]]:
-    """An expression whose calls of graphs are written out, and its products with large constant matrices, in order."""
+def written_out(point: Sequence[ca.MX], value: ca.MX, but: str = "\0") -> ca.MX:
+    """An expression whose calls of graphs are written out, but for functions whose names end with ``but``."""
     while True:
         whole = ca.Function("whole", list(point), [value])
-        nodes = [(whole.instruction_id(k), whole.instruction_MX(k)) for k in range(whole.n_instructions())]
-        calls = [n for code, n in nodes if code == ca.OP_CALL and n.which_function().is_a("MXFunction")]
-        if not calls:
-            return value, [n for code, n in nodes if code == ca.OP_MTIMES and _large(n)]
-        call = calls[0]
-        f = call.which_function()
+        for k in range(whole.n_instructions()):
+            call = whole.instruction_MX(k)
+            if whole.instruction_id(k) != ca.OP_CALL:
+                continue
+            f = call.which_function()
+            if f.is_a("MXFunction") and not f.name().endswith(but):
+                break
+        else:
+            return value
         inner = ca.graph_substitute(_results(f), f.mx_in(), [call.dep(i) for i in range(f.n_in())])
         (value,) = ca.graph_substitute([value], [call.get_output(i) for i in range(f.n_out())], inner)
+
+
+def _products(point: Sequence[ca.MX], value: ca.MX) -> list[ca.MX]:
+    """Products with large constant matrices, in order."""
+    whole = ca.Function("whole", list(point), [value])
+    nodes = [(whole.instruction_id(k), whole.instruction_MX(k)) for k in range(whole.n_instructions())]
+    return [n for code, n in nodes if code == ca.OP_MTIMES and _large(n)]
 
 
 def _large(product: ca.MX) -> bool:
@@ -95,20 +106,22 @@ def _large(product: ca.MX) -> bool:
 def _results(f: ca.Function) -> list[ca.MX]:
     """What a graph computes of its own symbols; a call of a function that is not to be inlined would not say."""
     slots: dict[int, Any] = {}
-    found: list[ca.MX] = [ca.MX()] * f.n_out()
-    inputs = f.mx_in()
+    found: list[list[ca.MX]] = [[] for _ in range(f.n_out())]
+    inputs = [ca.vec(v) for v in f.mx_in()]
     for k in range(f.n_instructions()):
         code, taken, made = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
-        if code == ca.OP_OUTPUT:
-            found[made[0]] = slots[taken[0]]
+        node = f.instruction_MX(k)
+        if code == ca.OP_OUTPUT:  # what is joined there comes in pieces, in order
+            found[made[0]].append(ca.vec(slots[taken[0]]))
         elif code == ca.OP_INPUT:
-            slots[made[0]] = inputs[taken[0]]
+            first = int(node.info()["offset"])
+            piece = inputs[taken[0]][first : first + node.numel()]
+            slots[made[0]] = ca.reshape(piece, *node.shape)
         else:
-            node = f.instruction_MX(k)
             for i, place in enumerate(made):
                 if place >= 0:
-                    slots[place] = node if len(made) == 1 else node.get_output(i)
-    return found
+                    slots[place] = node.get_output(i) if node.has_output() else node
+    return [ca.reshape(ca.vertcat(*pieces), *f.size_out(i)) for i, pieces in enumerate(found)]
 
 
 @dataclass(frozen=True)
@@ -124,8 +137,9 @@ class LayerCode:
 
 
 def layer_code(
-    name: str, layers: Sequence[Layer], symbols: Sequence[ca.SX], places: Sequence[int], *, slopes: bool = True
-) -> LayerCode:
+    name: str, layers: Sequence[Layer], symbols: Sequence[ca.SX], places: Sequence[int], *, slopes: bool = True,
+    known: Mapping[bytes, str] | None = None,
+) -> LayerCode:  # fmt: skip
     """Functions ``{name}(z, u, w, m)``, and with ``slopes`` ``{name}_slope(z, u, w, m, through)``.
 
     Args:
@@ -134,6 +148,7 @@ def layer_code(
         symbols: ``z, u, w`` of the model, as scalars.
         places: Columns of the Jacobian by ``(z, u)``.
         slopes: Whether derivatives are needed, too.
+        known: Weights that have a table, by their content (:func:`tables_of`). Default: none.
 
     Raises:
         InputError: If an operation has no C, or there are too many.
@@ -145,14 +160,14 @@ def layer_code(
     read = {"z": z, "u": u, "w": w, "m": m}
     arguments = [f"const real *{key}" for key in read]
     n_x = layers[0].seen.numel_in(0) if layers else 0
-    texts, operations, shared = [], {}, dict[bytes, str]()
+    texts, operations, shared = [], {}, dict(known or {})
     forward, backward, through, owners = [], [], 0, []
     for i, layer in enumerate(layers):
         own, (rows, columns) = f"{name}{i}", layer.weight.shape
         seen = layer.seen(z[:n_x], z[n_x:], u, w, m)
         outs = [(f"seen[{k}]", seen[k]) for k in range(columns)]
         text, operations[f"{own}_seen"] = c_function(f"{own}_seen", [*arguments, "real *seen"], read, outs)
-        key = layer.weight.tobytes() + bytes(str(layer.weight.shape), "ascii")
+        key = _key(layer)
         if key not in shared:
             shared[key] = f"{own}_weight"
             texts.append(table(shared[key], layer.weight))
@@ -218,6 +233,18 @@ def layer_code(
             f"{unused}  (void)through;\n{''.join(backward)}}}\n"
         )
     return LayerCode("".join(texts), int(first[-1]), through, operations, tuple(owners))
+
+
+def tables_of(name: str, layers: Sequence[Layer]) -> dict[bytes, str]:
+    """Names of the tables that :func:`layer_code` makes of weights, by their content."""
+    found: dict[bytes, str] = {}
+    for i, layer in enumerate(layers):
+        found.setdefault(_key(layer), f"{name}{i}_weight")
+    return found
+
+
+def _key(layer: Layer) -> bytes:
+    return layer.weight.tobytes() + str(layer.weight.shape).encode()
 
 
 Entry = tuple[int, int, ca.SX]

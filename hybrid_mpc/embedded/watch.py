@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.embedded.cut import Cut, cut, reduced
-from hybrid_mpc.embedded.layers import layer_code
+from hybrid_mpc.embedded.layers import layer_code, tables_of
 from hybrid_mpc.embedded.scalar import c_function, table
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.loop.guard import TINY, Guard, Mode
@@ -229,7 +229,8 @@ def _rates(model: HybridModel, parts: Cut) -> tuple[str, dict[str, int], dict[st
     x, h = z[: model.n_x], z[model.n_x :]
     inputs, point = {"z": z, "u": u, "w": w}, ["const real *z", "const real *u", "const real *w"]
     texts, operations = [], dict[str, int]()
-    code = layer_code("rate_layers", own.layers, (z, u, w), [], slopes=False)
+    known = tables_of("layers", parts.layers)
+    code = layer_code("rate_layers", own.layers, (z, u, w), [], slopes=False, known=known)
     g = ca.SX.sym("g", code.products if own.cell is None else own.cell.units)
     head, out, value = np.zeros((0, 0)), g, own.after(x, h, u, w, g)
     if own.before is not None:
