@@ -62,6 +62,7 @@ class Machine:
     periods: int = 10_000
     parameters: tuple[tuple[str, float], ...] = ()
     load: float = 0.02
+    load_observer: bool = True
 
 
 def sine(*columns):
@@ -148,7 +149,7 @@ def made(m: Machine, periods):
         prior = replace(prior, parameters=p)
     ocp = make_ocp(prior, kit.problem(m.task))
     model = with_network(prior, ocp, m.network)
-    estimator = make_estimator(model, kit, kit.noise("prior_observer"), ocp, observer=True)
+    estimator = make_estimator(model, kit, kit.noise("prior_observer"), ocp, observer=m.load_observer)
     safe_input = kit.safe_input
     if m.control is not None:
         safe_input = tuple(np.clip(0.0, ocp.u_min, ocp.u_max))
@@ -170,7 +171,7 @@ MACHINES = (
     Machine("unbalanced_disk", gru(), "hang", sine((0.5, 3.0))),
     Machine("cascaded_tanks", gru(), "levels", parameters=(("bend", 0.05),)),
     Machine("temperature_lab", lambda: Cells(nn.LSTMCell, 8), "set_points"),
-    Machine("heat_exchanger", lambda: Cells(nn.GRUCell, 8, 6), "saw_tooth_ahead"),
+    Machine("heat_exchanger", lambda: Cells(nn.GRUCell, 8, 6), "saw_tooth_ahead", load_observer=False),
     Machine("cart_pole", gru(), "move"),
     Machine("race_car", lambda: Cells(nn.RNNCell, 8), "slalom", periods=320),
     Machine("coupled_drives", lambda: Deep(8, 12), "speeds"),

@@ -216,8 +216,8 @@ def replay(whole, case, *, own=False, known=None):
         whole.call("hmpc_finish", goal)
         for name in SAID:
             assert int(view[f"monitor_{name}"]) == int(getattr(step.reading, name)), (k, name)
-        for name, own in names.items():
-            found[name].append(np.array(view[f"monitor_{own}"]))
+        for name, place in names.items():
+            found[name].append(np.array(view[f"monitor_{place}"]))
             wanted[name].append(np.array(getattr(step.reading, name)))
     largest = 0.0
     for name in names:
