@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -97,7 +98,7 @@ def make_sources(
     Raises:
         InputError: If something of them has no C, all at once, by name.
     """
-    refused = _refused(ocp, single)
+    refused = _refused(ocp, estimator, single)
     parts: Cut | None = None
     try:
         parts = cut(model)
@@ -165,10 +166,8 @@ def backup_of(guard: Guard | None, single: bool) -> dict[str, str]:
     if guard is None or guard.backup is None or guard.backup_estimator is None:
         return {}
     safe, estimator = guard.backup, guard.backup_estimator
-    if not isinstance(estimator, ExtendedKalmanFilter | SwitchingFilter):
-        raise InputError(f"no C for an estimator of this kind ({type(estimator).__name__})")
     found = make_sources(
-        safe.controller.model, safe.controller.ocp, estimator=estimator, fallback=safe.fallback,
+        safe.controller.model, safe.controller.ocp, estimator=cast(Filter, estimator), fallback=safe.fallback,
         safe_input=safe.safe_input, single=single, max_age=safe.max_age,
     )  # fmt: skip
     texts = {name: template(name) for name in (*HEADERS, *CORE)} | dict(found.texts)
@@ -184,14 +183,20 @@ def sources_of(found: Sources) -> tuple[str, ...]:
     return (*SOURCES, *(_renamed(name) for name in CORE if found.sizes["BACKUP"]))
 
 
-def _refused(ocp: OCP, single: bool) -> list[str]:
-    """What of a control problem has no C, in words."""
+def _refused(ocp: OCP, estimator: object, single: bool) -> list[str]:
+    """What of a control problem and an estimator has no C, in words."""
+    found = []
+    if not isinstance(estimator, ExtendedKalmanFilter | SwitchingFilter | None):
+        found.append(
+            f"an estimator of this kind ({type(estimator).__name__}); needed: an ExtendedKalmanFilter or a "
+            "SwitchingFilter, on a model that holds the delays (with_input_delay)"
+        )
     if ocp.hard and single:
-        return [
+        found.append(
             "hard bounds in single precision: where one gives way, seven digits leave none beside its penalty; "
             "generate double precision"
-        ]
-    return []
+        )
+    return found
 
 
 def _curved(model: HybridModel) -> bool:

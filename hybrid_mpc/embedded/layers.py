@@ -10,13 +10,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.embedded.scalar import c_function, table
+from hybrid_mpc.embedded.scalar import SMALL, c_function, table
 from hybrid_mpc.errors import InputError
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
-SMALL = 32
-"""Entries of a matrix up to which its product is scalar code."""
 FEW = 4
 """Derivatives of a layer's argument, in a row, up to which they are looked at one by one."""
 
