@@ -1,13 +1,13 @@
-"""10,000 periods of eleven machines: the exported C beside Python's loop, estimator, MPC, safeguards, monitor and guard.
+"""10,000 periods of eleven machines: the exported C beside Python's loop with observer, MPC, monitor and guard.
 
     python benchmarks/ten_thousand.py [--periods 10000] [--only tanks] [--out FILE.json]
 
 Golf robot and disk are those of ``tests/golden`` with their trained networks. The others are priors with nominal
 parameters and small networks with random weights of several kinds; the tanks' sensor is bent. Each loop begins alike,
-tracks the machine's task over and over, and has a frozen sensor and a part that gives less. "own" is the largest
-difference of the input, of its range, of C that goes on from its own plans after the first, "handed" that of C that goes
-on from Python's plan in each period; "state" and "reading" are those of the estimate and of the monitor in the first of
-the two. The script ends with an error where an alarm, a mode, a source or a status differs in any period.
+tracks the machine's task over and over, and has a frozen sensor and an input that is off. "own" is the largest
+difference of the input, of its range, of C that goes on from its own plans after the first, "handed" that of C that
+goes on from Python's plan in each period; "state" and "reading" are those of the estimate and of the monitor in the
+first of the two. The script ends with an error where an alarm, a mode, a source or a status differs in any period.
 """
 
 from __future__ import annotations
@@ -100,7 +100,8 @@ def with_network(model, ocp, net, seed=0):
     n_h = inner.hidden
     f = to_casadi(Whole(), (torch.zeros(features, dtype=torch.double), torch.zeros(n_h, dtype=torch.double)))
     x, h, u, w, p = (
-        ca.MX.sym(k, n) for k, n in zip("xhuwp", (model.n_x, n_h, model.n_u, model.n_w, model.n_p), strict=True)
+        ca.MX.sym(k, n)
+        for k, n in zip("xhuwp", (model.n_x, n_h, model.n_u, model.n_w, model.n_p), strict=True)
     )
     seen = ca.vertcat((x - model.x0) / size, (u - model.u0) / span)
     extra, h_next = f(seen, h)

@@ -378,21 +378,21 @@ def _expressions(
         given, read = {"x": x, "u": u, "w": w}, ["const real *x", "const real *u", "const real *w"]
         add("outputs", [*read, "real *y"], given, outs)
         if asked["CURVED"]:
-            for name, by in (("by_x", x), ("by_u", u)):
-                jacobian = ca.densify(ca.jacobian(y, by)).T
+            for name, of in (("by_x", x), ("by_u", u)):
+                jacobian = ca.densify(ca.jacobian(y, of)).T
                 outs += [(f"{name}[{i}]", jacobian[i]) for i in range(jacobian.numel())]
             add("output_slopes", [*read, "real *y", "real *by_x", "real *by_u"], given, outs)
     if asked["STAGE_COST"] and problem.economic.function is not None:
-        y_ref, point = ca.SX.sym("y", ocp.n_y), ca.vertcat(x, u)
-        more = ca.vertcat(p, y_ref, d, w) if ocp.n_y else p[: problem.economic.n_p]
+        y_ref, both = ca.SX.sym("y", ocp.n_y), ca.vertcat(x, u)
+        known = ca.vertcat(p, y_ref, d, w) if ocp.n_y else p[: problem.economic.n_p]
         f = _scalar("the stage cost", problem.economic.function)
-        value = model.dt * ca.densify(f(x, u, more) if f.n_in() > 2 else f(x, u))
-        slope = ca.densify(ca.jacobian(value, point))
-        curve = ca.densify(ca.jacobian(slope, point))
-        given, n = {"x": x, "u": u, "w": w, "d": d, "p": p, "y": y_ref}, point.numel()
+        cost = model.dt * ca.densify(f(x, u, known) if f.n_in() > 2 else f(x, u))
+        by = ca.densify(ca.jacobian(cost, both))
+        curve = ca.densify(ca.jacobian(by, both))
+        given, n = {"x": x, "u": u, "w": w, "d": d, "p": p, "y": y_ref}, both.numel()
         read = [f"const real *{name}" for name in given]
-        add("stage_cost", [*read, "real *value"], given, [("value[0]", value)])
-        outs = [(f"slope[{i}]", slope[i]) for i in range(n)]
+        add("stage_cost", [*read, "real *value"], given, [("value[0]", cost)])
+        outs = [(f"slope[{i}]", by[i]) for i in range(n)]
         outs += [(f"curve[{i * n + j}]", curve[i, j]) for i in range(n) for j in range(i + 1)]
         add("stage_cost_slopes", [*read, "real *slope", "real *curve"], given, outs)
     if fallback is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -17,6 +18,12 @@ from nn_export.errors import last_line
 Array = NDArray[np.float64]
 FEW = 4
 """Derivatives of a layer's argument, in a row, up to which they are looked at one by one."""
+
+
+Entry = tuple[int, int, ca.SX]
+"""Row, column and expression of a derivative."""
+Owner = tuple[int, int, int, tuple[int, ...]]
+"""Of a layer the first product, their number, the place of its derivatives, and by which columns these are."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def split(point: Sequence[ca.MX], value: ca.MX, what: str) -> tuple[tuple[Layer,
     (after,) = ca.graph_substitute([whole], old, new)
     layers, m = [], ca.MX.sym("m", sum(v.numel() for v in given))
     ends = np.cumsum([0, *(v.numel() for v in given)])
-    parts = [m[int(a) : int(b)] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    parts = [m[int(a) : int(b)] for a, b in pairwise(ends)]
     results = ca.graph_substitute([*seen, after], given, parts) if given else [after]
     for weight, own in zip(weights, results[:-1], strict=True):
         layers.append(Layer(weight, _scalar(what, [*point, m], own)))
@@ -130,8 +137,8 @@ class LayerCode:
     products: int
     through: int
     operations: dict[str, int]
-    owners: tuple[tuple[int, int, int, tuple[int, ...]], ...]
-    """Of each layer the first product, their number, the place of its derivatives, and by which columns these are."""
+    owners: tuple[Owner, ...]
+    """Of each layer."""
 
 
 def layer_code(
@@ -158,8 +165,9 @@ def layer_code(
     read = {"z": z, "u": u, "w": w, "m": m}
     arguments = [f"const real *{key}" for key in read]
     n_x = layers[0].seen.numel_in(0) if layers else 0
-    texts, operations, shared = [], {}, dict(known or {})
-    forward, backward, through, owners = [], [], 0, []
+    texts, operations, shared = [], dict[str, int](), dict(known or {})
+    owners: list[Owner] = []
+    forward, backward, through = [], [], 0
     for i, layer in enumerate(layers):
         own, (rows, columns) = f"{name}{i}", layer.weight.shape
         seen = layer.seen(z[:n_x], z[n_x:], u, w, m)
@@ -193,7 +201,9 @@ def layer_code(
         texts.append(table(f"{own}_row", [r for r, *_ in entries], "int"))
         texts.append(table(f"{own}_column", [where[places[c]] for _, c, _ in entries], "int"))
         for k, chosen in passed.items():
-            text, step = _pass(f"{own}_{k}", owners[k], chosen, [where[c] for c in owners[k][3]], count, "g[0]", n)
+            text, step = _pass(
+                f"{own}_{k}", owners[k], chosen, [where[c] for c in owners[k][3]], count, "g[0]", n
+            )
             texts.append(text)
             steps.append(step)
             slope_outs += [(f"by_v[{count + j}]", value) for j, (*_, value) in enumerate(chosen)]
@@ -223,7 +233,9 @@ def layer_code(
         owners.append((int(first[i]), rows, through, tuple(active)))
         through += rows * n
     unused = "".join(f"  (void){key};\n" for key in read)
-    texts.append(f"static inline void {name}(const real *z, const real *u, const real *w, real *m) {{\n{unused}")
+    texts.append(
+        f"static inline void {name}(const real *z, const real *u, const real *w, real *m) {{\n{unused}"
+    )
     texts.append("".join(forward) + "}\n")
     if slopes:
         texts.append(
@@ -245,18 +257,13 @@ def _key(layer: Layer) -> bytes:
     return layer.weight.tobytes() + str(layer.weight.shape).encode()
 
 
-Entry = tuple[int, int, ca.SX]
-
-
 def _entries(matrix: ca.SX) -> list[Entry]:
     """Row, column and expression of what is not always zero."""
     rows, columns = matrix.sparsity().get_triplet()
     return [(r, c, matrix[r, c]) for r, c in zip(rows, columns, strict=True)]
 
 
-def _passed(
-    by_m: ca.SX, owners: Sequence[tuple[int, int, int, tuple[int, ...]]]
-) -> dict[int, list[Entry]]:
+def _passed(by_m: ca.SX, owners: Sequence[Owner]) -> dict[int, list[Entry]]:
     """Derivatives by products, by the layer that these are of."""
     found: dict[int, list[Entry]] = {}
     ends = [first + n for first, n, *_ in owners]
@@ -267,13 +274,15 @@ def _passed(
 
 
 def _pass(
-    name: str, owner: tuple[int, int, int, tuple[int, ...]], chosen: Sequence[Entry], onto: Sequence[int],
+    name: str, owner: Owner, chosen: Sequence[Entry], onto: Sequence[int],
     at: int, to: str, stride: int | str,
 ) -> tuple[str, str]:  # fmt: skip
     """Tables and the statement that adds a layer's derivatives, times those by its products, to others."""
     first, _, through, active = owner
     text = table(f"{name}_at", [r for r, *_ in chosen], "int")
-    text += table(f"{name}_from", [c - first for _, c, _ in chosen], "int") + table(f"{name}_onto", onto, "int")
+    text += table(f"{name}_from", [c - first for _, c, _ in chosen], "int") + table(
+        f"{name}_onto", onto, "int"
+    )
     n = max(1, len(active))
     return text, (
         f"    hmpc_layer_pass({name}_at, {name}_from, by_v + {at}, {len(chosen)}, through + {through}, {n}, "
@@ -281,13 +290,18 @@ def _pass(
     )
 
 
-def after_code(name: str, value: ca.SX, m: ca.SX, code: LayerCode) -> tuple[str, list[tuple[str, ca.SX]], list[int]]:
+def after_code(
+    name: str, value: ca.SX, m: ca.SX, code: LayerCode
+) -> tuple[str, list[tuple[str, ca.SX]], list[int]]:
     """A function ``{name}(by_v, through, slope)`` that adds to a Jacobian what goes through the layers; the derivatives
     by products that it takes; the rows that it adds to.
     """
-    texts, steps, outs, rows = [], [], [], set[int]()
+    texts, steps, rows = [], [], set[int]()
+    outs: list[tuple[str, ca.SX]] = []
     for k, chosen in _passed(ca.jacobian(value, m), code.owners).items():
-        text, step = _pass(f"{name}_{k}", code.owners[k], chosen, code.owners[k][3], len(outs), "slope", "HMPC_LJ")
+        text, step = _pass(
+            f"{name}_{k}", code.owners[k], chosen, code.owners[k][3], len(outs), "slope", "HMPC_LJ"
+        )
         texts.append(text)
         steps.append(step)
         outs += [(f"by_out[{len(outs) + j}]", v) for j, (*_, v) in enumerate(chosen)]

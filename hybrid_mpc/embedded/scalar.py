@@ -32,7 +32,8 @@ _LIBM = {
     ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow", ca.OP_ASIN: "asin", ca.OP_ACOS: "acos", ca.OP_ATAN: "atan",
     ca.OP_ATAN2: "atan2", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_ASINH: "asinh", ca.OP_ACOSH: "acosh",
     ca.OP_ATANH: "atanh", ca.OP_ERF: "erf", ca.OP_HYPOT: "hypot", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
-    ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder", ca.OP_COPYSIGN: "copysign", ca.OP_LOG1P: "log1p", ca.OP_EXPM1: "expm1",
+    ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder", ca.OP_COPYSIGN: "copysign", ca.OP_LOG1P: "log1p",
+    ca.OP_EXPM1: "expm1",
 }  # fmt: skip
 """Functions that come from the C library, whose last bits differ from one to the next."""
 _NAMES = {code: name for name, code in vars(ca).items() if name.startswith("OP_")}
@@ -101,8 +102,8 @@ def c_function(
     f = ca.Function("f", list(inputs.values()), [values], {"cse": True})
     if f.n_instructions() > MOST:
         raise InputError(
-            f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; products with constant matrices of "
-            f"more than {SMALL} numbers do not count, so write networks with them (torch's Linear, GRUCell, LSTM)"
+            f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; products with constant matrices "
+            f"of more than {SMALL} numbers do not count: write networks with them (torch's Linear, GRUCell, LSTM)"
         )
     lines, names = [], list(inputs)
     register: dict[int, str] = {}

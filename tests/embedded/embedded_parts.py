@@ -72,7 +72,7 @@ def heaters():
 
 def shown(model, y, **changes):
     """The model with other outputs: ``y(x, u, w)``."""
-    x, u, w, p = (ca.MX.sym(n, size) for n, size in zip("xuwp", (model.n_x, model.n_u, model.n_w, model.n_p)))
+    x, u, w, p = model.output.mx_in()
     return replace(model, output=ca.Function("y", [x, u, w, p], [y(x, u, w)]), **changes)
 
 
@@ -95,7 +95,9 @@ def priced():
     model, ocp = tanks()
     span = 2 * machines.PUMP
     x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p")
-    worth = p * (u / span) * ca.sqrt(0.1 + x[0] ** 2) - 0.3 * ca.tanh(4.0 * (x[1] - model.x0[1])) * (1 + u / span)
+    worth = p * (u / span) * ca.sqrt(0.1 + x[0] ** 2) - 0.3 * ca.tanh(4.0 * (x[1] - model.x0[1])) * (
+        1 + u / span
+    )
     return model, ocp.changed(economic=ca.Function("price", [x, u, p], [worth]))
 
 
@@ -103,7 +105,9 @@ def priced_outputs():
     """Curved sensors that are weighed, and a cost of its own without parameters."""
     model, ocp = curved()
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
-    return model, ocp.changed(economic=ca.Function("power", [x, u], [0.01 * u[0] * u[1] + 1e-4 * x[0] * u[0]]))
+    return model, ocp.changed(
+        economic=ca.Function("power", [x, u], [0.01 * u[0] * u[1] + 1e-4 * x[0] * u[0]])
+    )
 
 
 def spare():
@@ -156,7 +160,9 @@ def ways_round():
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
     place, speeds = tuple(Signal(n, "m") for n in "ab"), tuple(Signal(f"v{n}", "m/s") for n in "ab")
     model = HybridModel.of("point", 0.1, place, speeds, place, x=x, u=u, x_next=x + 0.1 * u, xdot=u, y=x)
-    hill = 8.0 * ca.exp(-((x[0] - 0.5) ** 2 + (x[1] - 0.1) ** 2) / 0.04) + 1 / (1 + ca.exp(30 * (x[1] + 0.15)))
+    hill = 8.0 * ca.exp(-((x[0] - 0.5) ** 2 + (x[1] - 0.1) ** 2) / 0.04) + 1 / (
+        1 + ca.exp(30 * (x[1] + 0.15))
+    )
     return model, OCP(
         20, [4.0, 1.0], [0.05, 0.05], [0.05, 0.05], [-2.0, -2.0], [2.0, 2.0],
         economic=ca.Function("hill", [x, u], [hill]),

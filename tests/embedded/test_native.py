@@ -207,7 +207,12 @@ def test_the_first_plan_is_the_cheapest_of_several():
             plan = rti.solve(plan, e, end).delayed(np.zeros(2))
         each[name] = rti.solve(plan, e, end).cost
     assert each["up"] < 0.95 * each["none"]
-    for name, known in (("none", ("none",)), ("up", ("none", "up")), ("down", ("none", "down")), ("both", each)):
+    for name, known in (
+        ("none", ("none",)),
+        ("up", ("none", "up")),
+        ("down", ("none", "down")),
+        ("both", each),
+    ):
         assert costs[name] == pytest.approx(min(each[k] for k in known), rel=1e-3), name
 
 

@@ -77,7 +77,9 @@ class Deep(nn.Module):
     def __init__(self, units=10, wide=110):
         super().__init__()
         self.norm, self.cell = nn.LayerNorm(FEATURES), nn.GRUCell(FEATURES, units)
-        self.head = nn.Sequential(nn.Linear(units, wide), nn.SiLU(), nn.Linear(wide, wide), nn.Tanh(), nn.Linear(wide, 1))
+        self.head = nn.Sequential(
+            nn.Linear(units, wide), nn.SiLU(), nn.Linear(wide, wide), nn.Tanh(), nn.Linear(wide, 1)
+        )
         self.hidden = units
 
     def forward(self, s, h):
@@ -110,7 +112,9 @@ def model_of(name):
     """A pendulum whose acceleration a network with random weights corrects."""
     torch.manual_seed(3)
     net = NETWORKS[name]().double().eval()
-    f = to_casadi(net, (torch.zeros(FEATURES, dtype=torch.double), torch.zeros(net.hidden, dtype=torch.double)))
+    f = to_casadi(
+        net, (torch.zeros(FEATURES, dtype=torch.double), torch.zeros(net.hidden, dtype=torch.double))
+    )
     x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", net.hidden), ca.MX.sym("u")
     extra, h_next = f(ca.vertcat(ca.sin(x[0]), ca.cos(x[0]), x[1], u), h)
     rhs = lambda v: pendulum_rhs(v, u) + ca.vertcat(0, extra)  # noqa: E731
@@ -126,7 +130,9 @@ OCP_ = OCP(12, [40.0, 0.5], [1.0], [0.5], [-2.0], [2.0], working_point=([0.0, 1.
 SHORT = ("gru", "lstm", "deep")
 
 
-@pytest.mark.parametrize("name", [n if n in SHORT else pytest.param(n, marks=pytest.mark.full) for n in NETWORKS])
+@pytest.mark.parametrize(
+    "name", [n if n in SHORT else pytest.param(n, marks=pytest.mark.full) for n in NETWORKS]
+)
 def test_steps_slopes_rates_and_inputs(name):
     model = model_of(name)
     assert (cut(model).cell is not None) == (name in ONE_CELL)
@@ -139,18 +145,21 @@ def test_steps_slopes_rates_and_inputs(name):
     for _ in range(4):
         z, z_next, xdot, slope = np.zeros(wide), np.zeros(wide), np.zeros(2), np.zeros((n, wide + 1))
         z[:2], z[2:n], u = rng.standard_normal(2), rng.uniform(-0.9, 0.9, model.n_h), rng.standard_normal(1)
-        z_at, u_at, next_at, slope_at, rate_at = (ctypes.c_void_p(v.ctypes.data) for v in (z, u, z_next, slope, xdot))
+        z_at, u_at, next_at, slope_at, rate_at = (
+            ctypes.c_void_p(v.ctypes.data) for v in (z, u, z_next, slope, xdot)
+        )
         x_next, h_next, by_z, by_u = (m.full() for m in model.with_jacobian(z[:2], z[2:n], u, [], []))
         wanted = np.vstack([x_next, h_next]).ravel()
-        for step in (lambda: c.hmpc_model(z_at, u_at, none, next_at),
-                     lambda: c.hmpc_model_slope(z_at, u_at, none, next_at, slope_at)):  # fmt: skip
+        for name_of, more in (("model", ()), ("model_slope", (slope_at,))):
             z_next[:] = np.nan
-            step()
+            getattr(c, f"hmpc_{name_of}")(z_at, u_at, none, next_at, *more)
             np.testing.assert_allclose(z_next[:n], wanted, rtol=1e-13, atol=1e-14)
         np.testing.assert_allclose(slope[:, :n], by_z, rtol=1e-12, atol=1e-13)
         np.testing.assert_allclose(slope[:, wide:], by_u, rtol=1e-12, atol=1e-13)
         c.hmpc_rates(z_at, u_at, none, rate_at)
-        np.testing.assert_allclose(xdot, model.xdot(z[:2], z[2:n], u, [], []).full().ravel(), rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(
+            xdot, model.xdot(z[:2], z[2:n], u, [], []).full().ravel(), rtol=1e-12, atol=1e-13
+        )
     python, native = CondensedController(model, OCP_), NativeController(model, OCP_, flags=parts.QUICK)
     e = TrueState(model).start(np.concatenate([[0.5, 0.0], np.zeros(model.n_h)]))
     plan = python.initial(e)
@@ -167,7 +176,9 @@ def test_steps_slopes_rates_and_inputs(name):
 def test_equal_weights_are_there_once():
     """Of a step and its rates, which hold the same network: less than twice the size of one."""
     model = model_of("lstm")
-    with_rates = make_sources(model, OCP_, estimator=parts.filters_of(model, OCP_), monitor=guard_monitor(model))
+    with_rates = make_sources(
+        model, OCP_, estimator=parts.filters_of(model, OCP_), monitor=guard_monitor(model)
+    )
     text = with_rates.texts["hmpc_expressions.h"]
     assert text.count("_weight[48][12]") == 1
     assert text.count("_weight[48][4]") == 1
