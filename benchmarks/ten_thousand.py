@@ -63,6 +63,7 @@ class Machine:
     parameters: tuple[tuple[str, float], ...] = ()
     load: float = 0.02
     load_observer: bool = True
+    learned: int = 300
 
 
 def sine(*columns):
@@ -115,9 +116,9 @@ def with_network(model, ocp, net, seed=0):
     return replace(model, name="hybrid", with_jacobian=None, side_by_side=None, **functions)
 
 
-def watched(case, model, weak):
+def watched(case, model, weak, learned=300):
     """The case with residuals whose limits are learned in loops without faults, a guard that rests, and faults."""
-    nominal = [replays.run(replace(case, seed=50 + i, periods=300))[1] for i in range(2)]
+    nominal = [replays.run(replace(case, seed=50 + i, periods=learned))[1] for i in range(2)]
     limits = learn_residuals(model, case.estimator, nominal)
     t = case.periods * model.dt
     faults = (
@@ -140,7 +141,7 @@ def stored(m: Machine, periods):
 def made(m: Machine, periods):
     """A prior with a random network, in the loop of its scenario's task."""
     changes = {} if m.control is None else {
-        "control": m.control, "sensor_sigma": (m.sigma,), "safe_input": tuple(0.0 * m.control.r),
+        "control": m.control, "sensor_sigma": (m.sigma,), "safe_input": tuple(np.clip(0.0, m.control.u_min, m.control.u_max)),
     }  # fmt: skip
     scenario, kit = of_prior(m.name, **changes)
     prior = kit.models["prior"]
@@ -151,10 +152,7 @@ def made(m: Machine, periods):
     ocp = make_ocp(prior, kit.problem(m.task))
     model = with_network(prior, ocp, m.network)
     estimator = make_estimator(model, kit, kit.noise("prior_observer"), ocp, observer=m.load_observer)
-    safe_input = kit.safe_input
-    if m.control is not None:
-        safe_input = tuple(np.clip(0.0, ocp.u_min, ocp.u_max))
-    safe = SafeController(CondensedController(model, ocp), prior, safe_input=safe_input)
+    safe = SafeController(CondensedController(model, ocp), prior, safe_input=kit.safe_input)
     plant = replays.MachinePlant(prior, sigma=m.sigma) if scenario.plant is None else scenario.plant()
     reference, x0, w = m.reference, model.x0, None
     if reference is None:
@@ -162,7 +160,7 @@ def made(m: Machine, periods):
         reference, x0 = (lambda t: task.reference(np.mod(t, task.duration))), np.array(task.x0)
         w = None if task.w is None else (lambda t: task.w(np.mod(t, task.duration)))
     case = Case(estimator, safe, None, None, plant, reference, x0, min(periods, m.periods), w=w)
-    return watched(case, model, m.load * ocp.input_range[0])
+    return watched(case, model, m.load * ocp.input_range[0], m.learned)
 
 
 EMPS = OCP(40, [2.5e3, 25.0], [1e-3], [1e-3], [-150.0], [150.0])
@@ -176,8 +174,8 @@ MACHINES = (
     Machine("cart_pole", gru(), "move"),
     Machine("race_car", lambda: Cells(nn.RNNCell, 8), "slalom", periods=320),
     Machine("coupled_drives", lambda: Deep(8, 12), "speeds"),
-    Machine("emps", gru(), reference=sine((0.1, 2.0)), control=EMPS, sigma=1e-5),
-    Machine("xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, sigma=1e-3),
+    Machine("emps", gru(), reference=sine((0.1, 2.0)), control=EMPS, sigma=1e-5, learned=1500),
+    Machine("xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False),
     Machine("torque_pendulum", gru(), reference=sine((0.25, 2.0))),
 )
 

@@ -173,9 +173,10 @@ def run(case):
     return steps, result
 
 
-def replay(whole, case, *, own=False, known=None):
+def replay(whole, case, *, own=False, told=True, known=None):
     """Both loops on the same samples, C going on from Python's plan in each period, or with ``own`` from its own ones
-    after the first: all decisions are the same. ``known`` is what :func:`run` gave, by default it runs.
+    after the first: all decisions are the same. With ``own`` C is ``told`` by default which input really acted, Python's.
+    ``known`` is what :func:`run` gave, by default it runs.
     """
     steps, result = run(case) if known is None else known
     model, ocp, view = whole.model, whole.ocp, whole.view
@@ -199,7 +200,7 @@ def replay(whole, case, *, own=False, known=None):
             before = steps[k - 1].decision
             if k == 1 or not own:
                 whole.plan(before, backup=result.mode[k - 1] == "BACKUP")
-            whole.call("hmpc_step", step.y, w, None, goal)
+            whole.call("hmpc_step", step.y, w, before.u if own and told else None, goal)
             decision = step.decision
             assert parts.SOURCES[int(view["source"])] == decision.source.name, k
             assert STATUSES[int(view["status"])] == decision.status.name, k

@@ -179,7 +179,7 @@ static inline void hmpc_multiply(const real *restrict a, int length, const real 
       for (int p = 0; p < HMPC_ROWS; ++p)
         for (int q = 0; q < HMPC_COLUMNS; ++q) c[(i + p) * stride + j + q] = sum[p][q];
     }
-    if (i < rows) { /* the last of an odd number */
+    if (rows % HMPC_ROWS) { /* the last of an odd number */
       real sum[HMPC_COLUMNS];
       for (int q = 0; q < HMPC_COLUMNS; ++q) sum[q] = R(0.0);
       for (int l = 0; l < inner; ++l) {
