@@ -30,6 +30,7 @@ class Plant:
         sigma: White noise of the sensors ``(n_y,)``.
         step: Steps of the sensors ``(n_y,)``; 0: none.
         longest: Longest step [s] of its integration.
+        advance: ``(x, u, w, p) -> x`` a period later, in place of Runge-Kutta steps. Default: none.
     """
 
     rates: Callable[[Array, Array, Array, Any], Array]
@@ -39,6 +40,7 @@ class Plant:
     sigma: tuple[float, ...]
     step: tuple[float, ...]
     longest: float
+    advance: Callable[[Array, Array, Array, Any], Array] | None = None
 
     @property
     def p(self) -> SimpleNamespace:
