@@ -4,15 +4,15 @@
     python benchmarks/unknown_loops.py --names ship building --seeds 4  # some of them
 
 Of each machine's recordings a new user gets a fitted prior, the control problem that ``hybrid-mpc new`` proposes
-(weights on no more outputs than there are inputs, set-points not known ahead), and the observer and controller of a run.
+(weights on no more outputs than inputs, set-points not known ahead), and the observer and controller of a run.
 The loop runs on the plant of the recordings, every parameter of which is 20 % off, up or down, with constant loads at
 all inputs: a fifth of the room to a limit. Its rival is PI(D) by SIMC or LQR with integral action and Kalman filter,
 designed on the same fitted prior (:mod:`unknown.rivals` says which, by rule); noise, parameters, loads, set-points,
 limits, period and measurements are the same for both.
 
 The cost is that of the control problem on the noise-free outputs, a second of time: errors over a twentieth of the
-recorded range, squared, and changes of inputs over a tenth of theirs. Both share it: the regulator has these weights, and
-the free number of either rule is the one that makes this cost least on the prior. ``error`` is the ratio of the errors'
+recorded range, squared, and changes of inputs over a tenth of theirs. Both share it: the regulator has these weights,
+and the free number of either rule is the one that makes this cost least on the prior. ``error`` is the ratio of the errors'
 part alone. A ratio is the geometric mean over seeds with a 95 % interval (paired, Student's t of the logarithms).
 A loop has settled if in the last fifth of every set-point the mean error of each controlled output is at most one
 standard deviation of its sensor, and the scatter about it at most five, as in a kit's promises.
@@ -58,9 +58,7 @@ def prepared(machine: Machine, folder: Path) -> tuple[Plant, Made]:
     held = [names.index(one) for one in HELD.get(machine.name, names)]
     plant = PLANTS[machine.name]
     sigma = np.hypot(plant.sigma, np.array(plant.step) / np.sqrt(12)).tolist()
-    own = made(
-        machine.name, machine.prior, machine.spec, parts[0], parts[1], machine.length, sigma, held
-    )
+    own = made(machine.name, machine.prior, machine.spec, parts[0], parts[1], machine.length, sigma, held)
     return plant, own
 
 
@@ -79,7 +77,14 @@ def compared(name: str, plant: Plant, own: Made, seeds: int) -> dict[str, Any]:
     try:
         ours_made = own.loop()
     except InputError as error:
-        return {"machine": name, "rival": "–", "settled": "refused", "rival settled": "–", "cost": str(error), "good": "no"}
+        return {
+            "machine": name,
+            "rival": "–",
+            "settled": "refused",
+            "rival settled": "–",
+            "cost": str(error),
+            "good": "no",
+        }
     del ours_made
     make, what = tuned_rival(name, own)
     pairs, offs = list[tuple[Ran, Ran]](), list[float]()

@@ -23,6 +23,7 @@ from hybrid_mpc.job.first_model import Runs, first_lag, slowest
 from hybrid_mpc.job.new import HORIZONS
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import make_controller, make_estimator, tuned_noise
+from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.loop.loop import Loop
 from unknown.common import Array, quantised
 from unknown.plants import Plant
@@ -39,7 +40,7 @@ INSIDE, MARGIN = 0.3, 0.05
 """Share of the recorded range that set-points keep away from its ends, and inputs that hold them from their limits."""
 OFFSET, SCATTER = 1.0, 5.0
 """Largest offset, and largest scatter about it, in standard deviations of the sensor: as in a kit's promises."""
-DRAWS = 100
+DRAWS = 60
 """Draws of set-points, parameters and loads at most. From half of them on inputs are drawn, and set-points are what the
 plant makes of them: some machines can hold little of what was recorded."""
 TUNED_ON = (1000, 1001, 1002)
@@ -79,6 +80,11 @@ class Made:
         """The sensors' noise ``(n_y,)``."""
         return np.array(self.scenario.sensor_sigma)
 
+    @cached_property
+    def prior(self) -> Plant:
+        """The fitted prior as a plant."""
+        return of_model(self)
+
     def loop(self) -> Rival:
         """The tool's own loop."""
         estimator = make_estimator(self.model, self.scenario, self.noise[0], self.control)
@@ -105,9 +111,7 @@ class Own:
         return self.loop.step(y, w, reference=self._goal(goal))
 
 
-def first_problem(
-    prior: Prior, train: Sequence[Trajectory], dt: float, held: Sequence[int]
-) -> OCP:
+def first_problem(prior: Prior, train: Sequence[Trajectory], dt: float, held: Sequence[int]) -> OCP:
     """The control problem that ``hybrid-mpc new`` proposes for recordings, with weights on held outputs alone."""
     y, u = (np.concatenate([getattr(t, key) for t in train]) for key in "yu")
     runs = [Runs(t.y, np.hstack([t.u, t.w]) if prior.disturbances else t.u) for t in train]
@@ -142,6 +146,8 @@ def made(
         name, name, "", prior=make, data=spec, control=first_problem(phy, train, spec.dt, held),
         sensor_sigma=tuple(sigma),
     )  # fmt: skip
+    chosen = default_disturbances(model, first_problem(phy, train, spec.dt, held))
+    model = replace(model, disturbance_model=chosen)
     errors = process_noise(model, known)
     noise = tuple(tuned_noise(model, scenario, errors, known, observer=own) for own in (True, False))
     y = np.concatenate([t.y for t in train])
@@ -198,7 +204,7 @@ def steady(plant: Plant, p: Any, held: Sequence[int], goal: Array, w: Array, x: 
     try:
         found = least_squares(
             lack, np.concatenate([x, np.clip(u, ends[0] + 1e-3 * scale, ends[1] - 1e-3 * scale)]), x_scale="jac",
-            xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=200,
+            xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=60,
             bounds=[np.concatenate([np.full(n, s * np.inf), v]) for s, v in zip((-1, 1), ends, strict=True)],
         )  # fmt: skip
     except ValueError:  # not finite
@@ -211,7 +217,9 @@ def steady(plant: Plant, p: Any, held: Sequence[int], goal: Array, w: Array, x: 
 def answer(plant: Plant, p: Any, held: Sequence[int], w: Array, x: Array, u: Array, scale: Array) -> Array:
     """Held outputs at the steady state of an input ``(n_u,)``; NaN where none is found."""
     pace = np.maximum(np.abs(plant.rates(x + 1e-3 * (1 + np.abs(x)), u + 0.1 * scale, w, p)), 1e-9)
-    found = least_squares(lambda v: plant.rates(v, u, w, p) / pace, x, x_scale="jac", xtol=1e-14, ftol=1e-14)
+    found = least_squares(
+        lambda v: plant.rates(v, u, w, p) / pace, x, x_scale="jac", xtol=1e-14, ftol=1e-14, max_nfev=60
+    )
     sound = np.max(np.abs(found.fun)) < 1e-4
     return plant.measure(found.x)[list(held)] if sound else np.full(len(held), np.nan)
 
@@ -221,7 +229,9 @@ def slow_gain(plant: Plant, p: Any, held: Sequence[int], w: Array, x: Array, u: 
 
     def slopes(f: Callable[[Array], Array], at: Array) -> Array:
         steps = 1e-5 * (1e-3 + np.abs(at))
-        return np.array([(f(at + h) - f(at - h)) / (2 * s) for h, s in zip(np.diag(steps), steps, strict=True)]).T
+        return np.array(
+            [(f(at + h) - f(at - h)) / (2 * s) for h, s in zip(np.diag(steps), steps, strict=True)]
+        ).T
 
     a = slopes(lambda v: plant.rates(v, u, w, p), x)
     b = slopes(lambda v: plant.rates(x, v, w, p), u)
@@ -236,7 +246,7 @@ def drawn(name: str, plant: Plant, own: Made, seed: int) -> Trial:
     without offset (Grosdidier, Morari and Holt, *Closed-loop properties from steady-state gain information*, 1985).
     """
     rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
-    c, held, prior = own.control, list(own.held), of_model(own)
+    c, held, prior = own.control, list(own.held), own.prior
     low, high = own.span[:, held]
     scale, size, ends = c.u_max - c.u_min, 1.0 / np.sqrt(c.q_y[held]), (c.u_min, c.u_max)
     x, u = np.array(plant.start, dtype=float), np.clip(own.model.u0, c.u_min, c.u_max)
@@ -253,14 +263,24 @@ def drawn(name: str, plant: Plant, own: Made, seed: int) -> Trial:
                 goals = np.array([answer(plant, p, held, own.w, x, one, scale) for one in asked])
                 if not (np.all(goals >= low) and np.all(goals <= high)):
                     continue
-            found = [at for goal in goals if (at := steady(plant, p, held, goal, own.w, x, u, ends, size)) is not None]
+            found = []
+            for goal in goals:
+                at = steady(plant, p, held, goal, own.w, x, u, ends, size)
+                if at is None:
+                    break
+                found.append(at)
             if len(found) < HOLDS:
                 continue
             inputs = np.array([at[1] for at in found])
-            load = LOAD * ways * np.where(ways > 0, inputs.min(axis=0) - c.u_min, c.u_max - inputs.max(axis=0))
+            load = (
+                LOAD * ways * np.where(ways > 0, inputs.min(axis=0) - c.u_min, c.u_max - inputs.max(axis=0))
+            )
             needed = np.vstack([inputs, inputs - load])
             fits = np.all((needed > c.u_min + MARGIN * scale) & (needed < c.u_max - MARGIN * scale))
-            if fits and all(_answers_alike(prior, plant, p, own, at, goal, rate) for at, goal in zip(found, goals, strict=True)):
+            if fits and all(
+                _answers_alike(prior, plant, p, own, at, goal, rate)
+                for at, goal in zip(found, goals, strict=True)
+            ):
                 return Trial(seed, goals, load, p, *found[0], off)
     raise RuntimeError(f"{name}, seed {seed}: no draw can hold its set-points within the limits")
 
@@ -273,7 +293,10 @@ def _answers_alike(
     size, ends = 1.0 / np.sqrt(c.q_y[held]), (c.u_min, c.u_max)
     there = steady(prior, prior.p, held, goal, own.w, own.model.x0, own.model.u0, ends, size)
     x, u = (own.model.x0, own.model.u0) if there is None else there
-    ours, theirs = slow_gain(prior, prior.p, held, own.w, x, u, rate), slow_gain(plant, p, held, own.w, *at, rate)
+    ours, theirs = (
+        slow_gain(prior, prior.p, held, own.w, x, u, rate),
+        slow_gain(plant, p, held, own.w, *at, rate),
+    )
     return bool(np.linalg.det(theirs @ np.linalg.pinv(ours)) > 0)
 
 
@@ -374,7 +397,7 @@ def of_model(own: Made) -> Plant:
 
 def tuned_rival(name: str, own: Made) -> tuple[Callable[[], Rival], str]:
     """The rival that suits a machine by rule, its free number chosen in loops on the fitted prior; and what it is."""
-    prior, c, held = of_model(own), own.control, list(own.held)
+    prior, c, held = own.prior, own.control, list(own.held)
     ends, size = (c.u_min, c.u_max), 1.0 / np.sqrt(c.q_y[held])
     middle = own.span[:, held].mean(axis=0)
     nominal = prior.p

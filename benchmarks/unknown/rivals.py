@@ -1,8 +1,8 @@
 """Rivals of the tool's loops, designed on the same fitted prior: PI(D) by SIMC, and LQR with integral action.
 
-Which of the two a machine gets is decided by :func:`simc_models` before any loop runs: PI(D) where every paired transfer
-function of the linearized prior has a model of lags and a delay (no unstable pole, one integrator at most, damping 0.5
-at least) and the relative gains of the pairing lie within 0.5 and 2; the regulator everywhere else.
+Which of the two a machine gets is decided by :func:`simc_models` before any loop runs: PI(D) where every paired
+transfer function of the linearized prior has a model of lags and a delay (no unstable pole, one integrator at most,
+damping 0.5 at least) and the relative gains of the pairing lie within 0.5 and 2; the regulator everywhere else.
 
 The rule's free number (SIMC's closed-loop time constant with PI or PID; the regulator's integral time with the noise of
 its Kalman filter) is the one of a grid that costs least in loops on the fitted prior with parameters 20 % off and
@@ -149,7 +149,7 @@ def relative_gains(point: Point, held: Sequence[int], seconds: float) -> Array:
 
 
 def simc_models(point: Point, held: Sequence[int], seconds: float) -> tuple[list[tuple[int, Lags]], str]:
-    """Input and lags of each held output, paired by relative gains; nothing and the reason where PI(D) is not suited."""
+    """Input and lags of each held output, paired by relative gains; nothing and the reason where PI(D) does not suit."""
     a, b, c = point.rates
     if np.max(np.linalg.eigvals(a).real) > 1e-6 * np.abs(np.linalg.eigvals(a)).max():
         return [], "unstable"

@@ -21,6 +21,7 @@ from hybrid_mpc.job.stage import Absent, Stage, source_of
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, trained_models
 from hybrid_mpc.kit.artifact import member_names, save_models
+from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.kit.parts import (
     MOST_MEMBERS,
     PROGRAMS,
@@ -34,6 +35,7 @@ from hybrid_mpc.kit.parts import (
 )
 from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.model.disturbance import Disturbance
 
 FEW = 10
 """Samples at which a network is compared that is another one's program with its own weights; one of ten is extreme."""
@@ -52,12 +54,13 @@ class ExportResult:
 
 @dataclass(frozen=True)
 class NoiseResult:
-    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator, and the
-    digest of the models that it was estimated with.
+    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator, the
+    digest of the models that it was estimated with, and the disturbance model; None: one at each input.
     """
 
     process_noise: Mapping[str, tuple[float, ...]]
     of: str = ""
+    disturbance_model: tuple[Disturbance, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -145,13 +148,20 @@ def artifact_is_there(context: Context, found: ExportResult) -> str:
 
 
 def noise_stage(context: Context) -> NoiseResult | Absent:
-    """Tune the estimators on training recordings, by maximum likelihood."""
+    """Choose the disturbance model where the scenario names none, and tune the estimators on training recordings, by
+    maximum likelihood.
+    """
     of = read_parts(context.out / "model").models
     if context.scenario.control is None:
-        put_noise(context, NoiseResult({}, of))
+        put_noise(context, NoiseResult({}, of, context.scenario.disturbance_model))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
-    found = noise_of(context.scenario, context.kit, context.commanded("train"))
-    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()}, of)
+    kit, chosen = context.kit, context.scenario.disturbance_model
+    if chosen is None:
+        plain = replace(kit.models["prior"], disturbance_model=None)
+        chosen = default_disturbances(plain, context.scenario.control)
+    kit = kit.with_disturbances(chosen)
+    found = noise_of(context.scenario, kit, context.commanded("train"))
+    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()}, of, chosen)
     put_noise(context, result)
     return result
 
@@ -162,7 +172,7 @@ def put_noise(context: Context, found: NoiseResult) -> str:
     write_observer(
         folder,
         ObserverSettings(
-            scenario.sensor_sigma, scenario.first_sigma, found.process_noise, scenario.disturbance_model,
+            scenario.sensor_sigma, scenario.first_sigma, found.process_noise, found.disturbance_model,
             found.of,
         ),
     )  # fmt: skip
@@ -191,6 +201,7 @@ def observed(context: Context) -> dict[str, object]:
         "limits of the input": None if control is None else (control.u_min, control.u_max),
         "beyond recordings": scenario.beyond_recordings,
         "disturbance model": scenario.disturbance_model,
+        "weights of outputs": None if control is None else (control.q_y, control.horizon),
         "oracle": source_of(scenario.oracle),
     }
 
