@@ -12,9 +12,11 @@ limits, period and measurements are the same for both.
 
 The cost is that of the control problem on the noise-free outputs, a second of time: errors over a twentieth of the
 recorded range, squared, and changes of inputs over a tenth of theirs. Both share it: the regulator has these weights,
-and the free number of either rule is the one that makes this cost least on the prior. ``error`` is the ratio of the errors'
-part alone. A ratio is the geometric mean over seeds with a 95 % interval (paired, Student's t of the logarithms).
-A loop has settled if in the last fifth of every set-point the mean error of each controlled output is at most one
+and the free number of either rule is the one that makes this cost least on the prior. ``error`` is the ratio of the
+errors' part alone. A ratio is the geometric mean over seeds with a 95 % interval (paired, by Student's t of the
+logarithms).
+
+A loop has settled if in the last 30 % of every set-point the mean error of each controlled output is at most one
 standard deviation of its sensor, and the scatter about it at most five, as in a kit's promises.
 """
 

@@ -42,9 +42,10 @@ def places(model, problem):
 
 
 def two_outputs(gain=1.0):
-    """A lag behind an actuator's lag: one input, two outputs."""
+    """A lag behind an actuator's lag: one input, two outputs; at work at (1, 1)."""
     parameters = (Parameter("gain", gain, "-", 0.1, 5.0),)
-    return model_of(lambda x, p: ca.vertcat(-x[0] + p[0] * x[1], -x[1]), [[0.0], [1.0]], parameters)
+    model = model_of(lambda x, p: ca.vertcat(-x[0] + p[0] * x[1], -x[1]), [[0.0], [1.0]], parameters)
+    return replace(model, nominal_x=(1.0, 1.0), nominal_u=(1.0,))
 
 
 PROBLEM = OCP(30, [0.0, 0.0], [0.0], [0.1], [-5.0], [5.0], q_y=[1.0, 0.0])
@@ -61,11 +62,18 @@ def test_a_wrong_gain_leaves_no_offset(chosen, offset):
     model = replace(model, disturbance_model=default_disturbances(model, PROBLEM) if chosen else None)
     observer = make_estimator(model, Assumed(), np.full(2, 1e-3), PROBLEM)
     result = simulate(
-        ModelPlant(two_outputs(1.3), (0.0, 0.0)), observer, make_controller(model, model, PROBLEM), [1.0, 0.0],
-        dt=0.1, duration=60.0, x0=[0.0, 0.0], seed=0,
+        ModelPlant(two_outputs(1.3), (0.0, 0.0)), observer, make_controller(model, model, PROBLEM), [2.0, 0.0],
+        dt=0.1, duration=60.0, x0=[1.0, 1.0], seed=0,
     )  # fmt: skip
-    late = abs(np.mean(result.x[-100:, 0]) - 1.0)
+    late = abs(np.mean(result.x[-100:, 0]) - 2.0)
     assert late < offset if offset else late > 0.05
+
+
+def test_errors_that_a_load_explains_need_no_more():
+    """A cart: the gain of its force moves neither position nor speed at rest, and a load at the force explains all."""
+    parameters = (Parameter("gain", 1.0, "-", 0.1, 5.0),)
+    model = model_of(lambda x, p: ca.vertcat(x[1], -p[0] * x[1]), [[0.0], [1.0]], parameters)
+    assert places(model, PROBLEM) is None
 
 
 def test_of_more_inputs_than_outputs_those_that_are_told_apart():

@@ -32,10 +32,11 @@ from unknown.rivals import FILTERS, INTEGRAL, TIGHT, Point, Regulator, Rival, Si
 OFF, LOAD = (0.2, 0.1, 0.05), 0.2
 """Share by which each parameter of a plant is off, the next one only where no draw of the one before can hold its
 set-points; share of the room to an input's limit that the load at it takes."""
-HELD, HOLDS = 6, 3
-"""Horizons that a set-point is held, as the trials of a kit's promises last; set-points of a trial."""
-END = 0.2
-"""Share of a hold at its end over which offset and scatter count."""
+HELD, LEAST, HOLDS = 6, 300, 3
+"""Horizons and periods that a set-point is held at least, as the trials of a kit's promises last; set-points of a trial.
+"""
+END = 0.3
+"""Share of a hold at its end over which offset and scatter count: the mean of fewer periods is that of the noise."""
 INSIDE, MARGIN = 0.3, 0.05
 """Share of the recorded range that set-points keep away from its ends, and inputs that hold them from their limits."""
 OFFSET, SCATTER = 1.0, 5.0
@@ -43,7 +44,7 @@ OFFSET, SCATTER = 1.0, 5.0
 DRAWS = 60
 """Draws of set-points, parameters and loads at most. From half of them on inputs are drawn, and set-points are what the
 plant makes of them: some machines can hold little of what was recorded."""
-TUNED_ON = (1000, 1001, 1002)
+TUNED_ON = (1000, 1001)
 """Seeds of the loops on the prior by which a rival's free number is chosen."""
 
 
@@ -324,9 +325,9 @@ class Ran:
 def ran(plant: Plant, own: Made, trial: Trial, rival: Rival) -> Ran:
     """A loop of a controller on a plant with loads."""
     rng = np.random.default_rng([trial.seed, 7])
-    dt, horizon = own.model.dt, own.control.horizon
+    dt = own.model.dt
     steps = max(1, math.ceil(dt / plant.longest - 1e-9))
-    h, periods = dt / steps, HELD * horizon
+    h, periods = dt / steps, max(HELD * own.control.horizon, LEAST)
     sigma, step = np.array(plant.sigma), np.array(plant.step)
     low, high = own.control.u_min, own.control.u_max
 

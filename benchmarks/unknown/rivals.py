@@ -31,9 +31,9 @@ DAMPED = 0.5
 """Least damping of a pair of poles that two equal lags stand for."""
 INTERACTS = (0.5, 2.0)
 """Relative gains within which one loop hardly notices the others."""
-TIGHT = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+TIGHT = (1.0, 3.0, 9.0, 27.0, 81.0)
 """Closed-loop time constants of SIMC, over the effective delay."""
-INTEGRAL = (0.1, 0.3, 1.0, 3.0)
+INTEGRAL = (0.1, 0.3, 1.0)
 """Integral times of the regulator, over the horizon."""
 FILTERS = (1.0, 5.0, 25.0)
 """Factors on the process noise of its Kalman filter."""
@@ -149,7 +149,7 @@ def relative_gains(point: Point, held: Sequence[int], seconds: float) -> Array:
 
 
 def simc_models(point: Point, held: Sequence[int], seconds: float) -> tuple[list[tuple[int, Lags]], str]:
-    """Input and lags of each held output, paired by relative gains; nothing and the reason where PI(D) does not suit."""
+    """Input and lags of each held output, paired by relative gains; or nothing, and why."""
     a, b, c = point.rates
     if np.max(np.linalg.eigvals(a).real) > 1e-6 * np.abs(np.linalg.eigvals(a)).max():
         return [], "unstable"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
-from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
+from hybrid_mpc.estimate.offset_free import RANK, distinguishable, offset_free
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
@@ -22,6 +22,8 @@ OFF = 0.2
 CARRIES = 1.0
 """Largest disturbance, over its size, that errors of the parameters may ask for. Inputs that need more have so little
 effect at rest that a load at them explains no error: its estimate wanders off."""
+EXPLAINED = 0.01
+"""Largest deviation of an output, over its size, that is no offset."""
 QUARTER, RUN, STILL = 0.25, 5000, 1e-6
 """Share of its range by which an input is moved; longest run to rest [periods]; change a period, over a state's size,
 at which it rests."""
@@ -32,10 +34,11 @@ REACH = 0.5
 def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance, ...] | None:
     """What unmeasured disturbances are added to where nobody says it; None: one at each input.
 
-    There are as many as outputs: fewer leave an offset, and more cannot be told apart. An output that no weight holds
-    has a disturbance of its own, so that its error does not move the held outputs. Disturbances of held outputs act at
-    the inputs. Where errors of the parameters ask for larger ones than the inputs' ranges, they act on the rates of the
-    states that held outputs show. A problem with references of states has one at each input.
+    Disturbances of held outputs act at the inputs. Where errors of the parameters ask for larger ones than the inputs'
+    ranges, they act on the rates of the states that held outputs show. An output that no weight holds has a disturbance
+    of its own where errors of the parameters move it in a way that no load at an input explains: without, they leave an
+    offset in the held ones. There are never more disturbances than outputs, which could not be told apart. A problem
+    with references of states has one at each input.
 
     Args:
         model: The fitted prior.
@@ -46,10 +49,12 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     Example:
         >>> import casadi as ca
         >>> from hybrid_mpc.machine.signals import Signal
-        >>> x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+        >>> from hybrid_mpc.machine.signals import Parameter
+        >>> x, u, p = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("p")
         >>> level, flow = Signal("level", "m", 0.0, 2.0), Signal("flow", "l/s", 0.0, 5.0)
         >>> tank = HybridModel.of("tank", 1.0, (level, flow), (Signal("valve", "-"),), (level, flow), x=x, u=u, y=x,
-        ...     x_next=ca.vertcat(0.9 * x[0] + 0.1 * x[1], 0.5 * x[1] + u), xdot=x)
+        ...     p=p, parameters=(Parameter("share", 0.1, "-", 0.01, 1.0),), nominal_x=(1.0, 1.0), nominal_u=(0.5,),
+        ...     x_next=ca.vertcat(0.9 * x[0] + p * x[1], 0.5 * x[1] + u), xdot=x)
         >>> problem = OCP(10, [0.0, 0.0], [0.0], [1.0], [0.0], [1.0], q_y=[4.0, 0.0])
         >>> [(d.at, d.signal) for d in default_disturbances(tank, problem)]
         [('input', 'valve'), ('output', 'flow')]
@@ -57,13 +62,14 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     if control.n_y != model.n_y or not control.n_y:
         return None
     held = np.flatnonzero(control.q_y > 0).tolist()
-    n_in = min(model.n_u, model.n_y)
+    n_in, sizes = min(model.n_u, model.n_y), Sizes(model, control)
     free = [i for i in range(model.n_y) if i not in held]
-    sizes = Sizes(model, control)
     own = [
         Disturbance("output", model.outputs[i].name, float(sizes.outputs[i]))
         for i in [*free, *held][: model.n_y - n_in]
     ]
+    if own and unexplained(replace(model, disturbance_model=None), control) <= EXPLAINED:
+        own = []
     at_inputs = [_with_inputs(model, way, own) for way in combinations(range(model.n_u), n_in)]
     found = [one for one in at_inputs if distinguishable(one, sizes.states).detectable]
     best = min(found, key=lambda one: needed(one, control), default=None)
@@ -113,24 +119,49 @@ def needed(model: HybridModel, control: OCP) -> float:
 
     Zero of a model without free parameters or without disturbances at inputs.
     """
-    free = [i for i, one in enumerate(model.parameters) if not one.fixed]
     at_inputs = np.any(model.disturbed[0] != 0, axis=0)
-    if not free or not at_inputs.any():
-        return 0.0
-    theta, (x, h, u) = (
-        ca.SX.sym("p", model.n_p),
-        (ca.SX.sym(k, n) for k, n in zip("xhu", (model.n_x, model.n_h, model.n_u), strict=True)),
-    )
+    sizes, found = disturbance_sizes(model, control), [0.0]
+    for matrix, off in _errors(model, control) if at_inputs.any() else ():
+        d = np.linalg.lstsq(matrix, off, rcond=None)[0][model.n_x + model.n_h :]
+        found.append(float(np.max((np.sqrt(np.sum(d**2, axis=1)) / sizes)[at_inputs])))
+    return max(found)
+
+
+def unexplained(model: HybridModel, control: OCP) -> float:
+    """Largest deviation of an output, over its size, that remains when each parameter is off by a share of :data:`OFF`
+    and the disturbances explain what they can; over the same points.
+    """
+    sizes, n_z, found = Sizes(model, control).outputs, model.n_x + model.n_h, [0.0]
+    for matrix, off in _errors(model, control):
+        # what outputs do where state and disturbance are at rest: the rest of the equations holds exactly
+        _, values, rows = np.linalg.svd(matrix[:n_z])
+        rank = int(np.sum(values > RANK * values[0]))
+        rest = np.linalg.lstsq(matrix[:n_z], off[:n_z], rcond=RANK)[0]
+        free = matrix[n_z:] @ rows[rank:].T / sizes[:, None]
+        left = (off[n_z:] - matrix[n_z:] @ rest) / sizes[:, None]
+        left = left - free @ np.linalg.lstsq(free, left, rcond=RANK)[0]
+        found.append(float(np.max(np.sqrt(np.sum(left**2, axis=1)))))
+    return max(found)
+
+
+def _errors(model: HybridModel, control: OCP) -> list[tuple[Array, Array]]:
+    """At each point of :func:`_rests`: ``[[A - I, B_d], [C, C_d]]``, and what errors of the parameters add to states and
+    outputs ``(n_z + n_y, n_free)``; none of a model without free parameters.
+    """
+    free = [i for i, one in enumerate(model.parameters) if not one.fixed]
+    if not free:
+        return []
+    theta = ca.SX.sym("p", model.n_p)
+    x, h, u = (ca.SX.sym(k, n) for k, n in zip("xhu", (model.n_x, model.n_h, model.n_u), strict=True))
     values = ca.vertcat(*model.step(x, h, u, model.w, theta)), model.output(x, u, model.w, theta)
     slopes = ca.Function("slopes", [x, h, u, theta], [ca.densify(ca.jacobian(v, theta)) for v in values])
-    sizes, found = disturbance_sizes(model, control)[at_inputs], [0.0]
+    found = []
     for point in _rests(model, control):
-        matrix = _at_rest(model, *point)
         off = np.vstack([m.full()[:, free] for m in slopes(*point, model.p)]) * (OFF * np.abs(model.p[free]))
+        matrix = _at_rest(model, *point)
         if np.all(np.isfinite(matrix)) and np.all(np.isfinite(off)):
-            d = np.linalg.lstsq(matrix, off, rcond=None)[0][model.n_x + model.n_h :][at_inputs]
-            found.append(float(np.max(np.sqrt(np.sum(d**2, axis=1)) / sizes)))
-    return max(found)
+            found.append((matrix, off))
+    return found
 
 
 def _at_rest(model: HybridModel, x: Array, h: Array, u: Array) -> Array:
