@@ -36,6 +36,8 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import t as student
+from unknown.case_plants import case_plants
+from unknown.cases import Case, cases
 from unknown.common import Machine
 from unknown.loops import Made, Ran, drawn, made, ran, tuned_rival
 from unknown.motion import MOTION
@@ -62,6 +64,20 @@ def prepared(machine: Machine, folder: Path) -> tuple[Plant, Made]:
     sigma = np.hypot(plant.sigma, np.array(plant.step) / np.sqrt(12)).tolist()
     own = made(machine.name, machine.prior, machine.spec, parts[0], parts[1], machine.length, sigma, held)
     return plant, own
+
+
+def of_case(case: Case, plant: Plant) -> Made:
+    """What a new user gets of a case, whose scenario has a control problem: one held output an input."""
+    own = case.scenario
+    assert own.control is not None
+    parts = read(case.files, own.prior, own.data)  # type: ignore[arg-type]
+    held = list(range(min(own.control.n_u, own.control.n_y)))
+    weights = np.where(np.isin(np.arange(own.control.n_y), held), own.control.q_y, 0.0)
+    control = own.control.changed(q_y=weights, preview=False)
+    sigma = np.maximum(own.sensor_sigma, np.hypot(plant.sigma, np.array(plant.step) / np.sqrt(12)))
+    return made(
+        case.name, own.prior, own.data, parts[0], parts[1], case.length, sigma.tolist(), held, control
+    )  # type: ignore[arg-type]
 
 
 def interval(ratios: Sequence[float]) -> tuple[float, float, float]:
@@ -122,6 +138,7 @@ def main() -> None:
     )
     parser.add_argument("--names", nargs="+", default=(), help="some machines alone")
     parser.add_argument("--only", choices=("all", "in-view", "others"), default="all")
+    parser.add_argument("--cases", type=Path, default=Path("../shared/cases"), help="folder of the cases")
     parser.add_argument("--seeds", type=int, default=10, help="paired loops of each machine")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     given = parser.parse_args()
@@ -132,6 +149,18 @@ def main() -> None:
             if (given.names and machine.name not in given.names) or not wanted:
                 continue
             rows.append(compared(machine.name, *prepared(machine, Path(folder)), given.seeds))
+            print(rows[-1], flush=True)
+        found, missing = cases(given.cases, Path("no recordings of real machines"), Path(folder))
+        plants = case_plants(given.cases)
+        print(*(f"left out: {why}" for why in missing), sep="\n")
+        for case in found:
+            if (
+                case.name not in plants
+                or given.only == "in-view"
+                or (given.names and case.name not in given.names)
+            ):
+                continue
+            rows.append(compared(case.name, plants[case.name], of_case(case, plants[case.name]), given.seeds))
             print(rows[-1], flush=True)
     if rows:
         print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))

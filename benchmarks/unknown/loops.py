@@ -33,8 +33,8 @@ OFF, LOAD = (0.2, 0.1, 0.05), 0.2
 """Share by which each parameter of a plant is off, the next one only where no draw of the one before can hold its
 set-points; share of the room to an input's limit that the load at it takes."""
 HELD, LEAST, HOLDS = 6, 300, 3
-"""Horizons and periods that a set-point is held at least, as the trials of a kit's promises last; set-points of a trial.
-"""
+"""Horizons that a set-point is held, as the trials of a kit's promises last, and periods at least; set-points of a
+trial."""
 END = 0.3
 """Share of a hold at its end over which offset and scatter count: the mean of fewer periods is that of the noise."""
 INSIDE, MARGIN = 0.3, 0.05
@@ -130,9 +130,12 @@ def first_problem(prior: Prior, train: Sequence[Trajectory], dt: float, held: Se
 
 def made(
     name: str, make: type[Prior], spec: DataSpec, train: Sequence[Trajectory], valid: Sequence[Trajectory],
-    length: float, sigma: Sequence[float], held: Sequence[int],
+    length: float, sigma: Sequence[float], held: Sequence[int], control: OCP | None = None,
 ) -> Made:  # fmt: skip
-    """Fit the prior, and make what a run makes of it: model, control problem, process noise."""
+    """Fit the prior, and make what a run makes of it: model, control problem, process noise.
+
+    ``control`` is the control problem. Default: the one that is proposed for the recordings.
+    """
     fit = fit_prior(make, train, valid, dt=spec.dt, length=length)
     phy, known = make(fit.values), smoothed(make, fit, train, spec.dt)
     info = replace(
@@ -143,12 +146,12 @@ def made(
     )  # fmt: skip
     programs = prior_programs(phy, spec.dt, fit.substeps)
     model = build_model("prior", {f"prior/{key}": v for key, v in programs.items()}, info)
+    control = first_problem(phy, train, spec.dt, held) if control is None else control
     scenario = Scenario(
-        name, name, "", prior=make, data=spec, control=first_problem(phy, train, spec.dt, held),
+        name, name, "", prior=make, data=spec, control=control,
         sensor_sigma=tuple(sigma),
     )  # fmt: skip
-    chosen = default_disturbances(model, first_problem(phy, train, spec.dt, held))
-    model = replace(model, disturbance_model=chosen)
+    model = replace(model, disturbance_model=default_disturbances(model, control))
     errors = process_noise(model, known)
     noise = tuple(tuned_noise(model, scenario, errors, known, observer=own) for own in (True, False))
     y = np.concatenate([t.y for t in train])

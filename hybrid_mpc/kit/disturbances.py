@@ -145,8 +145,8 @@ def unexplained(model: HybridModel, control: OCP) -> float:
 
 
 def _errors(model: HybridModel, control: OCP) -> list[tuple[Array, Array]]:
-    """At each point of :func:`_rests`: ``[[A - I, B_d], [C, C_d]]``, and what errors of the parameters add to states and
-    outputs ``(n_z + n_y, n_free)``; none of a model without free parameters.
+    """At each point of :func:`_rests`: ``[[A - I, B_d], [C, C_d]]``, and what errors of the parameters add to states
+    and outputs ``(n_z + n_y, n_free)``; none of a model without free parameters.
     """
     free = [i for i, one in enumerate(model.parameters) if not one.fixed]
     if not free:
