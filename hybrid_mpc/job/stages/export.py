@@ -21,7 +21,6 @@ from hybrid_mpc.job.stage import Absent, Stage, source_of
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, trained_models
 from hybrid_mpc.kit.artifact import member_names, save_models
-from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.kit.parts import (
     MOST_MEMBERS,
     PROGRAMS,
@@ -148,20 +147,15 @@ def artifact_is_there(context: Context, found: ExportResult) -> str:
 
 
 def noise_stage(context: Context) -> NoiseResult | Absent:
-    """Choose the disturbance model where the scenario names none, and tune the estimators on training recordings, by
-    maximum likelihood.
-    """
+    """Tune the estimators on training recordings, by maximum likelihood."""
     of = read_parts(context.out / "model").models
     if context.scenario.control is None:
         put_noise(context, NoiseResult({}, of, context.scenario.disturbance_model))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
-    kit, chosen = context.kit, context.scenario.disturbance_model
-    if chosen is None:
-        plain = replace(kit.models["prior"], disturbance_model=None)
-        chosen = default_disturbances(plain, context.scenario.control)
-    kit = kit.with_disturbances(chosen)
+    kit = context.kit
     found = noise_of(context.scenario, kit, context.commanded("train"))
-    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()}, of, chosen)
+    noise = {name: tuple(sigma.tolist()) for name, sigma in found.items()}
+    result = NoiseResult(noise, of, kit.loop.disturbance_model)
     put_noise(context, result)
     return result
 
