@@ -19,8 +19,8 @@ from hybrid_mpc.estimate.tuning import process_noise
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.job.first_model import Runs, first_lag, slowest
-from hybrid_mpc.job.new import HORIZONS
+from hybrid_mpc.job.first_model import CLOSED, Runs, feedback_of, first_lag, growth_of, slowest
+from hybrid_mpc.job.new import HORIZONS, first_limits
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import make_controller, make_estimator, tuned_noise
 from hybrid_mpc.kit.disturbances import default_disturbances
@@ -122,9 +122,12 @@ def first_problem(prior: Prior, train: Sequence[Trajectory], dt: float, held: Se
     spans = [np.nanmax(v, axis=0) - np.nanmin(v, axis=0) for v in (y, u)]
     weights = np.zeros(y.shape[1])
     weights[list(held)] = (0.05 * spans[0][list(held)]) ** -2
+    commanded = [Runs(t.y, t.u) for t in train]
+    growth = growth_of(commanded, dt) if feedback_of(commanded) > CLOSED else 0.0
+    limits = np.array([first_limits((float(np.nanmin(v)), float(np.nanmax(v))), growth) for v in u.T])
     return OCP(
-        horizon, np.zeros(len(prior.states)), np.zeros(u.shape[1]), (0.1 * spans[1]) ** -2, np.nanmin(u, axis=0),
-        np.nanmax(u, axis=0), q_y=weights, preview=False,
+        horizon, np.zeros(len(prior.states)), np.zeros(u.shape[1]), (0.1 * spans[1]) ** -2, limits[:, 0],
+        limits[:, 1], q_y=weights, preview=False,
     )  # fmt: skip
 
 
