@@ -93,7 +93,7 @@ def compared(name: str, plant: Plant, own: Made, seeds: int) -> dict[str, Any]:
     """A row of the table."""
     began = time.process_time()
     try:
-        ours_made = own.loop()
+        _ = own.parts
     except InputError as error:
         return {
             "machine": name,
@@ -103,7 +103,6 @@ def compared(name: str, plant: Plant, own: Made, seeds: int) -> dict[str, Any]:
             "cost": str(error),
             "good": "no",
         }
-    del ours_made
     make, what = tuned_rival(name, own)
     pairs, offs = list[tuple[Ran, Ran]](), list[float]()
     for seed in range(seeds):

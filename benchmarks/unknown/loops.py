@@ -14,7 +14,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hybrid_mpc import OCP, DataSpec, HybridModel, Prior, Scenario, Trajectory, fit_prior
+from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.data.scales import robust_spread, time_unit
+from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.estimate.tuning import process_noise
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
@@ -88,8 +90,13 @@ class Made:
 
     def loop(self) -> Rival:
         """The tool's own loop."""
-        estimator = make_estimator(self.model, self.scenario, self.noise[0], self.control)
-        return Own(Loop(estimator, make_controller(self.model, self.model, self.control)), self.held)
+        return Own(Loop(*self.parts), self.held)
+
+    @cached_property
+    def parts(self) -> tuple[Filter, SafeController]:
+        """Observer and controller, which keep nothing from one loop to the next."""
+        observer = make_estimator(self.model, self.scenario, self.noise[0], self.control)
+        return observer, make_controller(self.model, self.model, self.control)
 
 
 class Own:
