@@ -7,9 +7,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from hybrid_mpc import DataSpec, Disturbance, OperatingPoint, Prior, Scenario, load
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.identify.prior_model import model_info, prior_programs
+from hybrid_mpc.kit.artifact import save_artifact
 from hybrid_mpc.kit.assembly import make_controller, make_estimator
 from hybrid_mpc.kit.disturbances import default_disturbances, needed
+from hybrid_mpc.kit.parts import loop_settings
 from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.loop.simulate import simulate
 from hybrid_mpc.machine.signals import Parameter, Signal
@@ -106,3 +110,39 @@ def test_an_input_without_effect_at_rest_carries_no_load(gain, expected):
 
 def test_references_of_states_have_one_at_each_input():
     assert default_disturbances(two_outputs(), OCP(30, [1.0, 0.0], [0.0], [0.1], [-5.0], [5.0])) is None
+
+
+class TwoOutputs(Prior):
+    """A lag behind an actuator's lag."""
+
+    states = (Signal("level", "m", -5.0, 5.0), Signal("flow", "l/s", -5.0, 5.0))
+    inputs = (Signal("valve", "-", -5.0, 5.0),)
+    outputs = states
+    parameters = (Parameter("gain", 1.0, "-", 0.1, 5.0),)
+    operating_point = OperatingPoint(x=(1.0, 1.0), u=(1.0,))
+
+    def xdot(self, x, u, w, p):
+        """First order each."""
+        return -x.level + p.gain * x.flow, u.valve - x.flow
+
+
+def test_a_kit_has_the_default_where_its_scenario_names_none(tmp_path):
+    spec = DataSpec("t", ("valve",), ("level", "flow"), 0.1, 0.5, 0.7, 1.0)
+    scenario = Scenario(
+        "two", "two", "", prior=TwoOutputs, data=spec, control=PROBLEM, sensor_sigma=(0.01, 0.01)
+    )
+    prior = TwoOutputs()
+    save_artifact(
+        tmp_path, {"prior": prior_programs(prior, 0.1)}, model_info(prior, 0.1), loop=loop_settings(scenario),
+        recommended="prior",
+    )  # fmt: skip
+    kit = load(tmp_path)
+    assert kit.models["prior"].disturbance_model is None
+    found = kit.on(scenario)
+    assert [(d.at, d.signal) for d in found.loop.disturbance_model] == [
+        ("input", "valve"),
+        ("output", "flow"),
+    ]
+    assert found.models["prior"].disturbance_model == found.loop.disturbance_model
+    named = kit.on(replace(scenario, disturbance_model=(Disturbance("input", "valve"),)))
+    assert named.models["prior"].n_d == 1
