@@ -9,6 +9,7 @@ import pytest
 
 from hybrid_mpc import DataSpec, Disturbance, OperatingPoint, Prior, Scenario, load
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.kit.artifact import save_artifact
 from hybrid_mpc.kit.assembly import make_controller, make_estimator
@@ -89,6 +90,8 @@ def test_of_more_inputs_than_outputs_those_that_are_told_apart():
     assert len(found) == 2
     assert ("input", "u2") in found
     assert all(at == "input" for at, _ in found)
+    with pytest.raises(InputError):
+        make_estimator(model, Assumed(), np.full(2, 1e-3), problem)
 
 
 @pytest.mark.parametrize(("gain", "expected"), [(1.0, None), (0.01, [("rate", "x0")])])
