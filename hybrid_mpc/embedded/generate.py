@@ -53,7 +53,7 @@ SEARCH: Mapping[str, tuple[str, str]] = {
         ("STALLED", equilibrium.STALLED), ("CONTRACTS", equilibrium.CONTRACTS), ("FOLLOWED", equilibrium.FOLLOWED),
         ("LEAST_PART", equilibrium.LEAST_PART), ("EQUAL", equilibrium.EQUAL),
     )}, "VIOLATED": ("1e-12", "1e-6"),
-    "ROUNDING": ("1e-15", "1e-7"),
+    "ROUNDING": ("1e-15", "1e-7"), "AWAY": (repr(equilibrium.AWAY), repr(equilibrium.AWAY)),
 }  # fmt: skip
 """What the search for steady states goes by, in double and in single precision: ``hybrid_mpc.model.equilibrium``."""
 MAX_AGE = 5

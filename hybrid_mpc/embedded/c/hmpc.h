@@ -138,7 +138,7 @@ typedef struct {
 
 /* Its memory, see hmpc_targets.c; d are the disturbances under which it searches. */
 typedef struct {
-  hmpc_point at, after, settled;
+  hmpc_point at, after, settled, kept;
   hmpc_descent tried[HMPC_TARGET_STARTS + 3];
   hmpc_real d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)];
   hmpc_real a[HMPC_NZ][HMPC_NT], half[HMPC_NZ], diagonal[HMPC_NZ], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];

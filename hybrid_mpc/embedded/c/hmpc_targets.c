@@ -3,8 +3,8 @@
    method, the steady states eliminated by their null space; bounds are an active set. All loops end after a fixed
    number of rounds.
 
-   Source: Rawlings, Mayne, Diehl, Model Predictive Control, 2017, section 1.5; Golub and Van Loan, Matrix Computations,
-   2013, sections 5.4 and 5.5. */
+   Source: Rawlings, Mayne, Diehl, Model Predictive Control, 2017, section 1.5; Nocedal, Wright, Numerical Optimization,
+   2006, section 15.6; Golub and Van Loan, Matrix Computations, 2013, sections 5.4 and 5.5. */
 #include "hmpc_math.h"
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
@@ -422,10 +422,30 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
     }
     if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * before)) sure = 0;
     before = size;
-    for (int half = 0; half <= HALVINGS; ++half, share *= R(0.5)) {
+    for (int i = 0; i < NT; ++i) there[i] = at->v[i] + step[i];
+    settle(s, there, goal, w, after);
+    if (!(after->merit < at->merit) && !(size < HMPC_TARGET_NEAR)) {
+      /* watchdog: along a curved branch a step leaves it by its square, and the next one comes back to it */
+      const real answer = work->answer;
+      real second[NT], again = R(0.0);
+      work->kept = *at;
+      *at = *after;
+      if (newton(work, goal, bounded, second)) {
+        for (int i = 0; i < NT; ++i) again = hmpc_max(again, hmpc_abs(second[i] / target_scale[i]));
+        for (int i = 0; i < NT; ++i) there[i] = at->v[i] + second[i];
+        settle(s, there, goal, w, after);
+        if (after->merit < work->kept.merit) {
+          if (!(again < HMPC_TARGET_NEAR || again <= HMPC_TARGET_CONTRACTS * size)) sure = 0;
+          before = again;
+        }
+      }
+      *at = work->kept;
+      work->answer = answer;
+    }
+    for (int half = 0; half < HALVINGS && !(after->merit < at->merit); ++half) {
+      share *= R(0.5);
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
-      if (after->merit < at->merit) break;
       if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
     if (!(after->merit < at->merit)) { /* rounding is all that is left, or it gets nowhere */
@@ -434,6 +454,9 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
     }
     *at = *after;
     lacks[k] = at->lacks;
+    size = R(0.0);
+    for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs((at->v[i] - v[i]) / target_scale[i]));
+    if (size > HMPC_TARGET_AWAY) break;
     if (k < HMPC_TARGET_WITHIN) continue;
     if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[k - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL)) break;
   }
