@@ -30,6 +30,7 @@ from hybrid_mpc.kit.assembly import (
     sensor_steps,
 )
 from hybrid_mpc.kit.at_use import ModelsAtUse
+from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.kit.parts import (
     AGAIN,
     BALANCE,
@@ -400,11 +401,22 @@ class Kit:
         return replace(self, loop=replace(self.loop, process_noise=tuples(noise)))
 
     def on(self, scenario: Scenario) -> Kit:
-        """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now."""
+        """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now; where
+        it names no disturbances, the default ones (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`).
+        """
         if not isinstance(scenario, Scenario):
             raise InputError(f"on: a Scenario is needed, got {type(scenario).__name__}")
-        models = ModelsAtUse(tuple(self.models), partial(_disturbed, self.models, scenario.disturbance_model))
-        return replace(self, models=models, loop=loop_settings(scenario, self.loop.process_noise))
+        chosen, problem = scenario.disturbance_model, scenario.control
+        if chosen is None and problem is not None and problem.n_y:
+            name = "prior" if "prior" in self.models else self.recommended
+            chosen = default_disturbances(_disturbed(self.models, None, name), problem)
+        return replace(self, loop=loop_settings(scenario, self.loop.process_noise)).with_disturbances(chosen)
+
+    def with_disturbances(self, chosen: Sequence[Disturbance] | None) -> Kit:
+        """The kit with another disturbance model (see ``Scenario``); None: one at each input."""
+        own = None if chosen is None else tuple(chosen)
+        models = ModelsAtUse(tuple(self.models), partial(_disturbed, self.models, own))
+        return replace(self, models=models, loop=replace(self.loop, disturbance_model=own))
 
     def problem(self, task: str = "") -> OCP:
         """The control problem of a task; of one without a problem of its own, and where no task is named, the common
