@@ -16,7 +16,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.files import Columns, MissingColumn, Source, name_and_unit, opened
+from hybrid_mpc.data.files import opened
+from hybrid_mpc.data.source import Columns, MissingColumn, Source, name_and_unit
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.files import Columns, Source, name_and_unit
 from hybrid_mpc.data.names import FIELD, Said, said_by, unit_behind
+from hybrid_mpc.data.source import Columns, Source, name_and_unit
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.job.first_model import FEWEST
 from hybrid_mpc.machine.signals import Signal

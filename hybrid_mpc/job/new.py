@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation
-from hybrid_mpc.data.files import Source, name_and_unit, opened
+from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.names import ANGLES
 from hybrid_mpc.data.recording import MIN_SCORED, read_recordings
+from hybrid_mpc.data.source import Source, name_and_unit
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_text

@@ -16,7 +16,7 @@ DIGESTS = {
     "heat_exchanger": "f59b1ad279faf393",
     "quarter_drone": "3afe7abf9dd54528",
     "race_car": "9868e0125ba993a2",
-    "temperature_lab": "4d5e3ffcba4f81b9",
+    "temperature_lab": "1fc93f5a516de984",
     "torque_pendulum": "abe5650a7a3f60a6",
     "unbalanced_disk": "e2f3aee40e8e2c16",
     "xl330_pendulum": "b30941407f443824",
@@ -35,7 +35,7 @@ def digest(folder):
             columns = source.read(None, [name], [name])
             assert not columns.problems
             found.update(f"{path.name} {name} {columns.place(0)}".encode())
-            found.update(columns.values.tobytes())
+            found.update((columns.values + 0.0).tobytes())  # a zero has no sign
     return found.hexdigest()[:16]
 
 

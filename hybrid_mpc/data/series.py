@@ -1,0 +1,77 @@
+"""Signals of one file that have clocks of their own, brought to one table by the rules of their roles."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.source import Columns, Source
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.records import shown
+
+Array = NDArray[np.float64]
+TIME = "time [s]"
+"""Name of the time of files whose signals have clocks of their own."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """A signal of a file: its time stamps ``t`` ``(m,)`` [s] and numbers ``(m,)``; ``fault`` is what is wrong."""
+
+    name: str
+    t: Array
+    values: Array
+    fault: str = ""
+
+
+def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME, note: str = "") -> Source:
+    """A source of signals with clocks of their own.
+
+    The rows are all stamps of the signals that are asked for. A column that may have blank cells (an output, a
+    disturbance) has a number where it was sampled, and none between; all others (inputs) hold their last number, and
+    rows before their first one are left out.
+    """
+    by_name = {one.name: one for one in series}
+    clocks = {id(one.t): one.t for one in series}
+
+    def read(asked: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
+        names = [*([] if asked is None else [asked]), *wanted]
+        chosen = [by_name[name] for name in names if name != time] or list(series)
+        stamps = {id(one.t): one.t for one in chosen} or clocks
+        faults = {one.name: one.fault for one in chosen if one.fault}
+        for one in chosen:
+            if (np.diff(one.t) <= 0).any() and one.name not in faults:
+                k = int(np.argmax(np.diff(one.t) <= 0))
+                faults[one.name] = (
+                    f"column {shown(one.name)}: sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at "
+                    f"{one.t[k]:.10g} s. Time stamps must increase: delete the repeated samples, or split the file."
+                )
+        t = np.unique(np.concatenate(list(stamps.values())))
+        values = np.full((len(t), len(names)), np.nan)
+        first = t[0] if len(t) else 0.0
+        for j, name in enumerate(names):
+            if name == time:
+                values[:, j] = t
+                continue
+            one = by_name[name]
+            if name in faults or not len(one.t):
+                continue
+            if name in blanks:
+                values[np.searchsorted(t, one.t), j] = one.values
+                continue
+            known = np.isfinite(one.values)
+            at = np.searchsorted(one.t[known], t, side="right") - 1
+            values[:, j] = (
+                np.where(at >= 0, one.values[known][np.maximum(at, 0)], np.nan) if known.any() else np.nan
+            )
+            first = max(first, float(one.t[known][0])) if known.any() else first
+        rows = t >= first
+        return Columns(values[rows], "sample", range(1, int(rows.sum()) + 1), faults)
+
+    if len(by_name) < len(series):
+        raise InputError(f"{path}: two signals have the same name and the same clock. Rename one.")
+    return Source(path, sha256, (time, *by_name), read, note)
