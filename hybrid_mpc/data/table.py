@@ -48,6 +48,8 @@ SAMPLE, MOST_SEEN = 2**17, 1000
 """Bytes, and rows, at the beginning of a file that show where its table begins."""
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "vertical bars", " ": "blanks"}
 """What may stand between the cells of a text file."""
+STEADY = 3
+"""Fewest rows that show a table."""
 COMMENTS = ("#", "%", "//", ";;")
 """How comments begin."""
 HEAD = 200
@@ -112,15 +114,21 @@ def layout_of(
 
     ``split(row)`` gives the cells of a row as other separators split it, ``number(row)`` the row's number.
     """
-    best: list[Look] = []
-    run: list[Look] = []
+    runs: list[list[Look]] = []
+    whole = False  # whether the last row goes on
     for look in rows:
         if look.is_data(comma):
-            run = [*run, look] if run and len(run[-1].cells) == len(look.cells) else [look]
-        elif look.filled:
-            run = []
-        best = run if len(run) > len(best) else best
-    while len(best) > 2 and _words_over_numbers(best[0], best[1:4], comma):
+            if whole and len(runs[-1][-1].cells) == len(look.cells):
+                runs[-1].append(look)
+            else:
+                runs.append([look])
+            whole = True
+        elif look.filled and not look.cells[0].startswith(COMMENTS):
+            whole = False
+    best = max(runs, key=len, default=[])
+    # words in a row, or the header again, part a table in two: it begins with the first part
+    best = next((run for run in runs if len(run) >= STEADY and _alike(run, best, comma)), best)
+    while len(best) > 1 and _words_over_numbers(best[0], best[1:4], comma):
         best = best[1:]
     if not best:
         return 0.0, ""
@@ -129,6 +137,12 @@ def layout_of(
     score = len(best) * sum(look.values(comma) for look in best) / filled
     above = [look for look in rows if look.row < first and look.filled]
     return score, _headed(above, best, width, comma, split, number)
+
+
+def _alike(one: Sequence[Look], other: Sequence[Look], comma: bool) -> bool:
+    """Whether two runs of rows have numbers in the same columns."""
+    kinds = [[is_value(cell, comma) for cell in run[-1].cells] for run in (one, other)]
+    return kinds[0] == kinds[1]
 
 
 def _words_over_numbers(look: Look, below: Sequence[Look], comma: bool) -> bool:
@@ -165,18 +179,20 @@ def _headed(
     names: list[str] = []
     header = -1
     if candidates:
+        names = _names_in(candidates[-1], width, spare, split)
+        while not names and len(candidates) > 1 and candidates[-1].is_data(comma):  # rows of another length
+            candidates.pop()
+            names = _names_in(candidates[-1], width, spare, split)
         last = candidates[-1]
-        names = _names_in(last, width, spare, split)
         if names:
-            header = last.row
-        elif (
-            len(last.filled) > 1 and not any(c.startswith(COMMENTS) for c in last.cells[:1]) and last.row >= 0
-        ):
-            count = max(len(last.cells), *map(len, split(last.row)), 0)
-            if count > 2 and abs(count - width) < 3:
+            header, first = last.row, first if last is above[-1] or units else last.row + 1
+        elif not last.is_data(comma) and not last.cells[0].startswith(COMMENTS):
+            counts = [len([cell for cell in cells if cell]) for cells in (last.cells, *split(last.row)[1:-1])]
+            count = max(counts)
+            if count > 1 and abs(count - width) < 3 and max(width, count) > 2:
                 return (
-                    f"row {number(first)} has {width} cells, the header (row {number(last.row)}) has "
-                    f"{len(last.cells)}. Separate all cells in one way, write decimals with a point, and complete or delete the row."
+                    f"row {number(first)} has {width} cells, the header (row {number(last.row)}) has {count}. Separate "
+                    "all cells in one way, write decimals with a point, and complete or delete the row."
                 )
     if header < 0:
         names = [f"column {j + 1}" for j in range(width)]

@@ -1,0 +1,266 @@
+"""Tables as engineers have them: known content is read to the last digit, and what is ambiguous is refused in a line."""
+
+import datetime
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import InputError
+from hybrid_mpc.data.files import opened
+
+K = np.arange(40)
+T = np.array([float(f"{0.01 * k:.2f}") for k in K])
+U = np.array([float(f"{np.cos(0.3 * k):.6f}") for k in K])
+Y = np.array([float(f"{20 + 5 * np.sin(0.1 * k):.4f}") for k in K])
+PLAIN = [[f"{0.01 * k:.2f}", f"{np.cos(0.3 * k):.6f}", f"{20 + 5 * np.sin(0.1 * k):.4f}"] for k in K]
+GERMAN = [[cell.replace(".", ",") for cell in row] for row in PLAIN]
+NAMES = ("t", "u", "y")
+BEGIN = datetime.datetime(2024, 3, 30, 23, 59, 59, 700_000)  # passes midnight after 0.3 s
+STAMPS = [BEGIN + datetime.timedelta(milliseconds=10 * int(k)) for k in K]
+TRUE = {"t": T, "u": U, "y": Y}
+
+
+def text(rows, separator=",", above=(), header=NAMES, below=(), end="\n"):
+    """Rows of cells as a text file."""
+    lines = [*above, *([separator.join(header)] if header else []), *map(separator.join, rows), *below]
+    return end.join(lines) + end
+
+
+def first(stamp, form=None):
+    """The table with stamps in place of the time."""
+    return [[stamp(s) if form is None else s.strftime(form), *row[1:]] for s, row in zip(STAMPS, PLAIN, strict=True)]
+
+
+def ms(stamp):
+    return f"{stamp:%Y-%m-%d %H:%M:%S}.{stamp.microsecond // 1000:03d}"
+
+
+LVM = [
+    "LabVIEW Measurement\t", "Writer_Version\t2", "Separator\tTab", "Date\t2024/03/30", "Time\t10:11:12,5",
+    "***End_of_Header***\t", "\t", "Channels\t2\t\t", "Samples\t40\t40\t", "X_Dimension\tTime\tTime\t",
+    "***End_of_Header***\t\t\t",
+]  # fmt: skip
+SECONDS = {"t [s]": T, "u": U, "y": Y}
+NUMBERED = {"column 1": T, "column 2": U, "column 3": Y}
+UNITS = {"t [s]": T, "u [V]": U, "y [degC]": Y}
+
+TABLES = {
+    "plain": (text(PLAIN), TRUE),
+    "semicolons": (text(PLAIN, ";"), TRUE),
+    "tabs": (text(PLAIN, "\t"), TRUE),
+    "vertical bars": (text(PLAIN, "|"), TRUE),
+    "blanks": (text(PLAIN, " "), TRUE),
+    "columns of one width": (text([[cell.rjust(14) for cell in row] for row in PLAIN], "", header=("t   u   y",)), TRUE),
+    "names with blanks over columns": (
+        text([[c.rjust(14) for c in row] for row in PLAIN], "", header=("time (s)   u (V)     level (m)",)),
+        {"time (s)": T, "u (V)": U, "level (m)": Y},
+    ),
+    "commas and blanks": (text(PLAIN, ", "), TRUE),
+    "decimal commas": (text(GERMAN, ";"), TRUE),
+    "decimal commas, tabs": (text(GERMAN, "\t"), TRUE),
+    "quoted decimal commas": (text([[f'"{c}"' for c in row] for row in GERMAN], ","), TRUE),
+    "ends of Windows": (text(PLAIN, end="\r\n"), TRUE),
+    "ends of an old Mac": (text(PLAIN, end="\r"), TRUE),
+    "BOM": ("\ufeff" + text(PLAIN), TRUE),
+    "UTF-16": (text(GERMAN, "\t").encode("utf-16"), TRUE),
+    "UTF-16 without a mark": (text(PLAIN, "\t").encode("utf-16-le"), TRUE),
+    "Latin-1": (text(GERMAN, ";", header=("t", "u", "Füllstand [°C]")).encode("latin-1"), {"Füllstand [°C]": Y}),
+    "quoted names": (text(PLAIN, header=('"t"', '"u, first"', '"y ""inner"""')), {"u, first": U, 'y "inner"': Y}),
+    "no header": (text(PLAIN, header=()), NUMBERED),
+    "no header below a preamble": (text(PLAIN, header=(), above=["Logger 5", "", "-----"]), NUMBERED),
+    "preamble": (text(PLAIN, above=["Logger 5", "Rate: 10 Hz", "", "Operator: Ann, Bob"]), TRUE),
+    "preamble of keys": (text(PLAIN, above=[f"Key {k},{k}" for k in range(12)]), TRUE),
+    "long preamble": (text(PLAIN, above=[f"# setting {k} = {k}" for k in range(300)]), TRUE),
+    "header as a remark": (text(PLAIN, " ", header=("# t", "u", "y")), TRUE),
+    "LabVIEW": (text([[*row, ""] for row in GERMAN], "\t", above=LVM, header=("X_Value", "u", "y", "Comment")), {"y": Y}),
+    "LabVIEW without comments": (text(PLAIN, "\t", above=LVM, header=("X_Value", "u", "y", "Comment")), {"X_Value": T}),
+    "row of units": (text(PLAIN, header=NAMES, below=()).replace("t,u,y", "t,u,y\ns,V,degC", 1), UNITS),
+    "units in brackets": (text(PLAIN, ";").replace("t;u;y", "t;u;y\n[s];[V];[degC]", 1), UNITS),
+    "units of which some are numbers": (text(PLAIN).replace("t,u,y", "t,u,y\ns,1,degC", 1), {"y [degC]": Y}),
+    "separators at the ends of rows": (text([[*row, ""] for row in PLAIN]), TRUE),
+    "separators everywhere": (text([[*row, ""] for row in PLAIN], header=(*NAMES, "")), TRUE),
+    "a separator behind the header": (text(PLAIN, header=(*NAMES, "")), TRUE),
+    "closing rows": (text(PLAIN, below=["Mean,1,2", "Std. dev.,1,2", "", "# end"]), TRUE),
+    "blank rows": (text([row for pair in zip(PLAIN, [["", "", ""]] * 40, strict=True) for row in pair]), TRUE),
+    "remarks between": (text([*PLAIN[:9], ["# a pause"], *PLAIN[9:]]), TRUE),
+    "header again, soon": (text([*PLAIN[:5], list(NAMES), *PLAIN[5:]]), TRUE),
+    "header again": (text([*PLAIN[:20], list(NAMES), *PLAIN[20:]]), TRUE),
+    "words for a switch": (
+        text([[row[0], "ON" if k % 3 else "off", row[2]] for k, row in enumerate(PLAIN)]),
+        {"u": np.where(K % 3, 1.0, 0.0)},
+    ),
+    "true and false": (text([[r[0], str(bool(k % 3)), r[2]] for k, r in enumerate(PLAIN)]), {"u": np.sign(K % 3)}),
+    "cells with units": (text([[row[0], f"{row[1]} V", f"{row[2]}°C"] for row in PLAIN]), {"u [V]": U, "y [°C]": Y}),
+    "missing ones": (
+        text([[row[0], row[1], ("n/a", "---", "NaN", "", row[2])[k % 5]] for k, row in enumerate(PLAIN)]),
+        {"y": np.where(K % 5 == 4, Y, np.nan)},
+    ),
+    "thousands": (
+        text([[r[0], f"{1234567.25 + k:,}", r[2]] for k, r in enumerate(PLAIN)], ";"),
+        {"u": 1234567.25 + K, "y": Y},
+    ),
+    "German thousands": (
+        text([[r[0], f"{4567.25 + k:,}".translate(str.maketrans(",.", ".,")), r[2]] for k, r in enumerate(GERMAN)], ";"),
+        {"u": 4567.25 + K, "y": Y},
+    ),
+    "Swiss thousands": (text([[r[0], f"{4567 + k:,}".replace(",", "'"), r[2]] for k, r in enumerate(PLAIN)]), {"u": 4567.0 + K}),
+    "ISO": (text(first(ms)), SECONDS),
+    "ISO with T and zone": (text(first(lambda s: s.isoformat(timespec="microseconds") + "+02:00")), SECONDS),
+    "ISO in UTC": (text(first(lambda s: ms(s) + "Z"), header=("t [UTC]", "u", "y")), SECONDS),
+    "two zones": (
+        text(first(lambda s: ms(s) + "+01:00" if s.day == 30 else ms(s + datetime.timedelta(hours=1)) + "+02:00")),
+        SECONDS,
+    ),
+    "days with points": (
+        text(first(lambda s: f"{s:%d.%m.%Y %H:%M:%S},{s.microsecond // 1000:03d}"), ";"),
+        SECONDS,
+    ),
+    "day first": (text(first(lambda s: f"{s:%d/%m/%Y %H:%M:%S}.{s.microsecond // 1000:03d}")), SECONDS),
+    "month first": (text(first(lambda s: f"{s:%m/%d/%Y %I:%M:%S}.{s.microsecond // 1000:03d} {s:%p}")), SECONDS),
+    "months by name": (text(first(lambda s: f"{s:%d-%b-%Y %H:%M:%S}.{s.microsecond // 1000:03d}")), SECONDS),
+    "milliseconds behind a colon": (text(first(lambda s: f"{s:%Y-%m-%d %H:%M:%S}:{s.microsecond // 1000:03d}")), SECONDS),
+    "date and time": (
+        text([[f"{s:%Y-%m-%d}", f"{s:%H:%M:%S.%f}", *row[1:]] for s, row in zip(STAMPS, PLAIN, strict=True)],
+             header=("Date", "t", "u", "y")),
+        SECONDS,
+    ),
+    "time of day past midnight": (text(first(lambda s: f"{s:%H:%M:%S.%f}")), {"t [s]": 86399.7 + T}),
+    "minutes and seconds": (text([[f"{k // 6:02d}:{k % 6 * 10:02d}.5", *r[1:]] for k, r in enumerate(PLAIN)]), {"t [s]": 10.0 * K + 0.5}),
+    "microseconds since 1970": (text([[f"{1711843199700000 + 10000 * k}", *r[1:]] for k, r in enumerate(PLAIN)]), {"t": 1711843199.7e6 + 1e4 * K}),
+    "sixteen digits": (text([[r[0], repr(np.pi * 10.0 ** (k - 20)), r[2]] for k, r in enumerate(PLAIN)]), {"u": [float(repr(np.pi * 10.0 ** (int(k) - 20))) for k in K]}),
+}  # fmt: skip
+"""Contents by kind, and columns as they are read."""
+
+
+@pytest.fixture
+def wrote(tmp_path):
+    def write(content, name="run.csv"):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+def numbers(path, names=None):
+    """All columns of a file by name; none may have a fault."""
+    source = opened(path)
+    found = {}
+    for name in source.header if names is None else names:
+        columns = source.read(None, [name], [name])
+        assert not columns.problems
+        found[name] = columns.values[:, 0]
+    return found
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_a_table_is_read_to_the_last_digit(wrote, kind):
+    content, expected = TABLES[kind]
+    path = wrote(content)
+    found = numbers(path, expected)
+    assert set(expected) <= set(opened(path).header)
+    assert len(opened(path).header) == 3
+    for name, values in expected.items():
+        exact = {"rtol": 0, "atol": 1e-9} if name == "t [s]" else {"rtol": 0, "atol": 0}  # far below 1 us
+        np.testing.assert_allclose(found[name], np.asarray(values), **exact)
+
+
+LONG = [[ms(s), tag, row[j]] for s, row in zip(STAMPS, PLAIN, strict=True) for j, tag in ((1, "FIC-1.OP"), (2, "TI-7"))]
+
+
+def test_long_form_is_a_column_a_tag(wrote):
+    path = wrote(text(LONG, header=("timestamp", "tag", "value")))
+    source = opened(path)
+    assert source.header == ("timestamp [s]", "FIC-1.OP", "TI-7")
+    columns = source.read("timestamp [s]", ["FIC-1.OP", "TI-7"], ["TI-7"])
+    np.testing.assert_allclose(columns.values, np.c_[T, U, Y], atol=1e-9)
+    units = [[*row, "%" if "OP" in row[1] else "degC"] for row in LONG]
+    assert opened(wrote(text(units, header=("timestamp", "tag", "value", "unit")))).header[1:] == (
+        "FIC-1.OP [%]",
+        "TI-7 [degC]",
+    )
+
+
+def test_clocks_of_their_own_meet_by_the_rules_of_their_roles(wrote):
+    """The input holds its last number; the output has one where it was sampled; rows before the first input go."""
+    rows = [[f"{0.5 * k:.1f}", "u", f"{k}"] for k in range(1, 9)] + [[f"{0.3 * k:.1f}", "y", f"{k}"] for k in range(15)]
+    columns = opened(wrote(text(rows, header=("time", "tag", "value")))).read("time", ["u", "y"], ["y"])
+    t, u, y = columns.values.T
+    np.testing.assert_array_equal(t, np.unique(np.round([*0.5 * np.arange(1, 9), *0.3 * np.arange(2, 15)], 1)))
+    np.testing.assert_array_equal(u, np.minimum(np.floor(t / 0.5 + 1e-9), 8))
+    sampled = np.isclose(t / 0.3, np.round(t / 0.3))
+    np.testing.assert_allclose(y[sampled], np.round(t[sampled] / 0.3))
+    assert np.isnan(y[~sampled]).all()
+
+
+def test_one_sensor_a_row(wrote):
+    rows = [[f"{k}", f"s{k % 2}", f"{k / 4}", f"{k / 8}"] for k in range(20)]
+    source = opened(wrote(text(rows, header=("time", "sensor", "temp", "level"))))
+    assert source.header == ("time", "s0.temp", "s0.level", "s1.temp", "s1.level")
+    columns = source.read("time", ["s1.level"], ["s1.level"])
+    np.testing.assert_array_equal(columns.values, np.c_[np.arange(1, 20, 2), np.arange(1, 20, 2) / 8])
+
+
+def without(column):
+    return [[c for j, c in enumerate(row) if j != column] for row in PLAIN]
+
+
+def cell(row, column, value, rows=PLAIN):
+    return [[value if (k, j) == (row, column) else c for j, c in enumerate(r)] for k, r in enumerate(rows)]
+
+
+AMBIGUOUS = {
+    "no table": ("nothing here\nis a number\n", "row 2 has 3 cells"),
+    "day or month": (
+        text([[f"0{1 + k % 2}/0{2 + k % 3}/2024 10:00:{k:02d}", *r[1:]] for k, r in enumerate(PLAIN)]),
+        "day or month first",
+    ),
+    "hours or minutes": (text([[f"{10 + k // 60}:{k % 60:02d}", *r[1:]] for k, r in enumerate(PLAIN)]), "hours and minutes"),
+    "no such day": (text([[f"30.02.2024 10:00:{k:02d}", *r[1:]] for k, r in enumerate(PLAIN)], ";"), "no such day"),
+    "two zones by name": (
+        text([[f"2024-03-31 10:00:{k:02d} {'CET' if k < 9 else 'CEST'}", *r[1:]] for k, r in enumerate(PLAIN)]),
+        "time zones",
+    ),
+    "thousands or decimals": (text([[r[0], f"{800 + 10 * k:,}".replace(",", "."), r[2]] for k, r in enumerate(GERMAN)], ";"), "row 2[23], .*thousands"),
+    "two decimal marks": (text(cell(7, 1, "0,25"), ";"), "row 9|0,25"),
+    "a decimal comma between commas": (text(cell(7, 1, "0,25")), "row 9 has 4 cells"),
+    "two units in cells": (text([[r[0], f"{r[1]} {'V' if k else 'mV'}", r[2]] for k, r in enumerate(PLAIN)]), "row 2, .*unit"),
+    "a word": (text(cell(7, 1, "overload")), "row 9, column 'u' is 'overload'"),
+    "three positions": (text([[r[0], ("on", "off", "auto")[k % 3], r[2]] for k, r in enumerate(PLAIN)]), "row 2, column 'u'"),
+    "a row of words": (text([*PLAIN[:9], ["off", "line", "now"], *PLAIN[9:]]), "row 11, column 't'"),
+    "a switch among numbers": (text(cell(7, 1, "ON")), "row 9, .*switch"),
+    "a short row": (text([*PLAIN[:9], PLAIN[9][:2], *PLAIN[10:]]), "row 11 has 2 cells"),
+    "a long row": (text([*PLAIN[:9], [*PLAIN[9], "1"], *PLAIN[10:]]), "row 11 has 4 cells"),
+    "a header too short": (text(PLAIN, header=("t", "u")), "row 2 has 3 cells, the header .row 1. has 2"),
+    "a header by other separators": (text(PLAIN, ";", header=("t,u,y,z",)), "row 2 has 3 cells, .* has 4"),
+    "units that contradict": (text(PLAIN, header=("t", "u", "y [K]")).replace("]", "]\ns,V,degC", 1), "row 2, .*'degC'.*'K'"),
+    "an open quotation mark": (text(cell(7, 1, '"0.5')), "row 9.*quotation"),
+    "bytes": (text(PLAIN).encode()[:200] + b"\0\1\2" + text(PLAIN).encode()[200:], "is no text"),
+    "cut in two": (text(PLAIN)[:-4], "row 41, .*cut in two"),
+    "infinite": (text(cell(7, 2, "inf")), "row 9, column 'y' is 'inf'"),
+    "a blank input": (text(cell(7, 1, "")), "row 9, column 'u' is empty"),
+    "AM beside 13 h": (text([[f"1/31/2024 {9 + k // 8}:00:{k:02d} AM", *r[1:]] for k, r in enumerate(PLAIN)]), "AM and PM"),
+    "a date among numbers": (text(cell(7, 1, "2024-01-31")), "row 9, .*date"),
+}  # fmt: skip
+"""Damaged or ambiguous contents, and what the refusal says."""
+
+
+@pytest.mark.parametrize("kind", AMBIGUOUS)
+def test_what_is_ambiguous_is_refused_in_a_line(wrote, kind):
+    content, match = AMBIGUOUS[kind]
+    path = wrote(content)
+    with pytest.raises(InputError, match=match) as caught:  # noqa: PT012  (opening or reading refuses)
+        source = opened(path)
+        time = source.find("t") if kind != "no table" else "t"
+        columns = source.read(time, [source.find("u"), source.find("y")], [source.find("y")])
+        if columns.problems:
+            raise InputError(f"{path}: {columns.problems[0]}")
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_what_was_done_is_said(wrote):
+    source = opened(wrote(text(GERMAN, ";", above=["Logger", "Nr 5"], below=["Mittel;1;2"])))
+    told = "; ".join(source.notes)
+    for words in ("rows 1 to 2 are a preamble; header in row 3", "decimal comma", "row", "44"):
+        assert words in told
