@@ -8,8 +8,10 @@ from __future__ import annotations
 import csv
 import errno
 import hashlib
+import importlib
 import io
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,51 +34,85 @@ LONGEST_ROW = 2**20
 """Longest row of a text file [byte]: ten thousand columns of a hundred characters."""
 
 
+BEGINS = (
+    (re.compile(rb"PAR1|ARROW1"), "sheets", "arrow_source"),
+    (re.compile(rb"\x89HDF\r\n\x1a\n"), "sheets", "hdf5_source"),
+    (re.compile(rb"MATLAB (5.0|7.3) MAT-file"), "matlab", "mat_source"),
+    (
+        re.compile(rb"MDF     |TDSm|\x89MCAP0\r\n|#ROSBAG V2|SQLite format 3|ULog\x01\x125|LOGG"),
+        "loggers",
+        "logger_source",
+    ),
+    (
+        re.compile(rb"date .*\r?\n\s*base (hex|dec)|\(\d+\.\d+\) \S+ [0-9A-Fa-f]+#|;\$FILEVERSION"),
+        "loggers",
+        "logger_source",
+    ),
+)
+"""How files of a format begin, and what reads them."""
+ENDS = {
+    ".npz": ("vectors", "npz_source"),
+    ".mat": ("matlab", "mat_source"),
+    ".xlsx": ("sheets", "excel_source"),
+    ".xlsm": ("sheets", "excel_source"),
+}
+"""The same by their ending, for formats that do not say what they are."""
+OTHERS = (
+    (b"\xd0\xcf\x11\xe0", "an old Excel workbook"),
+    (b"PK\x03\x04\x14\x00\x00\x08\x00\x00", "an OpenDocument file"),
+)
+"""Formats that are not read."""
+
+
 def opened(path: Path) -> Source:
-    """Open a recording's file: by how it begins where its format says so, else by its ending, else as a table of text.
+    """Open a recording's file: by its ending, by how it begins, else as a table of text.
 
-    ==========  ========================================================================================
-    ``.npz``    named vectors (``numpy.savez``); objects are refused
-    ``.mat``    MATLAB's vectors; a struct's fields are ``struct.field``
-    any other   a table as text: :mod:`hybrid_mpc.data.table`
-    ==========  ========================================================================================
+    ==================  ==================================================================================
+    ``.npz``            named vectors (``numpy.savez``); objects are refused
+    ``.mat``            MATLAB's vectors and matrices, v4 to v7.3; a struct's fields are ``struct.field``
+    ``.xlsx``           the table of a workbook
+    Parquet, Feather    columns
+    HDF5                datasets: vectors, matrices, tables
+    loggers             MDF, TDMS, ROS bags, MCAP, PX4 and CAN logs: :mod:`hybrid_mpc.data.loggers`
+    any other           a table of text: :mod:`hybrid_mpc.data.table`
+    ==================  ==================================================================================
     """
-    kind = path.suffix.lower()
-    content = _content(path, _Rows().check if kind not in (".npz", ".mat") else lambda piece: None)
-    sha256 = hashlib.sha256(content).hexdigest()
-    if kind == ".npz":
-        from hybrid_mpc.data.vectors import npz_source
-
-        return npz_source(path, content, sha256)
-    if kind == ".mat":
-        from hybrid_mpc.data.matlab import mat_source
-
-        return mat_source(path, content, sha256)
-    from hybrid_mpc.data.table import text_source
-
-    return text_source(path, content, sha256)
+    kind = ENDS.get(path.suffix.lower())
+    content = _content(path, None if kind else _Rows(path))
+    if kind is None:
+        kind = next((found for begin, *found in BEGINS if begin.match(content)), ("table", "text_source"))
+    if other := next((what for begin, what in OTHERS if content.startswith(begin)), ""):
+        raise InputError(f"{path}: is {other}, which is not read. Save the table as .xlsx or as CSV (UTF-8).")
+    module = importlib.import_module(f"hybrid_mpc.data.{kind[0]}")
+    source: Source = getattr(module, kind[1])(path, content, hashlib.sha256(content).hexdigest())
+    return source
 
 
 class _Rows:
     """Checks piece by piece that rows of text have a bearable length, before any is kept."""
 
-    def __init__(self) -> None:
-        self._length = 0
+    def __init__(self, path: Path) -> None:
+        self._path, self._length, self._first, self._text = path, 0, True, True
 
     def check(self, piece: bytes) -> None:
-        """See the next piece."""
+        """See the next piece; what is no text has no rows."""
+        if self._first and any(begin.match(piece) for begin, *_ in BEGINS):
+            self._text = False
+        self._first = False
+        if not self._text:
+            return
         parts = piece.replace(b"\r", b"\n").split(b"\n")
         longest = max(self._length + len(parts[0]), *map(len, parts))
         self._length = len(parts[-1]) if len(parts) > 1 else longest
         if longest > LONGEST_ROW:
             raise InputError(
-                f"has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with the columns that are "
-                "needed."
+                f"{self._path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with the "
+                "columns that are needed."
             )
 
 
-def _content(path: Path, check: Callable[[bytes], None] = lambda piece: None) -> bytes:
-    """The bytes of a regular file; ``check`` sees them piece by piece before any is kept.
+def _content(path: Path, rows: _Rows | None) -> bytes:
+    """The bytes of a regular file; ``rows`` sees them piece by piece before any is kept.
 
     Pipes and devices are refused: nothing says how long they are, and they may never end.
     """
@@ -84,7 +120,8 @@ def _content(path: Path, check: Callable[[bytes], None] = lambda piece: None) ->
         with nn_export.files.opened(path, LARGEST) as (file, size):
             left = size
             while left > 0 and (piece := file.read(min(CHUNK, left))):
-                check(piece)
+                if rows is not None:
+                    rows.check(piece)
                 left -= len(piece)
             file.seek(0)
             content = file.read(size)

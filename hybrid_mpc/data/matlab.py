@@ -61,7 +61,7 @@ def mat_source(path: Path, content: bytes, sha256: str) -> Source:
             if leaf.kind in CONVERT:
                 lines.append(CONVERT[leaf.kind].format(leaf.name, f"{path.stem}_vectors.mat"))
         else:
-            vectors |= dict(_columns(leaf))
+            vectors |= dict(columns_of_leaf(leaf))
     told = [f"{what} ({', '.join(map(shown, names[:LISTED]))})" for what, names in sorted(unread.items())]
     note = f" Not read are {' and '.join(told)}." if told else ""
     note += f" In MATLAB: {lines[0]}" if lines else " Save their vectors as variables." if told else ""
@@ -79,7 +79,7 @@ def mat_source(path: Path, content: bytes, sha256: str) -> Source:
     )
 
 
-def _columns(leaf: Leaf) -> Iterator[tuple[str, Callable[[], NDArray[Any]]]]:
+def columns_of_leaf(leaf: Leaf) -> Iterator[tuple[str, Callable[[], NDArray[Any]]]]:
     """A vector; or the columns of a matrix, rows where these are longer."""
     long = [size for size in leaf.shape if size != 1]
     if len(leaf.shape) != 2 or len(long) < 2 or min(long) > MOST_WIDE or 0 in long:
