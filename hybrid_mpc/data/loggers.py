@@ -11,6 +11,7 @@ import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,8 @@ FORMULA = 3
 
 def logger_source(path: Path, content: bytes, sha256: str) -> Source:
     """A logger's file as a source."""
-    reader, what = _READERS[path.suffix.lower()]
+    begins = (one[1:] for one in _READERS if content.startswith(one[0]))
+    reader, what = next(begins, (_can, "CAN log"))
     try:
         with named_extra(f"reading {what}"):
             return reader(path, content, sha256)
@@ -69,23 +71,17 @@ def _source(
 ) -> Source:
     """A source of signals: group, name, unit, stamps [s], numbers; times begin with the file's first stamp."""
     found = [one for one in found if len(one[3])]
+    if not found:
+        raise InputError(f"{path}: has no signal with numbers. Record some, or export them as CSV.")
     names = _distinct([(group, own) for group, own, *_ in found])
     series = [
-        Series(_named(n, one[2]), one[3], np.asarray(one[4], np.float64))
-        for n, one in zip(names, found, strict=True)
+        Series(_named(name, unit), t, np.asarray(values, np.float64))
+        for name, (_, _, unit, t, values) in zip(names, found, strict=True)
     ]
-    if not series:
-        raise InputError(f"{path}: has no signal with numbers. Record some, or export them as CSV.")
     told = f" Not read are {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
-    source = clocked(path, sha256, series, note=told)
-    rates = {len(one.t) for one in series}
-    notes = [note] if note else []
-    notes.append(
-        f"{len(series)} signals, {len({(len(s.t), *s.t[:1]) for s in series})} clocks"
-        if len(rates) > 1
-        else "one clock"
-    )
-    return Source(path, sha256, source.header, source.read, told, tuple(unread), tuple(notes))
+    clocks = len({(len(one.t), *one.t[[0, -1]]) for one in series})
+    notes = (*([note] if note else []), f"{len(series)} signals, {clocks} clock{'s' * (clocks > 1)}")
+    return replace(clocked(path, sha256, series, note=told), unread=tuple(unread), notes=notes)
 
 
 # MDF and TDMS
@@ -119,13 +115,8 @@ def _tdms(path: Path, content: bytes, sha256: str) -> Source:
 
     file = TdmsFile.read(io.BytesIO(content))
     found, plain = [], []
-    starts = [
-        one.properties["wf_start_time"]
-        for g in file.groups()
-        for one in g.channels()
-        if "wf_start_time" in one.properties
-    ]
-    begin = min(starts) if starts else None
+    starts = [one.properties.get("wf_start_time") for group in file.groups() for one in group.channels()]
+    begin = min((one for one in starts if one is not None), default=None)
     for group in file.groups():
         channels = {one.name: one for one in group.channels() if len(one) and one.dtype.kind in "biufM"}
         clock = next(
@@ -135,16 +126,9 @@ def _tdms(path: Path, content: bytes, sha256: str) -> Source:
             unit = one.properties.get("unit_string", "")
             if one.properties.get("wf_increment", 0):
                 start = one.properties.get("wf_start_time")
-                late = (
-                    (start - begin) / np.timedelta64(1, "ns") / 1e9
-                    if start is not None and begin is not None
-                    else 0.0
-                )
-                t = (
-                    late
-                    + one.properties.get("wf_start_offset", 0.0)
-                    + one.properties["wf_increment"] * np.arange(len(one))
-                )
+                late = 0.0 if start is None else float((start - begin) / np.timedelta64(1, "ns")) / 1e9
+                step, offset = one.properties["wf_increment"], one.properties.get("wf_start_offset", 0.0)
+                t = late + offset + step * np.arange(len(one))
                 found.append((group.name, name, unit, t, one[:]))
             elif clock is not None and name != clock and len(one) == len(channels[clock]):
                 found.append((group.name, name, unit, _seconds(channels[clock][:], clock), one[:]))
@@ -253,12 +237,7 @@ def _bag(path: Path, content: bytes, sha256: str) -> Source:
     topics, decoders, unread = _Topics(), _Decoders(), list[str]()
     with Reader(path) as reader:
         schemas = {
-            one.id: Schema(
-                id=one.id,
-                name=one.msgtype.replace("/msg/", "/"),
-                encoding="ros1msg",
-                data=one.msgdef.data.encode(),
-            )
+            one.id: Schema(one.id, one.msgdef.data.encode(), "ros1msg", one.msgtype.replace("/msg/", "/"))
             for one in reader.connections
         }
         for connection, stamp, data in reader.messages():
@@ -328,24 +307,20 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     if len(own) != 1:
         there = f"; that folder has {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
         raise InputError(
-            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Without it nobody knows "
-            "what its bytes mean."
+            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Without it nobody "
+            "knows what its bytes mean."
         )
     base = cantools.database.load_string(own[0].read_text(encoding="cp1252"), "dbc", strict=False)
     known = {message.frame_id: message for message in base.messages}
-    kind = {
-        ".blf": can.BLFReader,
-        ".asc": can.ASCReader,
-        ".log": can.CanutilsLogReader,
-        ".trc": can.TRCReader,
-    }
-    text = path.suffix.lower() != ".blf"
+    kinds = (
+        (b"LOGG", can.BLFReader), (b"date", can.ASCReader), (b"(", can.CanutilsLogReader), (b";", can.TRCReader)
+    )  # fmt: skip
+    kind = next(one for begin, one in kinds if content.startswith(begin))
+    file = io.BytesIO(content) if kind is can.BLFReader else io.StringIO(content.decode("cp1252"))
     stamps: dict[tuple[str, str], list[float]] = defaultdict(list)
     values: dict[tuple[str, str], list[float]] = defaultdict(list)
     unread: Counter[str] = Counter()
-    for frame in kind[path.suffix.lower()](
-        io.StringIO(content.decode("cp1252")) if text else io.BytesIO(content)
-    ):
+    for frame in kind(file):
         message = known.get(frame.arbitration_id)
         if message is None or frame.is_error_frame or frame.is_remote_frame:
             unread[f"0x{frame.arbitration_id:x}"] += 1
@@ -359,8 +334,8 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     return _source(path, sha256, found, list(unread), f"messages decoded by {own[0].name}")
 
 
-_READERS = {
-    ".mf4": (_mdf, "MDF file"), ".mdf": (_mdf, "MDF file"), ".dat": (_mdf, "MDF file"), ".tdms": (_tdms, "TDMS file"),
-    ".mcap": (_mcap, "MCAP file"), ".bag": (_bag, "ROS bag"), ".db3": (_db3, "ROS 2 bag"), ".ulg": (_ulog, "PX4 log"),
-    ".blf": (_can, "CAN log"), ".asc": (_can, "CAN log"), ".log": (_can, "CAN log"), ".trc": (_can, "CAN log"),
-}  # fmt: skip
+_READERS = (
+    (b"MDF     ", _mdf, "MDF file"), (b"TDSm", _tdms, "TDMS file"), (b"\x89MCAP0", _mcap, "MCAP file"),
+    (b"#ROSBAG", _bag, "ROS bag"), (b"SQLite", _db3, "ROS 2 bag"), (b"ULog", _ulog, "PX4 log"),
+)  # fmt: skip
+"""How files begin, what reads them, and what they are; all others are CAN logs."""

@@ -120,7 +120,12 @@ class Source:
             raise InputError(
                 f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
             )
-        fields = [column for column in self.header if column.endswith(f".{name}")] or [
+        inner = f".{name}"
+        fields = [
+            column
+            for column in self.header
+            if column.endswith(inner) or name_and_unit(column)[0].endswith(inner)
+        ] or [
             column
             for column in self.header
             if name_and_unit(column)[0] == name or column == f"{name_and_unit(name)[0]} [s]"

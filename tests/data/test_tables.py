@@ -28,7 +28,10 @@ def text(rows, separator=",", above=(), header=NAMES, below=(), end="\n"):
 
 def first(stamp, form=None):
     """The table with stamps in place of the time."""
-    return [[stamp(s) if form is None else s.strftime(form), *row[1:]] for s, row in zip(STAMPS, PLAIN, strict=True)]
+    return [
+        [stamp(s) if form is None else s.strftime(form), *row[1:]]
+        for s, row in zip(STAMPS, PLAIN, strict=True)
+    ]
 
 
 def ms(stamp):
@@ -165,7 +168,11 @@ def test_a_table_is_read_to_the_last_digit(wrote, kind):
         np.testing.assert_allclose(found[name], np.asarray(values), **exact)
 
 
-LONG = [[ms(s), tag, row[j]] for s, row in zip(STAMPS, PLAIN, strict=True) for j, tag in ((1, "FIC-1.OP"), (2, "TI-7"))]
+LONG = [
+    [ms(s), tag, row[j]]
+    for s, row in zip(STAMPS, PLAIN, strict=True)
+    for j, tag in ((1, "FIC-1.OP"), (2, "TI-7"))
+]
 
 
 def test_long_form_is_a_column_a_tag(wrote):
@@ -183,10 +190,14 @@ def test_long_form_is_a_column_a_tag(wrote):
 
 def test_clocks_of_their_own_meet_by_the_rules_of_their_roles(wrote):
     """The input holds its last number; the output has one where it was sampled; rows before the first input go."""
-    rows = [[f"{0.5 * k:.1f}", "u", f"{k}"] for k in range(1, 9)] + [[f"{0.3 * k:.1f}", "y", f"{k}"] for k in range(15)]
+    rows = [[f"{0.5 * k:.1f}", "u", f"{k}"] for k in range(1, 9)] + [
+        [f"{0.3 * k:.1f}", "y", f"{k}"] for k in range(15)
+    ]
     columns = opened(wrote(text(rows, header=("time", "tag", "value")))).read("time", ["u", "y"], ["y"])
     t, u, y = columns.values.T
-    np.testing.assert_array_equal(t, np.unique(np.round([*0.5 * np.arange(1, 9), *0.3 * np.arange(2, 15)], 1)))
+    np.testing.assert_array_equal(
+        t, np.unique(np.round([*0.5 * np.arange(1, 9), *0.3 * np.arange(2, 15)], 1))
+    )
     np.testing.assert_array_equal(u, np.minimum(np.floor(t / 0.5 + 1e-9), 8))
     sampled = np.isclose(t / 0.3, np.round(t / 0.3))
     np.testing.assert_allclose(y[sampled], np.round(t[sampled] / 0.3))
