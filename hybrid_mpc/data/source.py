@@ -19,6 +19,8 @@ ALIKE = 0.7
 """How alike a column's name must be to be proposed: ``inflow_degC`` is by 0.6 like ``tank_degC``, by its unit alone."""
 LISTED = 30
 """Most names that a message lists."""
+FEWEST = 10
+"""Fewest samples before and behind the place where time begins anew."""
 COMPARED = 1000
 """Most names among which a message looks for one that is nearly right."""
 
@@ -71,11 +73,12 @@ class Columns:
         return f"{self.row} {self.numbers[k]}"
 
     def disorder(self, t: Array, stamps: str) -> str:
-        """Where time stamps ``t`` ``(m,)`` [s] do not increase, and what to do; empty where all do.
+        """Where time stamps ``t`` ``(m,)`` [s] do not increase, and what to do; empty where all do, or begin anew.
 
         ``stamps`` says what they come from, e.g. ``"column 't'"``.
         """
         wrong = np.diff(t) <= 0
+        wrong[[k - 1 for k in restarts(t)]] = False
         if not wrong.any():
             return ""
         k, such = int(np.argmax(wrong)), int(wrong.sum())
@@ -85,6 +88,23 @@ class Columns:
             f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete the repeated rows or "
             "split the file into recordings."
         )
+
+
+def restarts(t: Array) -> list[int]:
+    """Samples at which time stamps ``t`` ``(m,)`` begin anew: they fall back to where they began, and go on from there.
+
+    Example:
+        >>> restarts(np.r_[np.arange(50), np.arange(30)]), restarts(np.r_[np.arange(50), 20, np.arange(51, 90)])
+        ([50], [])
+    """
+    falls = (np.flatnonzero(t[1:] < t[:-1]) + 1).tolist()
+    if not falls:
+        return []
+    with np.errstate(over="ignore"):  # what overflows is out of its range
+        near = t[0] + 2 * float(np.median(np.abs(np.diff(t))))
+    ends = [*falls[1:], len(t)]
+    sound = all(t[k] <= near and end - k >= FEWEST for k, end in zip(falls, ends, strict=True))
+    return falls if sound and falls[0] >= FEWEST else []
 
 
 @dataclass(frozen=True)
@@ -106,6 +126,8 @@ class Source:
 
     def find(self, name: str) -> str:
         """Full name of a column: its own, ``struct.field`` where just one struct has it, or with its unit in brackets.
+
+        Fields of structs in structs come after those of structs.
 
         Raises:
             MissingColumn: If there is none.
@@ -130,6 +152,7 @@ class Source:
             for column in self.header
             if name_and_unit(column)[0] == name or column == f"{name_and_unit(name)[0]} [s]"
         ]
+        fields = [column for column in fields if column.count(".") == min(one.count(".") for one in fields)]
         if len(fields) == 1:
             return fields[0]
         if fields:

@@ -152,7 +152,9 @@ def _words_over_numbers(look: Look, below: Sequence[Look], comma: bool) -> bool:
         return is_number(cell) or (comma and is_number(cell, ","))
 
     return any(
-        cell and not is_value(cell, comma) and all(number(one.cells[j]) for one in below)
+        cell.casefold() not in BLANK
+        and not is_value(cell, comma)
+        and all(number(one.cells[j]) for one in below)
         for j, cell in enumerate(look.cells)
     )
 
@@ -446,10 +448,11 @@ def text_source(path: Path, content: bytes, sha256: str) -> Source:
         if layout and (best is None or one[:3] > best[:3]):
             best = one
     if best is None:
-        separator = max(
-            SEPARATORS, key=lambda one: len((_Body(path, text, one).looks() or [Look(0, [])])[0].cells)
-        )
-        first = next((look for look in _Body(path, text, separator).looks() if look.filled), Look(0, []))
+        looks = {one: _Body(path, text, one).looks() for one in SEPARATORS}
+        tops = {one: next((look for look in looks[one] if look.filled), Look(0, [])) for one in SEPARATORS}
+        separator = max([*SEPARATORS][:-1], key=lambda one: len(tops[one].cells))
+        separator = separator if len(tops[separator].cells) > 1 else " "
+        first = tops[separator]
         names = tuple(first.cells)
         best = (0.0, 0, 0, separator, Layout(first.row, first.row + 1, names, len(names)))
     separator, layout = best[3:]

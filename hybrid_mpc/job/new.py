@@ -57,7 +57,7 @@ class Draft:
     ``disturbances`` are measured and act on the machine, but nobody commands them. ``verdicts`` say by column why it
     has its role. ``loop`` says how a closed loop is seen, empty if none is; ``growth`` [1/s] is the rate at which the
     machine leaves its rest, zero if it does not; ``lags`` are first models of the outputs. ``length`` is that of the
-    shortest recording [s].
+    shortest recording [s]. ``notes`` say by file what was done to read it.
     """
 
     time: Column | None
@@ -74,6 +74,7 @@ class Draft:
     growth: float = 0.0
     length: float = 0.0
     lags: tuple[Lag, ...] = ()
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def unsure(self) -> dict[str, str]:
@@ -144,7 +145,7 @@ def write_scenario(
 
     Args:
         path: Python file to make; there must be none.
-        data: The recording (CSV, npz, mat), or several of one machine. Signals are the columns that all have.
+        data: The recording, or several of one machine. Signals are the columns that all have.
         inputs: Columns of the inputs. Default: those that look commanded (:mod:`hybrid_mpc.job.roles`).
         outputs: Columns of the outputs. Default: those that look measured.
         time: Column of the time. Default: one whose name says so, or else one that rises evenly.
@@ -257,7 +258,8 @@ def drafted(
     left_out |= {c.full: verdicts[c.full].reason for c in free if c.full not in used}
     runs = draft.runs
     lags = [first_lag(runs, i, draft.period, len(draft.inputs)) for i in range(len(draft.outputs))]
-    return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags)))
+    notes = {one.path.name: one.notes for one in sources if one.notes}
+    return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags), notes=notes))
 
 
 def _left_to_user(

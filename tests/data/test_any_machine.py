@@ -496,11 +496,9 @@ def test_two_decimal_marks_are_refused(tmp_path):
     file = tmp_path / "run.csv"
     file.write_text("t;u;y\n0;1;1,5\n0.01;1;1,5\n")
     (told, *_) = problems(file)
-    assert "numbers have commas and points: '1,5' in row 2, '0.01' in row 3" in told
-    file.write_text("t;u;y\n0;1;1.000,5\n")
-    assert "'1.000,5'" in problems(file)[0]
+    assert "numbers have commas and points, e.g. 0.01 and 1,5" in told
     file.write_text("t;u;y\n0;1\n")
-    assert "Separate cells by semicolons" in problems(file)[0]
+    assert "row 2 has 2 cells" in problems(file)[0]
 
 
 def test_names_with_units_in_brackets(tmp_path):

@@ -1,12 +1,16 @@
-"""Tables as engineers have them: known content is read to the last digit, and what is ambiguous is refused in a line."""
+"""Tables as engineers have them: known content is read to the last digit, what is ambiguous is refused in a line."""
 
 import datetime
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from machine_signals import machine
 
-from hybrid_mpc import InputError
+from hybrid_mpc import DataSpec, InputError, Signal, load_trajectories
 from hybrid_mpc.data.files import opened
+from hybrid_mpc.data.recording import read_recording
+from hybrid_mpc.job.new import drafted
 
 K = np.arange(40)
 T = np.array([float(f"{0.01 * k:.2f}") for k in K])
@@ -275,3 +279,44 @@ def test_what_was_done_is_said(wrote):
     told = "; ".join(source.notes)
     for words in ("rows 1 to 2 are a preamble; header in row 3", "decimal comma", "row", "44"):
         assert words in told
+
+
+# Time
+
+
+LOOSE = machine((Signal("y", "-"),), (Signal("u", "-"),))
+SPEC = DataSpec("t", ("u",), ("y",), dt=0.01, max_gap=0.05, smoothing=0.1, warm_up=0.05)
+
+
+def test_a_logger_that_was_started_again_is_cut_there(wrote):
+    path = wrote(text([*PLAIN, *PLAIN[:30]]))
+    recording = read_recording(path, LOOSE, SPEC)
+    (finding,) = recording.findings
+    assert (finding.kind, finding.count, finding.refused) == ("clock", 1, False)
+    assert finding.message.startswith("row 42, ")
+    np.testing.assert_array_equal(recording.y[:, 0], np.r_[Y, Y[:30]])
+    np.testing.assert_allclose(np.diff(recording.t), np.r_[np.full(39, 0.01), 0.15, np.full(29, 0.01)], atol=1e-12)
+    whole = load_trajectories([path], LOOSE, SPEC, needed=()).whole
+    assert [len(one.t) for one in whole] == [39, 29]
+    assert drafted([opened(path)], ("u",), ("y",), "t").period == pytest.approx(0.01)
+
+
+def test_rows_that_stand_twice_are_left_out(wrote):
+    recording = read_recording(wrote(text([*PLAIN[:10], PLAIN[9], *PLAIN[10:]])), LOOSE, SPEC)
+    np.testing.assert_array_equal(recording.t, T)
+    assert recording.findings[0].message.startswith("row 12, ")
+    other = [*PLAIN[:10], [PLAIN[9][0], "0.5", "1"], *PLAIN[10:]]
+    with pytest.raises(InputError, match=r"row 12, column 't': time repeats"):
+        read_recording(wrote(text(other)), LOOSE, SPEC)
+
+
+def test_a_slow_output_of_a_long_table_is_mostly_missing(wrote):
+    """A laboratory sample each second with a delay, beside an input at 100 Hz."""
+    rows = [[f"{0.01 * k:.2f}", "u", f"{np.sin(0.02 * k):.5f}"] for k in range(900)]
+    rows += [[f"{k + 0.003:.3f}", "y", f"{k}"] for k in range(9)]
+    spec = replace(SPEC, time="time", delays={"y": 0.5}, max_gap=0.1)
+    (whole,) = load_trajectories([wrote(text(rows, header=("time", "tag", "value")))], LOOSE, spec, needed=()).whole
+    known = np.isfinite(whole.y[:, 0])
+    assert 7 <= known.sum() <= 9
+    assert np.isfinite(whole.u).all()
+    np.testing.assert_allclose(whole.t[known], whole.y[known, 0] + 0.003 - 0.5, atol=0.005)
