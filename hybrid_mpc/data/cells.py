@@ -56,8 +56,6 @@ MINUTES = re.compile(r"(?P<M>\d{1,3}):(?P<S>\d{2})[.,](?P<f>\d{1,9})")
 WITH_UNIT = re.compile(
     r"(?P<number>[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\W\d_][^\d_,;]{0,11}|%|°\w?)"
 )
-GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}(?:([.,])\d{3})(?:\1\d{3})*")
-"""A number that may have marks between thousands, or three decimals."""
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?P<mark>[.,'’ \u00a0\u202f])\d{3})(?:(?P=mark)\d{3})*(?:[.,]\d*)?")
 """A number with marks between thousands."""
 
@@ -191,7 +189,8 @@ def _of_objects(cells: Sequence[Any], decimal: str) -> Cells:
     blank = np.array([text.casefold() in BLANK for text in texts], dtype=bool)
     values = np.array([number(_pointed(text, decimal)) for text in texts])
     if any(stamps) and all(a or b for a, b in zip(stamps, blank, strict=True)):
-        made = pd.Series(pd.to_datetime([None if b else c for b, c in zip(blank, cells, strict=True)]))
+        dates = pd.Series([None if b else c for b, c in zip(blank, cells, strict=True)], dtype=object)
+        made = pd.to_datetime(dates)
         return cells_of(made)._replace(blank=blank)
     if any(times) or any(stamps):
         texts = [

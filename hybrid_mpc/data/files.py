@@ -35,9 +35,9 @@ LONGEST_ROW = 2**20
 
 
 BEGINS = (
-    (re.compile(rb"PAR1|ARROW1"), "sheets", "arrow_source"),
-    (re.compile(rb"\x89HDF\r\n\x1a\n"), "sheets", "hdf5_source"),
-    (re.compile(rb"MATLAB (5.0|7.3) MAT-file"), "matlab", "mat_source"),
+    (re.compile(rb"PAR1|ARROW1"), ("sheets", "arrow_source")),
+    (re.compile(rb"\x89HDF\r\n\x1a\n"), ("sheets", "hdf5_source")),
+    (re.compile(rb"MATLAB (5.0|7.3) MAT-file"), ("matlab", "mat_source")),
     (
         re.compile(rb"MDF     |TDSm|\x89MCAP0\r\n|#ROSBAG V2|SQLite format 3|ULog\x01\x125|LOGG"),
         "loggers",
@@ -77,14 +77,14 @@ def opened(path: Path) -> Source:
     any other           a table of text: :mod:`hybrid_mpc.data.table`
     ==================  ==================================================================================
     """
-    kind = ENDS.get(path.suffix.lower())
-    content = _content(path, None if kind else _Rows(path))
-    if kind is None:
-        kind = next((found for begin, *found in BEGINS if begin.match(content)), ("table", "text_source"))
+    reader = ENDS.get(path.suffix.lower())
+    content = _content(path, None if reader else _Rows(path))
+    if reader is None:
+        reader = next((found for begin, found in BEGINS if begin.match(content)), ("table", "text_source"))
     if other := next((what for begin, what in OTHERS if content.startswith(begin)), ""):
         raise InputError(f"{path}: is {other}, which is not read. Save the table as .xlsx or as CSV (UTF-8).")
-    module = importlib.import_module(f"hybrid_mpc.data.{kind[0]}")
-    source: Source = getattr(module, kind[1])(path, content, hashlib.sha256(content).hexdigest())
+    module = importlib.import_module(f"hybrid_mpc.data.{reader[0]}")
+    source: Source = getattr(module, reader[1])(path, content, hashlib.sha256(content).hexdigest())
     return source
 
 
@@ -96,7 +96,7 @@ class _Rows:
 
     def check(self, piece: bytes) -> None:
         """See the next piece; what is no text has no rows."""
-        if self._first and any(begin.match(piece) for begin, *_ in BEGINS):
+        if self._first and any(begin.match(piece) for begin, _ in BEGINS):
             self._text = False
         self._first = False
         if not self._text:

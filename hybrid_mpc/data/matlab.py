@@ -6,6 +6,7 @@ import io
 import math
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,10 +89,11 @@ def columns_of_leaf(leaf: Leaf) -> Iterator[tuple[str, Callable[[], NDArray[Any]
     upright = leaf.shape[0] >= leaf.shape[1]
     for k in range(min(long)):
         where = f"(:,{k + 1})" if upright else f"({k + 1},:)"
-        yield (
-            f"{leaf.name}{where}",
-            (lambda k=k: leaf.read()[:, k]) if upright else (lambda k=k: leaf.read()[k]),
-        )
+        yield f"{leaf.name}{where}", partial(_taken, leaf.read, k, int(upright))
+
+
+def _taken(read: Callable[[], NDArray[Any]], k: int, axis: int) -> NDArray[Any]:
+    return read().take(k, axis)
 
 
 # v4 to v7

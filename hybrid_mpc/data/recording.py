@@ -548,7 +548,7 @@ def _one_clock(
         findings.append(
             Finding("clock", file, str(spec.time), float(values[k, 0]), int(twice.sum()), message)
         )
-        numbers = [columns.numbers[j] for j in np.flatnonzero(~twice)]
+        numbers = [columns.numbers[j] for j in np.flatnonzero(~twice).tolist()]
         columns, values = replace(columns, values=columns.values[~twice], numbers=numbers), values[~twice]
     t, begins = values[:, 0].copy(), restarts(values[:, 0])
     seconds = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -224,16 +225,15 @@ def _walked(group: Any, prefix: str, depth: int) -> Iterator[Leaf]:
         if item.dtype.names:
             for field in item.dtype.names:
                 if item.dtype[field].kind in "biuf":
-                    yield Leaf(
-                        f"{full}.{field}", item.shape, lambda item=item, field=field: _numbers(item)[field]
-                    )
+                    yield Leaf(f"{full}.{field}", item.shape, partial(_numbers, item, field))
         elif item.dtype.kind in "biufc":
-            yield Leaf(named, item.shape, lambda item=item: _numbers(item))
+            yield Leaf(named, item.shape, partial(_numbers, item))
 
 
-def _numbers(item: Any) -> np.ndarray[Any, Any]:
+def _numbers(item: Any, field: str = "") -> np.ndarray[Any, Any]:
+    """A dataset's numbers, or those of a field of its records; what it declares is looked at first."""
     if max(8, item.dtype.itemsize) * item.size > budget_of(item.file.id.get_filesize()):
         raise InputError(
             f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file"
         )
-    return np.asarray(item[()])
+    return np.asarray(item[()][field] if field else item[()])

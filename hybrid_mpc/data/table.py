@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.cells import (
     BLANK,
-    GROUPED,
     Cells,
     cause,
     cells_of,
@@ -272,7 +271,7 @@ class Frame:
     names: tuple[str, ...]
     columns: Callable[[Sequence[int]], list[pd.Series]]
     head: Sequence[pd.Series]
-    numbers: Sequence[int] | Rows
+    numbers: Sequence[int]
     text: Callable[[int, int], str]
     fault: Callable[[int, Array], str] = lambda place, values: ""
     decimal: str = "."
@@ -448,8 +447,10 @@ def text_source(path: Path, content: bytes, sha256: str) -> Source:
         if layout and (best is None or one[:3] > best[:3]):
             best = one
     if best is None:
-        looks = {one: _Body(path, text, one).looks() for one in SEPARATORS}
-        tops = {one: next((look for look in looks[one] if look.filled), Look(0, [])) for one in SEPARATORS}
+        tops = {
+            one: next((look for look in _Body(path, text, one).looks() if look.filled), Look(0, []))
+            for one in SEPARATORS
+        }
         separator = max([*SEPARATORS][:-1], key=lambda one: len(tops[one].cells))
         separator = separator if len(tops[separator].cells) > 1 else " "
         first = tops[separator]
@@ -531,7 +532,7 @@ class _Body:
         count, names = int(keep.sum()), layout.names
         if count * len(names) * 8 > 4 * LARGEST:
             raise InputError(f"{self.path}: has {count} rows, more than are read. Split the recording.")
-        numbers = rows.numbers[keep]
+        numbers = rows.numbers[keep].tolist()
         decimal, unsure = self._decimal(rows, keep, layout)
 
         def columns(places: Sequence[int]) -> list[pd.Series]:
@@ -608,13 +609,13 @@ class _Body:
             return decimal, other if other in grouped else ""
         return ("," if grouped == "," else "."), grouped
 
-    def _grouped(self, column: pd.Series, unsure: str, decimal: str, numbers: Sequence[int] | Rows) -> str:
+    def _grouped(self, column: pd.Series, unsure: str, decimal: str, numbers: Sequence[int]) -> str:
         """Whether a column's marks may stand between thousands, and may not: the fault, empty without one."""
         texts = column.astype(str).str.strip()
         if not (found := texts.str.contains(f"[{unsure}]", regex=True)).any():
             return ""
         whole = texts.str.fullmatch(r"[+-]?\d{1,3}")
-        single = texts.map(lambda cell: bool(m := GROUPED.fullmatch(cell)) and cell.count(m[1]) == 1)
+        single = texts.str.fullmatch(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
         blank = texts.str.casefold().isin(BLANK)
         told = decimal not in unsure or len(unsure) > 1  # another column shows another mark
         if (whole | single | blank).all() and (whole.any() or told):

@@ -70,7 +70,7 @@ def look(path: Path) -> Look:
     read, reasons = read_all(source)
     lengths = Counter(len(one.values) for one in read.values())
     rows = lengths.most_common(1)[0][0] if lengths else 0
-    findings = []
+    findings = list[str]()
     time, t, name = _time(source, findings, rows)
     columns = []
     for full in dict.fromkeys(source.header):
