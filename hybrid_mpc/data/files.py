@@ -39,14 +39,11 @@ BEGINS = (
     (re.compile(rb"\x89HDF\r\n\x1a\n"), ("sheets", "hdf5_source")),
     (re.compile(rb"MATLAB (5.0|7.3) MAT-file"), ("matlab", "mat_source")),
     (
-        re.compile(rb"MDF     |TDSm|\x89MCAP0\r\n|#ROSBAG V2|SQLite format 3|ULog\x01\x125|LOGG"),
-        "loggers",
-        "logger_source",
-    ),
-    (
-        re.compile(rb"date .*\r?\n\s*base (hex|dec)|\(\d+\.\d+\) \S+ [0-9A-Fa-f]+#|;\$FILEVERSION"),
-        "loggers",
-        "logger_source",
+        re.compile(
+            rb"MDF     |TDSm|\x89MCAP0\r\n|#ROSBAG V2|SQLite format 3|ULog\x01\x125|LOGG|"
+            rb"date .*\r?\n\s*base (hex|dec)|\(\d+\.\d+\) \S+ [0-9A-Fa-f]+#|;\$FILEVERSION"
+        ),
+        ("loggers", "logger_source"),
     ),
 )
 """How files of a format begin, and what reads them."""
