@@ -96,7 +96,8 @@ class Look(NamedTuple):
 class Layout:
     """Where a table stands: row index of its header (-1 without) and of its ``first`` row of values.
 
-    ``names`` are those of its columns, with units; ``width`` is the number of cells of its rows.
+    ``names`` are those of its columns, with units; ``width`` is the number of cells of its rows. ``clock`` is the
+    time of the sample 0 and the sampling time [s], where the first column counts samples and the header says so.
     """
 
     header: int
@@ -104,6 +105,7 @@ class Layout:
     names: tuple[str, ...]
     width: int
     notes: tuple[str, ...] = ()
+    clock: tuple[float, float] | None = None
 
 
 def layout_of(
@@ -127,7 +129,8 @@ def layout_of(
     best = max(runs, key=len, default=[])
     # words in a row, or the header again, part a table in two: it begins with the first part
     best = next((run for run in runs if len(run) >= STEADY and _alike(run, best, comma)), best)
-    while len(best) > 1 and _words_over_numbers(best[0], best[1:4], comma):
+    top = best and not any(look.filled for look in rows if look.row < best[0].row)
+    while len(best) > 1 and _words_over_numbers(best[0], best[1:4], comma, bool(top)):
         best = best[1:]
     if not best:
         return 0.0, ""
@@ -144,18 +147,20 @@ def _alike(one: Sequence[Look], other: Sequence[Look], comma: bool) -> bool:
     return kinds[0] == kinds[1]
 
 
-def _words_over_numbers(look: Look, below: Sequence[Look], comma: bool) -> bool:
-    """Whether a row has words where all rows below have numbers: a row of units, of which some look like numbers."""
+def _words_over_numbers(look: Look, below: Sequence[Look], comma: bool, top: bool) -> bool:
+    """Whether a row is none of values: it has words where all rows below have numbers, and is the first one of the
+    file (``top``), or all of its other cells may be units, too (``s,1,1``).
+    """
 
     def number(cell: str) -> bool:
         return is_number(cell) or (comma and is_number(cell, ","))
 
-    return any(
-        cell.casefold() not in BLANK
-        and not is_value(cell, comma)
-        and all(number(one.cells[j]) for one in below)
-        for j, cell in enumerate(look.cells)
-    )
+    words = [
+        j for j, cell in enumerate(look.cells) if cell.casefold() not in BLANK and not is_value(cell, comma)
+    ]
+    others = [cell for j, cell in enumerate(look.cells) if j not in words]
+    units = all(cell in ("", "1", "-", "%") for cell in others)
+    return (top or units) and any(all(number(one.cells[j]) for one in below) for j in words)
 
 
 def _headed(
@@ -167,6 +172,8 @@ def _headed(
     number: Callable[[int], int],
 ) -> Layout | str:
     """The layout by the rows above the first row of values; or why nobody knows which column is which."""
+    if scope := _of_a_scope(above, body[0].row, width):
+        return scope
     first, notes = body[0].row, list[str]()
     spare = width - 1 if all(not look.cells[-1] for look in body) else width  # separators at the ends of rows
     units: list[str] = []
@@ -211,6 +218,23 @@ def _headed(
             return f"row {number(first) - 1}, {named}"
         names = named
     return Layout(header, first, tuple(names), width, tuple(notes))
+
+
+def _of_a_scope(above: Sequence[Look], first: int, width: int) -> Layout | None:
+    """The layout of an oscilloscope's file, whose header names start and increment of the time (Rigol)."""
+    if len(above) < 2 or not {"start", "increment"} <= {cell.casefold() for cell in above[-2].cells}:
+        return None
+    header, values = above[-2], above[-1].cells
+    at = {cell.casefold(): j for j, cell in enumerate(header.cells)}
+    start, step = (values[at[key]] if at[key] < len(values) else "" for key in ("start", "increment"))
+    if not is_number(start) or not is_number(step):
+        return None
+    names = [
+        f"{name} [{unit}]" for name, unit in zip(header.cells[1 : at["start"]], values[1:], strict=False)
+    ]
+    names = ["time [s]", *names, *[""] * (width - len(names) - 1)]
+    note = f"row {first} gives the time: from {start} s, every {step} s"
+    return Layout(header.row, first, tuple(names[:width]), width, (note,), (float(start), float(step)))
 
 
 def _names_in(look: Look, width: int, spare: int, split: Callable[[int], list[list[str]]]) -> list[str]:
@@ -276,6 +300,7 @@ class Frame:
     fault: Callable[[int, Array], str] = lambda place, values: ""
     decimal: str = "."
     notes: tuple[str, ...] = ()
+    clock: tuple[float, float] | None = None
 
 
 @dataclass
@@ -294,7 +319,11 @@ class _Reader:
         read = dict(zip(places, self.frame.columns(places), strict=True)) if places else {}
         for name in missing:
             columns = [read[place] for place in self.places[name]]
-            self.done[name] = cells_of(_joined(columns), self.frame.decimal)
+            cells = cells_of(_joined(columns), self.frame.decimal)
+            if self.frame.clock is not None and self.places[name] == (0,):
+                start, step = self.frame.clock
+                cells = cells._replace(values=start + step * cells.values)
+            self.done[name] = cells
         return [self.done[name] for name in names]
 
     def read(self, time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
@@ -575,6 +604,7 @@ class _Body:
             lambda j, values: fault(places[j], values),
             decimal,
             tuple(notes),
+            layout.clock,
         )
 
     def _kept_text(self, rows: _Rows, keep: NDArray[np.bool_]) -> bytes:

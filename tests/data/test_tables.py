@@ -134,6 +134,11 @@ TABLES = {
     "time of day past midnight": (text(first(lambda s: f"{s:%H:%M:%S.%f}")), {"t [s]": 86399.7 + T}),
     "minutes and seconds": (text([[f"{k // 6:02d}:{k % 6 * 10:02d}.5", *r[1:]] for k, r in enumerate(PLAIN)]), {"t [s]": 10.0 * K + 0.5}),
     "microseconds since 1970": (text([[f"{1711843199700000 + 10000 * k}", *r[1:]] for k, r in enumerate(PLAIN)]), {"t": 1711843199.7e6 + 1e4 * K}),
+    "an oscilloscope's": (
+        text([[str(k), row[1], row[2], ""] for k, row in enumerate(PLAIN)], header=(),
+             above=["X,CH1,CH2,Start,Increment,", "Sequence,Volt,Volt,-1.5e-01,2.5e-03"]),
+        {"time [s]": -0.15 + 2.5e-3 * K, "CH1 [Volt]": U, "CH2 [Volt]": Y},
+    ),
     "sixteen digits": (text([[r[0], repr(np.pi * 10.0 ** (k - 20)), r[2]] for k, r in enumerate(PLAIN)]), {"u": [float(repr(np.pi * 10.0 ** (int(k) - 20))) for k in K]}),
 }  # fmt: skip
 """Contents by kind, and columns as they are read."""

@@ -394,21 +394,21 @@ def test_the_column_that_says_time_is_the_time(tmp_path, name, unit):
 
 REPEATED = stamps()[:100] + stamps()[99:299]
 RESTARTED = stamps(rows=150) + stamps(rows=150)
+BROKEN = stamps(rows=150) + stamps(rows=150, start=1.0)
 
 
 @pytest.mark.parametrize(
     ("time", "match"),
     [
         (REPEATED, "row 102, column 't': time repeats"),
-        (RESTARTED, "row 152, column 't': time decreases"),
+        (BROKEN, "row 152, column 't': time decreases"),
         (stamps()[::-1], "time decreases"),
         (["1.5"] * 300, "time repeats"),
         (["", *stamps()[1:]], "row 2, column 't' is empty"),
         ([*stamps()[:299], "Mean"], "row 301, column 't' is 'Mean'"),
-        ([f"2024-01-01 10:{k // 60:02d}:{k % 60:02d}" for k in range(300)], "a date or a time of day"),
-        ([f"10:{k // 60:02d}:{k % 60:02d}" for k in range(300)], "a date or a time of day"),
+        ([f"10:{k // 60:02d}" for k in range(300)], "hours and minutes|minutes and seconds"),
         (["s", *stamps(rows=299)], "row 2, column 't' is 's'"),
-        ([f"{0.02 * k:.2f} s" for k in range(300)], "a number with a unit"),
+        ([f"{0.02 * k:.2f} {'s' if k else 'V'}" for k in range(300)], "a number with a unit"),
     ],
 )
 @pytest.mark.parametrize("asked", ["", "t"])
@@ -418,6 +418,21 @@ def test_a_time_that_cannot_be_used_is_refused_with_its_reason(tmp_path, time, m
     with pytest.raises(InputError, match=match):
         write_scenario(tmp_path / "m.py", file, time=asked)
     assert not (tmp_path / "m.py").exists()
+
+
+@pytest.mark.parametrize(
+    ("time", "period"),
+    [
+        (RESTARTED, 0.02),
+        ([f"2024-01-01 10:{k // 60:02d}:{k % 60:02d}" for k in range(300)], 1.0),
+        ([f"10:{k // 60:02d}:{k % 60:02d}" for k in range(300)], 1.0),
+        ([f"{0.02 * k:.2f} s" for k in range(300)], 0.02),
+    ],
+)
+def test_dates_units_in_cells_and_restarts_are_a_time(tmp_path, time, period):
+    draft = write_scenario(tmp_path / "m.py", logged(tmp_path / "a.csv", time, "t", {"index": range(300)}))
+    assert draft.time.name == "t"
+    assert draft.period == pytest.approx(period)
 
 
 @pytest.mark.parametrize("name", ["Time [ticks]", "time [V]", "Date", "Datum"])
