@@ -73,14 +73,16 @@ def _source(
     found = [one for one in found if len(one[3])]
     if not found:
         raise InputError(f"{path}: has no signal with numbers. Record some, or export them as CSV.")
-    names = _distinct([(group, own) for group, own, *_ in found])
-    series = [
-        Series(_named(name, unit), t, np.asarray(values, np.float64))
-        for name, (_, _, unit, t, values) in zip(names, found, strict=True)
-    ]
+    names, twice, series = _distinct([(group, own) for group, own, *_ in found]), 0, list[Series]()
+    for name, (_, _, unit, t, values) in zip(names, found, strict=True):
+        last = np.r_[np.diff(t) != 0, True]  # of samples with one stamp the last one
+        twice += int((~last).sum())
+        series.append(Series(_named(name, unit), t[last], np.asarray(values, np.float64)[last]))
     told = f" Not read are {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
     clocks = len({(len(one.t), *one.t[[0, -1]]) for one in series})
     notes = (*([note] if note else []), f"{len(series)} signals, {clocks} clock{'s' * (clocks > 1)}")
+    if twice:
+        notes = (*notes, f"of samples with the same stamp the last one is read: {twice} are left out")
     return replace(clocked(path, sha256, series, note=told), unread=tuple(unread), notes=notes)
 
 

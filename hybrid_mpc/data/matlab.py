@@ -125,14 +125,20 @@ def _leaves(path: Path, content: bytes) -> list[Leaf]:
 def _walked(name: str, value: Any, depth: int) -> Iterator[Leaf]:
     from scipy.io.matlab import MatlabObject, MatlabOpaque
 
-    if isinstance(value, MatlabOpaque | MatlabObject):
-        yield Leaf(name, what=f"{OBJECTS} of class {getattr(value, 'classname', 'unknown')}")
+    if isinstance(value, MatlabOpaque) or (isinstance(value, MatlabObject) and value.dtype.names is None):
+        kind = getattr(value, "classname", "unknown")
+        yield Leaf(name, what=f"{OBJECTS} of class {kind}", kind=kind)
     elif not isinstance(value, np.ndarray):
         yield Leaf(name, what="sparse matrices")
+    elif value.size > MOST_STRUCTS and value.dtype.kind in "VO":
+        yield Leaf(name, what="arrays of structs" if value.dtype.names else "cells")
+    elif depth > DEEPEST:
+        yield Leaf(name, what="structs in structs")
+    elif value.dtype.kind == "O":
+        for k, one in enumerate(value.ravel(), 1):
+            yield from _walked(f"{name}{{{k}}}" if value.size > 1 else name, one, depth + 1)
     elif value.dtype.names is None:
         yield Leaf(name, value.shape, lambda: value)
-    elif value.size > MOST_STRUCTS or depth > DEEPEST:
-        yield Leaf(name, what="arrays of structs")
     else:
         for k, one in enumerate(value.ravel(), 1):
             where = f"{name}({k})" if value.size > 1 else name
@@ -183,6 +189,9 @@ def _walked_73(file: Any, name: str, item: Any, depth: int) -> Iterator[Leaf]:
                 yield from _walked_73(file, f"{name}.{field}", inner, depth + 1)
     elif item.attrs.get("MATLAB_empty", 0):
         yield Leaf(name, (0, 0), lambda: np.zeros(0))
+    elif kind == "cell" and item.dtype == h5py.ref_dtype and item.size <= MOST_STRUCTS and depth <= DEEPEST:
+        for k, one in enumerate(item[()].ravel(), 1):
+            yield from _walked_73(file, f"{name}{{{k}}}" if item.size > 1 else name, file[one], depth + 1)
     elif kind in ("cell", "function_handle") or item.dtype.kind not in "biufc":
         yield Leaf(name, what="cells")
     elif kind == "char":

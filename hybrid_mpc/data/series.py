@@ -36,21 +36,14 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
     rows before their first one are left out.
     """
     by_name = {one.name: one for one in series}
-    clocks = {id(one.t): one.t for one in series}
+    found = {one.name: fault for one in series if (fault := one.fault or _disorder(one))}
 
     def read(asked: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
         names = [*([] if asked is None else [asked]), *wanted]
-        chosen = [by_name[name] for name in names if name != time] or list(series)
-        stamps = {id(one.t): one.t for one in chosen} or clocks
-        faults = {one.name: one.fault for one in chosen if one.fault}
-        for one in chosen:
-            if (np.diff(one.t) <= 0).any() and one.name not in faults:
-                k = int(np.argmax(np.diff(one.t) <= 0))
-                faults[one.name] = (
-                    f"column {shown(one.name)}: sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at "
-                    f"{one.t[k]:.10g} s. Time stamps must increase: delete the repeated samples, or split the file."
-                )
-        t = np.unique(np.concatenate(list(stamps.values())))
+        faults = {name: found[name] for name in names if name in found}
+        sound = [by_name[name] for name in names if name != time and name not in found]
+        stamps = [one.t for one in sound] or [one.t for one in series if one.name not in found]
+        t = np.unique(np.concatenate([np.zeros(0), *stamps]))
         values = np.full((len(t), len(names)), np.nan)
         first = t[0] if len(t) else 0.0
         for j, name in enumerate(names):
@@ -75,3 +68,15 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
     if len(by_name) < len(series):
         raise InputError(f"{path}: two signals have the same name and the same clock. Rename one.")
     return Source(path, sha256, (time, *by_name), read, note)
+
+
+def _disorder(one: Series) -> str:
+    """Where the stamps of a signal do not increase; empty where all do."""
+    falls = np.diff(one.t) <= 0
+    if not falls.any():
+        return ""
+    k = int(np.argmax(falls))
+    return (
+        f"column {shown(one.name)}: sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at {one.t[k]:.10g} s. "
+        "Time stamps must increase: delete the repeated samples, or split the file."
+    )

@@ -367,6 +367,7 @@ def _sampling_time(source: Source, full: str, said: Said) -> Clock | None:
         values = source.read(None, [full], ()).values[:, 0]
     except InputError:
         return None
+    values = values[np.isfinite(values)]
     if not (len(values) and 0 < values[0] < math.inf and (values == values[0]).all()):
         return None
     if said.unit and said.seconds is None:

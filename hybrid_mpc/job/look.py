@@ -124,7 +124,7 @@ def _time(source: Source, findings: list[str], rows: int) -> tuple[str, Array, s
     place = source.read(None, [name], ()).place
     if len(gaps):
         k = int(gaps[np.argmax(steps[gaps])])
-        findings.append(f"{len(gaps)} gaps in the time, the longest {steps[k]:.4g} s before {place(k + 1)}")
+        findings.append(f"gaps in the time: {len(gaps)}, the longest {steps[k]:.4g} s before {place(k + 1)}")
     for k in restarts(t):
         findings.append(f"{place(k)}: time begins anew; a recording is cut there")
     if clock.doubt:
@@ -136,11 +136,14 @@ def _odd(full: str, values: Array) -> list[str]:
     """Numbers of a column that may be none."""
     if (code := missing_code(values)) is not None:
         count = int((values == code).sum())
+        rows = f"{count} row{'s' * (count > 1)}"
         return [
-            f"column {shown(full)}: {code:.10g} in {count} rows is far from all other values: a code for missing ones?"
+            f"column {shown(full)}: {code:.10g} in {rows} is far from all others: a code for missing ones?"
         ]
     if (odd := outliers(values)) is not None:
-        return [f"column {shown(full)}: {len(odd)} values are far from all others, e.g. {values[odd[0]]:.6g}"]
+        return [
+            f"column {shown(full)}: {len(odd)} of its values far from all others, e.g. {values[odd[0]]:.6g}"
+        ]
     return []
 
 

@@ -50,7 +50,7 @@ def test_a_look_says_columns_time_gaps_and_what_stands_out(file):
     assert abs(float(u.high) - U.max()) < 0.01 * np.ptp(U)
     assert code.count == 200
     told = "\n".join(found.findings)
-    for words in ("-9999 in 1 row", "1 gaps", "4.01 s before row 104"):
+    for words in ("-9999 in 1 row", "gaps in the time: 1", "4.01 s before row 104"):
         assert words in told
     assert "header in row 3" in " ".join(found.notes)
     np.testing.assert_allclose(found.t, T, rtol=1e-9)
