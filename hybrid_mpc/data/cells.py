@@ -30,6 +30,8 @@ PAIRS = (
 """Words for the two positions of a switch, 0 and 1, in small letters."""
 SWITCH = frozenset(word for pair in PAIRS for word in pair)
 DAY = 86400.0
+FAR = 20.0
+"""Usual steps of dates by which none is away from the next one, where the order of day and month must be told."""
 SEEN = 100
 """Cells that are looked at before all are read as dates of ISO 8601."""
 ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}(:\d{2}([.,]\d{1,9})?)?(Z|[+-]\d{2}:?\d{2})?")
@@ -285,13 +287,17 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
         return Cells(within / 1e9, none > 0, "s", TIMES)
     if pattern is MINUTES:
         return Cells(within / 1e9, none > 0, "s", "minutes and seconds read as seconds")
-    days = _days(parts)
-    if isinstance(days, str):
-        return _no_stamps(words, days)
     zone = _zone(parts)
     if zone is None:
         return _no_stamps(words, "the names of their time zones differ. Write the offset, e.g. +02:00")
-    total = days * 86400 * 10**9 + within - zone
+    ways = [days * 86400 * 10**9 + within - zone for days in _days(parts)]
+    if not ways:
+        return _no_stamps(words, "there is no such day. Correct that row")
+    if any((np.diff(way) != np.diff(ways[0])).any() for way in ways[1:]):
+        ways = [way for way in ways if _goes_on(way)]
+        if len(ways) != 1:
+            return _no_stamps(words, "day or month first? Write year, month and day, e.g. 2024-01-31")
+    total = ways[0]
     done = f"dates read as seconds since {words[0]}"
     return Cells((total - total[0]) / 1e9, none > 0, "s", done)
 
@@ -300,10 +306,15 @@ def _no_stamps(words: Sequence[str], fault: str) -> Cells:
     return Cells(np.full(len(words), np.nan), np.zeros(0, bool), fault=f"its dates, as {words[0]!r}: {fault}")
 
 
-def _days(parts: pd.DataFrame) -> NDArray[np.int64] | str:
-    """Days since 1970; or why they are not known."""
+def _goes_on(stamps: NDArray[np.int64]) -> bool:
+    """Whether stamps of different rows increase, and none by far more than usual."""
+    steps = np.diff(stamps)
+    return bool((steps > 0).all() and steps.max() <= FAR * np.median(steps))
+
+
+def _days(parts: pd.DataFrame) -> list[NDArray[np.int64]]:
+    """Days since 1970, by every way to read the dates: none where there are no such days."""
     year = parts["Y"].to_numpy(np.int64)
-    year = np.where(year < 100, year + 2000, year)
     if "name" in parts:
         begins = {begin: k + 1 for k, names in enumerate(MONTHS) for begin in names}
         small = parts["name"].str.casefold()
@@ -312,27 +323,22 @@ def _days(parts: pd.DataFrame) -> NDArray[np.int64] | str:
     if "a" not in parts:
         return _since_1970(year, parts["m"].to_numpy(np.int64), parts["d"].to_numpy(np.int64))
     first, second = parts["a"].to_numpy(np.int64), parts["b"].to_numpy(np.int64)
-    ways = [_since_1970(year, second, first), _since_1970(year, first, second)]
+    ways = _since_1970(year, second, first)
     if (parts["sep"] == ".").all():
-        return ways[0]
-    sound = [way for way in ways if not isinstance(way, str)]
-    if len(sound) == 2 and (np.diff(sound[0]) != np.diff(sound[1])).any():
-        return "day or month first? Write year, month and day, e.g. 2024-01-31"
-    return sound[0] if sound else ways[0]
+        return ways
+    ways += _since_1970(year, first, second)
+    return ways + (_since_1970(first, second, year) if (year < 100).all() else [])
 
 
 def _since_1970(
     year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int64]
-) -> NDArray[np.int64] | str:
-    wrong = "there is no such day. Correct that row"
+) -> list[NDArray[np.int64]]:
     if (month < 1).any() or (month > 12).any() or (day < 1).any():
-        return wrong
+        return []
+    year = np.where(year < 100, year + 2000, year)
     months = ((year - 1970) * 12 + month - 1).astype("datetime64[M]")
     days = months.astype("datetime64[D]") + (day - 1)
-    if (days.astype("datetime64[M]") != months).any():
-        return wrong
-    found: NDArray[np.int64] = days.astype(np.int64)
-    return found
+    return [days.astype(np.int64)] if (days.astype("datetime64[M]") == months).all() else []
 
 
 def _zone(parts: pd.DataFrame) -> NDArray[np.int64] | None:

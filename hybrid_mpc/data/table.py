@@ -197,12 +197,22 @@ def _headed(
         elif not last.is_data(comma) and not last.cells[0].startswith(COMMENTS):
             counts = [len([cell for cell in cells if cell]) for cells in (last.cells, *split(last.row)[1:-1])]
             count = max(counts)
-            if count > 1 and abs(count - width) < 3 and max(width, count) > 2:
+            if count > 1 and max(width, count) > 2 and (count > 2 or width <= 2 * count):
                 return (
                     f"row {number(first)} has {width} cells, the header (row {number(last.row)}) has {count}. Separate "
                     "all cells in one way, write decimals with a point, and complete or delete the row."
                 )
     if header < 0:
+        counted = (
+            [str(k) for k in range(width)],
+            [str(k + 1) for k in range(width)],
+            ["", *map(str, range(width - 1))],
+        )
+        if width > 2 and body[0].cells in counted:
+            return (
+                f"row {number(first)} counts columns: a header, or values? Write a first row with a name for each "
+                "column, e.g. 'time [s]'."
+            )
         names = [f"column {j + 1}" for j in range(width)]
         notes.append("no header; columns are named by their number")
     before = [look for look in above if look.row < header] if header >= 0 else list(above)
@@ -428,6 +438,8 @@ def _in_long_form(source: Source, frame: Frame, reader: _Reader) -> Source | Non
         (reader.places[n][0] for n in source.header if small[n] in ("unit", "units", "einheit")), None
     )
     several = list(dict.fromkeys(said))
+    if all(map(is_number, several)) and not small[tags[0]].endswith("id"):
+        return None
     values = [n for n in source.header if small[n] in VALUES] or [
         n
         for n in source.header

@@ -21,6 +21,7 @@ GERMAN = [[cell.replace(".", ",") for cell in row] for row in PLAIN]
 NAMES = ("t", "u", "y")
 BEGIN = datetime.datetime(2024, 3, 30, 23, 59, 59, 700_000)  # passes midnight after 0.3 s
 STAMPS = [BEGIN + datetime.timedelta(milliseconds=10 * int(k)) for k in K]
+PAST = datetime.timedelta(days=26)
 TRUE = {"t": T, "u": U, "y": Y}
 
 
@@ -124,6 +125,8 @@ TABLES = {
     ),
     "day first": (text(first(lambda s: f"{s:%d/%m/%Y %H:%M:%S}.{s.microsecond // 1000:03d}")), SECONDS),
     "month first": (text(first(lambda s: f"{s:%m/%d/%Y %I:%M:%S}.{s.microsecond // 1000:03d} {s:%p}")), SECONDS),
+    "month first over midnight": (text(first(lambda s: f"{s - PAST:%m/%d/%Y %H:%M:%S.%f}")), SECONDS),
+    "two digits of a year": (text(first(lambda s: f"{s:%y-%m-%d %H:%M:%S.%f}")), SECONDS),
     "months by name": (text(first(lambda s: f"{s:%d-%b-%Y %H:%M:%S}.{s.microsecond // 1000:03d}")), SECONDS),
     "milliseconds behind a colon": (text(first(lambda s: f"{s:%Y-%m-%d %H:%M:%S}:{s.microsecond // 1000:03d}")), SECONDS),
     "date and time": (
@@ -221,8 +224,12 @@ def test_one_sensor_a_row(wrote):
     np.testing.assert_array_equal(columns.values, np.c_[np.arange(1, 20, 2), np.arange(1, 20, 2) / 8])
 
 
-def without(column):
-    return [[c for j, c in enumerate(row) if j != column] for row in PLAIN]
+def test_a_signal_is_no_tag(wrote):
+    """A column of numbers that is called a signal, and words that do not repeat, name no signals."""
+    path = wrote(text([[row[0], str(k % 2), row[2]] for k, row in enumerate(PLAIN)], header=("time", "signal", "value")))
+    same = numbers(path)
+    np.testing.assert_array_equal(same["signal"], K % 2)
+    np.testing.assert_array_equal(same["value"], Y)
 
 
 def cell(row, column, value, rows=PLAIN):
@@ -251,6 +258,9 @@ AMBIGUOUS = {
     "a switch among numbers": (text(cell(7, 1, "ON")), "row 9, .*switch"),
     "a short row": (text([*PLAIN[:9], PLAIN[9][:2], *PLAIN[10:]]), "row 11 has 2 cells"),
     "a long row": (text([*PLAIN[:9], [*PLAIN[9], "1"], *PLAIN[10:]]), "row 11 has 4 cells"),
+    "a header of numbers": (text(PLAIN, header=("0", "1", "2")), "row 1 counts columns"),
+    "decimal commas between commas": (text(GERMAN), "row 2 has 6 cells, the header .row 1. has 3"),
+    "a month a row": (text([[f"0{1 + k % 9}/0{1 + k // 9}/2024", *r[1:]] for k, r in enumerate(PLAIN)]), "day or month"),
     "a header too short": (text(PLAIN, header=("t", "u")), "row 2 has 3 cells, the header .row 1. has 2"),
     "a header by other separators": (text(PLAIN, ";", header=("t,u,y,z",)), "row 2 has 3 cells, .* has 4"),
     "units that contradict": (text(PLAIN, header=("t", "u", "y [K]")).replace("]", "]\ns,V,degC", 1), "row 2, .*'degC'.*'K'"),
