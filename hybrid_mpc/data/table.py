@@ -180,7 +180,7 @@ def _headed(
     candidates = list(above)
     if (
         len(candidates) > 1
-        and _are_units(candidates[-1], width)
+        and _are_units(candidates[-1], candidates[-2], width)
         and _names_in(candidates[-2], width, spare, split)
     ):
         units = candidates.pop().cells
@@ -213,7 +213,7 @@ def _headed(
                 f"row {number(first)} counts columns: a header, or values? Write a first row with a name for each "
                 "column, e.g. 'time [s]'."
             )
-        names = [f"column {j + 1}" for j in range(width)]
+        names = [f"column {j + 1}" if j < spare else "" for j in range(width)]
         notes.append("no header; columns are named by their number")
     before = [look for look in above if look.row < header] if header >= 0 else list(above)
     if before:
@@ -265,16 +265,19 @@ def _names_in(look: Look, width: int, spare: int, split: Callable[[int], list[li
     return []
 
 
-def _are_units(look: Look, width: int) -> bool:
-    """Whether a row holds units: half of its cells, and one at least that is more than a number or a dash."""
+def _are_units(look: Look, above: Look, width: int) -> bool:
+    """Whether a row holds the units of the names ``above`` it, and is no header below a preamble.
+
+    All of its cells are units, or dashes, and one at least is more. ``T``, ``V`` may be names, too: of two rows the
+    names are where the time is.
+    """
     filled = look.filled
     known = [cell for cell in filled if is_unit(cell)]
     plain = [c for c in filled if c.strip("[]()") in ("", "-", "1", "%") or re.fullmatch(r"[\[(].*[\])]", c)]
-    return (
-        width - 1 <= len(look.cells) <= width
-        and bool(known)
-        and 2 * len({*known, *plain}) >= len(set(filled))
-    )
+    if not known or len({*known, *plain}) < len(set(filled)) or not width - 1 <= len(look.cells) <= width:
+        return False
+    times = [any(said_by(cell).kind == "time" for cell in row.filled) for row in (look, above)]
+    return not times[0] or times[1] or filled[0] in ("s", "ms", "us", "ns", "min", "h")
 
 
 def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | str:
@@ -671,11 +674,11 @@ class _Body:
 
 def split(line: str, separator: str) -> list[str]:
     """The cells of a row, without blanks around them."""
-    if separator == " ":
+    if separator == " " and '"' not in line:
         return line.split()
     if '"' in line:
         try:
-            cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+            cells = next(csv.reader([line.strip(" ")], delimiter=separator, skipinitialspace=True), [])
         except csv.Error:
             cells = [line]
         return [cell.strip() for cell in cells]
@@ -700,7 +703,8 @@ def _rows(path: Path, text: bytes, separator: str) -> _Rows:
     newline = codes == 10
     visible = (codes > 32) & (codes != 34)
     if separator == " ":
-        is_sep = visible & ~np.r_[False, visible[:-1]]  # where cells begin
+        marks = visible | (codes == 34)
+        is_sep = marks & ~np.r_[False, marks[:-1]]  # where cells begin
     else:
         is_sep = codes == ord(separator)
         visible &= ~is_sep
@@ -714,7 +718,7 @@ def _rows(path: Path, text: bytes, separator: str) -> _Rows:
             )
         all_ends = np.flatnonzero(newline)
         newline &= outside
-        is_sep &= outside
+        is_sep &= np.r_[True, outside[:-1]] if separator == " " else outside
         numbers = all_ends
     ends = np.flatnonzero(newline)
     if not text.endswith(b"\n"):
