@@ -71,13 +71,13 @@ def opened(path: Path) -> Source:
     Parquet, Feather    columns
     HDF5                datasets: vectors, matrices, tables
     loggers             MDF, TDMS, ROS bags, MCAP, PX4 and CAN logs: :mod:`hybrid_mpc.data.loggers`
-    any other           a table of text: :mod:`hybrid_mpc.data.table`
+    any other           a table of text: :mod:`hybrid_mpc.data.text`
     ==================  ==================================================================================
     """
     reader = ENDS.get(path.suffix.lower())
     content = _content(path, None if reader else _Rows(path))
     if reader is None:
-        reader = next((found for begin, found in BEGINS if begin.match(content)), ("table", "text_source"))
+        reader = next((found for begin, found in BEGINS if begin.match(content)), ("text", "text_source"))
     if other := next((what for begin, what in OTHERS if content.startswith(begin)), ""):
         raise InputError(f"{path}: is {other}, which is not read. Save the table as .xlsx or as CSV (UTF-8).")
     module = importlib.import_module(f"hybrid_mpc.data.{reader[0]}")

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybrid_mpc.data.frames import HEAD, Frame, frame_source
+from hybrid_mpc.data.layout import MOST_SEEN, STEADY, Layout, Look, layout_of
 from hybrid_mpc.data.matlab import Leaf, columns_of_leaf
 from hybrid_mpc.data.source import LISTED, Source, line_of, megabytes
-from hybrid_mpc.data.table import HEAD, MOST_SEEN, STEADY, Frame, Layout, Look, frame_source, layout_of
 from hybrid_mpc.data.vectors import LARGEST, budget_of, vector_source
 from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.records import shown
