@@ -64,7 +64,9 @@ def test_two_million_rows_are_read(tmp_path):
     rows = np.c_[t, np.round(np.cos(3 * t), 4), np.round(np.sin(3 * t), 4)]
     np.savetxt(path, rows, delimiter=",", header="time_s,tau,phi", comments="", fmt=("%.3f", "%.4f", "%.4f"))
     write_csv(tmp_path / "short.csv", bombs.GOOD)
-    read_recording(tmp_path / "short.csv", bombs.SIGNALS, bombs.SPEC)  # what is loaded at the first use is loaded now
+    read_recording(
+        tmp_path / "short.csv", bombs.SIGNALS, bombs.SPEC
+    )  # what is loaded at the first use is loaded now
     begin = time.process_time()
     table = read_recording(path, bombs.SIGNALS, bombs.SPEC)
     assert time.process_time() - begin < SECONDS  # 1.8 s on an idle machine; the promise is 3 s

@@ -44,6 +44,7 @@ def near(t, expected):
 
 
 def test_a_workbook(tmp_path):
+    pytest.importorskip("openpyxl", reason="openpyxl is not installed")
     path = tmp_path / "run.xlsx"
     FRAME.to_excel(path, index=False)
     np.testing.assert_allclose(
@@ -56,8 +57,7 @@ def test_a_workbook(tmp_path):
 
 
 def test_a_sheet_with_a_preamble_units_and_closing_rows(tmp_path):
-    import openpyxl
-
+    openpyxl = pytest.importorskip("openpyxl", reason="openpyxl is not installed")
     path, book = tmp_path / "run.xlsx", openpyxl.Workbook()
     rows = [
         ["Test bench 5"],
@@ -90,6 +90,7 @@ def test_a_sheet_with_a_preamble_units_and_closing_rows(tmp_path):
 
 @pytest.mark.parametrize("ending", ["parquet", "feather"])
 def test_columns_of_arrow(tmp_path, ending):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     path = tmp_path / f"run.{ending}"
     write = pd.DataFrame.to_parquet if ending == "parquet" else pd.DataFrame.to_feather
     write(FRAME, path)
@@ -104,6 +105,7 @@ def test_columns_of_arrow(tmp_path, ending):
 
 
 def test_an_index_of_dates_with_a_zone(tmp_path):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     frame = DATED.set_index(DATED.time.dt.tz_localize("Europe/Berlin"))[["u", "y"]]
     frame.to_parquet(tmp_path / "run.parquet")
     t, u = read(tmp_path / "run.parquet", "time", ["u"])
@@ -370,7 +372,7 @@ def test_can_with_its_database(tmp_path, ending):
 @pytest.mark.parametrize(
     ("name", "begin", "package"),
     [
-        ("a.mf4", b"MDF     4.10", "asammdf"), ("a.tdms", b"TDSm", "nptdms"), ("a.bag", b"#ROSBAG V2.0\n", "rosbags"),
+        ("a.mf4", b"MDF     4.10", "asammdf"), ("a.tdms", b"TDSm", "nptdms"), ("a.bag", b"#ROSBAG V2.0\n", "mcap"),
         ("a.ulg", b"ULog\x01\x125", "pyulog"), ("a.blf", b"LOGG", "can"), ("a.mcap", b"\x89MCAP0\r\n", "mcap"),
         ("a.h5", b"\x89HDF\r\n\x1a\n", "h5py"), ("a.parquet", b"PAR1", "pyarrow"), ("a.xlsx", b"PK\3\4", "openpyxl"),
     ],

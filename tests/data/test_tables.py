@@ -1,6 +1,7 @@
 """Tables as engineers have them: known content is read to the last digit, what is ambiguous is refused in a line."""
 
 import datetime
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,9 @@ PLAIN = [[f"{0.01 * k:.2f}", f"{np.cos(0.3 * k):.6f}", f"{20 + 5 * np.sin(0.1 * 
 GERMAN = [[cell.replace(".", ",") for cell in row] for row in PLAIN]
 NAMES = ("t", "u", "y")
 BEGIN = datetime.datetime(2024, 3, 30, 23, 59, 59, 700_000)  # passes midnight after 0.3 s
+ALIGNED = [[cell.rjust(14) for cell in row] for row in PLAIN]
+LABVIEW = ("X_Value", "u", "y", "Comment")
+SWAPPED = str.maketrans(",.", ".,")
 STAMPS = [BEGIN + datetime.timedelta(milliseconds=10 * int(k)) for k in K]
 PAST = datetime.timedelta(days=26)
 TRUE = {"t": T, "u": U, "y": Y}
@@ -37,6 +41,12 @@ def first(stamp, form=None):
         [stamp(s) if form is None else s.strftime(form), *row[1:]]
         for s, row in zip(STAMPS, PLAIN, strict=True)
     ]
+
+
+def with_cells(make, column=1, rows=None):
+    """The table with other cells in a column: ``make(k)``, or of the old one, ``make(k, cell)``."""
+    rows = PLAIN if rows is None else rows
+    return [[make(k, c) if j == column else c for j, c in enumerate(row)] for k, row in enumerate(rows)]
 
 
 def ms(stamp):
@@ -58,9 +68,9 @@ TABLES = {
     "tabs": (text(PLAIN, "\t"), TRUE),
     "vertical bars": (text(PLAIN, "|"), TRUE),
     "blanks": (text(PLAIN, " "), TRUE),
-    "columns of one width": (text([[cell.rjust(14) for cell in row] for row in PLAIN], "", header=("t   u   y",)), TRUE),
+    "columns of one width": (text(ALIGNED, "", header=("t   u   y",)), TRUE),
     "names with blanks over columns": (
-        text([[c.rjust(14) for c in row] for row in PLAIN], "", header=("time (s)   u (V)     level (m)",)),
+        text(ALIGNED, "", header=("time (s)   u (V)     level (m)",)),
         {"time (s)": T, "u (V)": U, "level (m)": Y},
     ),
     "commas and blanks": (text(PLAIN, ", "), TRUE),
@@ -80,8 +90,8 @@ TABLES = {
     "preamble of keys": (text(PLAIN, above=[f"Key {k},{k}" for k in range(12)]), TRUE),
     "long preamble": (text(PLAIN, above=[f"# setting {k} = {k}" for k in range(300)]), TRUE),
     "header as a remark": (text(PLAIN, " ", header=("# t", "u", "y")), TRUE),
-    "LabVIEW": (text([[*row, ""] for row in GERMAN], "\t", above=LVM, header=("X_Value", "u", "y", "Comment")), {"y": Y}),
-    "LabVIEW without comments": (text(PLAIN, "\t", above=LVM, header=("X_Value", "u", "y", "Comment")), {"X_Value": T}),
+    "LabVIEW": (text([[*row, ""] for row in GERMAN], "\t", above=LVM, header=LABVIEW), {"y": Y}),
+    "LabVIEW without comments": (text(PLAIN, "\t", above=LVM, header=LABVIEW), {"X_Value": T}),
     "row of units": (text(PLAIN, header=NAMES, below=()).replace("t,u,y", "t,u,y\ns,V,degC", 1), UNITS),
     "units in brackets": (text(PLAIN, ";").replace("t;u;y", "t;u;y\n[s];[V];[degC]", 1), UNITS),
     "units of which some are numbers": (text(PLAIN).replace("t,u,y", "t,u,y\ns,1,degC", 1), {"y [degC]": Y}),
@@ -94,24 +104,24 @@ TABLES = {
     "header again, soon": (text([*PLAIN[:5], list(NAMES), *PLAIN[5:]]), TRUE),
     "header again": (text([*PLAIN[:20], list(NAMES), *PLAIN[20:]]), TRUE),
     "words for a switch": (
-        text([[row[0], "ON" if k % 3 else "off", row[2]] for k, row in enumerate(PLAIN)]),
+        text(with_cells(lambda k, c: "ON" if k % 3 else "off")),
         {"u": np.where(K % 3, 1.0, 0.0)},
     ),
-    "true and false": (text([[r[0], str(bool(k % 3)), r[2]] for k, r in enumerate(PLAIN)]), {"u": np.sign(K % 3)}),
+    "true and false": (text(with_cells(lambda k, c: str(bool(k % 3)))), {"u": np.sign(K % 3)}),
     "cells with units": (text([[row[0], f"{row[1]} V", f"{row[2]}°C"] for row in PLAIN]), {"u [V]": U, "y [°C]": Y}),
     "missing ones": (
-        text([[row[0], row[1], ("n/a", "---", "NaN", "", row[2])[k % 5]] for k, row in enumerate(PLAIN)]),
+        text(with_cells(lambda k, c: ("n/a", "---", "NaN", "", c)[k % 5], 2)),
         {"y": np.where(K % 5 == 4, Y, np.nan)},
     ),
     "thousands": (
-        text([[r[0], f"{1234567.25 + k:,}", r[2]] for k, r in enumerate(PLAIN)], ";"),
+        text(with_cells(lambda k, c: f"{1234567.25 + k:,}"), ";"),
         {"u": 1234567.25 + K, "y": Y},
     ),
     "German thousands": (
-        text([[r[0], f"{4567.25 + k:,}".translate(str.maketrans(",.", ".,")), r[2]] for k, r in enumerate(GERMAN)], ";"),
+        text(with_cells(lambda k, c: f"{4567.25 + k:,}".translate(SWAPPED), rows=GERMAN), ";"),
         {"u": 4567.25 + K, "y": Y},
     ),
-    "Swiss thousands": (text([[r[0], f"{4567 + k:,}".replace(",", "'"), r[2]] for k, r in enumerate(PLAIN)]), {"u": 4567.0 + K}),
+    "Swiss thousands": (text(with_cells(lambda k, c: f"{4567 + k:,}".replace(",", "'"))), {"u": 4567.0 + K}),
     "ISO": (text(first(ms)), SECONDS),
     "ISO with T and zone": (text(first(lambda s: s.isoformat(timespec="microseconds") + "+02:00")), SECONDS),
     "ISO in UTC": (text(first(lambda s: ms(s) + "Z"), header=("t [UTC]", "u", "y")), SECONDS),
@@ -128,21 +138,33 @@ TABLES = {
     "month first over midnight": (text(first(lambda s: f"{s - PAST:%m/%d/%Y %H:%M:%S.%f}")), SECONDS),
     "two digits of a year": (text(first(lambda s: f"{s:%y-%m-%d %H:%M:%S.%f}")), SECONDS),
     "months by name": (text(first(lambda s: f"{s:%d-%b-%Y %H:%M:%S}.{s.microsecond // 1000:03d}")), SECONDS),
-    "milliseconds behind a colon": (text(first(lambda s: f"{s:%Y-%m-%d %H:%M:%S}:{s.microsecond // 1000:03d}")), SECONDS),
+    "milliseconds behind a colon": (
+        text(first(lambda s: f"{s:%Y-%m-%d %H:%M:%S}:{s.microsecond // 1000:03d}")),
+        SECONDS,
+    ),
     "date and time": (
         text([[f"{s:%Y-%m-%d}", f"{s:%H:%M:%S.%f}", *row[1:]] for s, row in zip(STAMPS, PLAIN, strict=True)],
              header=("Date", "t", "u", "y")),
         SECONDS,
     ),
     "time of day past midnight": (text(first(lambda s: f"{s:%H:%M:%S.%f}")), {"t [s]": 86399.7 + T}),
-    "minutes and seconds": (text([[f"{k // 6:02d}:{k % 6 * 10:02d}.5", *r[1:]] for k, r in enumerate(PLAIN)]), {"t [s]": 10.0 * K + 0.5}),
-    "microseconds since 1970": (text([[f"{1711843199700000 + 10000 * k}", *r[1:]] for k, r in enumerate(PLAIN)]), {"t": 1711843199.7e6 + 1e4 * K}),
+    "minutes and seconds": (
+        text(with_cells(lambda k, c: f"{k // 6:02d}:{k % 6 * 10:02d}.5", 0)),
+        {"t [s]": 10.0 * K + 0.5},
+    ),
+    "microseconds since 1970": (
+        text(with_cells(lambda k, c: f"{1711843199700000 + 10000 * k}", 0)),
+        {"t": 1711843199.7e6 + 1e4 * K},
+    ),
     "an oscilloscope's": (
         text([[str(k), row[1], row[2], ""] for k, row in enumerate(PLAIN)], header=(),
              above=["X,CH1,CH2,Start,Increment,", "Sequence,Volt,Volt,-1.5e-01,2.5e-03"]),
         {"time [s]": -0.15 + 2.5e-3 * K, "CH1 [Volt]": U, "CH2 [Volt]": Y},
     ),
-    "sixteen digits": (text([[r[0], repr(np.pi * 10.0 ** (k - 20)), r[2]] for k, r in enumerate(PLAIN)]), {"u": [float(repr(np.pi * 10.0 ** (int(k) - 20))) for k in K]}),
+    "sixteen digits": (
+        text(with_cells(lambda k, c: repr(math.pi * 10.0 ** (k - 20)))),
+        {"u": [math.pi * 10.0 ** (k - 20) for k in range(40)]},
+    ),
 }  # fmt: skip
 """Contents by kind, and columns as they are read."""
 
@@ -226,7 +248,11 @@ def test_one_sensor_a_row(wrote):
 
 def test_a_signal_is_no_tag(wrote):
     """A column of numbers that is called a signal, and words that do not repeat, name no signals."""
-    path = wrote(text([[row[0], str(k % 2), row[2]] for k, row in enumerate(PLAIN)], header=("time", "signal", "value")))
+    path = wrote(
+        text(
+            [[row[0], str(k % 2), row[2]] for k, row in enumerate(PLAIN)], header=("time", "signal", "value")
+        )
+    )
     same = numbers(path)
     np.testing.assert_array_equal(same["signal"], K % 2)
     np.testing.assert_array_equal(same["value"], Y)
@@ -239,37 +265,43 @@ def cell(row, column, value, rows=PLAIN):
 AMBIGUOUS = {
     "no table": ("nothing here\nis a number\n", "row 2 has 3 cells"),
     "day or month": (
-        text([[f"0{1 + k % 2}/0{2 + k % 3}/2024 10:00:{k:02d}", *r[1:]] for k, r in enumerate(PLAIN)]),
+        text(with_cells(lambda k, c: f"0{1 + k % 2}/0{2 + k % 3}/2024 10:00:{k:02d}", 0)),
         "day or month first",
     ),
-    "hours or minutes": (text([[f"{10 + k // 60}:{k % 60:02d}", *r[1:]] for k, r in enumerate(PLAIN)]), "hours and minutes"),
-    "no such day": (text([[f"30.02.2024 10:00:{k:02d}", *r[1:]] for k, r in enumerate(PLAIN)], ";"), "no such day"),
+    "hours or minutes": (text(with_cells(lambda k, c: f"10:{k:02d}", 0)), "hours and minutes"),
+    "no such day": (text(with_cells(lambda k, c: f"30.02.2024 10:00:{k:02d}", 0), ";"), "no such day"),
     "two zones by name": (
-        text([[f"2024-03-31 10:00:{k:02d} {'CET' if k < 9 else 'CEST'}", *r[1:]] for k, r in enumerate(PLAIN)]),
+        text(with_cells(lambda k, c: f"2024-03-31 10:00:{k:02d} {'CET' if k < 9 else 'CEST'}", 0)),
         "time zones",
     ),
-    "thousands or decimals": (text([[r[0], f"{800 + 10 * k:,}".replace(",", "."), r[2]] for k, r in enumerate(GERMAN)], ";"), "row 2[23], .*thousands"),
+    "thousands or decimals": (
+        text(with_cells(lambda k, c: f"{800 + 10 * k:,}".replace(",", "."), rows=GERMAN), ";"),
+        "row 2[23], .*thousands",
+    ),
     "two decimal marks": (text(cell(7, 1, "0,25"), ";"), "row 9|0,25"),
     "a decimal comma between commas": (text(cell(7, 1, "0,25")), "row 9 has 4 cells"),
-    "two units in cells": (text([[r[0], f"{r[1]} {'V' if k else 'mV'}", r[2]] for k, r in enumerate(PLAIN)]), "row 2, .*unit"),
+    "two units in cells": (text(with_cells(lambda k, c: f"{c} {'V' if k else 'mV'}")), "row 2, .*unit"),
     "a word": (text(cell(7, 1, "overload")), "row 9, column 'u' is 'overload'"),
-    "three positions": (text([[r[0], ("on", "off", "auto")[k % 3], r[2]] for k, r in enumerate(PLAIN)]), "row 2, column 'u'"),
+    "three positions": (text(with_cells(lambda k, c: ("on", "off", "auto")[k % 3])), "row 2, column 'u'"),
     "a row of words": (text([*PLAIN[:9], ["off", "line", "now"], *PLAIN[9:]]), "row 11, column 't'"),
     "a switch among numbers": (text(cell(7, 1, "ON")), "row 9, .*switch"),
     "a short row": (text([*PLAIN[:9], PLAIN[9][:2], *PLAIN[10:]]), "row 11 has 2 cells"),
     "a long row": (text([*PLAIN[:9], [*PLAIN[9], "1"], *PLAIN[10:]]), "row 11 has 4 cells"),
     "a header of numbers": (text(PLAIN, header=("0", "1", "2")), "row 1 counts columns"),
     "decimal commas between commas": (text(GERMAN), "row 2 has 6 cells, the header .row 1. has 3"),
-    "a month a row": (text([[f"0{1 + k % 9}/0{1 + k // 9}/2024", *r[1:]] for k, r in enumerate(PLAIN)]), "day or month"),
+    "a month a row": (text(with_cells(lambda k, c: f"0{1 + k % 9}/0{1 + k // 9}/2024", 0)), "day or month"),
     "a header too short": (text(PLAIN, header=("t", "u")), "row 2 has 3 cells, the header .row 1. has 2"),
     "a header by other separators": (text(PLAIN, ";", header=("t,u,y,z",)), "row 2 has 3 cells, .* has 4"),
-    "units that contradict": (text(PLAIN, header=("t", "u", "y [K]")).replace("]", "]\ns,V,degC", 1), "row 2, .*'degC'.*'K'"),
+    "units that contradict": (
+        text(PLAIN, header=("t", "u", "y [K]")).replace("]", "]\ns,V,degC", 1),
+        "row 2, .*'degC'.*'K'",
+    ),
     "an open quotation mark": (text(cell(7, 1, '"0.5')), "row 9.*quotation"),
     "bytes": (text(PLAIN).encode()[:200] + b"\0\1\2" + text(PLAIN).encode()[200:], "is no text"),
     "cut in two": (text(PLAIN)[:-4], "row 41, .*cut in two"),
     "infinite": (text(cell(7, 2, "inf")), "row 9, column 'y' is 'inf'"),
     "a blank input": (text(cell(7, 1, "")), "row 9, column 'u' is empty"),
-    "AM beside 13 h": (text([[f"1/31/2024 {9 + k // 8}:00:{k:02d} AM", *r[1:]] for k, r in enumerate(PLAIN)]), "AM and PM"),
+    "AM beside 13 h": (text(with_cells(lambda k, c: f"1/31/2024 {9 + k // 8}:00:{k:02d} AM", 0)), "AM and PM"),
     "a date among numbers": (text(cell(7, 1, "2024-01-31")), "row 9, .*date"),
 }  # fmt: skip
 """Damaged or ambiguous contents, and what the refusal says."""
@@ -310,7 +342,9 @@ def test_a_logger_that_was_started_again_is_cut_there(wrote):
     assert (finding.kind, finding.count, finding.refused) == ("clock", 1, False)
     assert finding.message.startswith("row 42, ")
     np.testing.assert_array_equal(recording.y[:, 0], np.r_[Y, Y[:30]])
-    np.testing.assert_allclose(np.diff(recording.t), np.r_[np.full(39, 0.01), 0.15, np.full(29, 0.01)], atol=1e-12)
+    np.testing.assert_allclose(
+        np.diff(recording.t), np.r_[np.full(39, 0.01), 0.15, np.full(29, 0.01)], atol=1e-12
+    )
     whole = load_trajectories([path], LOOSE, SPEC, needed=()).whole
     assert [len(one.t) for one in whole] == [39, 29]
     assert drafted([opened(path)], ("u",), ("y",), "t").period == pytest.approx(0.01)
@@ -330,7 +364,9 @@ def test_a_slow_output_of_a_long_table_is_mostly_missing(wrote):
     rows = [[f"{0.01 * k:.2f}", "u", f"{np.sin(0.02 * k):.5f}"] for k in range(900)]
     rows += [[f"{k + 0.003:.3f}", "y", f"{k}"] for k in range(9)]
     spec = replace(SPEC, time="time", delays={"y": 0.5}, max_gap=0.1)
-    (whole,) = load_trajectories([wrote(text(rows, header=("time", "tag", "value")))], LOOSE, spec, needed=()).whole
+    (whole,) = load_trajectories(
+        [wrote(text(rows, header=("time", "tag", "value")))], LOOSE, spec, needed=()
+    ).whole
     known = np.isfinite(whole.y[:, 0])
     assert 7 <= known.sum() <= 9
     assert np.isfinite(whole.u).all()
