@@ -104,12 +104,26 @@ def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
         dates = pd.to_datetime(column, format="ISO8601", utc=True, errors="coerce")
         if not dates.isna().any():
             return cells_of(dates)
-    codes, uniques = pd.factorize(column, use_na_sentinel=False)
-    found = _of_objects(list(uniques), decimal)
-    values, done = found.values[codes], found.done
+    found = _of_stamps(column)
+    if found is None:
+        codes, uniques = pd.factorize(column, use_na_sentinel=False)
+        found = _of_objects(list(uniques), decimal)
+        found = found._replace(values=found.values[codes], blank=found.blank[codes])
+    values, done = found.values, found.done
     if done == TIMES and (turned := np.cumsum(np.r_[0, np.diff(values) < -DAY / 2])).any():
         values, done = values + DAY * turned, f"{done}, past midnight {turned[-1]} times"
-    return found._replace(values=values, blank=found.blank[codes], done=done)
+    return found._replace(values=values, done=done)
+
+
+def _of_stamps(column: pd.Series) -> Cells | None:
+    """The same where all cells are dates that are written in one way; None elsewhere."""
+    words = column.tolist()
+    if not words or not all(isinstance(one, str) and is_stamp(one) for one in words[:SEEN]):
+        return None
+    if any(not isinstance(one, str) for one in words):
+        return None
+    found = _stamps(words, np.zeros(0), ".")
+    return None if found is None or found.fault else found._replace(blank=np.zeros(len(words), bool))
 
 
 def number(cell: str) -> float:
@@ -266,10 +280,15 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     if len(others):
         return None
     patterns = [p for p in (*DATES, MINUTES, TIME_OF_DAY) if p.fullmatch(words[0])]
-    pattern = next((p for p in patterns if all(map(p.fullmatch, words))), None)
-    if pattern is None:
+    parts = None
+    for pattern in patterns:
+        parts = _fixed(words, pattern)
+        if parts is None and all(map(pattern.fullmatch, words)):
+            parts = pd.Series(words).str.extract(rf"^(?:{pattern.pattern})$")
+        if parts is not None:
+            break
+    if parts is None:
         return None
-    parts = pd.Series(words).str.extract(rf"^(?:{pattern.pattern})$")
     count = {key: pd.to_numeric(parts[key]).fillna(0).to_numpy(np.int64) for key in "HMS" if key in parts}
     none = np.zeros(len(words), np.int64)
     hours = count.get("H", none)
@@ -277,7 +296,10 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
         if parts["ap"].isna().any() or (hours > 12).any() or (hours < 1).any():
             return Cells(np.full(len(words), np.nan), none > 0, fault="AM and PM do not fit all of its cells")
         hours = hours % 12 + 12 * parts["ap"].str.upper().str.startswith("P").to_numpy()
-    fraction = parts["f"].fillna("0").str.ljust(9, "0").to_numpy(np.int64) if "f" in parts else none
+    fraction = none
+    if "f" in parts and parts["f"].notna().any():
+        written = parts["f"].dtype.kind != "i"
+        fraction = (parts["f"].fillna("0").str.ljust(9, "0") if written else parts["f"]).to_numpy(np.int64)
     within = ((hours * 60 + count.get("M", none)) * 60 + count.get("S", none)) * 10**9 + fraction
     if pattern is TIME_OF_DAY:
         if parts["S"].isna().all():
@@ -302,6 +324,37 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     return Cells((total - total[0]) / 1e9, none > 0, "s", done)
 
 
+def _fixed(words: Sequence[str], pattern: re.Pattern[str]) -> pd.DataFrame | None:
+    """The parts of dates of which only digits differ, and these stand in the same places; None of any others."""
+    import pandas as pd
+
+    first = pattern.fullmatch(words[0])
+    if first is None or not words[0].isascii() or max(map(len, words)) != len(words[0]):
+        return None
+    try:
+        codes = np.array(words, dtype="S").view(np.uint8).reshape(len(words), -1)
+    except UnicodeEncodeError:
+        return None
+    digits = np.array([c.isdigit() for c in words[0]])
+    if ((codes[:, digits] - 48) > 9).any() or (codes[:, ~digits] != codes[0, ~digits]).any():
+        return None
+    parts = {}
+    for key, text in first.groupdict().items():
+        if text is not None and text.isdigit():
+            begin, end = first.span(key)
+            width = 9 if key == "f" else end - begin
+            powers = 10 ** np.arange(width - 1, width - 1 - (end - begin), -1)
+            parts[key] = (codes[:, begin:end].astype(np.int64) - 48) @ powers
+        elif (
+            text is not None
+            and (codes[:, slice(*first.span(key))] != codes[0, slice(*first.span(key))]).any()
+        ):
+            return None
+        else:
+            parts[key] = np.full(len(words), text, dtype=object)
+    return pd.DataFrame(parts)
+
+
 def _no_stamps(words: Sequence[str], fault: str) -> Cells:
     return Cells(np.full(len(words), np.nan), np.zeros(0, bool), fault=f"its dates, as {words[0]!r}: {fault}")
 
@@ -309,7 +362,8 @@ def _no_stamps(words: Sequence[str], fault: str) -> Cells:
 def _goes_on(stamps: NDArray[np.int64]) -> bool:
     """Whether stamps of different rows increase, and none by far more than usual."""
     steps = np.diff(stamps)
-    return bool((steps > 0).all() and steps.max() <= FAR * np.median(steps))
+    steps = steps[steps != 0]
+    return bool(len(steps) and (steps > 0).all() and steps.max() <= FAR * np.median(steps))
 
 
 def _days(parts: pd.DataFrame) -> list[NDArray[np.int64]]:
@@ -343,11 +397,14 @@ def _since_1970(
 
 def _zone(parts: pd.DataFrame) -> NDArray[np.int64] | None:
     """Offsets of the time zones [ns]; None where they are names that differ."""
-    zone = parts["z"].fillna("")
-    offset = zone.str.extract(r"(?P<sign>[+-])(?P<h>\d{2}):?(?P<m>\d{2})")
-    names = set(zone[offset["sign"].isna()]) - {"Z", "UTC", "GMT"}
-    if len(names) > 1 or (names and offset["sign"].notna().any()):
+    codes, zones = parts["z"].fillna("").factorize()
+    found = [re.fullmatch(r"([+-])(\d{2}):?(\d{2})", zone) for zone in zones]
+    names = {zone for zone, match in zip(zones, found, strict=True) if not match} - {"Z", "UTC", "GMT"}
+    if len(names) > 1 or (names and any(found)):
         return None
-    size = offset["h"].fillna("0").to_numpy(np.int64) * 3600 + offset["m"].fillna("0").to_numpy(np.int64) * 60
-    found: NDArray[np.int64] = np.where(offset["sign"] == "-", -size, size) * 10**9
-    return found
+    sizes = [
+        (-1 if match[1] == "-" else 1) * (int(match[2]) * 3600 + int(match[3]) * 60) if match else 0
+        for match in found
+    ]
+    offsets: NDArray[np.int64] = np.array(sizes, np.int64)[codes] * 10**9
+    return offsets
