@@ -28,8 +28,10 @@ from hybrid_mpc.records import shown
 Array = NDArray[np.float64]
 MOST_FIELDS = 64
 """Longest array in a message whose elements are signals."""
-FORMULA = 3
-"""The conversion of a channel in an MDF file that is a formula as text."""
+NUMBERS = {"2": (0, 1, 2, 6, 7, 8, 9, 65535), "3": (0, 1, 2, 6, 7, 8, 9, 65535), "4": (0, 1, 2, 4, 5, 6)}
+"""Conversions of a channel's raw numbers into numbers, by the version of an MDF file; tables of texts are not used."""
+FORMULAS = {"2": 10, "3": 10, "4": 3}
+"""The conversion that is a formula as text."""
 
 
 def logger_source(path: Path, content: bytes, sha256: str) -> Source:
@@ -98,10 +100,11 @@ def _mdf(path: Path, content: bytes, sha256: str) -> Source:
             for j, channel in enumerate(group.channels):
                 if j == file.masters_db.get(k):
                     continue
-                if getattr(channel.conversion, "conversion_type", 0) == FORMULA:
-                    unread.append(channel.name)  # a formula in the file, which is not evaluated
+                kind = getattr(channel.conversion, "conversion_type", 0)
+                if kind == FORMULAS[file.version[0]]:  # it would be evaluated
+                    unread.append(channel.name)
                     continue
-                signal = file.get(group=k, index=j, ignore_invalidation_bits=False)
+                signal = file.get(group=k, index=j, raw=kind not in NUMBERS[file.version[0]])
                 if signal.samples.ndim != 1 or signal.samples.dtype.kind not in "biuf":
                     unread.append(channel.name)
                     continue
