@@ -24,7 +24,9 @@ from hybrid_mpc.files import write_text
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-ENDINGS = (".csv", ".npz", ".mat")
+ENDINGS = (
+    ".csv", ".txt", ".npz", ".mat", ".xlsx", ".parquet", ".feather", ".h5", ".mf4", ".tdms", ".mcap", ".bag", ".ulg"
+)  # fmt: skip
 """Endings that a message lists of a folder's files."""
 LARGEST = 2**31
 """Largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day."""
@@ -55,8 +57,8 @@ ENDS = {
 }
 """The same by their ending, for formats that do not say what they are."""
 OTHERS = (
-    (b"\xd0\xcf\x11\xe0", "an old Excel workbook"),
-    (b"PK\x03\x04\x14\x00\x00\x08\x00\x00", "an OpenDocument file"),
+    (re.compile(rb"\xd0\xcf\x11\xe0"), "an old Excel workbook"),
+    (re.compile(rb"PK\x03\x04.{26}mimetypeapplication/vnd\.oasis", re.DOTALL), "an OpenDocument file"),
 )
 """Formats that are not read."""
 
@@ -78,7 +80,7 @@ def opened(path: Path) -> Source:
     content = _content(path, None if reader else _Rows(path))
     if reader is None:
         reader = next((found for begin, found in BEGINS if begin.match(content)), ("text", "text_source"))
-    if other := next((what for begin, what in OTHERS if content.startswith(begin)), ""):
+    if other := next((what for begin, what in OTHERS if begin.match(content)), ""):
         raise InputError(f"{path}: is {other}, which is not read. Save the table as .xlsx or as CSV (UTF-8).")
     module = importlib.import_module(f"hybrid_mpc.data.{reader[0]}")
     source: Source = getattr(module, reader[1])(path, content, hashlib.sha256(content).hexdigest())
@@ -130,7 +132,7 @@ def _content(path: Path, rows: _Rows | None) -> bytes:
         remedy = (
             "Split the recording, or leave out columns that are not needed."
             if error.errno == errno.EFBIG
-            else "Give a readable CSV, npz or mat file."
+            else "Give a readable file."
         )
         raise InputError(f"{path}: cannot be read ({error.strerror}). {remedy}") from error
     if not content or content.isspace():

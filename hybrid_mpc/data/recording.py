@@ -210,7 +210,7 @@ def read_recording(
     prior: Signals,
     spec: DataSpec,
 ) -> Recording:
-    """Read one recording (CSV, ``.npz`` or ``.mat``) and check what would mislead an identification.
+    """Read one recording, whatever its format (:func:`hybrid_mpc.data.files.opened`), and check what would mislead.
 
     Columns that ``spec`` does not name are ignored; ``spec.units``, or units in brackets behind a column's name, are
     turned into the signals' own. A blank cell or NaN in the column of an output or a disturbance is a missing sample. A

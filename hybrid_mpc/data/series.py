@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,10 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
+LARGEST = 2**31
+"""Most bytes of numbers in a table [byte]."""
+ROUNDING, SHARE = 5e-7, 1e-3
+"""Stamps of two clocks are one where they differ by less: in their unit, and in steps of the fastest clock."""
 TIME = "time [s]"
 """Name of the time of files whose signals have clocks of their own."""
 
@@ -35,6 +39,7 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
     disturbance) has a number where it was sampled, and none between; all others (inputs) hold their last number, and
     rows before their first one are left out.
     """
+    series = [_once(one) for one in series]
     by_name = {one.name: one for one in series}
     found = {one.name: fault for one in series if (fault := one.fault or _disorder(one))}
 
@@ -43,7 +48,11 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
         faults = {name: found[name] for name in names if name in found}
         sound = [by_name[name] for name in names if name != time and name not in found]
         stamps = [one.t for one in sound] or [one.t for one in series if one.name not in found]
-        t = np.unique(np.concatenate([np.zeros(0), *stamps]))
+        t = _joined(stamps)
+        if 8 * len(t) * len(names) > LARGEST:
+            raise InputError(
+                f"{path}: {len(names)} signals at {len(t)} stamps are more numbers than are read. Name fewer of them."
+            )
         values = np.full((len(t), len(names)), np.nan)
         first = t[0] if len(t) else 0.0
         for j, name in enumerate(names):
@@ -54,20 +63,41 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
             if name in faults or not len(one.t):
                 continue
             if name in blanks:
-                values[np.searchsorted(t, one.t), j] = one.values
+                values[np.searchsorted(t, _onto(one.t, t)), j] = one.values
                 continue
             known = np.isfinite(one.values)
-            at = np.searchsorted(one.t[known], t, side="right") - 1
+            at = np.searchsorted(_onto(one.t[known], t), t, side="right") - 1
             values[:, j] = (
                 np.where(at >= 0, one.values[known][np.maximum(at, 0)], np.nan) if known.any() else np.nan
             )
-            first = max(first, float(one.t[known][0])) if known.any() else first
+            first = max(first, float(t[np.argmax(at >= 0)])) if known.any() else first
         rows = t >= first
         return Columns(values[rows], "sample", range(1, int(rows.sum()) + 1), faults)
 
     if len(by_name) < len(series):
         raise InputError(f"{path}: two signals have the same name and the same clock. Rename one.")
     return Source(path, sha256, (time, *by_name), read, note)
+
+
+def _once(one: Series) -> Series:
+    """A signal without samples that stand twice."""
+    again = (np.diff(one.t) == 0) & (np.diff(one.values) == 0)
+    keep = np.r_[np.ones(min(1, len(one.t)), bool), ~again]
+    return one if keep.all() else replace(one, t=one.t[keep], values=one.values[keep])
+
+
+def _joined(stamps: Sequence[Array]) -> Array:
+    """All stamps of several clocks; those that differ by rounding alone are one."""
+    t = np.unique(np.concatenate([np.zeros(0), *stamps]))
+    steps = [float(np.median(np.diff(one))) for one in stamps if len(one) > 1]
+    least = min([ROUNDING, *(SHARE * step for step in steps if step > 0)])
+    return t[np.r_[True, np.diff(t) > least]] if len(t) else t
+
+
+def _onto(stamps: Array, t: Array) -> Array:
+    """Stamps as they stand among those of all clocks."""
+    found: Array = t[np.searchsorted(t, stamps, side="right") - 1]
+    return found
 
 
 def _disorder(one: Series) -> str:

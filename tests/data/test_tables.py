@@ -238,6 +238,15 @@ def test_clocks_of_their_own_meet_by_the_rules_of_their_roles(wrote):
     assert np.isnan(y[~sampled]).all()
 
 
+def test_clocks_that_differ_by_rounding_are_one(wrote):
+    rows = [[repr(0.1 * k), "u", f"{k}"] for k in range(40)] + [
+        [repr(0.1 * k + 1e-12), "y", f"{k}"] for k in range(40)
+    ]
+    rows += [[repr(0.1 * 39 + 1e-12), "y", "39"]]  # stands twice
+    columns = opened(wrote(text(rows, header=("time", "tag", "value")))).read("time", ["u", "y"], ["y"])
+    np.testing.assert_array_equal(columns.values, np.c_[0.1 * K, K, K])
+
+
 def test_one_sensor_a_row(wrote):
     rows = [[f"{k}", f"s{k % 2}", f"{k / 4}", f"{k / 8}"] for k in range(20)]
     source = opened(wrote(text(rows, header=("time", "sensor", "temp", "level"))))
