@@ -141,7 +141,8 @@ def stored(m: Machine, periods):
 def made(m: Machine, periods):
     """A prior with a random network, in the loop of its scenario's task."""
     changes = {} if m.control is None else {
-        "control": m.control, "sensor_sigma": (m.sigma,), "safe_input": tuple(np.clip(0.0, m.control.u_min, m.control.u_max)),
+        "control": m.control, "sensor_sigma": (m.sigma,),
+        "safe_input": tuple(np.clip(0.0, m.control.u_min, m.control.u_max)),
     }  # fmt: skip
     scenario, kit = of_prior(m.name, **changes)
     prior = kit.models["prior"]
@@ -175,7 +176,9 @@ MACHINES = (
     Machine("race_car", lambda: Cells(nn.RNNCell, 8), "slalom", periods=320),
     Machine("coupled_drives", lambda: Deep(8, 12), "speeds"),
     Machine("emps", gru(), reference=sine((0.1, 2.0)), control=EMPS, sigma=1e-5, learned=1500),
-    Machine("xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False),
+    Machine(
+        "xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False
+    ),
     Machine("torque_pendulum", gru(), reference=sine((0.25, 2.0))),
 )
 
