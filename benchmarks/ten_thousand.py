@@ -8,7 +8,8 @@ tracks the machine's task over and over, and has a frozen sensor and an input th
 the inputs that acted there: without these it would be a controller whose input nobody applies, and one with integral
 action adds rounding up. "own" is the largest difference of the input, of its range, of C that goes on from its own
 plans after the first, "handed" that of C that goes on from Python's plan in each period; "state" and "reading" are
-those of the estimate and of the monitor in the first of the two. The script ends with an error where an alarm, a mode, a source or a status differs in any period.
+those of the estimate and of the monitor in the first of the two. The script ends with an error where an alarm, a mode,
+a source or a status differs in any period.
 """
 
 from __future__ import annotations
@@ -142,7 +143,8 @@ def stored(m: Machine, periods):
 def made(m: Machine, periods):
     """A prior with a random network, in the loop of its scenario's task."""
     changes = {} if m.control is None else {
-        "control": m.control, "sensor_sigma": (m.sigma,), "safe_input": tuple(np.clip(0.0, m.control.u_min, m.control.u_max)),
+        "control": m.control, "sensor_sigma": (m.sigma,),
+        "safe_input": tuple(np.clip(0.0, m.control.u_min, m.control.u_max)),
     }  # fmt: skip
     scenario, kit = of_prior(m.name, **changes)
     prior = kit.models["prior"]
@@ -176,7 +178,9 @@ MACHINES = (
     Machine("race_car", lambda: Cells(nn.RNNCell, 8), "slalom", periods=320),
     Machine("coupled_drives", lambda: Deep(8, 12), "speeds"),
     Machine("emps", gru(), reference=sine((0.1, 2.0)), control=EMPS, sigma=1e-5, learned=1500),
-    Machine("xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False),
+    Machine(
+        "xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False
+    ),
     Machine("torque_pendulum", gru(), reference=sine((0.25, 2.0))),
 )
 

@@ -18,6 +18,7 @@ from replay_parts import Case, Whole, replay
 import hybrid_mpc as hm
 from hybrid_mpc import (
     CondensedController,
+    DelayCompensation,
     ExtendedKalmanFilter,
     Guard,
     InputError,
@@ -236,10 +237,8 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
     refused(case, "a guard without a monitor", monitor=None)
     bare = SafeController(case.safe.controller, model)
     both = "mode REST without a safe input.*a backup by another solver.*its guard's backup: no C"
-    twice = CondensedController(
-        model, case.safe.controller.ocp.changed(starts=[np.zeros((12, 2))]), iterations=2
-    )
-    guard = Guard(backup=twice, backup_estimator=case.estimator)
+    twice = CondensedController(model, case.safe.controller.ocp, iterations=2)
+    guard = Guard(backup=twice, backup_estimator=DelayCompensation(case.estimator))
     refused(case, both, safe=bare, guard=guard)
 
 
