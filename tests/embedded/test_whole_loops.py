@@ -106,6 +106,16 @@ def test_a_loop_with_faults_replayed(name, tmp_path):
     assert told.reading < TOLERANCE
 
 
+def test_a_loop_of_its_own_plans(tmp_path):
+    """C that goes on from its own plans, told which inputs acted: nothing adds up."""
+    case = tanks()
+    told = replay(Whole(tmp_path, case), case, own=True)
+    assert told.alarms > 20
+    assert told.input < TOLERANCE
+    assert told.estimate < TOLERANCE
+    assert told.reading < TOLERANCE
+
+
 def guarded(name):
     """A machine of the other tests with a monitor and a guard that goes through every mode."""
     if name == "arm":
