@@ -175,7 +175,7 @@ def run(case):
 
 def replay(whole, case, *, own=False, told=True, known=None):
     """Both loops on the same samples, C going on from Python's plan in each period, or with ``own`` from its own ones
-    after the first: all decisions are the same. With ``own`` C is ``told`` by default which input acted, Python's.
+    after the first: all decisions are the same. With ``own`` C is ``told`` which input really acted, Python's.
     ``known`` is what :func:`run` gave, by default it runs.
     """
     steps, result = run(case) if known is None else known

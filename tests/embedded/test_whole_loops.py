@@ -18,6 +18,7 @@ from replay_parts import Case, Whole, replay
 import hybrid_mpc as hm
 from hybrid_mpc import (
     CondensedController,
+    DelayCompensation,
     ExtendedKalmanFilter,
     Guard,
     InputError,
@@ -99,6 +100,16 @@ def test_a_loop_with_faults_replayed(name, tmp_path):
     case = make()
     told = replay(Whole(tmp_path, case), case)
     assert set(told.modes) == modes
+    assert told.alarms > 20
+    assert told.input < TOLERANCE
+    assert told.estimate < TOLERANCE
+    assert told.reading < TOLERANCE
+
+
+def test_a_loop_of_its_own_plans(tmp_path):
+    """C that goes on from its own plans, told which inputs acted: nothing adds up."""
+    case = tanks()
+    told = replay(Whole(tmp_path, case), case, own=True)
     assert told.alarms > 20
     assert told.input < TOLERANCE
     assert told.estimate < TOLERANCE
@@ -236,10 +247,8 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
     refused(case, "a guard without a monitor", monitor=None)
     bare = SafeController(case.safe.controller, model)
     both = "mode REST without a safe input.*a backup by another solver.*its guard's backup: no C"
-    twice = CondensedController(
-        model, case.safe.controller.ocp.changed(starts=[np.zeros((12, 2))]), iterations=2
-    )
-    guard = Guard(backup=twice, backup_estimator=case.estimator)
+    twice = CondensedController(model, case.safe.controller.ocp, iterations=2)
+    guard = Guard(backup=twice, backup_estimator=DelayCompensation(case.estimator))
     refused(case, both, safe=bare, guard=guard)
 
 
