@@ -242,7 +242,9 @@ def test_parts_of_two_models_are_refused_before_the_loop_begins(run):
     kit = hm.load(run)
     with pytest.raises(hm.InputError, match=r"the monitor's model hybrid has .*give both the same"):
         hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor())
-    hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor("prior"))
+    hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor("prior", kind="own"))
+    with pytest.raises(hm.InputError, match="no limits of energy for the model prior"):
+        kit.monitor("prior")
 
 
 def test_a_state_of_other_parts_is_refused(run):

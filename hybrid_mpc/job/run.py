@@ -40,7 +40,7 @@ ALWAYS = (TASKS.name, REPORT.name)
 SECONDS = {
     "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4, "tasks": 1,
     "control": 42,
-    "on_model": 14, "estimation": 1, "promises": 6, "watch": 30, "analysis": 1,
+    "on_model": 14, "estimation": 1, "promises": 6, "watch": 36, "analysis": 1,
     "report": 9,
 }  # fmt: skip
 """What each stage of `make demo` takes on two idle cores [s], ``on_model`` where there is no plant: how long the rest

@@ -179,9 +179,8 @@ def test_artifact_holds_data_only(finished):
     folder = finished / "model"
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     # no task has a control problem of its own
-    assert names == {name for name in OWNERS if "*" not in name} | {"watch/hybrid.json"} | (
-        {f"watch/{load(folder).recommended}.json"}
-    )
+    watched = {"watch/hybrid.json", "watch/prior.json"}
+    assert names == {name for name in OWNERS if "*" not in name} | watched
     artifact = load(finished / "model")
     assert set(artifact.models) == {"hybrid", "prior"}
     assert artifact.models["prior"].n_h == 0

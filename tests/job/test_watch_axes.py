@@ -133,7 +133,8 @@ def slow(tmp_path_factory):
 def test_limits_of_an_axis_of_millimetres_a_second_are_learned_kept_and_put_back(slow):
     found = slow.read(WATCH)
     assert (found.reason, found.kind) == ("", "energy")
-    (own,) = found.watch.values()
+    assert list(found.watch) == ["prior", "hybrid"]
+    own = found.watch["hybrid"]
     assert set(own.limits) == {"energy", "residuals"}
     (rest,) = own.rest_speed
     top = max(np.abs(t.x[:, 1]).max() for t in slow.dataset.whole)

@@ -130,7 +130,9 @@ def test_a_state_is_frozen(model, safe):
     copies = state.estimate.x.copy(), state.decision.u.copy(), state.monitor.readings.memory.copy()
     rig = Rig()
     drive(loop, rig, 8, begun=True)
-    for now, before in zip((state.estimate.x, state.decision.u, state.monitor.readings.memory), copies, strict=True):
+    for now, before in zip(
+        (state.estimate.x, state.decision.u, state.monitor.readings.memory), copies, strict=True
+    ):
         np.testing.assert_array_equal(now, before)
     with pytest.raises(AttributeError):
         state.k = 3

@@ -171,7 +171,7 @@ class WatchResult:
     """What was learned, and what the monitor of the recommended model says of recordings and loops.
 
     Args:
-        watch: What the kit holds, by model.
+        watch: What the kit holds, by model, the recommended one last.
         kind: Kind of the readings that watch the machine.
         sources: What limits were learned from, in words, by kind.
         reason: Why nothing watches. Default: limits were learned.
@@ -218,7 +218,7 @@ class Data:
 
 
 def watch_stage(context: Context) -> WatchResult | Absent:
-    """Learn limits with the hybrid and with the recommended model, put them into the kit, and try them.
+    """Learn limits with hybrid, prior and the recommended model, put them into the kit, and try those of the last.
 
     Where none can be learned for the readings that would watch the machine the result holds the reason.
     """
@@ -239,7 +239,8 @@ def watch_stage(context: Context) -> WatchResult | Absent:
             rest = rest_speeds(nominal, kit.models["hybrid"])
         except InputError as short:
             reasons.append(f"no rest speeds: {short}")
-    for name in dict.fromkeys(("hybrid", kit.recommended)):
+    others = [name for name in ("hybrid", "prior") if name != kit.recommended]
+    for name in (*others, kit.recommended):
         limits: dict[str, WatchLimits] = {}
         missing = list(reasons)
         for kind in (ENERGY, RESIDUALS) if energy else (RESIDUALS,):
