@@ -11,9 +11,9 @@ from typing import Any, Generic, TypeVar
 
 import casadi as ca
 
-from nn_export.budget import Budget
+from nn_export.budget import NUMBER, Budget
 from nn_export.operators import cells
-from nn_export.operators.costs import HUGE, NUMBER
+from nn_export.operators.value import HUGE
 
 SCALAR_LIMIT = 50_000
 """Scalar operations, times sweeps of differentiation, up to which a piece becomes scalar code."""

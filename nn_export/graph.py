@@ -9,7 +9,7 @@ from typing import Any
 
 import casadi as ca
 
-from nn_export.budget import Budget, Limits, place, resolve
+from nn_export.budget import Budget, Limits, check_arguments, place, resolve
 from nn_export.chain import Chain, operations
 from nn_export.errors import ProgramError, ShapeError, last_line
 from nn_export.operators import OPERATORS, PLAIN, cells, recurrent
@@ -133,6 +133,7 @@ def _size(what: str, shape: tuple[int, ...]) -> tuple[int, int]:
 def _evaluate(node: Node, values: dict[tuple[str, str], Any], table: Mapping[str, Callable[..., Any]]) -> Any:
     try:
         args, kwargs = resolve(node.args, values), resolve(node.kwargs, values)
+        check_arguments(node.op, args, kwargs)
         result = table[node.op](*args, **kwargs)
         given = tuple(v.shape for v in (result if isinstance(result, tuple) else (result,)))
     except ShapeError as error:

@@ -13,12 +13,11 @@ from typing import Any
 
 import casadi as ca
 
-from nn_export.budget import Budget, Limits
+from nn_export.budget import NUMBER, Budget, Limits
 from nn_export.chain import Chain, Piece, differentiated
 from nn_export.errors import ProgramError
 from nn_export.graph import function, graph, named
 from nn_export.operators import OPERATORS, cells, recurrent
-from nn_export.operators.costs import NUMBER
 from nn_export.operators.value import Value
 from nn_export.program import Program
 

@@ -14,7 +14,6 @@ from nn_export.errors import ProgramError
 
 if TYPE_CHECKING:
     from nn_export.budget import Limits
-    from nn_export.operators.costs import Cost
 
 Shape = tuple[int, ...]
 _KINDS = ("input", "weight", "node")
@@ -78,9 +77,6 @@ class Program:
         weights: float64 arrays by name, e.g. ``"cell.weight_ih"``.
         metadata: Versions of the tools that made it.
 
-    Attributes:
-        known_cost: What it costs, once :mod:`nn_export.budget` has settled that.
-
     Raises:
         ProgramError: If a name is used twice, a reference leads nowhere or forward, or an operator is
             unknown.
@@ -96,7 +92,6 @@ class Program:
     nodes: tuple[Node, ...]
     weights: dict[str, np.ndarray] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
-    known_cost: Cost | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         from nn_export.operators import OPERATORS

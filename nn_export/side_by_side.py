@@ -16,14 +16,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nn_export.budget import Budget, Limits
+from nn_export.budget import NUMBER, Budget, Limits
 from nn_export.chain import Chain, differentiated
 from nn_export.columns import CellColumns, Results, Slope, Slot, Sum, matrices
 from nn_export.errors import ProgramError, ShapeError
 from nn_export.graph import graph, named
 from nn_export.jacobian import checked_blocks, spend_results
 from nn_export.operators import OPERATORS, cells, recurrent
-from nn_export.operators.costs import NUMBER
 from nn_export.program import Program
 from nn_export.vectorised import OnArrays, vectorised
 

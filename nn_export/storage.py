@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from nn_export.budget import Budget, Limits
+from nn_export.budget import NUMBER, Budget, Limits
 from nn_export.errors import ProgramError
 from nn_export.files import parse_json, read_bytes, write_bytes
-from nn_export.operators.costs import NUMBER, product
+from nn_export.operators.value import size_of
 from nn_export.program import Program, Shape, dumps, from_json, shape_of, to_json
 
 FORMAT = "nn_export programs"
@@ -171,7 +171,7 @@ def _weights(
         if not isinstance(entry, dict) or set(entry) != {"tensor", "shape"}:
             raise ProgramError(f"{place}: expected the fields tensor and shape; save it again")
         key, shape = entry["tensor"], shape_of(entry["shape"], f"{place}.shape")
-        budget.spend(place, elements=product(shape))
+        budget.spend(place, elements=size_of(shape))
         if not isinstance(key, str) or shapes.setdefault(key, shape) != shape:
             raise ProgramError(f"{place}: {WEIGHTS} has no such array; save the programs again")
         keys[name], stand_ins[name] = key, np.broadcast_to(np.float64(0.0), shape)
@@ -185,7 +185,7 @@ def _tensors(path: Path, sha256: str, shapes: Mapping[str, Shape]) -> dict[str, 
 
     # at most six bytes a character: "\u1234"
     names = HEADER + sum(HEADER_EACH + 6 * len(key) for key in shapes)
-    blob = _content(path, sum(NUMBER * product(shape) for shape in shapes.values()) + names)
+    blob = _content(path, sum(NUMBER * size_of(shape) for shape in shapes.values()) + names)
     if hashlib.sha256(blob).hexdigest() != sha256:
         raise ProgramError(
             f"{path}: its hash is not the one in {PROGRAMS} (field weights.sha256): damaged, truncated or of "

@@ -71,6 +71,23 @@ def test_no_rounding_changes_what_a_continuation_ends_at():
         np.testing.assert_allclose(found.v, wanted, atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    "curve", [lambda x: x**2, lambda x: x**3, ca.exp, ca.sqrt], ids=["x^2", "x^3", "e^x", "root"]
+)
+@pytest.mark.parametrize(
+    ("begun", "goal"), [(1.0, 1.05), (1.0, 2.0), (1.0, 5.0), (5.0, 1.0), (0.1, 1.0), (1.0, 0.1)]
+)
+def test_a_descent_follows_a_curved_branch_by_whole_steps(curve, begun, goal):
+    """A step along the branch leaves it by its square, which no merit likes; the next one comes back to it."""
+    one = search(rates(lambda x, u: u - curve(x)))
+    taken, newton = [], one._newton
+    one._newton = lambda *given: taken.append(given) or newton(*given)
+    found = one.descend(np.array([begun, float(curve(begun))]), np.array([goal]))
+    assert found.reached
+    np.testing.assert_allclose(found.v, [goal, float(curve(goal))], rtol=1e-9)
+    assert len(taken) == 3
+
+
 def test_of_equally_good_answers_the_nearest_to_the_operating_point_counts():
     one = search(rates(lambda x, u: u - x))
 

@@ -235,6 +235,10 @@ def operations(found: Sources) -> dict[str, int]:
         + units * (6 * (n.get("FEATURES", 0) + units) + 110)
     )
     stage += units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) + 2 * n["HEAD"] * units * (padded + n["NU"])
+    of_layers = [
+        count for name, count in code.items() if name.startswith("layers") and not name.endswith("_seen")
+    ]
+    stage += sum(of_layers) + 2 * n["PASSED"] * (n_z + n["NU"])
     n_e = n_z + n["ND"]
     n_t = n_z + n["NU"]
     newton = 2 * n_z**2 * n_t + 4 * n_z * n_t * n["NU"] + 2 * n["NH"] ** 3 // 3

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.embedded.cut import Cut, cut, reduced
+from hybrid_mpc.embedded.layers import layer_code, tables_of
 from hybrid_mpc.embedded.scalar import c_function, table
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.loop.guard import TINY, Guard, Mode
@@ -217,29 +218,19 @@ def _energy(readings: EnergyReadings, model: HybridModel, parts: Cut) -> Watched
 
 
 def _rates(model: HybridModel, parts: Cut) -> tuple[str, dict[str, int], dict[str, int]]:
-    """Code of the model's rates, by the step's own cell; sizes and operations."""
+    """Code of the model's rates, by the step's own cell where they have it; sizes and operations."""
     own = cut(model, "xdot")
-    cell, seen_by = parts.cell, own.cell
-    if (cell is None) != (seen_by is None) or (
-        cell is not None
-        and seen_by is not None
-        and not (
-            cell.first == seen_by.first
-            and all(
-                np.array_equal(getattr(cell, name), getattr(seen_by, name))
-                for name in ("input_weight", "hidden_weight", "input_bias", "hidden_bias")
-            )
-        )
-    ):
-        raise InputError(f"no C for this monitor: rates and step of model {model.name} have other networks")
+    if own.cell is not None and not own.cell.same(parts.cell):  # the step has none of this kind
+        own = cut(model, "xdot", layered=True)
     z, u, w = (
         ca.SX.sym(name, n) for name, n in (("z", model.n_x + model.n_h), ("u", model.n_u), ("w", model.n_w))
     )
     x, h = z[: model.n_x], z[model.n_x :]
     inputs, point = {"z": z, "u": u, "w": w}, ["const real *z", "const real *u", "const real *w"]
-    texts, operations = [], {}
-    units = 0 if cell is None else cell.units
-    g = ca.SX.sym("g", units)
+    texts, operations = [], dict[str, int]()
+    known = tables_of("layers", parts.layers)
+    code = layer_code("rate_layers", own.layers, (z, u, w), [], slopes=False, known=known)
+    g = ca.SX.sym("g", code.products if own.cell is None else own.cell.units)
     head, out, value = np.zeros((0, 0)), g, own.after(x, h, u, w, g)
     if own.before is not None:
         seen = own.before(x, h, u, w)
@@ -248,10 +239,14 @@ def _rates(model: HybridModel, parts: Cut) -> tuple[str, dict[str, int], dict[st
         texts.append(text)
         head, out, value = reduced(own, model, list(range(model.n_x)), z, u, w)
         texts.append(table("rate_head", head))
+    elif own.layers:
+        operations |= code.operations
+        texts.append(code.text)
     results = [(f"xdot[{i}]", ca.densify(value[i])) for i in range(model.n_x)]
     arguments = [*point, "const real *out", "real *xdot"]
     text, operations["rates_after"] = c_function("rates_after", arguments, {**inputs, "out": out}, results)
-    return "\n".join([*texts, text]), {"RATE_HEAD": len(head)}, operations
+    sizes = {"RATE_HEAD": len(head), "RATE_PRODUCTS": code.products}
+    return "\n".join([*texts, text]), sizes, operations
 
 
 def _residuals(readings: ResidualReadings, model: HybridModel) -> Watched:

@@ -926,6 +926,13 @@ class Shooting:
         empty = _Point(theta, x, substeps, self.spread, nothing, nothing, LOOSELY**2)
         return self._at(empty, theta, x, slopes)
 
+    def linear(self, theta: Array, x: Array) -> tuple[Array, Array]:
+        """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` and first states ``x``, these
+        eliminated, over their scales, by the root of their robust weights.
+        """
+        point = self.start(theta, x, "all")
+        return self._eliminated(replace(point, scale=self._left(point.error), held=1.0))[:2]
+
     def _at(self, before: _Point, theta: Array, x: Array, slopes: Slopes) -> _Point:
         """Another point."""
         windows, seen, n, limit = self.windows, self.seen, len(x), LARGEST * self.spread

@@ -37,6 +37,8 @@ FREE = 1e-6
 STALLED, WITHIN = 0.9, 5
 """A descent is given up whose lack of a steady state has not fallen to this share within so many steps, which those
 that arrive do many times over."""
+AWAY = 1e6
+"""Distance from its start, in scales of the unknowns, at which a descent has run away."""
 STILL = 1e-6
 """Largest lack of a steady state, in the states' scales, that is rounding."""
 NEAR = 1e-5
@@ -243,12 +245,14 @@ class SteadySearch:
         leans: Places of the unknowns that stay near it.
         bounds: Bounds. Default: none.
         heed: Shares ``(n_e,)`` of ``size`` that count as much. Default: 1.
-        hidden: Places of hidden states, which are brought to rest on the way. Default: there are none.
+        hidden: Places of hidden states, which are brought to rest on the way; the last equations are theirs. Default:
+            there are none.
         free: Places of the unknowns that are sought; the others are held. Default: all.
         steady: Largest step, in scales, at which a descent has converged. Default: 1e-9.
 
-    Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2017, section 1.5; Deuflhard, *Newton Methods for
-    Nonlinear Problems*, 2011, chapter 5, for the continuation.
+    Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2017, section 1.5; Nocedal, Wright, *Numerical
+    Optimization*, 2006, section 15.6, for the watchdog; Deuflhard, *Newton Methods for Nonlinear Problems*, 2011,
+    chapter 5, for the continuation.
 
     Example:
         >>> x, u = ca.SX.sym("x"), ca.SX.sym("u")
@@ -269,6 +273,7 @@ class SteadySearch:
         self._tracked = np.flatnonzero(root > 0)
         self._root, self._free, self._steady = root[self._tracked], free, steady
         self._hidden = hidden if scale[hidden].size else None
+        self._settles = slice(size.size - scale[hidden].size, size.size)
         self._own = size if heed is None else size * heed
         n_v = scale.size
         self._sought = np.arange(n_v) if free is None else free
@@ -305,6 +310,15 @@ class SteadySearch:
             sure = sure and (size < NEAR or size <= CONTRACTS * before)
             before, share = size, 1.0
             after = self._settled(at.v + step, goal)
+            if not after.merit < at.merit and size >= NEAR:
+                # watchdog: along a curved branch a step leaves it by its square, and the next one comes back to it
+                second = self._newton(after, goal, bounded)[0]
+                again = np.inf if second is None else float(np.max(np.abs(second / self.scale), initial=0.0))
+                if second is not None and np.isfinite(again):
+                    then = self._settled(after.v + second, goal)
+                    if then.merit < at.merit:
+                        sure = sure and (again < NEAR or again <= CONTRACTS * size)
+                        after, before = then, again
             while not after.merit < at.merit and share > LEAST_SHARE:
                 share, sure = 0.5 * share, sure and size < NEAR
                 after = self._settled(at.v + share * step, goal)
@@ -313,6 +327,8 @@ class SteadySearch:
                 break
             at = after
             lacks.append(at.lacks)
+            if np.max(np.abs((at.v - v) / self.scale), initial=0.0) > AWAY:
+                break
             if len(lacks) > WITHIN and at.lacks > max(STALLED * lacks[-1 - WITHIN], STILL):
                 break
         off = float(np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0))
@@ -432,11 +448,13 @@ class SteadySearch:
         hidden = self._hidden
         size = self.scale[hidden]
         for _ in range(SETTLING):
-            off = at.rest[hidden] / size
+            off = at.rest[self._settles] / size
             if not np.all(np.isfinite(at.rest)) or np.max(np.abs(off)) < STEADY:
                 break
             try:
-                move = size * np.linalg.solve(at.rest_by_v[hidden, hidden] * size / size[:, None], -off)
+                move = size * np.linalg.solve(
+                    at.rest_by_v[self._settles, hidden] * size / size[:, None], -off
+                )
             except np.linalg.LinAlgError:
                 return plain
             v = at.v.copy()
@@ -584,7 +602,7 @@ def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
     start = np.concatenate([x0, hidden_fixed_point(model, x0, u0, limit=100), u0])
     found = search.descend(start, np.zeros(model.n_y))
     size = residual_of(search, found.v)
-    if size > RESIDUAL:
+    if not found.steady or size > RESIDUAL:
         raise InputError(
             f"model {model.name}: the hidden state finds no rest at x = {x0.tolist()} (residual {size:.2g}); give h"
         )
@@ -607,11 +625,12 @@ class _Rows:
         return self._all.shown(v)
 
 
-def _of_rows(model: HybridModel, rows: Places, free: Places) -> SteadySearch:
+def _of_rows(model: HybridModel, rows: Places, free: Places, hidden: slice = slice(0, 0)) -> SteadySearch:
     scale = natural_sizes(model)
     return SteadySearch(
         _Rows(model, rows), np.concatenate([scale, input_sizes(model)]), scale[rows], np.zeros(model.n_y),
-        np.concatenate([model.x0, np.zeros(model.n_h), model.u0]), np.zeros(0, dtype=np.int64), free=free, steady=EXACT,
+        np.concatenate([model.x0, np.zeros(model.n_h), model.u0]), np.zeros(0, dtype=np.int64), hidden=hidden,
+        free=free, steady=EXACT,
     )  # fmt: skip
 
 
@@ -640,24 +659,11 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
     guess = np.zeros(model.n_u) if u_guess is None else vector(u_guess, model.n_u, "u_guess")
     n_x, n_z = model.n_x, model.n_x + model.n_h
-    search = _of_rows(model, np.arange(n_q, n_z), np.arange(n_x, n_z + model.n_u))
+    search = _of_rows(model, np.arange(n_q, n_z), np.arange(n_x, n_z + model.n_u), slice(n_x, n_z))
 
     def begun(u: Array) -> tuple[Array, float]:
-        v = np.concatenate([x, hidden_fixed_point(model, x, u, limit=100), u])
-        scale = np.concatenate([natural_sizes(model), input_sizes(model)])[n_x:]
-        rest, slopes = search.equations.rest(v)
-        for _ in range(ITERATIONS):  # halved by the residual: a descent's merit shortens steps too much
-            if not (np.isfinite(slopes).all() and np.isfinite(rest).all()):
-                break
-            step = scale * np.linalg.lstsq(slopes[:, n_x:] * scale, -rest, rcond=None)[0]
-            share, better = 1.0, False
-            while share > LEAST_SHARE and not better:
-                trial = np.concatenate([x, v[n_x:] + share * step])
-                after, by = search.equations.rest(trial)
-                share, better = 0.5 * share, bool(np.linalg.norm(after) < np.linalg.norm(rest))
-            if not better:
-                break
-            v, rest, slopes = trial, after, by
+        start = np.concatenate([x, hidden_fixed_point(model, x, u, limit=100), u])
+        v = search.descend(start, np.zeros(model.n_y)).v
         return v[n_z:], residual_of(search, v)
 
     found, size = begun(guess)

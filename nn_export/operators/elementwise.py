@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import casadi as ca
 
-from nn_export.operators.value import Value, broadcast, broadcast_shape, layout, lift
+from nn_export.operators.value import Value, broadcast, broadcast_shape, layout, lift, room
 
 Number = Value | float
 Operator = Callable[..., Value]
@@ -21,6 +21,7 @@ def apply(f: Callable[..., ca.MX], *args: Number) -> Value:
     """
     values = [lift(a) for a in args]
     shape = broadcast_shape([v.shape for v in values])
+    room(*shape)
     if 0 in shape:
         return Value(shape, ca.MX.zeros(*layout(shape)))
     size = layout(shape)

@@ -10,13 +10,14 @@ import numpy as np
 
 from nn_export.operators.elementwise import add, apply
 from nn_export.operators.reduce import mean, sum_, var
-from nn_export.operators.value import Value, arrange, concatenate, from_matrix, matrix, move
+from nn_export.operators.value import Value, arrange, concatenate, from_matrix, matrix, move, room
 
 
 def matmul(a: Value, b: Value) -> Value:
     """Product of two matrices, or of two equally long stacks of matrices."""
     if a.shape[:-2] != b.shape[:-2] or a.shape[-1] != b.shape[-2]:
         raise ValueError(f"product of shapes {a.shape} and {b.shape}")
+    room(*a.shape[:-1], b.shape[-1])
     stacks = []
     for value in (a, b):
         positions = value.positions.reshape(-1, *value.shape[-2:])
@@ -57,6 +58,7 @@ def linear(input: Value, weight: Value, bias: Value | None = None) -> Value:
     """``input weight' + bias`` on the last axis; one sample is kept as a column."""
     out, n = weight.shape
     rows = math.prod(input.shape[:-1])
+    room(rows, out)
     w = matrix(weight, out, n)
     if rows == 1:
         result = from_matrix(ca.mtimes(w, matrix(input, n, 1)), (*input.shape[:-1], out))

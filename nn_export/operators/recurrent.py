@@ -10,7 +10,7 @@ import casadi as ca
 from nn_export.operators import cells
 from nn_export.operators.cells import Kind, State, Weights
 from nn_export.operators.shape import flip, stack
-from nn_export.operators.value import Value, arrange, concatenate, from_matrix, matrix, move
+from nn_export.operators.value import Value, arrange, concatenate, from_matrix, matrix, move, unrolled
 
 Cell = Callable[[ca.MX, State, Weights], State]
 Form = Callable[[Kind, ca.MX, State, Weights], State]
@@ -56,6 +56,7 @@ def _run(
     cell: Cell, x: Value, states: Sequence[Value], w: Weights, projection: Value | None, reverse: bool
 ) -> tuple[Value, list[Value]]:
     """One direction of one layer over ``x`` (T, B, F); states (B, H); ``projection`` (P, H) of ``h``."""
+    unrolled(x.shape[0])
     x = flip(x, [0]) if reverse else x
     state = tuple(_columns(v) for v in states)
     steps = []
@@ -85,6 +86,7 @@ def _sequence(
     if train and dropout:
         raise ValueError("dropout in training mode; use eval()")
     directions = 2 if bidirectional else 1
+    unrolled(num_layers * max(x.shape, default=1))  # whichever axis is time
     size, left = divmod(len(params), num_layers * directions)
     whole = 4 if has_biases else 2
     if left or size not in (whole, whole + 1):

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from nn_export.operators.elementwise import add, apply
-from nn_export.operators.value import Value, arrange, concatenate, from_matrix, move
+from nn_export.operators.value import Value, arrange, concatenate, from_matrix, move, room, unrolled
 
 
 def reduced(f: Callable[[ca.MX], ca.MX], self: Value, dim: Sequence[int] | None, keepdim: bool) -> Value:
@@ -27,6 +27,7 @@ def reduced(f: Callable[[ca.MX], ca.MX], self: Value, dim: Sequence[int] | None,
 
 
 def _columns(x: ca.MX) -> list[ca.MX]:
+    unrolled(x.shape[1])
     return ca.horzsplit(x) if x.shape[1] > 1 else [x]
 
 
@@ -215,6 +216,7 @@ def cumprod(self: Value, dim: int) -> Value:
     """Running product along an axis."""
     if not self.shape:
         return self
+    unrolled(self.shape[dim])
     parts = [move(self, self.positions.take([k], axis=dim)) for k in range(self.shape[dim])]
     return concatenate(list(accumulate(parts, lambda a, b: apply(lambda x, y: x * y, a, b))), dim)
 
@@ -225,6 +227,7 @@ def cumsum(self: Value, dim: int) -> Value:
         return self
     last = np.moveaxis(self.positions, dim, -1)
     n = last.shape[-1]
+    room(n, n)
     x = arrange(self.mx, last.reshape(-1, n))
     sums = from_matrix(ca.mtimes(x, ca.MX(ca.DM(np.triu(np.ones((n, n)))))), last.shape)
     return Value(self.shape, arrange(sums.mx, _back(sums, dim, self.mx.shape)))

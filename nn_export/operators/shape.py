@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import zip_longest
 
 import numpy as np
 
-from nn_export.operators.value import Value, broadcast, concatenate, constant, lift, move, numbers
+from nn_export.operators.value import Value, broadcast, concatenate, constant, lift, move, numbers, room
 
 LONGEST = 2**31
 
@@ -70,6 +71,7 @@ def expand(self: Value, size: Sequence[int]) -> Value:
 
 def repeat(self: Value, repeats: Sequence[int]) -> Value:
     """Tiled."""
+    room(self.mx.numel(), *repeats)
     return move(self, np.tile(self.positions, tuple(repeats)))
 
 
@@ -85,13 +87,21 @@ def diagonal(self: Value, offset: int = 0, dim1: int = 0, dim2: int = 1) -> Valu
 
 def index_select(self: Value, dim: int, index: Value) -> Value:
     """Entries of an axis by a constant list."""
+    room(index.mx.numel(), self.mx.numel() // max(self.shape[dim], 1))
     return move(self, self.positions.take(numbers(index).astype(int).reshape(-1), axis=dim))
 
 
 def index(self: Value, indices: Sequence[Value | None]) -> Value:
     """Indexing by constant integer tensors."""
-    key = tuple(slice(None) if i is None else numbers(i).astype(int) for i in indices)
-    return move(self, self.positions[key])
+    return move(self, self.positions[_key(self, indices)])
+
+
+def _key(self: Value, indices: Sequence[Value | None]) -> tuple[slice | np.ndarray, ...]:
+    """Constant indices as NumPy takes them."""
+    chosen = np.broadcast_shapes(*(i.shape for i in indices if i is not None))
+    whole = [n for n, i in zip_longest(self.shape, indices) if n is not None and i is None]
+    room(*chosen, *whole)
+    return tuple(slice(None) if i is None else numbers(i).astype(int) for i in indices)
 
 
 def cat(tensors: Sequence[Value], dim: int = 0) -> Value:
@@ -115,6 +125,7 @@ def pad(self: Value, pad: Sequence[int], value: float = 0.0) -> Value:
     widths = [(0, 0)] * (len(self.shape) - len(axes)) + axes
     if min(pad) < 0:
         raise ValueError(f"negative pad {list(pad)}")
+    room(*(n + sum(width) for n, width in zip(self.shape, widths, strict=False)))
     border = self.mx.numel()
     positions = np.pad(self.positions, widths, constant_values=border)
     flat = concatenate([view(self, [-1]), view(lift(value), [1])], 0)
@@ -125,6 +136,7 @@ def pad(self: Value, pad: Sequence[int], value: float = 0.0) -> Value:
 def unfold(self: Value, dimension: int, size: int, step: int) -> Value:
     """Windows of an axis, as a new last axis."""
     p = np.lib.stride_tricks.sliding_window_view(self.positions, size, axis=dimension)
+    room(*p.shape)
     axis = dimension % len(self.shape)
     return move(self, p[(slice(None),) * axis + (slice(None, None, step),)])
 
@@ -139,6 +151,7 @@ def gather(self: Value, dim: int, index: Value) -> Value:
 
 def embedding(weight: Value, indices: Value, padding_idx: int = -1) -> Value:
     """Rows by constant positions."""
+    room(*indices.shape, *weight.shape[1:])
     return move(weight, weight.positions[numbers(indices).astype(int)])
 
 
@@ -177,7 +190,7 @@ def select_scatter(self: Value, src: Value, dim: int, index: int) -> Value:
 
 def index_put(self: Value, indices: Sequence[Value | None], values: Value) -> Value:
     """A copy with elements at constant positions replaced, each at most once."""
-    key = tuple(slice(None) if i is None else numbers(i).astype(int) for i in indices)
+    key = _key(self, indices)
     return _written(self, _each_once(_places(self)[key]), values)
 
 
@@ -219,6 +232,7 @@ def scalar_tensor(s: float, *, dtype: str = "float64") -> Value:
 
 def arange(start: float, end: float, step: float = 1, *, dtype: str = "float64") -> Value:
     """Equally spaced numbers; in float32 only those that float32 holds exactly."""
+    room(max(0, math.ceil((end - start) / step)))
     values = np.arange(start, end, step)
     if dtype == "float32" and np.any(values.astype(np.float32) != values):
         raise ValueError("arange in float32; use dtype=torch.float64 there")

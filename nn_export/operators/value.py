@@ -9,7 +9,7 @@ array of positions.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,12 @@ import numpy as np
 from nn_export.errors import ShapeError
 
 Shape = tuple[int, ...]
+LARGEST = 2**24
+"""Numbers that one operator may make, whatever its file says of its results."""
+UNROLLED = 2**13
+"""Steps in which an operator may go along an axis."""
+HUGE = 2**62
+"""Where products stop: more than any limit, and far from numbers of a million digits."""
 
 
 def matrix_shape(shape: Shape) -> tuple[int, int]:
@@ -37,6 +43,42 @@ def layout(shape: Shape) -> tuple[int, int]:
         return math.prod(kept[:-1]), kept[-1]
     rows, columns = (*kept, 1, 1)[:2]
     return rows, columns
+
+
+def size_of(shape: Iterable[int]) -> int:
+    """Numbers of a tensor, up to ``HUGE``; an axis of length 0 counts as 1: CasADi stores the others' all the same.
+
+    Example:
+        >>> size_of((3, 0, 4))
+        12
+    """
+    total = 1
+    for n in shape:
+        if n > 1:
+            total *= n
+            if total > HUGE:
+                return HUGE
+    return total
+
+
+def room(*shape: int) -> None:
+    """Refuse a result of this shape before it is made, where it is too large for any program.
+
+    Raises:
+        ValueError: If it has more than ``LARGEST`` numbers.
+    """
+    if (size := size_of(shape)) > LARGEST:
+        raise ValueError(f"it would make {size:.3g} numbers, at most {LARGEST} can be exported")
+
+
+def unrolled(steps: int) -> None:
+    """Refuse to go along an axis in too many steps.
+
+    Raises:
+        ValueError: If there are more than ``UNROLLED``.
+    """
+    if steps > UNROLLED:
+        raise ValueError(f"it would go along an axis in {steps} steps, at most {UNROLLED} can be exported")
 
 
 @dataclass(frozen=True)
@@ -124,6 +166,7 @@ def broadcast(value: Value, shape: Shape) -> Value:
     """The value repeated to a shape by the rules of torch."""
     if value.shape == shape:
         return value
+    room(*shape)
     if value.mx.numel() == 1:
         return Value(shape, ca.repmat(value.mx, *layout(shape)))
     return move(value, np.broadcast_to(value.positions, shape))

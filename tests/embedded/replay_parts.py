@@ -29,7 +29,7 @@ from hybrid_mpc import (
     simulate,
 )
 from hybrid_mpc.embedded.generate import sources_of
-from hybrid_mpc.loop.preview import Previews
+from hybrid_mpc.loop.preview import Forecast, Previews
 
 SHARED = [*parts.QUICK, "-fPIC", "-shared"]
 BRIDGE = """
@@ -55,6 +55,7 @@ void whole_plan(hmpc_state *s, int backup, const hmpc_real *held, const hmpc_rea
 """
 READ = {"values": "value", "levels": "level", "share": "share", "travel": "travel"}
 """Names of a reading's numbers in Python and in C."""
+WIDE = 1e-9
 SAID = ("alarm", "frozen", "blind", "validity")
 
 
@@ -73,6 +74,7 @@ class Case:
     weight: object = None
     faults: tuple = ()
     seed: int = 0
+    w: object = None
 
 
 class Whole:
@@ -135,7 +137,9 @@ class Whole:
 
 @dataclass
 class Told:
-    """What a replay found: periods, alarms, modes, and the largest differences."""
+    """What a replay found: periods, alarms, modes, the largest differences, and the first period with one of more than
+    :data:`WIDE` of the input's range; 0 for none.
+    """
 
     periods: int
     alarms: int
@@ -145,6 +149,7 @@ class Told:
     input: float
     estimate: float
     reading: float
+    wide: int = 0
 
 
 def run(case):
@@ -153,39 +158,47 @@ def run(case):
     result = simulate(
         case.plant, case.estimator, case.safe, case.reference, weight=case.weight, dt=case.safe.controller.model.dt,
         duration=case.periods * case.safe.controller.model.dt, x0=case.x0, seed=case.seed, monitor=case.monitor,
-        guard=case.guard, faults=case.faults, on_step=steps.append,
+        guard=case.guard, w=case.w, faults=case.faults, on_step=steps.append,
     )  # fmt: skip
     return steps, result
 
 
-def replay(whole, case):
-    """Both loops on the same samples, C going on from Python's plan in each period: all decisions are the same."""
-    steps, result = run(case)
+def replay(whole, case, *, own=False, told=True, known=None):
+    """Both loops on the same samples, C going on from Python's plan in each period, or with ``own`` from its own ones
+    after the first: all decisions are the same. With ``own`` C is ``told`` by default which input really acted, Python's.
+    ``known`` is what :func:`run` gave, by default it runs.
+    """
+    steps, result = run(case) if known is None else known
     model, ocp, view = whole.model, whole.ocp, whole.view
     preview = Previews(
         case.reference, case.weight, ocp, model.dt, np.inf, case.safe.controller.problem.standing()[0]
     )
+    forecast = Forecast(case.w, ocp, model.n_w, model.dt)
     size = case.safe.controller.problem.sizes.states
     names = {name: own for name, own in READ.items() if f"monitor_{own}" in view}
     found, wanted = {name: [] for name in names}, {name: [] for name in names}
     largest_u = largest_x = 0.0
+    wide = 0
     said = {Mode[name]: 0 for name in {*result.mode}}
     for k, step in enumerate(steps):
         rows, weight = preview(k * model.dt)
-        goal = parts.goal(rows[:, : ocp.columns - ocp.n_p], weight, ocp=ocp)
+        goal = parts.goal(rows, weight, ocp=ocp, w=forecast(k * model.dt))
         w = step.estimate.w if model.n_w else np.zeros(1)
         if k == 0:
             whole.call("hmpc_start", step.y, w, None, goal)
         else:
             before = steps[k - 1].decision
-            whole.plan(before, backup=result.mode[k - 1] == "BACKUP")
-            whole.call("hmpc_step", step.y, w, None, goal)
+            if k == 1 or not own:
+                whole.plan(before, backup=result.mode[k - 1] == "BACKUP")
+            whole.call("hmpc_step", step.y, w, before.u if own and told else None, goal)
             decision = step.decision
             assert parts.SOURCES[int(view["source"])] == decision.source.name, k
             assert STATUSES[int(view["status"])] == decision.status.name, k
             if k > 1:
                 assert int(view["age"]) == decision.age, k
             largest_u = max(largest_u, float(np.max(np.abs(view["u"] - decision.u) / ocp.input_range)))
+            if largest_u > WIDE and not wide:
+                wide = k
         if case.guard is not None:
             assert Mode(int(view["guard_mode"])).name == result.mode[k], k
             said[Mode[result.mode[k]]] += 1
@@ -194,8 +207,8 @@ def replay(whole, case):
         whole.call("hmpc_finish", goal)
         for name in SAID:
             assert int(view[f"monitor_{name}"]) == int(getattr(step.reading, name)), (k, name)
-        for name, own in names.items():
-            found[name].append(np.array(view[f"monitor_{own}"]))
+        for name, place in names.items():
+            found[name].append(np.array(view[f"monitor_{place}"]))
             wanted[name].append(np.array(getattr(step.reading, name)))
     largest = 0.0
     for name in names:
@@ -206,7 +219,7 @@ def replay(whole, case):
         largest = max(largest, float(np.max(off)))
     return Told(
         len(steps), int(np.sum(result.alarm)), sum(s.reading.frozen for s in steps), tuple(dict.fromkeys(result.mode)),
-        tuple(dict.fromkeys(result.source)), largest_u, largest_x, largest,
+        tuple(dict.fromkeys(result.source)), largest_u, largest_x, largest, wide,
     )  # fmt: skip
 
 

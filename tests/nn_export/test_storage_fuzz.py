@@ -175,13 +175,20 @@ def judged(tmp_path, cases, *steps):
     return outcomes
 
 
+CHEAP = {
+    "large product", "constants once more", "positions of positions", "products of constants",
+    "an expression for many cells", "parts of a large input",
+}  # fmt: skip
+"""Crafted files that are within the limits, and soon built."""
+
+
 @pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of a process are Linux's here")
 def test_small_files_that_ask_for_gigabytes_or_minutes_are_refused_at_once(tmp_path):
     outcomes = judged(tmp_path, crafted(), "load", "build")
-    assert not [name for name, o in outcomes.items() if not o["refused"]]
-    # A second on a machine of today, and twice that where others work too. 230 MB of the memory are casadi and numpy.
-    assert {name: o["seconds"] for name, o in outcomes.items() if sum(o["seconds"].values()) > 2.0} == {}
+    assert {name for name, o in outcomes.items() if not o["refused"]} == CHEAP
+    # A second on a machine of today, five times that where others work too. 230 MB are casadi and numpy.
+    assert {name: o["seconds"] for name, o in outcomes.items() if sum(o["seconds"].values()) > 5.0} == {}
     assert max(o["peak"] for o in outcomes.values()) < 500e6
     # Every other audited event (exec, compile, import, dlopen, subprocess, unpickling) would be listed too.
     assert {event for o in outcomes.values() for event in o["events"]} <= {"open", "object.__getattr__"}

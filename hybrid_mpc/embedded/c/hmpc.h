@@ -30,6 +30,7 @@
 #define HMPC_NE (HMPC_NZ + HMPC_ND)          /* what the estimator estimates: x, h, d */
 #define HMPC_LE HMPC_ROUND(HMPC_NE)
 #define HMPC_NT (HMPC_NZ + HMPC_NU)          /* unknowns of a steady state: z, u */
+#define HMPC_NC (HMPC_NX + HMPC_NU)          /* what a stage cost is one of: x, u */
 #define HMPC_NQ (HMPC_NX / 2)                /* positions of a machine whose energy is watched */
 #define HMPC_ENERGY 1                        /* values of HMPC_MONITOR; 0: none */
 #define HMPC_RESIDUALS 2
@@ -56,11 +57,14 @@ typedef enum {
 typedef struct {
   const hmpc_real *x;      /* reference of the states, rows of HMPC_NX; where outputs are weighed it does not matter */
   const hmpc_real *y;      /* where outputs are weighed (HMPC_OUTPUT_COST): theirs, rows of HMPC_NY */
-  const hmpc_real *p;      /* what bounds that move depend on, rows of HMPC_NP; NULL: zero */
+  const hmpc_real *p;      /* what bounds and costs that move depend on, rows of HMPC_NP; NULL: zero */
   int rows;                /* of x or y, and of p */
   const hmpc_real *weight; /* factors on the states' weights, HMPC_N + 1 rows of HMPC_NX */
   const hmpc_real *u_min;  /* tighter limits of the inputs, HMPC_NU */
   const hmpc_real *u_max;
+  const hmpc_real *w;      /* forecast of the measured disturbances, rows of HMPC_NW; what is not finite is as in the row
+                              before, the first row as it was measured. NULL: those measured last hold */
+  int w_rows;
 } hmpc_goal;
 
 /* A steady state. */
@@ -106,6 +110,9 @@ typedef struct {
   hmpc_real weight[HMPC_N + 1][HMPC_NX], terminal[HMPC_NX][HMPC_NX];
   hmpc_real by_x[HMPC_DIM(HMPC_SOFT_E) * HMPC_N][HMPC_NX]; /* of soft expressions */
   hmpc_real soft[HMPC_DIM(HMPC_SOFT)];
+#if HMPC_STAGE_COST
+  hmpc_real cost_slope[HMPC_N][HMPC_NC], cost_curve[HMPC_N][HMPC_NC][HMPC_NC]; /* of costs that are no squares */
+#endif
   hmpc_real largest_defect;
 } hmpc_linear;
 
@@ -126,6 +133,9 @@ typedef struct {
    from a steady state, and what a descent lowers. */
 typedef struct {
   hmpc_real v[HMPC_NT], rest[HMPC_NZ], slope[HMPC_NZ][HMPC_LJ], y[HMPC_NY], lacks, merit;
+#if HMPC_CURVED
+  hmpc_real by_x[HMPC_NY][HMPC_NX], by_u[HMPC_NY][HMPC_NU]; /* of the outputs, which are not linear */
+#endif
 } hmpc_point;
 
 /* Where a descent ended: how far outputs are off in tolerated deviations, how far states and inputs are from the operating
@@ -138,7 +148,7 @@ typedef struct {
 
 /* Its memory, see hmpc_targets.c; d are the disturbances under which it searches. */
 typedef struct {
-  hmpc_point at, after, settled;
+  hmpc_point at, after, settled, kept;
   hmpc_descent tried[HMPC_TARGET_STARTS + 3];
   hmpc_real d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)];
   hmpc_real a[HMPC_NZ][HMPC_NT], half[HMPC_NZ], diagonal[HMPC_NZ], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];

@@ -3,13 +3,21 @@
    method, the steady states eliminated by their null space; bounds are an active set. All loops end after a fixed
    number of rounds.
 
-   Source: Rawlings, Mayne, Diehl, Model Predictive Control, 2017, section 1.5; Golub and Van Loan, Matrix Computations,
-   2013, sections 5.4 and 5.5. */
+   Source: Rawlings, Mayne, Diehl, Model Predictive Control, 2017, section 1.5; Nocedal, Wright, Numerical Optimization,
+   2006, section 15.6; Golub and Van Loan, Matrix Computations, 2013, sections 5.4 and 5.5. */
 #include "hmpc_math.h"
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
 
 #if HMPC_OUTPUT_COST
+
+#if HMPC_CURVED /* slopes of the outputs at a point */
+#define OUTPUT_X(at) ((at)->by_x)
+#define OUTPUT_U(at) ((at)->by_u)
+#else
+#define OUTPUT_X(at) output_x
+#define OUTPUT_U(at) output_u
+#endif
 
 enum {
   NT = HMPC_NT,
@@ -35,7 +43,11 @@ static void look(const hmpc_state *s, const real *v, const real *goal, const rea
     p->rest[i] = next[i] - v[i];
     p->lacks += hmpc_abs(p->rest[i] / target_scale[i]);
   }
+#if HMPC_CURVED
+  output_slopes(z, acts, w, p->y, p->by_x[0], p->by_u[0]);
+#else
   outputs(z, acts, w, p->y);
+#endif
   for (int i = 0; i < HMPC_NY; ++i) {
     for (int j = 0; j < HMPC_ND; ++j) p->y[i] += disturbs_y[i][j] * s->search.d[j];
     if (q_y[i] > R(0.0)) off += target_root[i] * target_root[i] * (p->y[i] - goal[i]) * (p->y[i] - goal[i]);
@@ -333,8 +345,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   for (int i = 0; i < HMPC_NY; ++i) {
     if (!(q_y[i] > R(0.0))) continue;
     for (int j = 0; j < NT; ++j) row[j] = R(0.0);
-    for (int j = 0; j < HMPC_NX; ++j) row[j] = output_x[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) row[HMPC_NZ + j] = output_u[i][j] * target_scale[HMPC_NZ + j];
+    for (int j = 0; j < HMPC_NX; ++j) row[j] = OUTPUT_X(at)[i][j] * target_scale[j];
+    for (int j = 0; j < HMPC_NU; ++j) row[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
     for (int k = 0; k < m; ++k) sees[tracked][k] = target_root[i] * hmpc_dot(row, work->along[k], NT);
     error[tracked] = target_root[i] * (goal[i] - at->y[i] - hmpc_dot(row, onto, NT));
     ++tracked;
@@ -385,8 +397,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   }
   for (int i = 0; i < HMPC_NY && bounded; ++i) {
     real slope[NT] = {R(0.0)};
-    for (int j = 0; j < HMPC_NX; ++j) slope[j] = output_x[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) slope[HMPC_NZ + j] = output_u[i][j] * target_scale[HMPC_NZ + j];
+    for (int j = 0; j < HMPC_NX; ++j) slope[j] = OUTPUT_X(at)[i][j] * target_scale[j];
+    for (int j = 0; j < HMPC_NU; ++j) slope[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
     for (int k = 0; k < m; ++k) row[k] = hmpc_dot(slope, work->along[k], NT);
     const real now = at->y[i] + hmpc_dot(slope, onto, NT);
     if (!bounds(work, m, row, now, target_y_range[i][0], target_y_range[i][1], &count)) return 0;
@@ -422,10 +434,30 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
     }
     if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * before)) sure = 0;
     before = size;
-    for (int half = 0; half <= HALVINGS; ++half, share *= R(0.5)) {
+    for (int i = 0; i < NT; ++i) there[i] = at->v[i] + step[i];
+    settle(s, there, goal, w, after);
+    if (!(after->merit < at->merit) && !(size < HMPC_TARGET_NEAR)) {
+      /* watchdog: along a curved branch a step leaves it by its square, and the next one comes back to it */
+      const real answer = work->answer;
+      real second[NT], again = R(0.0);
+      work->kept = *at;
+      *at = *after;
+      if (newton(work, goal, bounded, second)) {
+        for (int i = 0; i < NT; ++i) again = hmpc_max(again, hmpc_abs(second[i] / target_scale[i]));
+        for (int i = 0; i < NT; ++i) there[i] = at->v[i] + second[i];
+        settle(s, there, goal, w, after);
+        if (after->merit < work->kept.merit) {
+          if (!(again < HMPC_TARGET_NEAR || again <= HMPC_TARGET_CONTRACTS * size)) sure = 0;
+          before = again;
+        }
+      }
+      *at = work->kept;
+      work->answer = answer;
+    }
+    for (int half = 0; half < HALVINGS && !(after->merit < at->merit); ++half) {
+      share *= R(0.5);
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
-      if (after->merit < at->merit) break;
       if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
     if (!(after->merit < at->merit)) { /* rounding is all that is left, or it gets nowhere */
@@ -434,6 +466,9 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
     }
     *at = *after;
     lacks[k] = at->lacks;
+    size = R(0.0);
+    for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs((at->v[i] - v[i]) / target_scale[i]));
+    if (size > HMPC_TARGET_AWAY) break;
     if (k < HMPC_TARGET_WITHIN) continue;
     if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[k - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL)) break;
   }

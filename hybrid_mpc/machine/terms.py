@@ -1,0 +1,667 @@
+"""Physical terms that any prior can be given beside what it has: friction, losses, curved inputs and sensors, lags.
+
+A :class:`Term` is a change of a prior with one to three parameters, which vanishes where these are zero.
+:func:`extended` gives the prior with terms: it is fitted, trained on, exported and controlled like any other, and its
+balances have what the terms store, supply and lose. What laws are known stands here as one function each; which of them
+a prior may lack, with bounds from its recordings, says :func:`hybrid_mpc.identify.explain.library`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
+
+import casadi as ca
+
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.machine.mechanical import MechanicalPrior
+from hybrid_mpc.machine.prior import Balance, OperatingPoint, Prior, named
+from hybrid_mpc.machine.signals import Parameter, Signal
+from hybrid_mpc.records import Fields
+from hybrid_mpc.rules import Line, Name
+
+Place: TypeAlias = Literal["force", "potential", "rate", "input", "output"]
+PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "output")
+
+
+class At(NamedTuple):
+    """What a law is a function of.
+
+    Attributes:
+        x: States of the prior, by name.
+        u: Inputs that act, by name.
+        w: Measured disturbances, by name.
+        own: The signal that the term changes: the state whose rate or force it adds to, the input or output itself.
+        position: The position whose speed :attr:`own` is; None where there is none.
+        driven: Force or rate by what the inputs do [unit of the force or rate], less what they do at rest.
+        resting: Force or rate of the machine at rest where it is, as that of gravity or a spring.
+        state: The term's own state; None where it has none.
+    """
+
+    x: Any
+    u: Any
+    w: Any
+    own: Any
+    position: Any
+    driven: Any
+    resting: Any
+    state: Any
+
+
+@dataclass(frozen=True)
+class Term:
+    """A change of a prior.
+
+    Args:
+        name: Name of the term, e.g. ``"Coulomb friction of phi_dot"``.
+        place: Where it stands: ``"force"`` adds a generalised force to a mechanical prior's speed ``of``,
+            ``"potential"`` an energy of its position, ``"rate"`` adds to the rate of the state ``of``; ``"input"`` and
+            ``"output"`` replace what acts or is shown.
+        of: Name of the speed, state, input or output.
+        parameters: Its parameters; at zero of the first one, or at its nominal value, it hardly acts.
+        law: ``(at, p) -> value``: the force or rate that is added, the energy, or the signal in place of ``at.own``.
+            With a state ``(value, rate)``. ``p`` are its parameters in order, by name.
+        text: Its formula.
+        loss: Whether what it does to a balance is a loss, as friction; else it is a supply. Default: a supply.
+        state: A state of its own, e.g. that of a lag; its nominal value is that of the signal. Default: none.
+        code: The call that makes it, for a file; empty if it has none.
+
+    Raises:
+        InputError: If a field is of another kind, or it has no parameter.
+
+    Example:
+        >>> leak = Term("leak", "rate", "level", (Parameter("leak", 0.0, "1/s", 0.0, 1.0),),
+        ...     lambda at, p: -p.leak * at.own, "-leak level")
+        >>> leak.names
+        ('leak',)
+    """
+
+    name: Line
+    place: Place
+    of: Name
+    parameters: tuple[Parameter, ...]
+    law: Callable[[At, Any], Any] = field(compare=False)
+    text: Line = ""
+    loss: bool = False
+    state: Signal | None = None
+    code: str = ""
+
+    def __post_init__(self) -> None:
+        own = Fields(self, f"term {self.name!r}")
+        own.need(
+            "place", lambda: self.place in PLACES, f"place {self.place!r} is none of {', '.join(PLACES)}"
+        )
+        own.need("parameters", lambda: len(self.parameters) > 0, "a term needs a parameter")
+        own.refuse()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its parameters."""
+        return tuple(p.name for p in self.parameters)
+
+
+def extended(base: type[Prior], *terms: Term) -> type[Prior]:
+    """A prior class with terms beside what ``base`` has; their parameters and states come after those of ``base``.
+
+    Args:
+        base: A prior, in CasADi or torch; an extended one too.
+        terms: Terms, in any order. Default: none, ``base`` itself.
+
+    Raises:
+        InputError: If a term's signal is not there, a parameter or state is there twice, or a force is added to a prior
+            that is not mechanical; all of it together.
+
+    Example:
+        >>> class Disk(MechanicalPrior):
+        ...     states, outputs = (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("phi", "rad"),)
+        ...     inputs, parameters = (Signal("torque", "N m"),), (Parameter("J", 0.5, "kg m^2", 0.1, 1.0),)
+        ...     def mass_matrix(self, q, p):
+        ...         return p.J
+        >>> drag = quadratic("phi_dot", Parameter("c", 0.1, "N m s^2/rad^2", 0.0, 1.0))
+        >>> dragged = extended(Disk, drag)()
+        >>> dragged.equations.xdot([0.0, 2.0], 0.0, [], dragged.p)
+        DM([2, -0.8])
+        >>> [b.loss([0.0, 2.0], 0.0, [], dragged.p) for b in dragged.equations.balances]
+        [DM(0.8)]
+    """
+    made: type[Prior] = _extended(cast(Any, base), terms) if terms else base
+    return made
+
+
+@cache
+def _extended(base: Any, terms: tuple[Term, ...]) -> Any:
+    _check(base, terms)
+    added = tuple(term.state for term in terms if term.state is not None)
+    states = (*base.states, *added)
+
+    class Extended(Prior):
+        inputs, outputs, disturbances = base.inputs, base.outputs, base.disturbances
+        parameters = (*base.parameters, *(p for term in terms for p in term.parameters))
+        corrects = tuple(base().states[i].name for i in base().corrected)
+        operating_point = _operating_point(base, terms)
+
+        def expressions(self, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[Any, Any, tuple[Balance, ...]]:
+            return _expressions(base, terms, x, u, w, p)
+
+    made: Any = Extended
+    made.states = states
+    made.__name__ = made.__qualname__ = f"{base.__name__}Extended"
+    made.__module__, made.__doc__ = base.__module__, base.__doc__
+    made.base, made.terms = base, terms
+    return made
+
+
+def _expressions(
+    base: type[Prior], terms: tuple[Term, ...], x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX
+) -> tuple[Any, Any, tuple[Balance, ...]]:
+    """Rates, outputs and balances of a prior with terms."""
+    prior = base()
+    n_x, n_p = len(base.states), len(base.parameters)
+    of_base, own_p = p[:n_p], iter(ca.vertsplit(p)[n_p:])
+    own_x = iter(ca.vertsplit(x)[n_x:])
+    states = {term: next(own_x) for term in terms if term.state is not None}
+    given = {term: named(term.names, [next(own_p) for _ in term.parameters]) for term in terms}
+    x_base, extra = x[:n_x], dict[Term, Any]()
+    parts = {"x": x_base, "u": u, "w": w}
+
+    def at(own: Any, term: Term, position: Any = None, driven: Any = 0.0, resting: Any = 0.0) -> At:
+        x_named, u_named, w_named = (named(prior.names_of(k), ca.vertsplit(v)) for k, v in parts.items())
+        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term))
+
+    def applied(term: Term, point: At) -> Any:
+        value = term.law(point, given[term])
+        if term.state is not None:
+            value, extra[term] = value
+        return value
+
+    acting = dict(zip(prior.names_of("u"), ca.vertsplit(u), strict=True))
+    for term in terms:
+        if term.place == "input":
+            acting[term.of] = applied(term, at(acting[term.of], term))
+    parts["u"] = u = ca.vertcat(*acting.values())
+    equations = prior.equations
+    rates = equations.xdot(x_base, u, w, of_base)
+    added, lost, stored = ca.SX.zeros(n_x), ca.SX.zeros(n_x), ca.SX(0)
+    names = prior.names_of("x")
+    positions = {names[v]: q for q, v in prior.kinematics}
+    for term in terms:
+        if term.place not in ("force", "potential", "rate"):
+            continue
+        i = names.index(term.of)
+        q = positions.get(term.of)
+        driven, resting = _forces(base, x_base, u, w, of_base, term, i)
+        value = ca.SX(applied(term, at(x_base[i], term, None if q is None else x_base[q], driven, resting)))
+        if term.place == "potential":
+            stored = stored + value
+            assert q is not None
+            value = -ca.gradient(value, x_base[q]) if ca.depends_on(value, x_base[q]) else ca.SX(0)
+        change = ca.SX.zeros(n_x)
+        if term.place == "rate":
+            change[i] = value
+        else:
+            force = ca.SX.zeros(n_x // 2)
+            force[i - n_x // 2] = value
+            change[n_x // 2 :] = ca.solve(_masses(cast(Any, base))(x_base[: n_x // 2], of_base), force)
+        added = added + change
+        if term.loss:
+            lost = lost + change
+    outputs = dict(
+        zip(
+            (s.name for s in base.outputs), ca.vertsplit(equations.output(x_base, u, w, of_base)), strict=True
+        )
+    )
+    for term in terms:
+        if term.place == "output":
+            outputs[term.of] = applied(term, at(outputs[term.of], term))
+    balances = []
+    for b in equations.balances:
+        storage = b.storage(x_base, of_base)
+        slope = ca.gradient(storage, x_base)
+        mechanical = issubclass(base, MechanicalPrior) and b.name == "energy"
+        # a potential's force only turns what is stored into another form: dS/dt of the sum has it on both sides
+        held = stored if mechanical else ca.SX(0)
+        supply = (
+            b.supply(x_base, u, w, of_base)
+            + slope.T @ (added - lost)
+            + ca.gradient(held, x_base).T @ (rates + added)
+        )
+        balances.append(
+            Balance(
+                b.name,
+                storage + held,
+                supply,
+                b.loss(x_base, u, w, of_base) - slope.T @ lost,
+                b.unit,
+                b.rate_unit,
+            )
+        )
+    return (
+        ca.vertcat(rates + added, *(extra[term] for term in states)),
+        tuple(outputs.values()),
+        tuple(balances),
+    )
+
+
+def _forces(
+    base: type[Prior], x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, term: Term, i: int
+) -> tuple[ca.SX, ca.SX]:
+    """Force, or rate, of a state by the inputs and at rest."""
+    prior, n_x = base(), len(base.states)
+    point = base.operating_point
+    at_rest = ca.DM([0.0] * len(base.inputs) if point is None else list(point.u))
+    still = ca.vertcat(*(0.0 if k in {v for _, v in prior.kinematics} else x[k] for k in range(n_x)))
+    xdot = prior.equations.xdot
+    driven, resting = xdot(x, u, w, p) - xdot(x, at_rest, w, p), xdot(still, at_rest, w, p)
+    if term.place == "rate":
+        return driven[i], resting[i]
+    half = n_x // 2
+    mass = _masses(cast(Any, base))(x[:half], p)
+    return (mass @ driven[half:])[i - half], (mass @ resting[half:])[i - half]
+
+
+@cache
+def _masses(base: Any) -> ca.Function:
+    prior = base()
+    assert isinstance(prior, MechanicalPrior)
+    return prior.masses
+
+
+def _operating_point(base: type[Prior], terms: tuple[Term, ...]) -> OperatingPoint | None:
+    """The base's, with the states of terms where the signals that they follow are."""
+    point = base.operating_point
+    if point is None or not any(term.state for term in terms):
+        return point
+    prior = base()
+    u = dict(zip((s.name for s in base.inputs), point.u, strict=True))
+    y = prior.equations.output(point.x, point.u, point.w, prior.p).full().ravel()
+    shown = {s.name: float(v) for s, v in zip(base.outputs, y, strict=True)}
+    more = [(u if term.place == "input" else shown)[term.of] for term in terms if term.state is not None]
+    return OperatingPoint((*point.x, *more), point.u, point.w)
+
+
+def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
+    problems, prior = [], base()
+    signals = {"input": base.inputs, "output": base.outputs}
+    moving = {base.states[v].name for _, v in prior.kinematics}
+    for term in terms:
+        where = f"term {term.name!r} for {base.__name__}"
+        names = [s.name for s in signals.get(term.place, base.states)]
+        if term.of not in names:
+            problems.append(f"{where}: there is no {term.of!r}; choose of {', '.join(names)}.")
+        elif term.place in ("force", "potential") and not issubclass(base, MechanicalPrior):
+            problems.append(f"{where}: a {term.place} needs a MechanicalPrior; take a rate.")
+        elif term.place in ("force", "potential") and term.of not in moving:
+            problems.append(f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}.")
+        if term.state is not None and term.place not in ("input", "output"):
+            problems.append(f"{where}: only inputs and outputs may have a state of their own.")
+    for what, every in (
+        ("parameter", [p.name for p in base.parameters] + [name for t in terms for name in t.names]),
+        ("state", [s.name for s in base.states] + [t.state.name for t in terms if t.state is not None]),
+    ):
+        twice = sorted({name for name in every if every.count(name) > 1})
+        if twice:
+            problems.append(
+                f"{base.__name__} with terms: {what} {', '.join(twice)} is there twice; rename one."
+            )
+    refuse(problems)
+
+
+def _sign(v: Any, width: Any) -> Any:
+    """Smooth sign of a speed: 96 % at two widths."""
+    return ca.tanh(v / width)
+
+
+def _call(maker: str, of: str, *parameters: Parameter, **options: Any) -> str:
+    more = [f"{key}={value!r}" for key, value in options.items()]
+    return f"terms.{maker}({', '.join([repr(of), *map(_parameter_code, parameters), *more])})"
+
+
+def _parameter_code(p: Parameter) -> str:
+    words = f", {p.description!r}" if p.description else ""
+    return f"Parameter({p.name!r}, {p.value!r}, {p.unit!r}, {p.lower!r}, {p.upper!r}{words})"
+
+
+def _added(
+    maker: str, title: str, place: Place, of: str, parameters: tuple[Parameter, ...], law: Callable[[At, Any], Any],
+    text: str, *, loss: bool = False, state: Signal | None = None, **options: Any,
+) -> Term:  # fmt: skip
+    code = _call(maker, of, *parameters, **({"place": place} if place == "rate" else {}), **options)
+    return Term(f"{title} of {of}", place, of, parameters, law, text, loss, state, code)
+
+
+# Friction: against the motion of one axis.
+
+
+def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") -> Term:
+    """Dry friction ``-F tanh(v / width)``.
+
+    ``F / (width inertia)`` is the rate at which it stops the machine near rest, which the integration steps follow.
+
+    Args:
+        of: Speed.
+        level: F [N or N m], of a rate [unit/s].
+        width: Speed over which it turns round.
+        place: ``"rate"`` for a prior that is not mechanical.
+    """
+    return _added(
+        "coulomb", "Coulomb friction", place, of, (level,), lambda at, p: -p[0] * _sign(at.own, width),
+        f"-{level.name} sign({of})", loss=True, width=width,
+    )  # fmt: skip
+
+
+def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force") -> Term:
+    """Dry friction that is larger forwards than backwards: ``-A tanh(v / width)^2``.
+
+    Args:
+        of: Speed.
+        more: A [N or N m], half of what it is larger.
+        width: Speed over which friction turns round.
+        place: ``"rate"`` for a prior that is not mechanical.
+    """
+    return _added(
+        "asymmetric", "friction by direction", place, of, (more,), lambda at, p: -p[0] * _sign(at.own, width) ** 2,
+        f"-{more.name} |sign({of})|", width=width,
+    )  # fmt: skip
+
+
+def viscous(of: str, d: Parameter, *, place: Place = "force") -> Term:
+    """Viscous friction ``-d v``."""
+    return _added(
+        "viscous",
+        "viscous friction",
+        place,
+        of,
+        (d,),
+        lambda at, p: -p[0] * at.own,
+        f"-{d.name} {of}",
+        loss=True,
+    )
+
+
+def viscous_by_direction(of: str, a: Parameter, *, place: Place = "force") -> Term:
+    """Viscous friction that differs by direction: ``-a |v|``."""
+    return _added(
+        "viscous_by_direction", "viscous friction by direction", place, of, (a,),
+        lambda at, p: -p[0] * ca.fabs(at.own), f"-{a.name} |{of}|",
+    )  # fmt: skip
+
+
+def quadratic(of: str, c: Parameter, *, place: Place = "force") -> Term:
+    """Drag ``-c v |v|``."""
+    return _added(
+        "quadratic", "quadratic drag", place, of, (c,), lambda at, p: -p[0] * at.own * ca.fabs(at.own),
+        f"-{c.name} {of} |{of}|", loss=True,
+    )  # fmt: skip
+
+
+def stribeck(of: str, more: Parameter, *, speed: float, width: float, place: Place = "force") -> Term:
+    """More friction near rest than in motion: ``-F exp(-(v / speed)^2) tanh(v / width)``.
+
+    Source: Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey of models, analysis tools and compensation methods for
+    the control of machines with friction*, Automatica 30 (1994).
+    """
+    return _added(
+        "stribeck", "Stribeck friction", place, of, (more,),
+        lambda at, p: -p[0] * ca.exp(-((at.own / speed) ** 2)) * _sign(at.own, width),
+        f"-{more.name} exp(-({of} / {speed:.3g})^2) sign({of})", loss=True, speed=speed, width=width,
+    )  # fmt: skip
+
+
+def loaded(of: str, mu: Parameter, *, load: str, width: float, place: Place = "force") -> Term:
+    """Friction that grows with the load of a gear or bearing: ``-mu |load| tanh(v / width)``.
+
+    ``load`` is ``"driven"`` (what the inputs do), ``"resting"`` (gravity, springs) or ``"both"``, their sum.
+
+    Source: Duclusaud, Passault, Padois, Ly, *Extended friction models for the physics simulation of servo actuators*
+    (ICRA 2025).
+    """
+    chosen: Mapping[str, Callable[[At], Any]] = {
+        "driven": lambda at: at.driven, "resting": lambda at: at.resting, "both": lambda at: at.driven + at.resting,
+    }  # fmt: skip
+    return _added(
+        "loaded", f"friction by {load} load", place, of, (mu,),
+        lambda at, p: -p[0] * ca.fabs(chosen[load](at)) * _sign(at.own, width),
+        f"-{mu.name} |{'load' if load == 'both' else load + ' load'}| sign({of})", loss=True, load=load, width=width,
+    )  # fmt: skip
+
+
+def coulomb_by_position(
+    of: str,
+    one: Parameter,
+    two: Parameter,
+    *,
+    width: float,
+    turning: bool,
+    centre: float = 0.0,
+    place: Place = "force",
+) -> Term:
+    """Dry friction that changes along the way: ``-(a sin q + b cos q) tanh(v / width)``, or with ``q - centre`` and its
+    square where the position does not turn.
+    """
+    first, second = (ca.sin, ca.cos) if turning else (lambda q: q - centre, lambda q: (q - centre) ** 2)
+    return _added(
+        "coulomb_by_position", "Coulomb friction by position", place, of, (one, two),
+        lambda at, p: -(p[0] * first(at.position) + p[1] * second(at.position)) * _sign(at.own, width),
+        f"-({one.name} {'sin' if turning else ''} q + {two.name} {'cos q' if turning else 'q^2'}) sign({of})",
+        width=width, turning=turning, centre=centre,
+    )  # fmt: skip
+
+
+# Forces and potentials.
+
+
+def offset(of: str, value: Parameter, *, place: Place = "force") -> Term:
+    """A constant force or rate."""
+    return _added("offset", "offset", place, of, (value,), lambda at, p: p[0], value.name)
+
+
+def gravity_error(of: str, sine: Parameter, cosine: Parameter) -> Term:
+    """A weight that the prior has not, or at another angle: the potential ``-a cos q + b sin q``."""
+    return _added(
+        "gravity_error", "gravity error", "potential", of, (sine, cosine),
+        lambda at, p: -p[0] * ca.cos(at.position) + p[1] * ca.sin(at.position),
+        f"-{sine.name} sin q - {cosine.name} cos q",
+    )  # fmt: skip
+
+
+def cogging(of: str, sine: Parameter, cosine: Parameter, *, periods: float) -> Term:
+    """Magnets on teeth, or a shaft that is not round: the potential ``(a cos(n q) - b sin(n q)) / n``, n the periods in
+    2 pi of the position.
+    """
+    return _added(
+        "cogging", f"cogging by {periods:.3g}", "potential", of, (sine, cosine),
+        lambda at, p: (p[0] * ca.cos(periods * at.position) - p[1] * ca.sin(periods * at.position)) / periods,
+        f"{sine.name} sin({periods:.3g} q) + {cosine.name} cos({periods:.3g} q)", periods=periods,
+    )  # fmt: skip
+
+
+def spring(of: str, stiffness: Parameter, *, centre: float) -> Term:
+    """A spring: the potential ``k (q - centre)^2 / 2``."""
+    return _added(
+        "spring", "spring", "potential", of, (stiffness,), lambda at, p: 0.5 * p[0] * (at.position - centre) ** 2,
+        f"-{stiffness.name} (q - {centre:.3g})", centre=centre,
+    )  # fmt: skip
+
+
+def elastic_end(of: str, stiffness: Parameter, *, edge: float, upper: bool) -> Term:
+    """An end that gives way: the potential ``k max(q - edge, 0)^2 / 2``, of a lower end ``edge - q``."""
+    side = 1.0 if upper else -1.0
+    return _added(
+        "elastic_end", f"{'upper' if upper else 'lower'} elastic end", "potential", of, (stiffness,),
+        lambda at, p: 0.5 * p[0] * ca.fmax(side * (at.position - edge), 0.0) ** 2,
+        f"-{stiffness.name} (q - {edge:.3g}) beyond it", edge=edge, upper=upper,
+    )  # fmt: skip
+
+
+# Rates of processes.
+
+
+def loss(of: str, k: Parameter, *, exponent: float, reference: str | float = 0.0) -> Term:
+    """A loss to what surrounds it: ``-k sign(x - r) |x - r|^exponent``.
+
+    ``exponent`` is 1 for conduction, 1.25 for free convection, 0.5 for an outlet. ``reference`` is the state or
+    measured disturbance of the same unit on the other side, or a number.
+
+    Source: Incropera, DeWitt, *Fundamentals of Heat and Mass Transfer*, 6th edition (2007), section 9.3, for 1.25.
+    """
+
+    def law(at: At, p: Any) -> Any:
+        other = reference if not isinstance(reference, str) else _signal(at, reference)
+        far = at.own - other
+        if exponent == 1.0:
+            return -p[0] * far
+        # finite slope where both are equal
+        return -p[0] * far * (far * far + 1e-4) ** (0.5 * (exponent - 1.0))
+
+    to = reference if isinstance(reference, str) else f"{reference:.3g}"
+    return _added(
+        "loss", f"loss to {to} by {exponent:g}", "rate", of, (k,), law, f"-{k.name} ({of} - {to})^{exponent:g}",
+        exponent=exponent, reference=reference,
+    )  # fmt: skip
+
+
+def radiation(of: str, k: Parameter, *, kelvin: float, surroundings: float) -> Term:
+    """Radiation ``-k ((x + kelvin)^4 - (surroundings + kelvin)^4) / 1e8``; ``kelvin`` is 273.15 for degC, 0 for K."""
+    return _added(
+        "radiation", "radiation", "rate", of, (k,),
+        lambda at, p: -p[0] * ((at.own + kelvin) ** 4 - (surroundings + kelvin) ** 4) / 1e8,
+        f"-{k.name} (T^4 - {surroundings:.3g}^4)", kelvin=kelvin, surroundings=surroundings,
+    )  # fmt: skip
+
+
+def overflow(of: str, k: Parameter, *, edge: float, width: float) -> Term:
+    """What runs over an edge: ``-k max(x - edge, 0)``, smooth over ``width``."""
+    return _added(
+        "overflow", f"overflow at {edge:.3g}", "rate", of, (k,),
+        lambda at, p: -0.5 * p[0] * (at.own - edge + ca.sqrt((at.own - edge) ** 2 + width**2)),
+        f"-{k.name} max({of} - {edge:.3g}, 0)", loss=True, edge=edge, width=width,
+    )  # fmt: skip
+
+
+def coupling(of: str, k: Parameter, *, source: str, centre: float = 0.0) -> Term:
+    """What another signal does to a state: ``k (source - centre)``; an input, state or measured disturbance."""
+    return _added(
+        "coupling", f"coupling from {source}", "rate", of, (k,), lambda at, p: p[0] * (_signal(at, source) - centre),
+        f"{k.name} {source}", source=source, centre=centre,
+    )  # fmt: skip
+
+
+def product(of: str, k: Parameter, *, one: str, two: str, centres: tuple[float, float] = (0.0, 0.0)) -> Term:
+    """What two signals do together: ``k (one - c1) (two - c2)``."""
+    return _added(
+        "product", f"product of {one} and {two}", "rate", of, (k,),
+        lambda at, p: p[0] * (_signal(at, one) - centres[0]) * (_signal(at, two) - centres[1]), f"{k.name} {one} {two}",
+        one=one, two=two, centres=centres,
+    )  # fmt: skip
+
+
+def _signal(at: At, name: str) -> Any:
+    """A state, input or disturbance by its name."""
+    for group in (at.x, at.u, at.w):
+        if name in getattr(group, "_fields", ()):
+            return getattr(group, name)
+    raise InputError(f"there is no state, input or disturbance {name!r}")
+
+
+# Inputs.
+
+
+def input_gain(of: str, g: Parameter) -> Term:
+    """Another gain: ``(1 + g) u``."""
+    return _added(
+        "input_gain", "gain", "input", of, (g,), lambda at, p: (1.0 + p[0]) * at.own, f"(1 + {g.name}) {of}"
+    )
+
+
+def input_offset(of: str, value: Parameter) -> Term:
+    """``u + offset``."""
+    return _added(
+        "input_offset",
+        "input offset",
+        "input",
+        of,
+        (value,),
+        lambda at, p: at.own + p[0],
+        f"{of} + {value.name}",
+    )
+
+
+def gain_by_direction(of: str, b: Parameter) -> Term:
+    """A gain that differs by the sign of the input: ``u + b |u|``."""
+    return _added(
+        "gain_by_direction", "gain by direction", "input", of, (b,), lambda at, p: at.own + p[0] * ca.fabs(at.own),
+        f"{of} + {b.name} |{of}|",
+    )  # fmt: skip
+
+
+def input_curve(of: str, c: Parameter, *, centre: float, span: float) -> Term:
+    """A bent characteristic: ``u + c (u - centre) |u - centre| / span``; negative ``c`` saturates."""
+    return _added(
+        "input_curve", "input curve", "input", of, (c,),
+        lambda at, p: at.own + p[0] * (at.own - centre) * ca.fabs(at.own - centre) / span,
+        f"{of} + {c.name} ({of} - {centre:.3g})^2", centre=centre, span=span,
+    )  # fmt: skip
+
+
+def dead_zone(of: str, d: Parameter, *, width: float) -> Term:
+    """An input that must be this large before it acts: ``u - d tanh(u / width)``."""
+    return _added(
+        "dead_zone", "dead zone", "input", of, (d,), lambda at, p: at.own - p[0] * _sign(at.own, width),
+        f"{of} - {d.name} sign({of})", width=width,
+    )  # fmt: skip
+
+
+def input_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
+    """An actuator that follows its command: ``tau s' = u - s``, and ``s`` acts."""
+    return _added(
+        "input_lag", "lag", "input", of, (tau,), lambda at, p: (at.state, (at.own - at.state) / p[0]),
+        f"{tau.name} s' = {of} - s", state=state,
+    )  # fmt: skip
+
+
+# Sensors.
+
+
+def output_gain(of: str, g: Parameter) -> Term:
+    """A sensor of another gain: ``(1 + g) y``."""
+    return _added(
+        "output_gain",
+        "sensor gain",
+        "output",
+        of,
+        (g,),
+        lambda at, p: (1.0 + p[0]) * at.own,
+        f"(1 + {g.name}) {of}",
+    )
+
+
+def output_offset(of: str, value: Parameter) -> Term:
+    """A sensor with an offset: ``y + offset``."""
+    return _added(
+        "output_offset",
+        "sensor offset",
+        "output",
+        of,
+        (value,),
+        lambda at, p: at.own + p[0],
+        f"{of} + {value.name}",
+    )
+
+
+def output_curve(of: str, bend: Parameter, *, lower: float, upper: float) -> Term:
+    """A bent sensor that is right at two readings: ``y + bend (y - lower) (y - upper)``."""
+    return _added(
+        "output_curve", "sensor curve", "output", of, (bend,),
+        lambda at, p: at.own + p[0] * (at.own - lower) * (at.own - upper),
+        f"{of} + {bend.name} ({of} - {lower:.3g}) ({of} - {upper:.3g})", lower=lower, upper=upper,
+    )  # fmt: skip
+
+
+def output_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
+    """A sensor that follows what it measures, or averages it: ``tau s' = y - s``, and ``s`` is shown."""
+    return _added(
+        "output_lag", "sensor lag", "output", of, (tau,), lambda at, p: (at.state, (at.own - at.state) / p[0]),
+        f"{tau.name} s' = {of} - s", state=state,
+    )  # fmt: skip

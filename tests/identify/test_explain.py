@@ -1,0 +1,103 @@
+"""The search for missing terms: a term that was taken out is found, and none is added where none is missing."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Signal, Trajectory, fit_prior
+from hybrid_mpc.identify.explain import explain, library
+from hybrid_mpc.identify.fit import smoothed
+from hybrid_mpc.identify.simulation import visited
+from hybrid_mpc.machine import terms
+from hybrid_mpc.machine.terms import extended
+
+DT = 0.02
+
+
+class Pendulum(MechanicalPrior):
+    states = (Signal("phi", "rad", -10.0, 10.0, periodic=True), Signal("phi_dot", "rad/s", -40.0, 40.0))
+    inputs = (Signal("torque", "N m", -3.0, 3.0),)
+    outputs = states[:1]
+    parameters = (
+        Parameter("J", 0.12, "kg m^2", 0.05, 0.3),
+        Parameter("mgl", 1.8, "N m", 0.5, 4.0),
+        Parameter("d", 0.03, "N m s/rad", 0.0, 0.5),
+    )
+    operating_point = OperatingPoint((0.0, 0.0), (0.0,))
+
+    def mass_matrix(self, q, p):
+        return p.J
+
+    def potential(self, q, p):
+        return -p.mgl * ca.cos(q.phi)
+
+    def friction(self, q, v, p):
+        return p.d * v.phi_dot
+
+
+def recorded(prior, count=6, seconds=8.0, seed=0):
+    """Runs of a plant from rest under torques that change every 0.3 s, each of its own size."""
+    rng, f, runs = np.random.default_rng(seed), prior.equations.xdot, []
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    h = DT / 10
+
+    def rates(at):
+        return f(at, u, [], prior.p)
+
+    one = x
+    for _ in range(10):
+        k1 = rates(one)
+        k2 = rates(one + h / 2 * k1)
+        k3 = rates(one + h / 2 * k2)
+        one = one + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(one + h * k3))
+    step = ca.Function("step", [x, u], [one])
+    n = round(seconds / DT)
+    for k in range(count):
+        torque = np.repeat(rng.uniform(-1, 1, n // 15 + 1), 15)[:n, None] * (0.6 + 0.25 * k)
+        states = [np.zeros(2)]
+        for row in torque[:-1]:
+            states.append(step(states[-1], row).full().ravel())
+        y = np.array(states)[:, :1] + 1e-3 * rng.standard_normal((n, 1))
+        nothing = np.full((n, 2), np.nan)
+        runs.append(Trajectory(f"run{k}", "train", DT, DT * np.arange(n), torque, y, nothing, nothing))
+    return runs
+
+
+def searched(plant):
+    runs = recorded(plant)
+    fit = fit_prior(Pendulum, runs, [], dt=DT, length=2.0)
+    return explain(Pendulum, fit.values, smoothed(Pendulum, fit, runs, DT), dt=DT, length=2.0)
+
+
+def test_dry_friction_that_is_missing_is_found():
+    level = Parameter("F", 0.15, "N m", 0.0, 1.0)
+    found = searched(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))())
+    assert found.steps[0].term.name == "Coulomb friction of phi_dot"
+    assert found.steps[0].ratio < 0.3
+    assert found.values["F_c_phi_dot"] == pytest.approx(0.15, rel=0.1)
+    assert found.values["mgl"] == pytest.approx(1.8, rel=0.02)
+
+
+def test_no_term_is_added_where_none_is_missing():
+    found = searched(Pendulum({"J": 0.14, "mgl": 2.1}))
+    assert found.steps == ()
+    assert found.prior is Pendulum
+    assert found.reason
+
+
+def test_every_term_of_the_library_vanishes_where_the_search_begins():
+    prior = Pendulum()
+    runs = smoothed(
+        Pendulum, fit_prior(Pendulum, recorded(prior, 2), [], dt=DT, length=1.0), recorded(prior, 2), DT
+    )
+    every = [
+        form for one in library(prior, visited(runs), DT, 2.0) for form in one.forms if form.state is None
+    ]
+    made = extended(Pendulum, *every)()
+    x, u = [0.4, 1.3], [0.7]
+    np.testing.assert_allclose(
+        made.equations.xdot(x, u, [], made.p).full(),
+        prior.equations.xdot(x, u, [], prior.p).full(),
+        rtol=1e-12,
+    )
+    assert len(every) > 20

@@ -1,0 +1,161 @@
+"""Terms beside a prior: each vanishes at zero, acts as its formula says, and keeps the balances."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from hybrid_mpc import InputError, MechanicalPrior, Parameter, Prior, Signal
+from hybrid_mpc.machine import terms
+from hybrid_mpc.machine.prior import Balance
+from hybrid_mpc.machine.terms import Term, extended
+
+
+class Arm(MechanicalPrior):
+    states = (
+        *(Signal(q, "rad", periodic=True) for q in ("q1", "q2")),
+        *(Signal(v, "rad/s") for v in ("v1", "v2")),
+    )
+    inputs = (Signal("t1", "N m"), Signal("t2", "N m"))
+    outputs = states[:2]
+    parameters = (Parameter("J", 0.5, "kg m^2", 0.1, 1.0),)
+
+    def mass_matrix(self, q, p):
+        return (p.J + 0.2 + 0.1 * ca.cos(q.q2), 0.1 + 0.05 * ca.cos(q.q2)), (0.1 + 0.05 * ca.cos(q.q2), 0.2)
+
+    def potential(self, q, p):
+        return -2.0 * ca.cos(q.q1) - 0.5 * ca.cos(q.q1 + q.q2)
+
+
+class Tank(Prior):
+    states = (Signal("level", "m", 0.0, 2.0), Signal("heat", "degC"))
+    inputs = (Signal("inflow", "m^3/s"),)
+    outputs = states
+    disturbances = (Signal("room", "degC"),)
+    parameters = (Parameter("k", 0.1, "m^0.5/s", 0.0, 1.0),)
+
+    def xdot(self, x, u, w, p):
+        return u.inflow - p.k * ca.sqrt(x.level), 0.01 * (w.room - x.heat)
+
+    def balances(self, x, u, w, p):
+        return (Balance("volume", x.level, u.inflow, p.k * ca.sqrt(x.level), "m", "m/s"),)
+
+
+def p(name, value=0.0, unit="N m", low=-10.0, high=10.0):
+    return Parameter(name, value, unit, low, high)
+
+
+def arm_terms(value):
+    """A term of each law of an axis, with this weight."""
+    one, two = p("a", value), p("b", value)
+    return {
+        "coulomb": terms.coulomb("v1", one, width=0.2),
+        "asymmetric": terms.asymmetric("v1", one, width=0.2),
+        "viscous": terms.viscous("v1", one),
+        "viscous by direction": terms.viscous_by_direction("v1", one),
+        "quadratic": terms.quadratic("v1", one),
+        "stribeck": terms.stribeck("v2", one, speed=0.5, width=0.2),
+        "loaded by motor": terms.loaded("v1", one, load="driven", width=0.2),
+        "loaded by both": terms.loaded("v2", one, load="both", width=0.2),
+        "by position": terms.coulomb_by_position("v1", one, two, width=0.2, turning=True),
+        "offset": terms.offset("v1", one),
+        "gravity": terms.gravity_error("v1", one, two),
+        "cogging": terms.cogging("v2", one, two, periods=4.0),
+        "spring": terms.spring("v1", one, centre=0.1),
+        "end": terms.elastic_end("v1", one, edge=-0.2, upper=True),
+        "gain": terms.input_gain("t1", one),
+        "input offset": terms.input_offset("t1", one),
+        "by direction": terms.gain_by_direction("t2", one),
+        "input curve": terms.input_curve("t1", one, centre=0.0, span=2.0),
+        "dead zone": terms.dead_zone("t1", one, width=0.1),
+        "sensor gain": terms.output_gain("q1", one),
+        "sensor offset": terms.output_offset("q1", one),
+        "sensor curve": terms.output_curve("q2", one, lower=-1.0, upper=1.0),
+    }
+
+
+X, U = np.array([0.4, -0.3, 1.2, -0.7]), np.array([0.8, -0.5])
+
+
+@pytest.mark.parametrize("name", arm_terms(0.0))
+def test_a_term_vanishes_at_zero_and_acts_elsewhere(name):
+    plain = Arm()
+    for value, acts in ((0.0, False), (0.3, True)):
+        made = extended(Arm, arm_terms(value)[name])()
+        off = [
+            np.abs((of_made(X, U, [], made.p) - of_plain(X, U, [], plain.p)).full()).max()
+            for of_made, of_plain in (
+                (made.equations.xdot, plain.equations.xdot), (made.equations.output, plain.equations.output),
+            )
+        ]  # fmt: skip
+        assert (max(off) > 1e-3) == acts
+
+
+@pytest.mark.parametrize("name", arm_terms(0.0))
+def test_the_energy_balance_holds_with_a_term(name):
+    """What is stored changes by what is supplied less what is lost, along a fine integration; no friction supplies."""
+    made = extended(Arm, arm_terms(0.3)[name])()
+    (energy,) = made.equations.balances
+    f, x, h = made.equations.xdot, ca.DM(X), 1e-3
+    stored, through = energy.storage(x, made.p), 0.0
+    for _ in range(300):
+        rates = [energy.supply(x, U, [], made.p) - energy.loss(x, U, [], made.p)]
+        k1 = f(x, U, [], made.p)
+        k2 = f(x + 0.5 * h * k1, U, [], made.p)
+        k3 = f(x + 0.5 * h * k2, U, [], made.p)
+        middle, x = x + 0.5 * h * k2, x + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(x + h * k3, U, [], made.p))
+        rates += [energy.supply(at, U, [], made.p) - energy.loss(at, U, [], made.p) for at in (middle, x)]
+        through = through + h / 6 * (rates[0] + 4 * rates[1] + rates[2])
+        if name in ("coulomb", "viscous", "quadratic", "stribeck", "loaded by motor", "loaded by both"):
+            assert float(energy.loss(x, U, [], made.p)) >= 0.0
+    assert float(energy.storage(x, made.p) - stored) == pytest.approx(float(through), abs=1e-5)
+
+
+def test_a_lag_has_a_state_of_its_own_that_starts_where_its_signal_is():
+    tau = p("tau", 0.1, "s", 0.01, 1.0)
+    lag = terms.input_lag("t1", tau, state=Signal("t1_acting", "N m"))
+    shown = terms.output_lag("q1", p("tau_s", 0.2, "s", 0.01, 1.0), state=Signal("q1_shown", "rad"))
+    made = extended(Arm, lag, shown)()
+    assert [s.name for s in made.states][4:] == ["t1_acting", "q1_shown"]
+    x = np.concatenate([X, [0.3, 0.1]])
+    rates, y = (getattr(made.equations, f)(x, U, [], made.p).full().ravel() for f in ("xdot", "output"))
+    wanted = Arm().equations.xdot(X, [0.3, U[1]], [], Arm().p).full().ravel()
+    np.testing.assert_allclose(rates, [*wanted, (0.8 - 0.3) / 0.1, (0.4 - 0.1) / 0.2], rtol=1e-12)
+    np.testing.assert_allclose(y, [0.1, -0.3], rtol=1e-12)
+
+
+def test_terms_of_processes_add_to_rates_and_balances():
+    made = extended(
+        Tank,
+        terms.overflow("level", p("s", 0.5, "1/s"), edge=0.8, width=1e-6),
+        terms.loss("heat", p("h", 0.02, "1/s"), exponent=1.25, reference="room"),
+        terms.coupling("level", p("c", 0.1, "m/s/K"), source="heat", centre=20.0),
+    )()
+    x, u, w = [1.0, 30.0], [0.2], [20.0]
+    rates = made.equations.xdot(x, u, w, made.p).full().ravel()
+    np.testing.assert_allclose(
+        rates, [0.2 - 0.1 - 0.5 * 0.2 + 0.1 * 10.0, -0.1 - 0.02 * 10.0**1.25], rtol=1e-5
+    )
+    (volume,) = made.equations.balances
+    assert float(volume.loss(x, u, w, made.p)) == pytest.approx(0.1 + 0.5 * 0.2, rel=1e-5)
+    assert float(volume.supply(x, u, w, made.p)) == pytest.approx(0.2 + 0.1 * 10.0)
+
+
+def test_an_own_term_takes_a_few_lines():
+    leak = Term("leak", "rate", "level", (p("leak", 0.25, "1/s"),), lambda at, p: -p.leak * at.own, loss=True)
+    made = extended(Tank, leak)()
+    assert float(made.equations.xdot([1.0, 20.0], [0.0], [20.0], made.p)[0]) == pytest.approx(-0.1 - 0.25)
+
+
+def test_what_does_not_fit_is_refused_all_at_once():
+    with pytest.raises(InputError) as refused:
+        extended(
+            Tank, terms.coulomb("level", p("k"), width=0.1), terms.viscous("speed", p("d"), place="rate"),
+            terms.output_gain("flow", p("g")),
+        )  # fmt: skip
+    assert len(refused.value.problems) == 4  # no mechanical prior, no such state, no such output, k twice
+
+
+def test_the_call_that_makes_a_term_makes_it_again():
+    for term in arm_terms(0.25).values():
+        again = eval(term.code, {"terms": terms, "Parameter": Parameter})
+        assert (again, again.code) == (term, term.code)
