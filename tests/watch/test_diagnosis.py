@@ -9,15 +9,16 @@ from machines import MachinePlant
 from online_models import rk4
 
 from hybrid_mpc import (
+    Diagnoser,
     ExtendedKalmanFilter,
     HybridModel,
     InputError,
+    Monitor,
     Parameter,
-    ResidualDiagnoser,
-    ResidualMonitor,
+    ResidualReadings,
     Signal,
-    learn_residuals,
-    replay_residuals,
+    learn_limits,
+    replay,
 )
 from hybrid_mpc.data.trajectories import Trajectory
 
@@ -72,16 +73,16 @@ def recording(n, seed, *, broken=None, sensor=(0.0, 0.0), actuator=(1.0, 0.0), r
 @pytest.fixture(scope="module")
 def limits():
     model = bodies()
-    return learn_residuals(model, observer(model), [recording(1500, seed) for seed in (0, 1)])
+    return learn_limits(ResidualReadings(model), observer(model), [recording(1500, seed) for seed in (0, 1)])
 
 
 def seen(limits, **fault):
     model = bodies()
-    monitor, run, estimates = ResidualMonitor(model, limits=limits), recording(400, 7, **fault), []
-    trace = replay_residuals(monitor, observer(model), run, on_sample=lambda k, e: estimates.append(e))
+    monitor, run, estimates = Monitor(ResidualReadings(model), limits), recording(400, 7, **fault), []
+    trace = replay(monitor, observer(model), run, on_sample=lambda k, e: estimates.append(e))
     assert not trace.alarm[:START].any()
     (k, *_) = np.flatnonzero(trace.alarm)
-    return ResidualDiagnoser(model, limits).of_alarm(int(k), trace, run, estimates), int(k)
+    return Diagnoser(model, limits).of_alarm(int(k), trace, run, estimates), int(k)
 
 
 @pytest.mark.parametrize(
@@ -121,23 +122,19 @@ def test_something_else_is_not_taken_for_a_known_cause(limits):
     model, run = bodies(), recording(400, 7)
     run.y[START:, 1] += 1.5 * np.sign(np.sin(np.arange(400 - START) * 1.3))
     estimates = []
-    trace = replay_residuals(
-        ResidualMonitor(model, limits=limits),
+    trace = replay(
+        Monitor(ResidualReadings(model), limits),
         observer(model),
         run,
         on_sample=lambda k, e: estimates.append(e),
     )
     (k, *_) = np.flatnonzero(trace.alarm)
-    assert (
-        ResidualDiagnoser(model, limits)
-        .of_alarm(int(k), trace, run, estimates)
-        .startswith("none of the known")
-    )
+    assert Diagnoser(model, limits).of_alarm(int(k), trace, run, estimates).startswith("none of the known")
 
 
 def test_groups_of_parameters_and_strange_ones(limits):
     model = bodies()
-    together = ResidualDiagnoser(model, limits, {"machine": ("gain", "loss"), "drive": ("gain of power",)})
+    together = Diagnoser(model, limits, {"machine": ("gain", "loss"), "drive": ("gain of power",)})
     assert together.names[:3] == ("machine", "gain of power", "offset of power")
     with pytest.raises(InputError, match="no parameter 'mass'; there are: gain, loss"):
-        ResidualDiagnoser(model, limits, {"heavier": ("mass",)})
+        Diagnoser(model, limits, {"heavier": ("mass",)})

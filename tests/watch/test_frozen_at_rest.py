@@ -5,9 +5,9 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from monitor_parts import DT, Estimate, J, pendulum
+from monitor_parts import DT, Estimate, J, energy, pendulum
 
-from hybrid_mpc import EnergyMonitor, InputError, Signal, with_input_delay
+from hybrid_mpc import InputError, Signal, with_input_delay
 from hybrid_mpc.model.model import step_symbols
 
 STEP, LIMIT = 1e-3, 1.0
@@ -28,9 +28,7 @@ def jacobian(model):
 
 def monitor(limit=LIMIT):
     signal = Signal("tau", "N m") if limit is None else Signal("tau", "N m", -limit, limit)
-    return EnergyMonitor(
-        replace(pendulum(), inputs=(signal,)), window=5, average=1, resolution=[STEP], rest_speed=REST
-    )
+    return energy(replace(pendulum(), inputs=(signal,)), resolution=[STEP], rest_speed=REST)
 
 
 def frozen(u, y, watching, x=None, h=None):
@@ -94,9 +92,7 @@ def test_a_machine_that_has_braked_to_rest_is_none(pull):
     cart = replace(pendulum(friction=0.0, mgl=0.0), inputs=(Signal("tau", "N m", -LIMIT, LIMIT),))
     u = np.concatenate([np.full(20, pull), np.full(20, -pull), np.zeros(60)])
     x, h, y = moved(u, cart)
-    assert (
-        frozen(u, y, EnergyMonitor(cart, window=5, average=1, resolution=[STEP], rest_speed=REST), x, h) == []
-    )
+    assert frozen(u, y, energy(cart, resolution=[STEP], rest_speed=REST), x, h) == []
     assert np.ptp(y[41:]) == 0.0  # it stands: there was something to be mistaken in
 
 
@@ -105,7 +101,7 @@ def test_an_input_on_its_way_has_moved_nothing_yet(periods):
     cart = replace(pendulum(friction=0.0, mgl=0.0), inputs=(Signal("tau", "N m", -LIMIT, LIMIT),))
     late = with_input_delay(replace(cart, with_jacobian=jacobian(cart)), periods * DT)
     u = np.concatenate([np.zeros(20), np.full(20, 0.8), np.full(20, -0.8), np.zeros(40)])
-    watching = EnergyMonitor(late, window=5, average=1, resolution=[STEP], rest_speed=REST)
+    watching = energy(late, resolution=[STEP], rest_speed=REST)
     x, h, y = moved(u, late)
     assert frozen(u, y, watching, x, h) == []
     # and frozen all the same it is found; the hidden states are the inputs on their way, the oldest first
@@ -115,13 +111,11 @@ def test_an_input_on_its_way_has_moved_nothing_yet(periods):
 
 
 def test_the_range_can_be_given():
-    free = EnergyMonitor(
-        pendulum(), window=5, average=1, resolution=[STEP], rest_speed=REST, input_range=[2 * LIMIT]
-    )
+    free = energy(pendulum(), resolution=[STEP], rest_speed=REST, input_range=[2 * LIMIT])
     u, y = pulling(0.1, 0.7)
     assert frozen(u, y, free) == frozen(u, y, monitor())
     with pytest.raises(InputError, match="input_range needs 1 positive"):
-        EnergyMonitor(pendulum(), window=5, average=1, input_range=[0.0])
+        energy(pendulum(), input_range=[0.0])
 
 
 def test_a_missing_estimate_or_sample_begins_anew():
@@ -134,7 +128,7 @@ def test_a_missing_estimate_or_sample_begins_anew():
 
 
 def test_a_missing_estimate_does_not_hide_a_sensor_that_freezes_in_motion():
-    watching = EnergyMonitor(pendulum(), window=5, average=1, resolution=[STEP], rest_speed=REST)
+    watching = energy(pendulum(), resolution=[STEP], rest_speed=REST)
     x = np.tile([0.0, 1.0], (30, 1))  # 1 rad/s are 20 mrad a period
     x[10, 1] = np.nan
     found = frozen(np.zeros(30), np.zeros(30), watching, x)

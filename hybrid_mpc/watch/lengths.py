@@ -15,13 +15,11 @@ Array = NDArray[np.float64]
 WINDOW_S = 0.2
 """Window of the guard's derivative: half of it is how late a reading is, and its noise grows with length^-2.5."""
 AVERAGE_S = 0.1
-"""Average of the guard's levels: half a window."""
+"""Beyond a window, so long may a monitor be without a valid reading: half a window."""
 FREE_RUN_S = 0.6
 """Length of the model's free runs: three windows."""
-HISTORY_S = 2.0
-"""How far back a diagnosis looks."""
-LEVEL_S = 0.3
-"""Window of the main job's monitor, for its derivative and for the average that makes its level."""
+SHORT_S, LONG_S = 0.3, 3.0
+"""Lengths of the two averages of residuals: one is soon there, one shows what is small and lasts."""
 SETTLING_S = 1.0
 """Beginning of a recording that nothing is learned from: the estimator does not know the speed yet."""
 BLOCK_S = 5.0
@@ -52,6 +50,11 @@ def samples(length: float, model: HybridModel, fewest: int = 1) -> int:
 def half_window(length: float, model: HybridModel) -> int:
     """Samples to either side of the centre of a window of that length: two at least, for a cubic needs five."""
     return samples(0.5 * length, model, 2)
+
+
+def settling_samples(model: HybridModel) -> int:
+    """Samples at the beginning of a recording that nothing is learned from."""
+    return periods(SETTLING_S * machine_second(model.dt, model.time_unit), model.dt)
 
 
 def machine_second(dt: float, time_unit: float) -> float:

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hybrid_mpc import Calibration, Detector, InputError, load, load_scenario, set_calibration, write_csv
+from hybrid_mpc import ChannelLimit, InputError, WatchLimits, load_scenario, set_limits, write_csv
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.files import write_json
-from hybrid_mpc.job.monitor import MonitorJob, prepared, read_detector, watched
-from hybrid_mpc.monitor.energy_readings import force_units
+from hybrid_mpc.job.monitor import MonitorJob, prepared, read_limits, watch
 from hybrid_mpc.records import plain
 from scenarios.golf_robot.rig import Rig
 
@@ -33,8 +32,10 @@ def folder(tmp_path_factory, noisy_artifact):
     columns = {"time_s": DT * np.arange(n), "u_nm": u, "phi_rad": np.array(phi)}
     write_csv(out / "pushed.csv", {name: values[kept] for name, values in columns.items()})
     # Wide scales: the network of this artifact is untrained, so the prior's own errors are nominal here.
-    detector = Detector(DT, ((0.02, 0.01, 0.0, 0.0),), (0.05, 0.1, 0.0, 0.0), 2.0, 15.0, 4.0)
-    write_json(out / "calibration.json", {"detector": plain(detector)})
+    force = ChannelLimit("force of phi", "N m", 0, 15.0, 7.5, (0.02, 0.01, 0.0, 0.0), 2.0)
+    power = ChannelLimit("power of the free run", "W", 1, 4.0, 2.0, (0.05, 0.1, 0.0, 0.0))
+    limits = WatchLimits("energy", DT, (force, power), (5e-3,), (0,))
+    write_json(out / "calibration.json", {"energy": plain(limits)})
     return out
 
 
@@ -64,40 +65,42 @@ def test_it_says_where_and_writes_what_it_saw(folder, noisy_artifact, tmp_path):
     assert 8.0 <= starts[0] < 9.0  # half a period of the motion at most
     assert "gap in pushed.csv" in done.output
     rows = (tmp_path / "out" / "pushed_2.csv").read_text().splitlines()
-    assert rows[0].startswith("t_s,phi_rad,dE_model_w")
+    assert rows[0].startswith("t_s,phi_rad,violation_value_W,violation_alarm,force_of_phi_value_N m")
     assert len(rows) == 1 + round(second["seconds"] / DT)
     assert len(rows) > 480
     assert (tmp_path / "out" / "pushed_2.png").stat().st_size > 10_000
-    assert force_units(load(noisy_artifact).models["hybrid"]) == ("N m",)
 
 
-def test_the_artifact_s_own_detector_needs_no_option(folder, noisy_artifact, tmp_path):
+def test_the_kit_s_own_limits_need_no_option(folder, noisy_artifact, tmp_path):
     model = shutil.copytree(noisy_artifact, tmp_path / "model")
-    detector = read_detector(folder / "calibration.json")
-    detector = replace(detector, false_alarms_per_hour=2.0, hours=0.05, data_hash="0123456789abcdef0123")
-    set_calibration(model, Calibration(9.0, 9.0, 1.0, 1, 1.0, "by hand", detector=detector))
+    limits = read_limits(folder / "calibration.json", "energy")
+    limits = replace(
+        limits, false_alarms_per_hour=2.0, hours=0.05, method="by hand", data_hash="0123456789abcdef"
+    )
+    set_limits(model, {"hybrid": [limits]})
     done = command(folder, model, tmp_path / "out")
     assert done.exit_code == 0, done.output
-    told = "watched with a detector for 2 false alarms an hour, learned from 3.0 min (hash 0123456789abcdef)"
+    told = "watched: force of phi, power of the free run; limits for 2 false alarms an hour, learned from 3.0 min"
     assert told in done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())
-    assert found["detector"]["data_hash"] == detector.data_hash
-    # as with the same detector from a file
+    assert found["limits"]["data_hash"] == limits.data_hash
+    # as with the same limits from a file
     assert 8.0 <= found["recordings"][1]["alarms"][0]["start_s"] < 9.0
     without = command(folder, noisy_artifact, tmp_path / "without")
-    assert "holds no detector" in without.output
+    assert "holds no limits of energy" in without.output
 
 
 def test_too_little_nominal_data_says_how_much_is_needed(folder, noisy_artifact, tmp_path):
     done = command(folder, noisy_artifact, tmp_path / "out", "--learn", "1")
-    assert isinstance(done.exception, InputError)
-    assert "false alarms an hour need" in str(done.exception)
+    assert done.exit_code == 0, done.output
+    assert "false alarms an hour need" in done.output
+    assert not read_limits(tmp_path / "out" / "calibration.json", "energy").rated
 
 
 def test_bad_input_speaks(folder, noisy_artifact, tmp_path):
     (tmp_path / "empty.json").write_text("{}")
     done = command(folder, noisy_artifact, tmp_path / "out", "--calibration", str(tmp_path / "empty.json"))
-    assert "holds no detector" in str(done.exception)
+    assert "holds no limits of energy" in str(done.exception)
     files, scenario = [folder / "pushed.csv"], load_scenario("golf_robot")
     with pytest.raises(InputError, match="no control problem"):
         prepared(replace(scenario, control=None), noisy_artifact, files)
@@ -105,15 +108,16 @@ def test_bad_input_speaks(folder, noisy_artifact, tmp_path):
         prepared(replace(scenario, data=replace(scenario.data, dt=0.01)), noisy_artifact, files)
 
 
-def test_an_alarm_is_explained_once(folder, noisy_artifact):
+def test_an_alarm_is_explained_once(folder, noisy_artifact, tmp_path):
     job = prepared(
         load_scenario("golf_robot"), noisy_artifact, [folder / "pushed.csv"],
         calibration=folder / "calibration.json",
     )  # fmt: skip
     assert isinstance(job, MonitorJob)
-    trace, alarms = watched(job, job.data.whole[1])
-    assert len(alarms) == len(trace.intervals())
-    assert all(alarm.diagnosis for alarm in alarms)
+    (tmp_path / "out").mkdir()
+    _, second = watch(job, tmp_path / "out").recordings
+    assert second.alarms
+    assert all(alarm.diagnosis and alarm.channels for alarm in second.alarms)
 
 
 def test_a_frozen_sensor_is_told_and_watched_all_the_same(folder, noisy_artifact, tmp_path):

@@ -9,22 +9,23 @@ import pytest
 from closed_loop_parts import DT as LOOP_DT
 from closed_loop_parts import make_ekf, make_safe
 from closed_loop_parts import run as closed_loop
-from monitor_parts import DT, Exact, pendulum, simulate
+from monitor_parts import DT, Exact, by_hand, energy, of_force, pendulum, simulate
 from online_models import pendulum_model
 from typer.testing import CliRunner
 
-from hybrid_mpc import Calibration, EnergyMonitor, Fault, Guard, InputError, Mode, replay, write_csv
+from hybrid_mpc import Fault, Guard, InputError, Mode, replay, write_csv
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.model.model import step_symbols
-from hybrid_mpc.monitor.energy import Validity
-from hybrid_mpc.monitor.replay import with_alarms
+from hybrid_mpc.watch.readings import Validity
+from hybrid_mpc.watch.replay import with_alarms
 
-WINDOW, AVERAGE = 5, 10
-NEVER = Calibration(1e9, 1e9, 1.0, 1, 1.0, "by hand")
+WINDOW, AVERAGE = 5, 5
+"""The window, and how long beyond it a reading may be missing: 0.1 s."""
+NEVER = by_hand(of_force(1e9))
 
 
-def monitor(model=None, **options):
-    return EnergyMonitor(model or pendulum(), window=WINDOW, average=AVERAGE, **options)
+def monitor(model=None, limits=None):
+    return energy(model, limits, window=WINDOW)
 
 
 class Lost(Exact):
@@ -51,14 +52,14 @@ def test_a_whole_recording_is_judged_but_for_the_warm_up():
 
 def test_an_estimator_that_gives_no_number_is_an_alarm_and_not_quiet():
     run = simulate(200)
-    trace = replay(monitor(calibration=NEVER), Lost(run, 100), run)
+    trace = replay(monitor(limits=NEVER), Lost(run, 100), run)
     # the estimate of sample 100 is that of the period after it
     assert (trace.validity[101:] == Validity.NOT_FINITE).all()
     assert (trace.validity[WINDOW - 1 : 101] == Validity.VALID).all()
-    # longer than both windows: from the 16th sample without a valid reading on
+    # longer than both windows: from the 11th sample without a valid reading on
     first = 101 + WINDOW + AVERAGE
     assert trace.intervals() == [(pytest.approx(first * DT), pytest.approx(199 * DT))]
-    assert np.array_equal(with_alarms(monitor(calibration=NEVER), trace).alarm, trace.alarm)
+    assert np.array_equal(with_alarms(monitor(limits=NEVER), trace).alarm, trace.alarm)
 
 
 @pytest.mark.parametrize("broken", ["step", "xdot", "balances"])
@@ -82,7 +83,7 @@ def test_missing_samples_are_counted_and_alarm_where_they_last():
     run = simulate(300)
     y = run.y.copy()
     y[50], y[100:140] = np.nan, np.nan
-    trace = replay(monitor(calibration=NEVER), Exact(run), replace(run, y=y))
+    trace = replay(monitor(limits=NEVER), Exact(run), replace(run, y=y))
     missing = np.flatnonzero(trace.validity == Validity.MISSING)
     # a sample is gone until it has left the window
     assert missing.tolist() == [*range(50, 55), *range(100, 144)]
@@ -95,7 +96,7 @@ def test_in_the_loop_a_blind_monitor_is_no_quiet_one():
     model, prior = pendulum_model(3), pendulum_model()
     gone = Fault(0.4, 1.0, "measurement_dropout")
     guard = Guard(backup=make_safe(prior), backup_estimator=make_ekf(prior), dwell=0.1, quiet=0.1)
-    watching = EnergyMonitor(model, window=5, average=5)
+    watching = energy(model)
     result = closed_loop(model, make_safe(model), guard=guard, monitor=watching, faults=(gone,), duration=1.6)
     assert [(s.before.name, s.after.name, s.why) for s in result.switches] == [
         ("NORMAL", "BACKUP", "the monitor has no valid reading"),
@@ -183,12 +184,12 @@ def test_a_recording_of_a_second_is_watched_and_the_replay_shows_how_far_it_is(
     done = command(recordings, noisy_artifact, tmp_path / "out", "short", "long")
     assert done.exit_code == 0, done.output
     assert (
-        "short: 1.0 s, 0 alarms; no valid reading for 0.32 s warm-up" in done.output
-    )  # a window of 17 samples
+        "short: 1.0 s, 0 alarms; no valid reading for 0.20 s warm-up" in done.output
+    )  # a window of 11 samples
     assert "replaying the recordings ..." in done.output
     header, first, *_ = (tmp_path / "out" / "short.csv").read_text().splitlines()
-    assert header.endswith("valid,frozen,alarm")
-    assert first.endswith(",0,0,0")
+    assert header.endswith("phi_frozen,share,valid,alarm")
+    assert first.endswith(",0,nan,0,0")
 
 
 def test_one_too_short_for_any_window_is_refused_with_what_it_needs(recordings, noisy_artifact, tmp_path):

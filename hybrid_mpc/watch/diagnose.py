@@ -1,7 +1,9 @@
-"""What broke, for any machine: the change of a parameter, an actuator or a sensor that best explains an alarm."""
+"""Diagnosis: the change of a parameter, an actuator or a sensor that best explains an alarm."""
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -14,10 +16,11 @@ from numpy.typing import NDArray
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, changeable, incidence
-from hybrid_mpc.monitor.diagnose import Change, Diagnosis
-from hybrid_mpc.monitor.lengths import machine_second
-from hybrid_mpc.monitor.replay import TrajectoryLike
-from hybrid_mpc.monitor.residuals import SHORT_S, ResidualLimits, ResidualTrace
+from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.lengths import SHORT_S, machine_second
+from hybrid_mpc.watch.readings import Validity
+from hybrid_mpc.watch.replay import Trace, TrajectoryLike
+from hybrid_mpc.watch.residuals import free_run_of
 
 Array = NDArray[np.float64]
 BEFORE_S, AFTER_S = 2.0, 1.0
@@ -44,6 +47,48 @@ RANGE = (-0.98, 4.0)
 machine."""
 
 
+BLIND = {
+    Validity.WARM_UP: "no valid reading: the monitor's window is not full",
+    Validity.MISSING: "no valid reading: samples are missing",
+    Validity.NOT_FINITE: "no valid reading: model or estimator gives no finite number",
+}
+"""Diagnosis of an alarm that the monitor raises because it has no valid reading."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of one cause with its standard deviation: as a share of the nominal value (0.5: half as much more), or,
+    with a ``unit``, as a sum.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    unit: str = ""
+
+    def __str__(self) -> str:
+        if self.unit:
+            return f"{self.name} {self.value:+.3g} ± {self.sigma:.2g} {self.unit}"
+        return f"{self.name} {100 * self.value:+.0f} ± {100 * self.sigma:.0f} %"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What explains an alarm.
+
+    Args:
+        text: In words: ``"friction +95 ± 20 %, which leaves 2% unexplained"``, ``"none of the known causes ..."``.
+        samples: Samples of the window.
+        causes: One cause that explains the alarm, or two that together do. Default: none does.
+        alternatives: Other single causes that explain it as well.
+    """
+
+    text: str
+    samples: float
+    causes: tuple[Change, ...] = ()
+    alternatives: tuple[Change, ...] = ()
+
+
 @dataclass(frozen=True)
 class Window:
     """A stretch of a recording around an alarm.
@@ -66,7 +111,7 @@ class Window:
     alarm: int
 
 
-class ResidualDiagnoser:
+class Diagnoser:
     """Says which change of the prior's parameters, of an actuator or of a sensor best explains an alarm; for any model.
 
     The model runs freely over a window around the alarm. Its first state, and the unmeasured disturbance that it took
@@ -78,7 +123,8 @@ class ResidualDiagnoser:
 
     Args:
         model: The model that the monitor compares with the machine.
-        limits: Limits of its monitor: what is ordinary in an output weighs it.
+        limits: Limits of the model's residuals: outputs weigh by what is ordinary in their free runs. Default: by
+            their errors in the window.
         causes: Names, and the parameters of each that change by the same share; gains and offsets of signals are
             always tried. Default: each parameter by itself.
         prior: Model of the prior alone, for a model with a network: its parameters are those of its prior. Default: the
@@ -87,24 +133,25 @@ class ResidualDiagnoser:
     Raises:
         InputError: If a cause's parameter is unknown, or the limits are of another model.
 
-    Example: ``ResidualDiagnoser(model, limits).diagnose(window).text`` says ``"offset of level +0.1 ± 0.01 m"``
+    Example: ``Diagnoser(model, limits).diagnose(window).text`` says ``"offset of level +0.1 ± 0.01 m"``
     """
 
     def __init__(
         self,
         model: HybridModel,
-        limits: ResidualLimits,
+        limits: WatchLimits | None = None,
         causes: Mapping[str, Sequence[str]] | None = None,
         *,
         prior: HybridModel | None = None,
     ) -> None:
-        rows = [f"free run of {s.name}" for s in model.outputs]
-        if missing := [row for row in rows if row not in limits.channels]:
-            raise InputError(
-                f"diagnosis: the limits have no channel {missing[0]!r}: they are of another model"
-            )
-        self.model = model
-        self._scale = np.array([limits.threshold[limits.channels.index(row)][0] for row in rows])
+        self.model, self._scale = model, np.full(model.n_y, math.nan)
+        if limits is not None:
+            of = [limits.of(free_run_of(s.name)) for s in model.outputs]
+            if not all(of):
+                raise InputError(
+                    "diagnosis: the limits have no free runs of this model's outputs; give its residuals'"
+                )
+            self._scale = np.array([shortest[0].threshold for shortest in of])
         gains = {f"gain of {s.name}" for s in model.inputs}
         named = {name: (name,) for name in changeable(model)} if not causes else dict(causes)
         groups = {name: tuple(of) for name, of in named.items() if not set(of) <= gains}
@@ -128,9 +175,7 @@ class ResidualDiagnoser:
             max(1, round(length * unit / model.dt)) for length in (BEFORE_S, AFTER_S, SHORT_S)
         )
 
-    def of_alarm(
-        self, alarm: int, trace: ResidualTrace, recording: TrajectoryLike, estimates: Sequence[Any]
-    ) -> str:
+    def of_alarm(self, alarm: int, trace: Trace, recording: TrajectoryLike, estimates: Sequence[Any]) -> str:
         """What explains the alarm that begins at a sample of a replayed recording, in words.
 
         Args:
@@ -140,12 +185,13 @@ class ResidualDiagnoser:
             estimates: The estimates along it.
         """
         model = self.model
-        stuck = [name for name, on in zip(trace.outputs, trace.frozen[alarm], strict=True) if on]
+        frozen = trace.frozen[alarm : alarm + self.after + 1].any(axis=0)
+        stuck = [name for name, on in zip(trace.outputs, frozen, strict=True) if on]
         if stuck:
             return f"the sensor of {', '.join(stuck)} repeats itself while motion is predicted"
-        on = [name for name, alarms in zip(trace.channels, trace.on[alarm], strict=True) if alarms]
+        on = [c.name for c, alarms in zip(trace.channels, trace.on[alarm], strict=True) if alarms]
         if not on:
-            return "the monitor has no valid reading"
+            return BLIND.get(Validity(int(trace.validity[alarm])), "")
         if set(on) <= {s.name for s in model.disturbances}:
             return f"{', '.join(on)} is where it never was when nothing was wrong"
         first, end = max(alarm - self.before, 0), min(alarm + self.after + 1, len(recording.y))
@@ -169,6 +215,8 @@ class ResidualDiagnoser:
         ):
             return Diagnosis("inputs or estimates are missing around the alarm", samples)
         none, still, m = np.zeros(len(self.names)), np.zeros(nuisance), len(self.names)
+        if not np.isfinite(self._scale).all():
+            return self._weighed(window).diagnose(window)
         linear = {onset: self._linear(window, none, still, onset) for onset in self._onsets(window)}
 
         def fitted(tried: Iterable[tuple[int, ...]], refine: int) -> list[_Fit]:
@@ -214,6 +262,17 @@ class ResidualDiagnoser:
         )
         text = " or ".join(str(change) for change in (first, *others))
         return Diagnosis(f"{text}, which leaves {left:.0%} unexplained", samples, (first,), others)
+
+    def _weighed(self, window: Window) -> Diagnoser:
+        """The same, with outputs that weigh by their errors in the window."""
+        found = copy.copy(self)
+        found._scale = np.ones(self.model.n_y)
+        errors, _ = found._linear(
+            window, np.zeros(len(self.names)), np.zeros(self.model.n_x + self.model.n_d), window.alarm
+        )
+        size = np.sqrt(np.mean(errors.reshape(-1, self.model.n_y) ** 2, axis=0))
+        found._scale = np.where(size > 0, size, 1.0)
+        return found
 
     def _within(self, fit: _Fit) -> _Fit:
         """The fit, or one that explains nothing where a share is out of range."""

@@ -1,4 +1,4 @@
-"""Stages monitor and guard on linear axes: slow ones are calibrated, and where nothing can be, the run goes on."""
+"""Stage watch on linear axes: limits are learned of slow ones, and where none can be, the run goes on."""
 
 import shutil
 from dataclasses import dataclass, replace
@@ -21,19 +21,13 @@ from hybrid_mpc import (
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.stage import Absent
 from hybrid_mpc.job.stages.export import NOISE, NoiseResult
-from hybrid_mpc.job.stages.figures import _monitor as monitor_figures
-from hybrid_mpc.job.stages.figures import guard_figures
-from hybrid_mpc.job.stages.guard import GUARD, guard_stage
+from hybrid_mpc.job.stages.figures import _watch as watch_figures
 from hybrid_mpc.job.stages.identify import PRIOR, PriorResult
-from hybrid_mpc.job.stages.monitor import MONITOR, monitor_stage
-from hybrid_mpc.job.stages.report import guard_tables, guard_words
-from hybrid_mpc.job.stages.residuals import put_residuals, residuals_stage
-from hybrid_mpc.job.stages.results import _guard as guard_results
-from hybrid_mpc.job.stages.results import _monitor as monitor_results
-from hybrid_mpc.kit.parts import ENERGY, set_residuals
-from hybrid_mpc.kit.parts import GUARD as GUARD_FILE
+from hybrid_mpc.job.stages.report import _watch_tables, _watch_words
+from hybrid_mpc.job.stages.results import _watch as watch_results
+from hybrid_mpc.job.stages.watch import WATCH, put_limits, watch_stage
+from hybrid_mpc.kit.parts import write_watch
 
 AXIS = """
 from hybrid_mpc import MechanicalPrior, Parameter, Signal
@@ -87,7 +81,7 @@ QUICK = Machine(dt=1e-3, speed=0.1, swing=0.5, noise=1e-7)
 
 
 def context(machine, samples, out, warm_up):
-    """A run that has come to stage monitor: its model is the prior that made the recordings."""
+    """A run that has come to stage watch: its model is the prior that made the recordings."""
     from hybrid_mpc import PriorStep, model_info, trace_model
 
     room = {}
@@ -132,104 +126,91 @@ def context(machine, samples, out, warm_up):
 @pytest.fixture(scope="module")
 def slow(tmp_path_factory):
     run = context(SLOW, (1200, 900), tmp_path_factory.mktemp("slow"), warm_up=10.0)
-    for stage, compute in ((MONITOR, monitor_stage), (GUARD, guard_stage)):
-        run.keep(stage, {}, compute(run))
+    run.keep(WATCH, {}, watch_stage(run))
     return run
 
 
-@pytest.mark.full
-def test_an_axis_of_millimetres_a_second_is_calibrated(slow):
-    found = slow.read(MONITOR)
-    assert found.reason == ""
-    (rest,) = found.calibration.rest_speed
+def test_limits_of_an_axis_of_millimetres_a_second_are_learned_kept_and_put_back(slow):
+    found = slow.read(WATCH)
+    assert (found.reason, found.kind) == ("", "energy")
+    assert list(found.watch) == ["prior", "hybrid"]
+    own = found.watch["hybrid"]
+    assert set(own.limits) == {"energy", "residuals"}
+    (rest,) = own.rest_speed
     top = max(np.abs(t.x[:, 1]).max() for t in slow.dataset.whole)
     assert top < 5e-3
     assert 0.03 * top < rest < 0.07 * top
-    # what dry friction may hold is 0.1 N: a residual that is always within the dead band would leave a threshold of 0
-    assert 0 < found.calibration.residual_threshold < 0.5
-    assert monitor_results(slow).threshold["energy [W]"] > 0
-    model = load(slow.out / "model").models["hybrid"]
-    assert model.time_unit == slow.time_unit > 5.0
+    limits = own.limits["energy"]
+    assert limits.rest_speed == (rest,)
+    # what dry friction may hold is 0.1 N: a force that is always within the dead band would leave no scale
+    assert 0 < np.sqrt(limits.of("force of q")[0].scale[0]) < 0.5
+    # 17 min are too little for the slowest rate of so slow a machine
+    assert not limits.rated
+    assert "false alarms an hour need" in limits.method
+    assert [one.channel for one in own.limits["residuals"].channels] == [
+        "q", "q", "energy", "energy", "free run of q", "free run of q",
+    ]  # fmt: skip
+    assert found.faults is None  # there is no plant
+    assert found.clean.alarms == 0  # thresholds are above the highest level of these very recordings
+    assert found.clean.seconds > 0
     covered = found.recordings[0]
     assert covered["valid_s"] > 500
     assert covered["not_finite_s"] == covered["missing_s"] == 0.0
-
-
-def test_monitor_and_guard_take_the_same_rest_speed(slow):
-    artifact = load(slow.out / "model")
-    (rest,) = slow.read(MONITOR).calibration.rest_speed
-    assert artifact.rest_speed == (rest,)
-    # 17 min are too little for the slowest rate of so slow a machine
-    block = 5 * slow.time_unit
-    assert f"in whole blocks of {block:g} s are too little" in guard_results(slow).reason
-
-
-def test_limits_of_residuals_are_learned_kept_and_put_back(slow):
-    found = residuals_stage(slow)
-    (name,) = found.limits
-    assert name == "hybrid"
-    assert found.limits[name].channels == ("q", "energy", "free run of q")
-    assert found.faults is None  # the energy is watched
-    assert found.clean.alarms == 0  # thresholds are above the highest level of these very recordings
-    assert found.clean.seconds > 0
     kit = load(slow.out / "model")
-    assert dict(kit.residuals) == dict(found.limits)
-    assert kit.monitor(kind="residuals").limits == found.limits[name]
-    assert kit.monitor(kind="energy").calibration is not None
-    set_residuals(slow.out / "model", {})
-    assert put_residuals(slow, found) == ""
-    assert dict(load(slow.out / "model").residuals) == dict(found.limits)
+    assert kit.models["hybrid"].time_unit == slow.time_unit > 5.0
+    assert kit.rest_speed == (rest,)
+    assert kit.monitor().limits == limits
+    assert kit.monitor(kind="residuals").limits == own.limits["residuals"]
+    write_watch(slow.out / "model", {})
+    assert load(slow.out / "model").watch == {}
+    assert put_limits(slow, found) == ""
+    assert dict(load(slow.out / "model").watch) == dict(found.watch)
+
+
+def test_the_report_says_what_limits_were_learned_from(slow):
+    said = watch_results(slow)
+    assert (said.kind, said.alarms, said.false_alarms_per_hour) == ("energy", (), 0.0)
+    assert "1.5 x the highest nominal level" in _watch_words(slow.read(WATCH))[0]
+    table, alarms = _watch_tables(slow)
+    assert [row[0] for row in table.rows] == [
+        "force of q", "power of the free run", "q frozen", "all together",
+    ]  # fmt: skip
+    assert alarms.rows == []
+    drawn = [name for _, name, _, _ in watch_figures(slow)]
+    assert drawn == ["monitor_run0", "monitor_run1"]
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """Recordings of 0.18 s, whose parts are shorter than the guard's window; training needs 20 ms for each part."""
     run = context(QUICK, (180, 180), tmp_path_factory.mktemp("short"), warm_up=0.01)
-    for stage, compute in ((MONITOR, monitor_stage), (GUARD, guard_stage)):
-        run.keep(stage, {}, compute(run))
+    run.keep(WATCH, {}, watch_stage(run))
     return run
 
 
 def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(short):
-    found = short.read(MONITOR)
-    assert found.calibration.threshold_w is None
+    found = short.read(WATCH)
+    assert found.limits is None
     window = 2 * round(0.1 * short.time_unit / QUICK.dt) + 1
     assert f"no recording has the {window} samples ({window * QUICK.dt:g} s)" in found.reason
-    assert found.recordings[0]["valid_s"] == 0.0
-    residuals = residuals_stage(short)
-    assert isinstance(residuals, Absent)
-    assert "no recording is longer than" in residuals.reason
-    said = monitor_results(short)
+    assert "no nominal stretch is longer than" in found.reason
+    said = watch_results(short)
     assert said.alarms is None
     assert found.reason == said.reason
-    assert said.details.recordings[1]["warm_up_s"] == pytest.approx(0.179)
-    assert list(monitor_figures(short)) == []
+    assert list(watch_figures(short)) == []
+    assert _watch_tables(short) == []
+    assert _watch_words(found)[0].startswith("No alarms here: no rest speeds")
+    kit = load(short.out / "model")
+    assert kit.rest_speed is None
+    with pytest.raises(InputError, match="holds no limits of energy"):
+        kit.monitor()
 
 
-def test_the_guard_copes_without_a_calibration(short):
-    said = guard_results(short)
-    assert "too little" in said.reason
-    assert guard_tables(said) == []
-    assert guard_words(said)[0].startswith("No detector could be learned")
-    captions = [caption for *_, caption in guard_figures(short)]
-    assert captions == [
-        "The recording run0, of which test data come, by the monitor, which has no thresholds."
-    ]
-    artifact = load(short.out / "model")
-    assert artifact.calibration.threshold_w is None
-    assert artifact.rest_speed is None  # a detector that is learned later takes it from its own recordings
-    with pytest.raises(
-        InputError, match="holds no detector"
-    ):  # what control --guard says before its first loop
-        artifact.detector()
-
-
-@pytest.mark.parametrize("stored", ["without thresholds", "none"])
-def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_path, monkeypatch, stored):
+@pytest.mark.parametrize("stored", ["without limits", "none"])
+def test_the_command_watches_with_a_kit_without_limits(short, tmp_path, monkeypatch, stored):
     model = shutil.copytree(short.out / "model", tmp_path / "model")
     if stored == "none":
-        (model / ENERGY).unlink()
-        (model / GUARD_FILE).unlink()
+        (model / "watch" / "hybrid.json").unlink()
     write_csv(tmp_path / "long.csv", QUICK.recording(5, 900))
     monkeypatch.setattr("hybrid_mpc.scenario.scenario_of", lambda *given: short.scenario)
     done = CliRunner().invoke(
@@ -237,6 +218,6 @@ def test_the_command_watches_with_an_artifact_without_calibration(short, tmp_pat
               "--out", str(tmp_path / "out")],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
-    assert "the artifact holds no detector and no thresholds" in done.output
-    warm_up = 2 * round(0.15 * short.time_unit / QUICK.dt) * QUICK.dt
+    assert "the kit holds no limits of energy" in done.output
+    warm_up = 2 * round(0.1 * short.time_unit / QUICK.dt) * QUICK.dt
     assert f"long: 0.9 s, 0 alarms; no valid reading for {warm_up:.2f} s warm-up" in done.output

@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 from machines import MachinePlant, dc_motor, thermal, two_tanks
 
-from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, ResidualMonitor, Signal, learn_residuals
-from hybrid_mpc.monitor.energy import Validity
-from hybrid_mpc.monitor.residuals import replay_residuals
+from hybrid_mpc import (
+    ExtendedKalmanFilter,
+    HybridModel,
+    InputError,
+    Monitor,
+    ResidualReadings,
+    Signal,
+    learn_limits,
+    replay,
+)
+from hybrid_mpc.watch.readings import Validity
 
 MACHINES = {
     "tanks": (two_tanks, (4e-5,), 1e-3, 1e-6),
@@ -49,14 +57,16 @@ def watched(request):
     make, swing, sigma, step = MACHINES[request.param]
     model = make()
     runs = [recording(make, swing, sigma, 3000, seed) for seed in range(3)]
-    limits = learn_residuals(model, observer(model, sigma, step), runs, false_alarms_per_hour=0.1 / model.dt)
+    limits = learn_limits(
+        ResidualReadings(model), observer(model, sigma, step), runs, false_alarms_per_hour=0.1 / model.dt
+    )
     return request.param, limits
 
 
 def readings(name, limits, run, **options):
     make, _, sigma, step = MACHINES[name]
     model = make()
-    monitor, estimator = ResidualMonitor(model, limits=limits, **options), observer(model, sigma, step)
+    monitor, estimator = Monitor(ResidualReadings(model), limits, **options), observer(model, sigma, step)
     state, estimate, found = monitor.initial(), None, []
     for k, y in enumerate(run.y):
         u_prev = run.u[k - 1] if k else np.full(model.n_u, np.nan)
@@ -111,7 +121,7 @@ def test_a_sensor_at_the_end_of_its_range_is_not_frozen():
     run = recording(make, 3 * np.array(swing), sigma, 600, 14, broken=lambda k, y, held: np.minimum(y, top))
     assert np.mean(run.y == top) > 0.1
     limited = tuple(type(s)(s.name, s.unit, saturation=(0.0, top)) for s in model.outputs)
-    known = ResidualMonitor(replace(model, outputs=limited), resolution=[1e-3, 1e-3])
+    known = Monitor(ResidualReadings(replace(model, outputs=limited)), resolution=[1e-3, 1e-3])
     estimator, estimate, state, frozen = observer(model, sigma, 1e-2), None, known.initial(), []
     for k, y in enumerate(run.y):
         u_prev = run.u[k - 1] if k else np.full(model.n_u, np.nan)
@@ -144,20 +154,21 @@ def test_the_violation_of_a_mechanical_machine_is_its_power():
         "cart", 0.01, (q, Signal("v", "m/s")), (Signal("F", "N"),), (q,), x=x, u=u, x_next=x + 0.01 * rates,
         xdot=rates, y=x[0], rate=rate, energy=(2.0 * rate[1] - u) * x[1],
     )  # fmt: skip
-    monitor = ResidualMonitor(cart)
-    assert (monitor.channels, monitor.units) == (("q", "energy", "free run of q"), ("m", "W", "m"))
+    monitor = Monitor(ResidualReadings(cart))
+    named = [(channel.name, channel.unit) for channel in monitor.readings.channels]
+    assert named == [("q", "m"), ("energy", "W"), ("free run of q", "m")]
     state, none = monitor.initial(), np.zeros(0)
     for now in ([1.0, 3.0], [1.03, 3.005]):
         estimate = SimpleNamespace(x=np.array(now), h=none, w=none)
         state, reading = monitor.update(state, np.array(now[:1]), np.zeros(1), estimate)
-    np.testing.assert_allclose(reading.residual[:2], [0.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(reading.values[:2], [0.0, 3.0], atol=1e-12)
 
 
 def test_what_does_not_fit_is_refused():
     model = two_tanks()
     make, swing, sigma, step = MACHINES["motor"]
-    limits = learn_residuals(
-        dc_motor(),
+    limits = learn_limits(
+        ResidualReadings(dc_motor()),
         observer(dc_motor(), sigma, step),
         [recording(make, swing, sigma, 1500, 0)],
         false_alarms_per_hour=1.0,
@@ -165,13 +176,13 @@ def test_what_does_not_fit_is_refused():
     assert "1.5 x the highest nominal level" in limits.method  # for one an hour 3.5 s are too short
     with pytest.raises(
         InputError,
-        match=r"the limits are of \('current', 'speed', 'free run.*\) at 0.005 s, the model two tanks has",
+        match=r"they are of current, current, speed, .* the readings are of residuals: ",
     ):
-        ResidualMonitor(model, limits=limits)
+        Monitor(ResidualReadings(model), limits)
     with pytest.raises(InputError, match="resolution needs 1 positive steps"):
-        ResidualMonitor(model, resolution=[0.0])
+        Monitor(ResidualReadings(model), resolution=[0.0])
     short = recording(make, swing, sigma, 20, 0)
-    with pytest.raises(InputError, match="no recording is longer than the"):
-        learn_residuals(dc_motor(), observer(dc_motor(), sigma, step), [short])
-    trace = replay_residuals(ResidualMonitor(dc_motor()), observer(dc_motor(), sigma, step), short)
-    assert trace.level.shape == (20, 4, 2)
+    with pytest.raises(InputError, match="no nominal stretch is longer than the"):
+        learn_limits(ResidualReadings(dc_motor()), observer(dc_motor(), sigma, step), [short])
+    trace = replay(Monitor(ResidualReadings(dc_motor()), limits), observer(dc_motor(), sigma, step), short)
+    assert trace.levels.shape == (20, 8)

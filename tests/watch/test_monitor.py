@@ -1,4 +1,4 @@
-"""The energy monitor against a machine whose faults are known."""
+"""Readings of the energy, and the monitor, against a machine whose faults are known."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,57 +6,74 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from monitor_parts import DT, GAMMA, NOISE, Estimate, Exact, Observer, Run, pendulum, simulate
+from monitor_parts import (
+    DT,
+    NOISE,
+    Estimate,
+    Exact,
+    Observer,
+    Run,
+    by_hand,
+    energy,
+    of_force,
+    pendulum,
+    simulate,
+)  # fmt: skip
 
-from hybrid_mpc import Calibration, EnergyMonitor, HybridModel, InputError, Signal, count_alarms, replay
+from hybrid_mpc import ChannelLimit, HybridModel, InputError, Signal, count_alarms, learn_limits, replay
 from hybrid_mpc.model.model import step_symbols
-from hybrid_mpc.monitor.calibrate import calibrate, with_residual
-from hybrid_mpc.monitor.replay import with_alarms
+from hybrid_mpc.watch.learn import calibrate
+from hybrid_mpc.watch.replay import with_alarms
 
 
 @pytest.mark.parametrize("kind", ["sine", "steps"])
 @pytest.mark.parametrize("window", [5, 11, 21])
 def test_perfect_model_has_no_violation_even_under_torque_steps(kind, window):
     run = simulate(400, kind=kind)
-    monitor = EnergyMonitor(pendulum(), window=window, average=5)
+    monitor = energy(window=window)
     trace = replay(monitor, Exact(run), run)
     # The identity is exact; what remains is the fourth-order integrator's dp against dv, h^5 per
     # sub-step of 5 ms (1e-11) over dt^2 (4e-4), with power ~ 10 W: below 1e-5 W. The power itself is ~ 1 W.
-    assert np.nanmax(trace.violation_w) < 1e-5
-    assert np.isfinite(trace.violation_w[window - 1 :]).all()
-    assert np.isnan(trace.violation_w[: window - 1]).all()
+    assert np.nanmax(trace.of("violation")) < 1e-5
+    assert np.isfinite(trace.of("violation")[window - 1 :]).all()
+    assert np.isnan(trace.of("violation")[: window - 1]).all()
 
 
 def test_violation_is_J_v_times_the_acceleration_error_under_a_constant_push():
     run = simulate(400, kind="sine")
-    trace = replay(EnergyMonitor(pendulum(push=0.3), window=5, average=1), Exact(run), run)
+    trace = replay(energy(pendulum(push=0.3)), Exact(run), run)
     # The model's one step feels its own friction: gamma dt / (2 J) = 1.5 % less than 0.3 |v|, plus the
     # cubic's velocity error, of order dt^2 at the kinks of the held input: below 2e-3 W.
     expected = 0.3 * np.abs(run.x[2:-2, 1])
-    assert np.all(np.abs(trace.violation_w[4:] - expected) < 0.02 * expected + 2e-3)
+    assert np.all(np.abs(trace.of("violation")[4:] - expected) < 0.02 * expected + 2e-3)
     assert expected.max() > 0.5
 
 
-@pytest.fixture(scope="module")
-def levels():
-    """Levels of four nominal runs of 100 s."""
-    model = pendulum()
-    monitor = EnergyMonitor(model, window=11, average=10)
-    return [replay(monitor, Observer(model), simulate(5000, s, noise=NOISE)).level_w[100:] for s in range(4)]
+def nominal(count, first=0):
+    return [simulate(5000, s, noise=NOISE) for s in range(first, first + count)]
+
+
+def learned(count, rate):
+    """Limits from so many nominal runs of 100 s."""
+    return learn_limits(
+        energy(window=11, free_run=0.6).readings,
+        Observer(pendulum()),
+        nominal(count),
+        false_alarms_per_hour=rate,
+    )
 
 
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("count", "least", "most"), [(2, 0, 20), pytest.param(6, 1, 30, marks=pytest.mark.full)]
 )
-def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate(levels, count, least, most):
-    model = pendulum()
-    monitor = EnergyMonitor(model, window=11, average=10)
-    calibration = calibrate(levels, DT, false_alarms_per_hour=60.0)
-    armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
-    runs = [replay(armed, Observer(model), simulate(5000, s, noise=NOISE)) for s in range(10, 10 + count)]
-    unarmed = replay(monitor, Observer(model), simulate(5000, 10, noise=NOISE))
-    np.testing.assert_array_equal(with_alarms(armed, unarmed).alarm, runs[0].alarm)
+def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate(count, least, most):
+    armed = energy(limits=learned(4, 60.0), window=11, free_run=0.6)
+    runs = [replay(armed, Observer(pendulum()), run) for run in nominal(count, 10)]
+    unarmed = replay(energy(window=11, free_run=0.6), Observer(pendulum()), nominal(1, 10)[0])
+    again = with_alarms(armed, unarmed)
+    for name in ("alarm", "on", "levels", "share", "frozen"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(runs[0], name))
     assert not unarmed.alarm.any()
     n = sum(count_alarms(r.alarm[100:], DT)[0] for r in runs)
     # 10 min at 60/h: 10 expected. Factor 3 for the threshold's own error (80 blocks, |scale| error 10 %
@@ -65,132 +82,106 @@ def test_alarm_rate_on_fresh_nominal_data_is_near_the_wanted_rate(levels, count,
     assert least <= n <= most
 
 
-@pytest.mark.parametrize(("fault", "limit"), [(pendulum(friction=3 * GAMMA), 1.0), (pendulum(push=0.5), 0.5)])
-def test_faults_raise_the_alarm_in_time(levels, fault, limit):
-    model = pendulum()
-    calibration = calibrate(levels[:2], DT, false_alarms_per_hour=20.0)
-    armed = EnergyMonitor(model, window=11, average=10, calibration=calibration)
-    run = simulate(700, seed=20, fault=fault, at=500, noise=NOISE)
-    trace = replay(armed, Observer(model), run)
-    # Limits [s]: window 0.2 + average 0.2 + one passage through rest (0.6 s).
-    assert not trace.alarm[100:500].any()
-    starts = [a for a, _ in trace.intervals() if a >= run.t[500]]
-    assert starts
-    assert starts[0] - run.t[500] <= limit
-
-
 def test_at_rest_there_is_no_power_whatever_the_torque_error():
     run = simulate(100, kind="rest")
-    trace = replay(EnergyMonitor(pendulum(push=1.0), window=11, average=10), Exact(run), run)
-    assert np.nanmax(trace.violation_w) == 0.0  # v = 0 exactly: the documented blind spot
+    trace = replay(energy(pendulum(push=1.0), window=11), Exact(run), run)
+    assert np.nanmax(trace.of("violation")) == 0.0  # v = 0 exactly: the documented blind spot
 
 
 def test_update_is_pure():
     run = simulate(40)
-    monitor = EnergyMonitor(pendulum(push=0.2), window=5, average=4)
+    monitor = energy(pendulum(push=0.2))
     state = monitor.initial()
     for k in range(1, 20):
         estimate = Estimate(run.x[k], np.zeros(0), np.zeros(1))
         state, _ = monitor.update(state, run.y[k], run.u[k - 1], estimate)
-    before = state.memory.copy()
+    before = state.readings.memory.copy()
     estimate = Estimate(run.x[20], np.zeros(0), np.zeros(1))
     first = monitor.update(state, run.y[20], run.u[19], estimate)
     monitor.update(first[0], run.y[21], run.u[20], estimate)
     second = monitor.update(state, run.y[20], run.u[19], estimate)
-    assert first[1] == second[1]
-    assert np.array_equal(first[0].memory, second[0].memory)
-    assert np.array_equal(before, state.memory)
+    assert first[1].values == second[1].values
+    assert np.array_equal(first[0].readings.memory, second[0].readings.memory)
+    assert np.array_equal(before, state.readings.memory)
 
 
 def test_a_missing_measurement_blinds_one_window_and_raises_nothing():
     run = simulate(200)
     y = run.y.copy()
     y[100] = np.nan
-    calibration = Calibration(1e-3, 5e-4, 1.0, 1, 1.0, "by hand")
-    monitor = EnergyMonitor(pendulum(), window=5, average=10, calibration=calibration)
-    trace = replay(monitor, Exact(run), replace(run, y=y))
-    assert np.flatnonzero(np.isnan(trace.violation_w[4:])).tolist() == list(range(96, 101))
-    assert np.isfinite(trace.level_w[20:]).all()  # 5 of 10 remain
+    trace = replay(energy(limits=by_hand(of_force(1e-3))), Exact(run), replace(run, y=y))
+    assert np.flatnonzero(np.isnan(trace.of("violation")[4:])).tolist() == list(range(96, 101))
+    assert np.isfinite(trace.levels).all()  # the sum waits
     assert not trace.alarm.any()
-
-
-def test_hysteresis_holds_between_release_and_threshold():
-    monitor = EnergyMonitor(
-        pendulum(), window=5, average=1, calibration=Calibration(1.0, 0.5, 1.0, 1, 1.0, "by hand")
-    )
-    sequence, on, seen = [0.7, 1.1, 0.7, 0.4, 0.7], (False, False), []
-    for level in sequence:
-        on = monitor.alarms(level, 0.0, on)
-        seen.append(on[0])
-    assert seen == [False, True, True, False, False]
 
 
 def test_residual_force_is_the_unknown_torque_while_the_machine_moves():
     run = simulate(300, fault=pendulum(push=0.1), at=100)
-    trace = replay(EnergyMonitor(pendulum(), window=5, average=1), Exact(run), run)
+    trace = replay(energy(), Exact(run), run)
     fast = np.abs(np.roll(run.x[:, 1], 2)) > 0.42  # at the window's centre; the dead band ends at 0.4 rad/s
     before, after = np.arange(300) < 100, np.arange(300) > 106
     # exact but for the fourth-order integrator's dp against dv, 1e-11 over dt^2 (see above), times J
-    np.testing.assert_allclose(trace.residual_level[10:][(fast & before)[10:]], 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.abs(trace.of("force of phi"))[10:][(fast & before)[10:]], 0.0, atol=1e-6)
     # within its own step the model lacks the push and thus push dt / 2J of speed on average, which viscous
     # friction GAMMA feels: 0.1 * 0.01 / 0.1 * 0.15 = 1.5e-3 less
-    np.testing.assert_allclose(trace.residual_level[fast & after], 0.1, atol=2e-3)
+    np.testing.assert_allclose(np.abs(trace.of("force of phi"))[fast & after], 0.1, atol=2e-3)
 
 
 @pytest.mark.parametrize(("torque", "excess"), [(0.15, 0.0), (-0.15, 0.0), (0.35, 0.15), (-0.35, 0.15)])
 def test_at_rest_only_what_friction_cannot_hold_counts(torque, excess):
     n = 60
     run = Run(np.arange(n) * DT, np.zeros((n, 1)), np.full((n, 1), torque), np.zeros((n, 2)))
-    monitor = EnergyMonitor(pendulum(friction=0.1, dry=0.2), window=5, average=5, rest_speed=0.2)
+    monitor = energy(pendulum(friction=0.1, dry=0.2), rest_speed=0.2)
     trace = replay(monitor, Exact(run), run)
     # dry friction holds 0.2 (tanh(10) = 1 - 4e-9); viscous friction, 0.02 at the rest speed of 0.2 rad/s, holds nothing
-    np.testing.assert_allclose(trace.residual_level[20:], excess, atol=1e-6)
-    np.testing.assert_allclose(trace.level_w[20:], 0.0, atol=1e-12)  # no power at rest
+    np.testing.assert_allclose(np.abs(trace.of("force of phi"))[20:], excess, atol=1e-6)
+    np.testing.assert_allclose(trace.of("violation")[20:], 0.0, atol=1e-12)  # no power at rest
 
 
-def test_either_alarm_is_an_alarm():
+def test_any_channel_s_alarm_is_an_alarm_and_is_named():
     run = simulate(300, fault=pendulum(push=0.3), at=150)
-    nothing = Calibration(1e9, 1e9, 1.0, 1, 1.0, "by hand")
-    assert not replay(
-        EnergyMonitor(pendulum(), window=5, average=5, calibration=nothing), Exact(run), run
-    ).alarm.any()
-    both = with_residual(nothing, Calibration(0.2, 0.1, 1.0, 1, 1.0, "by hand"))
-    alarm = replay(EnergyMonitor(pendulum(), window=5, average=5, calibration=both), Exact(run), run).alarm
-    assert not alarm[:150].any()
-    assert alarm[165:].any()
+    never = ChannelLimit("violation", "W", 1, 1e9, 1e9)
+    assert not replay(energy(limits=by_hand(never)), Exact(run), run).alarm.any()
+    both = by_hand(never, of_force(5.0, scale=0.01, drift=1.0))
+    trace = replay(energy(limits=both), Exact(run), run)
+    assert not trace.alarm[:150].any()
+    assert trace.alarm[165:].any()
+    assert list(trace.by_channel()) == ["force of phi"]
+    assert trace.named(0.0, 6.0) == ("force of phi",)
 
 
 def test_calibration_recovers_a_gumbel_quantile():
     rng = np.random.default_rng(3)
     levels = rng.gumbel(2.0, 0.3, 4000).clip(1e-3)
-    calibration = calibrate([levels], 5.0, false_alarms_per_hour=7.2)  # one sample a block, 1 % a block
+    threshold, release = calibrate(
+        [levels], 5.0, false_alarms_per_hour=7.2
+    )  # one sample a block, 1 % a block
+    assert release == pytest.approx(max(0.5 * threshold, np.quantile(levels, 0.95)))
     # L-moment estimates from 4000 samples: standard error of the 1 % quantile about 0.02.
-    assert abs(calibration.threshold_w - (2.0 - 0.3 * np.log(0.01))) < 0.08
+    assert abs(threshold - (2.0 - 0.3 * np.log(0.01))) < 0.08
 
 
 def test_bad_input_speaks():
     with pytest.raises(InputError, match=r"need 3\.0 min"):
         calibrate([np.ones(100)], 0.02)
     with pytest.raises(InputError, match="odd"):
-        EnergyMonitor(pendulum(), window=10, average=1)
+        energy(window=10)
     model = pendulum()
     x, _, u, w, p = step_symbols(model)
     with pytest.raises(InputError, match="positions"):
-        EnergyMonitor(replace(model, output=ca.Function("o", [x, u, w, p], [x[1]])), window=5, average=1)
+        energy(replace(model, output=ca.Function("o", [x, u, w, p], [x[1]])))
     run = simulate(10)
-    monitor = EnergyMonitor(model, window=5, average=1)
+    monitor = energy(model)
     with pytest.raises(InputError, match="resample"):
         replay(monitor, Exact(run), replace(run, t=2 * run.t))
     with pytest.raises(InputError, match="entries"):
         monitor.update(
             monitor.initial(), np.zeros(2), np.zeros(1), Estimate(np.zeros(2), np.zeros(0), np.zeros(1))
         )
-    with pytest.raises(InputError, match="residual_release"):
-        Calibration(1.0, 0.5, 1.0, 1, 1.0, "by hand", residual_threshold=1.0)
+    with pytest.raises(InputError, match="release <= threshold"):
+        of_force(1.0, 2.0)
     with pytest.raises(InputError, match="rest_speed"):
-        EnergyMonitor(model, window=5, average=1, rest_speed=0.0)
-    with pytest.raises(InputError, match="release_w"):
-        Calibration(1.0, 2.0, 1.0, 1, 1.0, "by hand")
+        energy(model, rest_speed=0.0)
 
 
 def windy() -> HybridModel:
@@ -222,12 +213,14 @@ def test_what_disturbs_and_is_measured_is_no_violation(free_run):
             self.told.append(w)
             return SimpleNamespace(**vars(super().update(estimate, y, u_prev)), w=w)
 
-    monitor, estimator = EnergyMonitor(model, window=11, average=5, free_run=free_run), Knowing(run)
+    monitor, estimator = energy(model, window=11, free_run=free_run), Knowing(run)
     trace = replay(monitor, estimator, blown)
     assert np.array_equal(estimator.told, wind)
     # as of a perfect model above; without wind it is 0.6 N m times 3 rad/s
-    assert np.nanmax(trace.violation_w) < 1e-5
-    assert np.nanmax(trace.residual_level) < 1e-5
+    assert np.nanmax(trace.of("violation")) < 1e-5
+    assert np.nanmax(np.abs(trace.of("force of phi"))) < 1e-5
     if free_run:
-        calm = replay(EnergyMonitor(pendulum(), window=11, average=5, free_run=free_run), Exact(run), run)
-        assert np.nanmax(np.abs(trace.energy_j - calm.energy_j)) < 1e-9  # the same run, but for rounding
+        calm = replay(energy(window=11, free_run=free_run), Exact(run), run)
+        assert (
+            np.nanmax(np.abs(trace.values[:, 2] - calm.values[:, 2])) < 1e-9
+        )  # the same run, but for rounding

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from linear_axes import Axis, kalman
 
-from hybrid_mpc import Diagnoser, guard_monitor, make_monitor, replay, rest_speeds
+from hybrid_mpc import Diagnoser, make_monitor, make_readings, replay, rest_speeds
 from hybrid_mpc.data.scales import time_unit
-from hybrid_mpc.monitor.learn import learn_detector
-from hybrid_mpc.monitor.lengths import SETTLING_S, samples, seconds
+from hybrid_mpc.watch.learn import limits_of
+from hybrid_mpc.watch.lengths import seconds, settling_samples
+from hybrid_mpc.watch.monitor import Monitor
 
 
 def axis(dt, swing, unit=1.0, speed=0.1, push=0.0, viscous=1.0):
@@ -31,28 +32,27 @@ def test_a_detector_is_learned_and_finds_a_fault_at_any_period(dt, swing):
     model = axis(dt, swing, unit).model()
     rest = rest_speeds(runs, model)
     assert rest[0] < 0.2 * speed
-    monitor, estimator = guard_monitor(model, rest_speed=rest), kalman(model, noise, speed)
-    skipped = samples(SETTLING_S, model)
-    numbers = [replay(monitor, estimator, run).numbers[skipped:] for run in runs]
+    readings, estimator = make_readings(model, rest_speed=rest), kalman(model, noise, speed)
+    assert readings.kind == "energy"
+    traces = [replay(Monitor(readings), estimator, run) for run in runs]
     # little data: short blocks, and an alarm in five of them, each of the two alarms in ten
     block = 100 * dt
-    detector = learn_detector(
-        numbers, dt, 1, false_alarms_per_hour=0.2 * 3600.0 / block, rest_speed=rest, time_unit=unit, trusted=True,
+    limits = limits_of(
+        readings, [run.y for run in runs], traces, false_alarms_per_hour=0.2 * 3600.0 / block, trusted=True,
         block_s=block,
     )  # fmt: skip
-    assert detector.hours * 3600 == pytest.approx(2 * (n - skipped) * dt)
+    assert limits.hours * 3600 == pytest.approx(2 * (n - settling_samples(model)) * dt)
     # a push of a tenth of the force from the middle of another run on
     pushed = plain.run(
         plain.swings(swing, 800, seed=7), noise=noise, seed=7, fault=axis(dt, swing, push=0.1), at=400
     )
-    armed = guard_monitor(model, detector, resolution=[3.5 * noise], diagnose=True)
-    trace = replay(armed, estimator, pushed)
+    armed, estimates = make_monitor(model, limits, resolution=[3.5 * noise]), []
+    trace = replay(armed, estimator, pushed, on_sample=lambda k, estimate: estimates.append(estimate))
     assert trace.alarm[400:].any()
     first = np.flatnonzero(trace.alarm[400:])[0]
     assert first * dt < 2 * swing
-    assert (trace.validity[armed.window - 1 :] == 0).all()
-    # what explains it is looked for in whole windows; a push is none of the parameters
-    assert Diagnoser(armed).diagnose(trace.state).text
+    assert (trace.validity[armed.readings.window - 1 :] == 0).all()
+    assert Diagnoser(model).of_alarm(400 + int(first), trace, pushed, estimates)
 
 
 def test_the_main_monitor_runs_at_any_period():
@@ -60,7 +60,7 @@ def test_the_main_monitor_runs_at_any_period():
         plain = axis(dt, swing)
         run = plain.run(plain.swings(swing, 600))
         model = axis(dt, swing, time_unit([run], dt)).model()
-        monitor = make_monitor(model, None, rest_speed=rest_speeds([run], model))
+        monitor = make_monitor(model, rest_speed=rest_speeds([run], model))
         trace = replay(monitor, kalman(model, 1e-9, 0.1), run)
-        assert np.isfinite(trace.level_w[monitor.window + monitor.average :]).all()
+        assert np.isfinite(trace.values[3 * monitor.readings.window :]).all()
         assert seconds(0.3, model) >= 5 * dt

@@ -8,25 +8,22 @@ import casadi as ca
 import numpy as np
 import pytest
 from linear_axes import Axis
-from monitor_parts import Estimate, Exact, Run
+from monitor_parts import Estimate, Exact, Run, by_hand, energy, of_force
 
 from hybrid_mpc import (
-    Calibration,
-    Detector,
-    EnergyMonitor,
     HybridModel,
     InputError,
     Signal,
-    guard_monitor,
+    WatchLimits,
     load_scenario,
     load_trajectories,
+    make_monitor,
     replay,
     rest_speeds,
 )
 from hybrid_mpc.data.scales import noise_of, time_unit
-from hybrid_mpc.monitor.energy_readings import force_units
-from hybrid_mpc.monitor.lengths import NOTHING_STICKS
 from hybrid_mpc.records import plain, record
+from hybrid_mpc.watch.lengths import NOTHING_STICKS
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 FIVE_CM = Axis(0.01, mass=2.0, viscous=10.0, dry=0.1)
@@ -65,11 +62,11 @@ def test_of_a_slow_one_it_is_no_less_than_what_its_sensor_makes_of_standing():
     standing = Run(
         t, measured(1e-4).y[:1] + 1e-4 * np.random.default_rng(0).choice([-0.5, 0.5], (12_000, 1)), 0, 0
     )
-    monitor = guard_monitor(Axis(0.02, time_unit=unit).model(), rest_speed=coarse)
+    readings = make_monitor(Axis(0.02, time_unit=unit).model(), rest_speed=coarse).readings
     noise = noise_of([standing])[0]
     assert coarse >= 5e-5
     assert noise * 0.25 < coarse < 1e-3  # far from the speed at work
-    assert monitor.rest_speed == (coarse,)
+    assert readings.rest_speed == (coarse,)
 
 
 MACHINES = {
@@ -109,55 +106,48 @@ def test_a_push_at_any_speed_reads_as_what_it_is(strokes, dry, speed, push):
     """On the axis of 5 cm, rest speed 12 mm/s; nobody told the monitor of the push."""
     axis = Axis(0.01, mass=2.0, viscous=10.0, dry=dry)
     run = axis.cruise(speed, 60, push=push)
-    monitor = EnergyMonitor(
-        axis.model(), window=21, average=5, rest_speed=rest_speeds([strokes], FIVE_CM.model())
-    )
+    monitor = energy(axis.model(), window=21, rest_speed=rest_speeds([strokes], FIVE_CM.model()))
     trace = replay(monitor, Exact(run), run)
     # below the rest speed dry friction may act either way: a push along the motion must exceed twice of it; from there
     # to twice the speed ever less so
-    near = np.clip(2 - abs(speed) / monitor.rest_speed[0], 0.0, 1.0)
+    near = np.clip(2 - abs(speed) / monitor.readings.rest_speed[0], 0.0, 1.0)
     expected = PUSH - (2 * dry * near if push * speed > 0 else 0.0)
     # within its own step the model is slowed by less than dt d / 2 m = 2.5 % of what it lacks
-    np.testing.assert_allclose(trace.residual_level[40:], expected, rtol=0.03)
+    np.testing.assert_allclose(np.abs(trace.of("force of q"))[40:], expected, rtol=0.03)
 
 
 @pytest.mark.parametrize(("pull", "excess"), [(0.09, 0.0), (-0.09, 0.0), (0.3, 0.2)])
 def test_dry_friction_raises_nothing_at_rest(strokes, pull, excess):
     n = 80
     run = Run(0.01 * np.arange(n), np.zeros((n, 1)), np.full((n, 1), pull), np.zeros((n, 2)))
-    monitor = EnergyMonitor(
-        FIVE_CM.model(), window=21, average=5, rest_speed=rest_speeds([strokes], FIVE_CM.model())
-    )
+    monitor = energy(FIVE_CM.model(), window=21, rest_speed=rest_speeds([strokes], FIVE_CM.model()))
     # dry friction holds 0.1 N; the rest is what nobody holds
-    np.testing.assert_allclose(replay(monitor, Exact(run), run).residual_level[40:], excess, atol=1e-6)
+    np.testing.assert_allclose(
+        np.abs(replay(monitor, Exact(run), run).of("force of q"))[40:], excess, atol=1e-6
+    )
 
 
 def test_every_consumer_takes_the_stored_value():
-    detector = Detector(
-        0.01,
-        ((1.0, 0, 0, 0),),
-        (1.0, 0, 0, 0),
-        1.0,
-        9.0,
-        9.0,
+    force = of_force(9.0)
+    limits = by_hand(
+        type(force)("force of q", "N", 0, 9.0, 4.5, (1.0, 0, 0, 0)),
+        dt=0.01,
         rest_speed=(0.003,),
-        false_alarms_per_hour=1.0,
         time_unit=2.0,
     )
-    calibration = Calibration(1.0, 0.5, 1.0, 1, 1.0, "by hand", rest_speed=(0.004,))
     model = FIVE_CM.model()
-    assert guard_monitor(replace(model, time_unit=2.0), detector).rest_speed == (0.003,)
-    with pytest.raises(InputError, match="count in a machine's second of 2 s"):
-        guard_monitor(model, detector)
-    assert EnergyMonitor(model, window=5, average=1, calibration=calibration).rest_speed == (0.004,)
-    for part in (detector, calibration):
-        assert record(type(part), json.loads(json.dumps(plain(part))), "") == part
+    assert make_monitor(replace(model, time_unit=2.0), limits).readings.rest_speed == (0.003,)
+    with pytest.raises(InputError, match="a machine's second of 2 s"):
+        make_monitor(model, limits)
+    assert record(WatchLimits, json.loads(json.dumps(plain(limits))), "") == limits
     # nobody gave one: no number of any unit stands for it, and nothing is taken to stick
-    unknown = EnergyMonitor(model, window=5, average=1)
-    assert unknown.rest_speed == (NOTHING_STICKS,)
+    unknown = energy(model)
+    assert unknown.readings.rest_speed == (NOTHING_STICKS,)
     pulled = Run(0.01 * np.arange(40), np.zeros((40, 1)), np.full((40, 1), 0.3), np.zeros((40, 2)))
     # dry friction of 0.1 N would hold a third of it; all of it counts
-    np.testing.assert_allclose(replay(unknown, Exact(pulled), pulled).residual_level[10:], 0.3, atol=1e-6)
+    np.testing.assert_allclose(
+        np.abs(replay(unknown, Exact(pulled), pulled).of("force of q"))[10:], 0.3, atol=1e-6
+    )
 
 
 def test_bad_input_speaks(strokes):
@@ -169,7 +159,7 @@ def test_bad_input_speaks(strokes):
     with pytest.raises(InputError, match="q never moves"):
         rest_speeds([still], model)
     with pytest.raises(InputError, match="1 positive speeds"):
-        EnergyMonitor(model, window=5, average=1, rest_speed=[0.1, 0.1])
+        energy(model, rest_speed=[0.1, 0.1])
 
 
 def two_joints(push=(0.0, 0.0)):
@@ -213,9 +203,10 @@ class Resting(Exact):
 def test_each_of_two_coupled_joints_has_a_rest_speed_and_a_dead_band_of_its_own(pull, excess):
     n = 60
     run = Run(0.02 * np.arange(n), np.zeros((n, 2)), np.tile(pull, (n, 1)), np.zeros((n, 4)))
-    monitor = EnergyMonitor(two_joints(), window=11, average=5, rest_speed=[0.1, 1e-3])
-    assert monitor.rest_speed == (0.1, 1e-3)
-    assert force_units(monitor.model) == ("N m", "N")
+    monitor = energy(two_joints(), window=11, rest_speed=[0.1, 1e-3])
+    assert monitor.readings.rest_speed == (0.1, 1e-3)
+    named = [(channel.name, channel.unit) for channel in monitor.readings.channels]
+    assert named == [("violation", "W"), ("force of phi", "N m"), ("force of q", "N")]
     trace = replay(monitor, Resting(run), run)
     # the machine stands, so that what nobody holds is unexplained, with its sign
-    np.testing.assert_allclose(trace.numbers[-1, 3:5], -np.array(excess), atol=1e-9)
+    np.testing.assert_allclose(trace.values[-1, 1:3], -np.array(excess), atol=1e-9)
