@@ -272,7 +272,8 @@ def trials_of(name: str, plant: Plant, own: Made, first: int, number: int) -> li
 
 
 def drawn(name: str, plant: Plant, own: Made, seed: int) -> Trial | None:
-    """A trial, or None where no draw fits; set-points, parameters and loads are drawn until the machine can hold what it is asked to.
+    """A trial; set-points, parameters and loads are drawn until the machine can hold what it is asked to. None: no draw
+    fits.
 
     That is: the inputs can, within their limits and with the load; and the outputs answer to the inputs in the long run
     as those of the prior do. Of a machine that answers the other way round no controller of the prior holds an output
