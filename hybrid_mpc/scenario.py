@@ -182,7 +182,7 @@ class Scenario:
         figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a
             :class:`~hybrid_mpc.job.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
-            for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: each by itself.
+            for :class:`~hybrid_mpc.watch.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` evaluates the machine's models on recordings; default: not at all.
         beyond_recordings: Whether tasks go where no recording was. The filters on the hybrid then assume no less
             process noise than those on the prior; see also ``Budget.prior_replay``. Default: no.

@@ -482,7 +482,8 @@ class EconomicCost:
         self, ocp: OCP, dt: float, model: HybridModel | None = None, sizes: Array | None = None
     ) -> None:
         self.function, self._dt, self._n = stage_cost(ocp, model), dt, ocp.horizon
-        self._size = np.concatenate([np.ones(ocp.n_x) if sizes is None else sizes, ocp.input_scale])
+        self.size: Array = np.concatenate([np.ones(ocp.n_x) if sizes is None else sizes, ocp.input_scale])
+        """In what directions ``(n_x + n_u,)`` of state and input count."""
         f, n_x, n_u = self.function, ocp.n_x, ocp.n_u
         self.n_p = int(f.numel_in(2)) if f is not None and f.n_in() > 2 else 0
         """Number of its parameters."""
@@ -520,7 +521,7 @@ class EconomicCost:
         slope, curvature = self.derivatives(x, u, p)
         if not np.all(np.isfinite(curvature)):
             return slope, curvature
-        both = np.outer(self._size, self._size)
+        both = np.outer(self.size, self.size)
         values, vectors = np.linalg.eigh(curvature * both)
         flat = np.maximum(values, 0.0)[:, None, :]
         return slope, (vectors * flat) @ vectors.transpose(0, 2, 1) / both

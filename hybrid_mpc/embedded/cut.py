@@ -1,4 +1,4 @@
-"""A model's step cut at its GRU: scalar code before it, the cell's weights, scalar code behind it."""
+"""A model's step cut at its network: scalar code, a GRU's weights or those of layers, scalar code."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.embedded.layers import Layer, split, written_out
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, inlined
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
+MOST_SCALARS = 10_000
+"""Operations before or behind a cell beyond which networks among them are taken as layers."""
 
 
 @dataclass(frozen=True)
@@ -31,23 +34,34 @@ class Cell:
         """Number of units."""
         return int(self.hidden_weight.shape[1])
 
+    def same(self, other: Cell | None) -> bool:
+        """Whether it is the other one, too."""
+        names = ("input_weight", "hidden_weight", "input_bias", "hidden_bias")
+        return (
+            other is not None
+            and self.first == other.first
+            and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+        )
+
 
 @dataclass(frozen=True)
 class Cut:
-    """A step, or rates, in scalars. ``before`` ``(x, h, u, w) -> features`` and ``cell`` are None without a network;
-    ``after`` ``(x, h, u, w, units) -> z_next`` takes the cell's new state.
+    """A step, or rates, in scalars. ``before`` ``(x, h, u, w) -> features`` and ``cell`` are those of a network that is
+    one GRU, ``layers`` those of any other; ``after`` ``(x, h, u, w, units) -> z_next`` takes the cell's new state, or
+    the products of all layers.
     """
 
     before: ca.Function | None
     cell: Cell | None
     after: ca.Function
+    layers: tuple[Layer, ...] = ()
 
 
-def cut(model: HybridModel, of: str = "step") -> Cut:
-    """The step of a model, or its rates (``of="xdot"``), its parameters at their values.
+def cut(model: HybridModel, of: str = "step", *, layered: bool = False) -> Cut:
+    """The step of a model, or its rates (``of="xdot"``), its parameters at their values; ``layered``: a GRU as layers.
 
     Raises:
-        InputError: If it holds another network than one GRU cell, by name.
+        InputError: If what lies between its layers is no scalar code.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal
@@ -59,6 +73,7 @@ def cut(model: HybridModel, of: str = "step") -> Cut:
     sizes = model.n_x, model.n_h, model.n_u, model.n_w
     point = [ca.MX.sym(name, n) for name, n in zip("xhuw", sizes, strict=True)]
     z_next: Any = ca.vertcat(*inlined(getattr(model, of), [*point, ca.MX(ca.DM(model.p))]))
+    z_next = written_out(point, z_next, but="_cell")
     whole = ca.Function(of, point, [z_next])
     calls = [
         whole.instruction_MX(k)
@@ -67,22 +82,49 @@ def cut(model: HybridModel, of: str = "step") -> Cut:
     ]
     cells = [c for c in calls if c.which_function().name().endswith("_cell")]
     names = [c.which_function().name() for c in cells]
-    if names not in ([], ["gru_cell"]):
-        raise InputError(
-            f"model {model.name}: its network has the cells {', '.join(names)}; C is generated for one GRU cell"
-        )
-    if not cells:
-        return Cut(None, None, _scalar(model, of, [*point, ca.MX.sym("units", 0)], z_next))
-    seen: ca.MX = cells[0].dep(0)
-    hidden, new = cells[0].dep(1), cells[0].get_output(0)
+    if names == ["gru_cell"] and not layered:
+        found = _gru(model, of, point, z_next, cells[0])
+        if found is not None:
+            return found
+    layers, after = split(point, z_next, f"model {model.name}: its {of}")
+    return Cut(None, None, after, layers)
+
+
+def _gru(model: HybridModel, of: str, point: list[ca.MX], z_next: ca.MX, call: ca.MX) -> Cut | None:
+    """The step cut at its only cell; None where it is not cut there: the cell goes on from something else than its own
+    hidden state, or a network behind it is no scalar code.
+    """
+    seen: ca.MX = call.dep(0)
+    hidden, new = call.dep(1), call.get_output(0)
     units = ca.MX.sym("units", new.shape[0])
     (behind,) = ca.graph_substitute([z_next], [new], [units])
     first = _place(model, point, hidden)
-    weights = _weights(cells[0].which_function())
-    return Cut(
-        _scalar(model, "features", point, seen), Cell(*weights, first),
+    if first is None:
+        return None
+    found = Cut(
+        _scalar(model, "features", point, seen), Cell(*_weights(call.which_function()), first),
         _scalar(model, of, [*point, units], behind),
     )  # fmt: skip
+    parts = (found.before, found.after)
+    if max(f.n_instructions() for f in parts if f is not None) > MOST_SCALARS:
+        return None
+    kept = of == "xdot" or _kept(model, found)
+    return found if kept else None
+
+
+def _kept(model: HybridModel, found: Cut) -> bool:
+    """Whether the cell's new state is the next hidden state as it is, unit by unit."""
+    point = [ca.SX.sym(n, found.after.numel_in(i)) for i, n in enumerate(("x", "h", "u", "w", "units"))]
+    z_next, g = found.after(*point), point[-1]
+    own = next_places(z_next, g)
+    first = min(own, default=0)
+    return [own.get(first + k) for k in range(g.numel())] == list(range(g.numel()))
+
+
+def next_places(z_next: ca.SX, units: ca.SX) -> dict[int, int]:
+    """Which entries of a step are units of the cell as they are: the unit by the entry's place."""
+    pairs = ((i, k) for i in range(z_next.numel()) for k in range(units.numel()))
+    return {i: k for i, k in pairs if ca.is_equal(z_next[i], units[k], 0)}
 
 
 def _scalar(model: HybridModel, name: str, point: list[ca.MX], value: ca.MX) -> ca.Function:
@@ -93,20 +135,20 @@ def _scalar(model: HybridModel, name: str, point: list[ca.MX], value: ca.MX) -> 
         raise InputError(f"model {model.name}: its {name} is no scalar code: {last_line(error)}") from error
 
 
-def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int:
-    """Place in ``h`` of the first state that the cell goes on from."""
+def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int | None:
+    """Place in ``h`` of the first state that the cell goes on from; None if these are others."""
     h = point[1]
     slope = ca.Function("slope", point, [ca.densify(ca.jacobian(hidden, h)), hidden])
     rng = np.random.default_rng(0)
     given = [rng.standard_normal(s.numel()) for s in point]
     rows, value = (v.full() for v in slope(*given))
+    if not rows.size:
+        return None
     first = int(np.argmax(rows[0]))
     wanted = np.eye(hidden.shape[0], model.n_h, first)
-    if not np.array_equal(rows, wanted) or not np.array_equal(
-        value[:, 0], given[1][first : first + len(rows)]
-    ):
-        raise InputError(f"model {model.name}: its GRU goes on from something else than its own hidden state")
-    return first
+    if not np.array_equal(rows, wanted):
+        return None
+    return first if np.array_equal(value[:, 0], given[1][first : first + len(rows)]) else None
 
 
 def _weights(cell: ca.Function) -> tuple[Array, Array, Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -15,11 +16,11 @@ from hybrid_mpc.control.problem import KEPT, KNOTS, Problem, SoftRows
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.control.targets import Targets
-from hybrid_mpc.embedded.cut import Cut, cut, reduced
+from hybrid_mpc.embedded.cut import Cut, cut, next_places, reduced
+from hybrid_mpc.embedded.layers import after_code, layer_code
 from hybrid_mpc.embedded.scalar import c_function, comment, number, table
 from hybrid_mpc.embedded.watch import (
     NOTHING,
-    Watch,
     Watched,
     guard_parts,
     monitor_parts,
@@ -27,12 +28,14 @@ from hybrid_mpc.embedded.watch import (
     refused_monitor,
 )
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate import kalman
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import NEGLIGIBLE, Filter, SwitchingFilter
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model import equilibrium
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
+from hybrid_mpc.watch.monitor import Monitor
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
@@ -56,6 +59,11 @@ SEARCH: Mapping[str, tuple[str, str]] = {
     "ROUNDING": ("1e-15", "1e-7"), "AWAY": (repr(equilibrium.AWAY), repr(equilibrium.AWAY)),
 }  # fmt: skip
 """What the search for steady states goes by, in double and in single precision: ``hybrid_mpc.model.equilibrium``."""
+START: Mapping[str, tuple[str, str]] = {
+    "FITS": (repr(kalman.FITS), "1e-2"), "EXACT": (repr(kalman.EXACT), "1e-3"),
+    "DEPENDENT": (repr(kalman.DEPENDENT), "1e-5"),
+}  # fmt: skip
+"""Likewise the search for the first state that fits the sensors: ``hybrid_mpc.estimate.kalman``."""
 MAX_AGE = 5
 """Periods a plan is followed without a successful solve, as :class:`~hybrid_mpc.control.safeguard.SafeController`."""
 
@@ -71,7 +79,7 @@ class Sources:
 
 def make_sources(
     model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
-    safe_input: Array | None = None, single: bool = False, monitor: Watch | None = None, guard: Guard | None = None,
+    safe_input: Array | None = None, single: bool = False, monitor: Monitor | None = None, guard: Guard | None = None,
     max_age: int = MAX_AGE,
 ) -> Sources:  # fmt: skip
     """The generated files of a controller; with a guard's backup all files of that one, too.
@@ -90,7 +98,7 @@ def make_sources(
     Raises:
         InputError: If something of them has no C, all at once, by name.
     """
-    refused = _refused(model, ocp, estimator, single)
+    refused = _refused(ocp, estimator, single)
     parts: Cut | None = None
     try:
         parts = cut(model)
@@ -120,6 +128,8 @@ def make_sources(
     expressions = sum(int(f.numel_out(0)) for f in soft.functions)
     modes = () if estimator is None else _modes(estimator)
     starts, aims = ocp.block_starts, target_starts(problem.targets)
+    curved, cost = _curved(model), problem.economic
+    staged = cost.function is not None and (ocp.economic is not None or curved)
     sizes = {
         "NX": model.n_x, "NH": model.n_h, "NU": model.n_u, "NY": model.n_y, "NW": model.n_w, "ND": model.n_d,
         "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": soft.states.size, "SOFT_E": expressions, "MODES": len(modes),
@@ -130,9 +140,12 @@ def make_sources(
         "TARGET_ITERATIONS": equilibrium.ITERATIONS, "TARGET_SETTLING": equilibrium.SETTLING,
         "TARGET_WITHIN": equilibrium.WITHIN, "TARGET_PARTS": equilibrium.MOST_PARTS, "TARGET_STARTS": len(aims),
         "TARGET_NEAREST": len(aims) - 1 if problem.targets is not None and problem.targets.run_out else 0,
+        "CURVED": int(curved), "STAGE_COST": int(staged), "COST_MOVES": int(staged and cost.n_p > 0),
+        "OUTPUT_ROWS": int(ocp.n_y > 0 and not staged), "STARTS": len(ocp.starts),
+        "START_MODES": len(modes) if len({(f.first.tobytes(), f.noise[1].tobytes()) for f in modes}) > 1 else 1,
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
-        model, parts, soft, fallback, ocp, bool(modes) or ocp.n_y > 0, watched.code
+        model, parts, soft, fallback, ocp, problem, sizes, watched.code
     )
     guard_sizes, guard_tables = guard_parts(guard, model)
     sizes |= {**model_sizes, **watched.sizes, **guard_sizes}
@@ -153,10 +166,8 @@ def backup_of(guard: Guard | None, single: bool) -> dict[str, str]:
     if guard is None or guard.backup is None or guard.backup_estimator is None:
         return {}
     safe, estimator = guard.backup, guard.backup_estimator
-    if not isinstance(estimator, ExtendedKalmanFilter | SwitchingFilter):
-        raise InputError(f"no C for an estimator of this kind ({type(estimator).__name__})")
     found = make_sources(
-        safe.controller.model, safe.controller.ocp, estimator=estimator, fallback=safe.fallback,
+        safe.controller.model, safe.controller.ocp, estimator=cast(Filter, estimator), fallback=safe.fallback,
         safe_input=safe.safe_input, single=single, max_age=safe.max_age,
     )  # fmt: skip
     texts = {name: template(name) for name in (*HEADERS, *CORE)} | dict(found.texts)
@@ -172,39 +183,27 @@ def sources_of(found: Sources) -> tuple[str, ...]:
     return (*SOURCES, *(_renamed(name) for name in CORE if found.sizes["BACKUP"]))
 
 
-def _refused(model: HybridModel, ocp: OCP, estimator: Filter | None, single: bool) -> list[str]:
-    """What of a controller has no C yet, in words."""
-    cases = {
-        "an economic stage cost": ocp.economic is not None,
-        "several first plans (starts)": bool(ocp.starts),
-        "hard bounds in single precision, whose seven digits their penalties leave no room in": bool(ocp.hard)
-        and single,
-        "a forecast of measured disturbances (preview_w)": ocp.preview_w and model.n_w > 0,
-    }
-    found = [what for what, wrong in cases.items() if wrong]
-    if estimator is not None or ocp.n_y:
-        found += _refused_outputs(model, ocp, estimator is not None)
+def _refused(ocp: OCP, estimator: object, single: bool) -> list[str]:
+    """What of a control problem and an estimator has no C, in words."""
+    found = []
+    if not isinstance(estimator, ExtendedKalmanFilter | SwitchingFilter | None):
+        found.append(
+            f"an estimator of this kind ({type(estimator).__name__}); needed: an ExtendedKalmanFilter or a "
+            "SwitchingFilter, on a model that holds the delays (with_input_delay)"
+        )
+    if ocp.hard and single:
+        found.append(
+            "hard bounds in single precision: where one gives way, seven digits leave none beside its penalty; "
+            "generate double precision"
+        )
     return found
 
 
-def _refused_outputs(model: HybridModel, ocp: OCP, measured: bool) -> list[str]:
-    slopes = output_with_jacobian(model)
-    rng = np.random.default_rng(0)
-    room = [0.5 * (s.upper - s.lower) for s in model.disturbances]
-    scale = Sizes(model, ocp).states, ocp.input_scale, np.where(np.isfinite(room), room, 1.0)
-    points: list[tuple[Array, ...]] = [(model.x0, model.u0, model.w)]
-    points += [
-        tuple(p + size * rng.standard_normal(p.size) for p, size in zip(points[0], scale, strict=True))
-        for _ in range(3)
-    ]
-    rows = [np.hstack([m.full() for m in slopes(*p)[1:]]) * np.concatenate(scale[:2]) for p in points]
-    largest = np.max(np.abs(rows[0]), axis=1, keepdims=True)  # of each output, in its unit
-    if not all(np.all(np.abs(m - rows[0]) <= 1e-12 * largest) for m in rows):
-        return ["outputs that are not linear in state and input, for an estimator or weights on them"]
-    c = rows[0][:, : model.n_x] / np.where(largest > 0, largest, 1.0)
-    if measured and np.linalg.matrix_rank(c) < model.n_y:
-        return ["an estimator with more sensors than states that they show"]
-    return []
+def _curved(model: HybridModel) -> bool:
+    """Whether outputs are not linear in state and input, or answer to these as measured disturbances say."""
+    point = [ca.SX.sym(name, n) for name, n in (("x", model.n_x), ("u", model.n_u), ("w", model.n_w))]
+    y = _scalar("the output", model.output)(*point, ca.DM(model.p))
+    return bool(ca.depends_on(ca.jacobian(y, ca.vertcat(*point[:2])), ca.vertcat(*point)))
 
 
 def _modes(estimator: Filter) -> tuple[ExtendedKalmanFilter, ...]:
@@ -246,6 +245,7 @@ def _config(sizes: Mapping[str, int], single: bool, names: list[str], watched: W
         *zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE", "KEPT"), exact, strict=True)
     ]
     tolerances += [(f"TARGET_{name}", value[single]) for name, value in SEARCH.items()]
+    tolerances += [(f"START_{name}", value[single]) for name, value in START.items()]
     defined += "".join(f"#define HMPC_{name} {number(value)}\n" for name, value in watched.numbers.items())
     return (
         "/* Sizes of this controller, generated. */\n#ifndef HMPC_CONFIG_H\n#define HMPC_CONFIG_H\n"
@@ -265,7 +265,8 @@ def _expressions(
     soft: SoftRows,
     fallback: HybridModel | None,
     ocp: OCP,
-    measured: bool,
+    problem: Problem,
+    asked: Mapping[str, int],
     watched: str,
 ) -> tuple[str, dict[str, int], dict[str, int]]:
     """The scalar code, sizes that follow from it, and its operations by function."""
@@ -284,22 +285,21 @@ def _expressions(
         texts.append(text)
 
     cell, units = parts.cell, 0 if parts.cell is None else parts.cell.units
-    g = ca.SX.sym("g", units)
+    layered = layer_code("layers", parts.layers, (z, u, w), places)
+    texts.append(layered.text if parts.layers else "")
+    operations |= layered.operations
+    g = ca.SX.sym("g", layered.products or units)
     x, h = z[:n_x], z[n_x:]
     z_next = parts.after(x, h, u, w, g)
     own: dict[int, int] = {}
-    sizes = {"UNITS": units}
+    sizes = {"UNITS": units, "PRODUCTS": layered.products, "THROUGH": layered.through}
     if cell is not None and parts.before is not None:
         seen = parts.before(x, h, u, w)
         slope = ca.jacobian(seen, ca.vertcat(z, u))
         rows, columns = slope.sparsity().get_triplet()
         values = [slope[i, j] for i, j in zip(rows, columns, strict=True)]
-        own = {i: k for i in range(n_z) for k in range(units) if ca.is_equal(z_next[i], g[k], 0)}
+        own = next_places(z_next, g)
         first = min(own, default=0)
-        if [own.get(first + k) for k in range(units)] != list(range(units)):
-            raise InputError(
-                f"no C for model {model.name}: its GRU's new state is not its next hidden state as it is"
-            )
         sizes |= {
             "FEATURES": seen.numel(), "SEEN_SLOPES": len(values), "HIDDEN": n_x + cell.first, "HIDDEN_NEXT": first,
         }  # fmt: skip
@@ -332,6 +332,12 @@ def _expressions(
     outs = [(f"z_next[{i}]", z_next[i]) for i in rest]
     add("model_after", [*point, "real *z_next"], inputs, outs)
     by_out, by_v = ca.jacobian(z_next, out), ca.jacobian(z_next, ca.vertcat(z, u))
+    passed: list[tuple[str, ca.SX]] = []
+    reached: list[int] = []
+    if parts.layers:
+        text, passed, reached = after_code("layers_after", z_next, out, layered)
+        texts.append(text)
+    outs, sizes["PASSED"] = outs + passed, len(passed)
     corrected = [i for i in rest if units and by_out[i, :].nnz()]
     outs += [
         (f"slope[{i * row + places[j]}]", by_v[i, j])
@@ -343,7 +349,7 @@ def _expressions(
         for k, i in enumerate(corrected)
         for j in range(len(head))
     ]
-    cleared = [f"memset(slope + {i * row}, 0, sizeof(real) * HMPC_LJ);" for i in corrected]
+    cleared = [f"memset(slope + {i * row}, 0, sizeof(real) * HMPC_LJ);" for i in (*corrected, *reached)]
     add("model_after_slope", [*point, "real *z_next", "real *slope", "real *by_out"], inputs, outs, cleared)
     sizes["CORRECTED"] = len(corrected)
     texts.append(table("corrected", np.array(corrected, dtype=float), "int"))
@@ -366,15 +372,29 @@ def _expressions(
             *(f"real *{name}" for name in ("value", "by_x", "by_u")),
         ]
         add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d, "p": p}, outs)
-    if measured:
-        y = _scalar("the output", model.output)(x, u, w, ca.DM(model.p))
+    if asked["MODES"] or ocp.n_y:
+        y = ca.densify(_scalar("the output", model.output)(x, u, w, ca.DM(model.p)))
         outs = [(f"y[{i}]", y[i]) for i in range(model.n_y)]
-        add(
-            "outputs",
-            ["const real *x", "const real *u", "const real *w", "real *y"],
-            {"x": x, "u": u, "w": w},
-            outs,
-        )
+        given, read = {"x": x, "u": u, "w": w}, ["const real *x", "const real *u", "const real *w"]
+        add("outputs", [*read, "real *y"], given, outs)
+        if asked["CURVED"]:
+            for name, of in (("by_x", x), ("by_u", u)):
+                jacobian = ca.densify(ca.jacobian(y, of)).T
+                outs += [(f"{name}[{i}]", jacobian[i]) for i in range(jacobian.numel())]
+            add("output_slopes", [*read, "real *y", "real *by_x", "real *by_u"], given, outs)
+    if asked["STAGE_COST"] and problem.economic.function is not None:
+        y_ref, both = ca.SX.sym("y", ocp.n_y), ca.vertcat(x, u)
+        known = ca.vertcat(p, y_ref, d, w) if ocp.n_y else p[: problem.economic.n_p]
+        f = _scalar("the stage cost", problem.economic.function)
+        cost = model.dt * ca.densify(f(x, u, known) if f.n_in() > 2 else f(x, u))
+        by = ca.densify(ca.jacobian(cost, both))
+        curve = ca.densify(ca.jacobian(by, both))
+        given, n = {"x": x, "u": u, "w": w, "d": d, "p": p, "y": y_ref}, both.numel()
+        read = [f"const real *{name}" for name in given]
+        add("stage_cost", [*read, "real *value"], given, [("value[0]", cost)])
+        outs = [(f"slope[{i}]", by[i]) for i in range(n)]
+        outs += [(f"curve[{i * n + j}]", curve[i, j]) for i in range(n) for j in range(i + 1)]
+        add("stage_cost_slopes", [*read, "real *slope", "real *curve"], given, outs)
     if fallback is not None:
         rates = _scalar("the prior", fallback.xdot)(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
         best = equilibrium.holding(rates, u, fallback.u0, Sizes(fallback, ocp).states, ocp.input_scale)
@@ -421,6 +441,10 @@ def _tables(
     if fallback is not None:
         gain = dare(*ocp.linear_quadratic(fallback))[1]
         reals["gain"] = gain[:, : ocp.n_x + fallback.delay_states]
+    if ocp.starts:
+        reals |= {"starts": np.array([np.clip(s, ocp.u_min, ocp.u_max).ravel() for s in ocp.starts])}
+    if problem.economic.function is not None:
+        reals |= {"cost_size": problem.economic.size}
     if estimator is not None or ocp.n_y:
         c, by_u = (m.full() for m in output_with_jacobian(model)(model.x0, model.u0, model.w)[1:])
         reals |= {"output_x": c, "output_d": by_u @ on_u + on_y, "disturbs_y": on_y}
@@ -438,8 +462,8 @@ def _tables(
         modes = _modes(estimator)
         switching = estimator if isinstance(estimator, SwitchingFilter) else None
         reals |= {
-            "noise": np.array([f.noise[0] for f in modes]), "noise_y": modes[0].noise[1],
-            "first_variance": np.array([f.first for f in modes]), "start_weight": modes[0].nearness ** 2,
+            "noise": np.array([f.noise[0] for f in modes]), "noise_y": np.array([f.noise[1] for f in modes]),
+            "first_variance": np.array([f.first for f in modes]), "start_size": np.array([f.nearness for f in modes]),
             "lost_variance": np.array([np.where(f.most < np.finfo(float).max, f.most, np.inf) for f in modes]),
             "switches": np.ones((1, 1)) if switching is None else switching.transition,
             "first_probability": np.ones(1) if switching is None else switching.first_probability,

@@ -49,6 +49,7 @@ class Goal(ctypes.Structure):
     _fields_ = (
         ("x", ctypes.c_void_p), ("y", ctypes.c_void_p), ("p", ctypes.c_void_p), ("rows", ctypes.c_int),
         ("weight", ctypes.c_void_p), ("u_min", ctypes.c_void_p), ("u_max", ctypes.c_void_p),
+        ("w", ctypes.c_void_p), ("w_rows", ctypes.c_int),
     )  # fmt: skip
 
 
@@ -177,7 +178,7 @@ class NativeController(SplitController):
 
 def goal_of(
     x: Array | None = None, weight: Array | None = None, u_min: Array | None = None, u_max: Array | None = None,
-    *, y: Array | None = None, p: Array | None = None,
+    *, y: Array | None = None, p: Array | None = None, w: Array | None = None,
 ) -> Goal:  # fmt: skip
     """What a plan is to follow; the arrays, row by row, must outlive it."""
 
@@ -185,7 +186,8 @@ def goal_of(
         return None if array is None else array.ctypes.data
 
     rows = x if y is None else y
-    return Goal(at(x), at(y), at(p), 1 if rows is None else len(rows), at(weight), at(u_min), at(u_max))
+    limits, ahead = (at(u_min), at(u_max)), (at(w), 0 if w is None else len(w))
+    return Goal(at(x), at(y), at(p), 1 if rows is None else len(rows), at(weight), *limits, *ahead)
 
 
 @dataclass(frozen=True)

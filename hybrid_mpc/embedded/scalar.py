@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike
 from hybrid_mpc.errors import InputError
 
 MOST = 30_000
-"""Operations of an expression beyond which it is no scalar code any more: dense layers that are no GRU."""
+"""Operations of an expression beyond which it is no scalar code any more."""
+SMALL = 32
+"""Entries of a constant matrix up to which its product is scalar code; larger ones are layers of a network."""
 _BINARY = {
     ca.OP_ADD: "{} + {}", ca.OP_SUB: "{} - {}", ca.OP_MUL: "{} * {}", ca.OP_DIV: "{} / {}",
     ca.OP_FMIN: "hmpc_min({}, {})", ca.OP_FMAX: "hmpc_max({}, {})",
@@ -30,7 +32,8 @@ _LIBM = {
     ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow", ca.OP_ASIN: "asin", ca.OP_ACOS: "acos", ca.OP_ATAN: "atan",
     ca.OP_ATAN2: "atan2", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_ASINH: "asinh", ca.OP_ACOSH: "acosh",
     ca.OP_ATANH: "atanh", ca.OP_ERF: "erf", ca.OP_HYPOT: "hypot", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
-    ca.OP_FMOD: "fmod", ca.OP_COPYSIGN: "copysign", ca.OP_LOG1P: "log1p", ca.OP_EXPM1: "expm1",
+    ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder", ca.OP_COPYSIGN: "copysign", ca.OP_LOG1P: "log1p",
+    ca.OP_EXPM1: "expm1",
 }  # fmt: skip
 """Functions that come from the C library, whose last bits differ from one to the next."""
 _NAMES = {code: name for name, code in vars(ca).items() if name.startswith("OP_")}
@@ -99,8 +102,8 @@ def c_function(
     f = ca.Function("f", list(inputs.values()), [values], {"cse": True})
     if f.n_instructions() > MOST:
         raise InputError(
-            f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; networks must be a GRU of "
-            "nn_export (torch's GRUCell, GRU)"
+            f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; products with constant matrices "
+            f"of more than {SMALL} numbers do not count: write networks with them (torch's Linear, GRUCell, LSTM)"
         )
     lines, names = [], list(inputs)
     register: dict[int, str] = {}
@@ -122,8 +125,9 @@ def c_function(
             elif code in _LIBM:
                 text = f"HMPC_LIBM({_LIBM[code]})({', '.join(arguments_c)})"
             else:
+                called = " (a lookup table or a solver)" if code == ca.OP_CALL else ""
                 raise InputError(
-                    f"{name}: no C for {_NAMES.get(code, code)}; write the prior with other operations"
+                    f"{name}: no C for {_NAMES.get(code, code)}{called}; write the prior with other operations"
                 )
             operations += 1
         register[given[0]] = f"t{k}"

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation
-from hybrid_mpc.data.files import Source, name_and_unit, opened
+from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.names import ANGLES
 from hybrid_mpc.data.recording import MIN_SCORED, read_recordings
+from hybrid_mpc.data.source import Source, name_and_unit
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_text
@@ -56,7 +57,7 @@ class Draft:
     ``disturbances`` are measured and act on the machine, but nobody commands them. ``verdicts`` say by column why it
     has its role. ``loop`` says how a closed loop is seen, empty if none is; ``growth`` [1/s] is the rate at which the
     machine leaves its rest, zero if it does not; ``lags`` are first models of the outputs. ``length`` is that of the
-    shortest recording [s].
+    shortest recording [s]. ``notes`` say by file what was done to read it.
     """
 
     time: Column | None
@@ -73,6 +74,7 @@ class Draft:
     growth: float = 0.0
     length: float = 0.0
     lags: tuple[Lag, ...] = ()
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def unsure(self) -> dict[str, str]:
@@ -143,7 +145,7 @@ def write_scenario(
 
     Args:
         path: Python file to make; there must be none.
-        data: The recording (CSV, npz, mat), or several of one machine. Signals are the columns that all have.
+        data: The recording, or several of one machine. Signals are the columns that all have.
         inputs: Columns of the inputs. Default: those that look commanded (:mod:`hybrid_mpc.job.roles`).
         outputs: Columns of the outputs. Default: those that look measured.
         time: Column of the time. Default: one whose name says so, or else one that rises evenly.
@@ -256,7 +258,8 @@ def drafted(
     left_out |= {c.full: verdicts[c.full].reason for c in free if c.full not in used}
     runs = draft.runs
     lags = [first_lag(runs, i, draft.period, len(draft.inputs)) for i in range(len(draft.outputs))]
-    return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags)))
+    notes = {one.path.name: one.notes for one in sources if one.notes}
+    return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags), notes=notes))
 
 
 def _left_to_user(

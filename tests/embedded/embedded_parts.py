@@ -2,6 +2,7 @@
 
 import ctypes
 import shutil
+from dataclasses import replace
 
 import casadi as ca
 import machines
@@ -14,6 +15,8 @@ from hybrid_mpc import (
     Disturbance,
     ExtendedKalmanFilter,
     HardBound,
+    HybridModel,
+    Signal,
     SoftBound,
     SwitchingFilter,
     with_input_delay,
@@ -67,6 +70,56 @@ def heaters():
     return model, ocp
 
 
+def shown(model, y, **changes):
+    """The model with other outputs: ``y(x, u, w)``."""
+    x, u, w, p = model.output.mx_in()
+    return replace(model, output=ca.Function("y", [x, u, w, p], [y(x, u, w)]), **changes)
+
+
+def curved():
+    """The heaters behind sensors that bend and mix, one of which sees its heater: weights, bounds, offsets of both."""
+    model, ocp = heaters()
+    t = model.x0
+
+    def y(x, u, w):
+        first = x[0] + 0.004 * (x[0] - t[0]) ** 2 + 0.05 * u[0]
+        return ca.vertcat(first, x[1] * ca.sqrt(0.5 + 0.5 * (x[0] / t[0]) ** 2) + 0.002 * u[1] ** 2)
+
+    model = shown(model, y)
+    top = model.output(model.x0, model.u0, model.w, model.p).full().ravel()
+    return model, ocp.changed(y_max=[top[0] + 6.0, np.inf], y_min=[-np.inf, top[1] - 4.0])
+
+
+def priced():
+    """Two levels, a pump whose power has a price, an overflow that curves the cost down, a band that moves with it."""
+    model, ocp = tanks()
+    span = 2 * machines.PUMP
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p")
+    worth = p * (u / span) * ca.sqrt(0.1 + x[0] ** 2) - 0.3 * ca.tanh(4.0 * (x[1] - model.x0[1])) * (
+        1 + u / span
+    )
+    return model, ocp.changed(economic=ca.Function("price", [x, u, p], [worth]))
+
+
+def priced_outputs():
+    """Curved sensors that are weighed, and a cost of its own without parameters."""
+    model, ocp = curved()
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    return model, ocp.changed(
+        economic=ca.Function("power", [x, u], [0.01 * u[0] * u[1] + 1e-4 * x[0] * u[0]])
+    )
+
+
+def spare():
+    """Three sensors for one level and one for the other, one of them curved."""
+    model, ocp = tanks()
+    names = ("a", "b", "c", "d")
+    return shown(
+        model, lambda x, u, w: ca.vertcat(x[1], 2.0 * x[1], x[1] + 0.5 * x[1] ** 2, 3.0 * x[1]),
+        outputs=tuple(Signal(n, "m") for n in names),
+    ), ocp  # fmt: skip
+
+
 def bounded():
     """Soft and hard bounds on the same states, an expression, outputs, blocks, limited changes, a hidden state."""
     model, ocp = coupled()
@@ -100,6 +153,20 @@ def cart(hard, *, delay=0.0, horizon=25, **options):
     model = online_models.linear_model(a, b, np.eye(2)[:1], dt=0.1)
     model = with_input_delay(model, delay) if delay else model
     return model, OCP(horizon, [10.0, 0.1], [0.01], [0.0], [-3.0], [3.0], hard=hard, **options)
+
+
+def ways_round():
+    """A point that is driven along a plane round a hill: the way that a plan finds by itself costs more."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    place, speeds = tuple(Signal(n, "m") for n in "ab"), tuple(Signal(f"v{n}", "m/s") for n in "ab")
+    model = HybridModel.of("point", 0.1, place, speeds, place, x=x, u=u, x_next=x + 0.1 * u, xdot=u, y=x)
+    hill = 8.0 * ca.exp(-((x[0] - 0.5) ** 2 + (x[1] - 0.1) ** 2) / 0.04) + 1 / (
+        1 + ca.exp(30 * (x[1] + 0.15))
+    )
+    return model, OCP(
+        20, [4.0, 1.0], [0.05, 0.05], [0.05, 0.05], [-2.0, -2.0], [2.0, 2.0],
+        economic=ca.Function("hill", [x, u], [hill]),
+    )  # fmt: skip
 
 
 def delayed():
@@ -170,12 +237,16 @@ class CLoop:
         self.call("decide", goal, None)
 
 
-def goal(reference, weight=None, limits=None, *, ocp=None):
-    """A goal whose arrays live as long as it; ``ocp`` says whether the reference is one of outputs."""
-    rows, weight = (None if v is None else np.ascontiguousarray(v, dtype=float) for v in (reference, weight))
+def goal(reference, weight=None, limits=None, *, ocp=None, w=None):
+    """A goal whose arrays live as long as it; ``ocp`` says of what the reference is, its parameters last."""
+    n = None if ocp is None else ocp.columns - ocp.n_p
+    given = (None, None) if reference is None else (reference[:, :n], reference[:, n:] if n else None)
+    kept = [None if v is None else np.ascontiguousarray(v, dtype=float) for v in (*given, weight, w)]
+    rows, p, weight, w = kept
     x, y = (None, rows) if ocp is not None and ocp.n_y else (rows, None)
-    found = goal_of(x, weight, *((None, None) if limits is None else (limits.u_min, limits.u_max)), y=y)
-    found.kept = rows, weight, limits
+    bounds = (None, None) if limits is None else (limits.u_min, limits.u_max)
+    found = goal_of(x, weight, *bounds, y=y, p=p if ocp is not None and ocp.n_p else None, w=w)
+    found.kept = kept, limits
     return found
 
 

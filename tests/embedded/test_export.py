@@ -1,5 +1,6 @@
 """The folder of C: compiles without a warning, replays its vectors, survives rubbish; what has no C is refused."""
 
+import dataclasses
 import errno
 import json
 import re
@@ -12,13 +13,12 @@ from pathlib import Path
 import casadi as ca
 import embedded_parts as parts
 import numpy as np
-import online_models
 import pytest
 from embedded_parts import needs_compiler
 
 import hybrid_mpc as hm
 import nn_export.files
-from hybrid_mpc import OCP, Calibration, CondensedController, InputError, set_calibration
+from hybrid_mpc import ChannelLimit, CondensedController, InputError, WatchLimits, set_limits
 from hybrid_mpc.embedded import export
 from hybrid_mpc.embedded.export import OTHERS, TOLERANCE
 from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, _config, make_sources
@@ -43,7 +43,16 @@ SANITIZERS = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recove
 MACHINES = {
     "coupled": parts.coupled, "tanks": parts.tanks, "delayed": parts.delayed, "heaters": parts.heaters,
     "bounded": parts.bounded, "band": parts.band, "cart": lambda: parts.cart([AWAY]),
+    "curved": parts.curved, "priced": parts.priced, "priced outputs": parts.priced_outputs, "spare": parts.spare,
+    "ways": lambda: several(*parts.ways_round()),
 }  # fmt: skip
+
+
+def several(model, ocp):
+    """With two first plans beside the usual one."""
+    return model, ocp.changed(starts=[np.full((ocp.horizon, 2), u) for u in (0.5, -0.5)])
+
+
 AWAY = hm.HardBound("x", [-0.4, -1.0], [0.4, 1.0])
 RUBBISH = """
 #include <stdio.h>
@@ -73,7 +82,8 @@ int main(int count, char **words) {
     const real low[HMPC_NU] = {R(-0.1)}, high[HMPC_NU] = {R(0.1)};
     const hmpc_goal goal = {.x = x, .y = x, .p = k % 13 ? x : (real *)0, .rows = k % 3 ? 1 : HMPC_N + 1,
                             .weight = k % 11 ? (real *)0 : weight,
-                            .u_min = k % 7 ? (real *)0 : low, .u_max = k % 7 ? (real *)0 : high};
+                            .u_min = k % 7 ? (real *)0 : low, .u_max = k % 7 ? (real *)0 : high,
+                            .w = k % 10 ? (real *)0 : x, .w_rows = k % 4 ? HMPC_N : 1};
     if (k % 400 == 0) hmpc_start(&s, y, w, k % 800 ? u : (real *)0, &goal);
     else hmpc_step(&s, y, k % 2 ? w : (real *)0, k % 9 ? (real *)0 : u, &goal);
     if (k % 3) hmpc_finish(&s, k % 5 ? &goal : (hmpc_goal *)0);
@@ -198,21 +208,17 @@ def refused(model, ocp, match, **options):
 
 
 def test_what_has_no_c_is_refused_by_name_all_at_once():
-    model, ocp = parts.coupled()
-    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
-    cost = ca.Function("cost", [x, u], [x[0] ** 2])
-    several = {"economic": cost, "starts": [np.zeros((ocp.horizon, 2))]}
-    refused(model, ocp.changed(**several), "economic stage cost.*several first plans")
-    tank, tank_ocp = parts.tanks()
-    refused(tank, tank_ocp.changed(preview_w=True), "preview_w")
-    refused(*parts.cart([AWAY]), "hard bounds in single precision", single=True)
-    pendulum = online_models.pendulum_model()
-    curved = hm.HybridModel(
-        "curved", pendulum.dt, pendulum.states, pendulum.inputs, pendulum.outputs, pendulum.step, pendulum.xdot,
-        ca.Function("y", pendulum.output.mx_in(), [ca.sin(pendulum.output.mx_in()[0][0])]),
-    )  # fmt: skip
-    plain = OCP(9, [40.0, 0.5], [1.0], [0.5], [-2.0], [2.0], working_point=([0.0, 1.0], [0.0]))
-    refused(curved, plain, "outputs that are not linear", estimator=parts.filters_of(curved, plain))
+    model, ocp = parts.cart([AWAY])
+    delayed = hm.DelayCompensation(parts.filters_of(model, ocp), input_delay=1)
+    refused(model, ocp, "DelayCompensation.*hard bounds in single precision", single=True, estimator=delayed)
+    x, table = ca.MX.sym("x"), ca.interpolant("table", "linear", [[0.0, 1.0, 2.0]], [0.0, 1.0, 4.0])
+    read = ca.Function("y", model.output.mx_in(), [table(model.output.mx_in()[0][0])])
+    with pytest.raises(InputError, match="no C for OP_CALL"):
+        make_sources(dataclasses.replace(model, output=read), ocp, estimator=parts.filters_of(model, ocp))
+    many = ca.Function("many", [x], [sum(ca.sin(k * x) for k in range(1, 20_000))]).expand()
+    s = ca.SX.sym("s")
+    with pytest.raises(InputError, match="at most 30000 become C"):
+        c_function("f", ["const real *x", "real *y"], {"x": s}, [("y[0]", many(s))])
 
 
 def test_an_operation_without_c_is_named():
@@ -270,7 +276,8 @@ def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     code, _, err = call("export", "c", run, "--out", folder)  # the run has learned nothing to alarm by
     assert code == 2
     assert "--no-monitor" in err
-    set_calibration(run, Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand"))
+    violation = ChannelLimit("violation", "W", 1, 0.2, 0.1)
+    set_limits(run, {"hybrid": [WatchLimits("energy", 0.02, (violation,), (5e-3,), (0,))]})
     code, out, err = call("export", "c", run, "--out", folder)
     assert code == 0, err
     assert "nothing of it was compiled or run" in out

@@ -4,12 +4,22 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import embedded_parts as parts
 import numpy as np
 import pytest
 from embedded_parts import CLoop, goal, needs_compiler
 
-from hybrid_mpc import CondensedController, Limits, Loop, SafeController, TrueState
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    ExtendedKalmanFilter,
+    Limits,
+    Loop,
+    SafeController,
+    SwitchingFilter,
+    TrueState,
+)
 from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.embedded.native import NativeController
 
@@ -53,6 +63,10 @@ PROBLEMS = {
     "tanks": parts.tanks,
     "delayed": parts.delayed,
     "heaters": parts.heaters,
+    "curved": parts.curved,
+    "priced": parts.priced,
+    "priced outputs": parts.priced_outputs,
+    "spare sensors": parts.spare,
 }
 
 
@@ -75,6 +89,8 @@ def test_small_machines_with_everything(name):
         reference = model.x0 + 0.5 * size * rng.standard_normal((k % 2 + 1, model.n_x))
         if ocp.n_y:
             reference = model.x0 + 6.0 * rng.standard_normal((k % 2 + 1, 2))
+        if ocp.n_p:
+            reference = np.hstack([reference, rng.uniform(0.2, 2.0, (k % 2 + 1, ocp.n_p))])
         weight = None if k % 4 else rng.uniform(0.2, 2.0, (ocp.horizon + 1, model.n_x))
         middle, half = model.u0, 0.3 * ocp.input_range
         limits = Limits(middle - half, middle + half) if k % 6 == 5 else None
@@ -107,7 +123,7 @@ def test_a_period_of_c_is_a_period_of_the_loop(name):
     c = CLoop(model, ocp, estimator, model, safe_input)
     z, size = np.concatenate([model.x0, np.zeros(model.n_h)]), python.controller.problem.sizes.states
     target, w, u = model.x0 + 0.5 * size, model.w, python.controller.problem.u_rest
-    target = python.controller.problem.standing()[0] + 2.0 if ocp.n_y else target
+    target = python.controller.problem.standing()[0] + 2.0 if ocp.n_y else np.append(target, np.ones(ocp.n_p))
     sources = set()
     for k in range(80):
         y = model.output(z[: model.n_x], u, w, model.p).full().ravel() + 0.003 * rng.standard_normal(
@@ -142,6 +158,105 @@ def test_a_period_of_c_is_a_period_of_the_loop(name):
             [v.full().ravel() for v in model.step(z[: model.n_x], z[model.n_x :], u, w, model.p)]
         )
     assert sources == {"MPC", "PLAN", "FALLBACK"}
+
+
+def test_forecasts_of_measured_disturbances():
+    """Rows ahead, gaps among them, fewer and more than the horizon has: as in Python's loop, from the first plan on."""
+    model, ocp = parts.tanks()
+    ocp = ocp.changed(preview_w=True)
+    estimator, rng = parts.filters_of(model, ocp), np.random.default_rng(4)
+    loop = Loop(estimator, SafeController(CondensedController(model, ocp), model))
+    c, given, moved = CLoop(model, ocp, estimator, model), parts.goal(None), 0.0
+    for k in range(40):
+        y = model.x0[1:] + 0.02 * rng.standard_normal(1)
+        rows = (1, 4, ocp.horizon, ocp.horizon + 6)[k % 4]
+        ahead = model.w * (1 + np.cumsum(0.4 * rng.standard_normal((rows, 1)), axis=0))
+        ahead[rng.uniform(size=ahead.shape) < 0.2] = np.nan
+        given = goal(model.x0[None], w=ahead if rows > 1 else None)
+        if k == 0:
+            loop.start(y, ahead)
+            first = SafeController(CondensedController(model, ocp)).initial(loop.estimate)
+            c.start(y, ahead[0], first, given)
+        else:
+            kept = loop.decision
+            loop.step(y, ahead)
+            c.state.view["u"][:] = kept.u
+            c.call("load_plan", kept.solution.u, np.hstack([kept.solution.x, kept.solution.h]), kept.solution.d,
+                   kept.solution.w)  # fmt: skip
+            c.call("step", y, ahead[0], None, given)
+            assert np.max(np.abs(c.u - loop.decision.u) / ocp.input_range) < TOLERANCE, k
+            np.testing.assert_allclose(c.plan_w, loop.decision.solution.w, rtol=1e-12)
+            moved = max(moved, float(np.max(np.abs(np.diff(c.plan_w, axis=0)))))
+    assert moved > 0.1 * model.w[0]
+
+
+def test_the_first_plan_is_the_cheapest_of_several():
+    """Round a hill there are two ways: the start that finds the cheaper one is taken."""
+    model, plain = parts.ways_round()
+    up, down = ([[0.8, u]] * 10 + [[0.8, -u]] * 10 for u in (0.8, -0.8))
+    estimator, y, end = parts.filters_of(model, plain), np.zeros(2), np.array([[1.0, 0.0]])
+    costs = {}
+    for name, ways in (("none", ()), ("up", (up,)), ("down", (down,)), ("both", (down, up))):
+        c = CLoop(model, plain.changed(starts=ways), estimator)
+        c.call("start", y, np.zeros(1), None, parts.goal(end))
+        costs[name] = float(c.cost[0])
+    rti, each, e = CondensedController(model, plain), {}, estimator.start(y)
+    for name, way in (("none", np.zeros((20, 2))), ("up", up), ("down", down)):
+        plan = rti.initial(e, np.array(way)).delayed(np.zeros(2))
+        for _ in range(25):
+            plan = rti.solve(plan, e, end).delayed(np.zeros(2))
+        each[name] = rti.solve(plan, e, end).cost
+    assert each["up"] < 0.95 * each["none"]
+    for name, known in (
+        ("none", ("none",)),
+        ("up", ("none", "up")),
+        ("down", ("none", "down")),
+        ("both", each),
+    ):
+        assert costs[name] == pytest.approx(min(each[k] for k in known), rel=1e-3), name
+
+
+def test_modes_with_sensors_and_first_states_of_their_own():
+    """Filters that differ in the noise of their sensors and in how far the first state may lie, behind bent sensors."""
+    model, ocp = parts.curved()
+    modes = [
+        ExtendedKalmanFilter(model, sigma_y=sigma * np.array([0.05, 0.1]), sigma_x=[0.02, 0.02],
+                             sigma_x0=first, sigma_d=[0.1, 0.05], sigma_d0=[0.1, 0.1])
+        for sigma, first in ((1.0, (2.0, 4.0)), (20.0, (3.0, 0.5)))
+    ]  # fmt: skip
+    python = SwitchingFilter(modes, ((0.9, 0.1), (0.2, 0.8)))
+    c, rng = CLoop(model, ocp, python), np.random.default_rng(0)
+    y = model.output(model.x0, model.u0, model.w, model.p).full().ravel()
+    estimate = None
+    for k in range(60):
+        sample = y + 3.0 * np.sin(k / 9.0) + 0.1 * rng.standard_normal(2)
+        sample[rng.uniform(size=2) < 0.1] = np.nan
+        u = model.u0 + rng.uniform(-1, 1, 2)
+        if estimate is None:
+            estimate = python.start(sample)
+            c.call("estimate_start", sample, np.zeros(1))
+        else:
+            estimate = python.update(estimate, sample, u)
+            c.call("estimate_update", sample, u, np.zeros(1))
+        np.testing.assert_allclose(c.x, estimate.x, rtol=1e-10)
+        np.testing.assert_allclose(c.d, estimate.d, atol=1e-9)
+
+
+def test_the_first_state_is_sought_beside_the_operating_point_too():
+    """Sensors that do not move at the operating point, or that several states fit: the same one as Python's."""
+    model = parts.online_models.pendulum_model()
+    ocp = OCP(9, [40.0, 0.5], [1.0], [0.5], [-2.0], [2.0], working_point=([0.0, 1.0], [0.0]))
+    for name, y, samples in (
+        ("sine", lambda x, u, w: ca.sin(x[0]), (0.0, 0.3, -0.9, 1.0, 1.2)),
+        ("size", lambda x, u, w: ca.sqrt(x[1] ** 2 + 1e-4), (0.01, 0.5, 3.0)),
+        ("square", lambda x, u, w: x[0] ** 2 + 0.1 * x[1] ** 2, (0.0, 0.4, 2.0)),
+    ):
+        own = parts.shown(model, y)
+        f = ExtendedKalmanFilter(own, sigma_y=[0.01], sigma_x=[0.01, 0.1], sigma_x0=[0.5, 1.0])
+        c = CLoop(own, ocp, f)
+        for value in samples:
+            c.call("estimate_start", np.array([value]), np.zeros(1))
+            np.testing.assert_allclose(c.x, f.start([value]).x, atol=1e-7, err_msg=f"{name} {value}")
 
 
 def test_what_was_prepared_for_another_plan_is_prepared_again():

@@ -107,6 +107,7 @@ def far_from_rest(seed):
 
 CASES = {
     "heaters": lambda: (*parts.heaters(), 8.0),
+    "curved": lambda: (*parts.curved(), 8.0),
     "level": level,
     "delayed level": lambda: level(7.0),
     "bounded level": lambda: level(y_max=[0.4], x_min=[0.1, 0.0]),

@@ -7,7 +7,12 @@
 
 #if HMPC_MODES > 0
 
-enum { START_LIMIT = 25 }; /* most periods at rest that the first estimate runs the hidden state through */
+enum {
+  START_LIMIT = 25, /* most periods at rest that the first estimate runs the hidden state through */
+  START_ROUNDS = 20,
+  START_HALVINGS = 60, /* of a step that does not help */
+  START_SWEEPS = 30    /* of Jacobi's rotations */
+};
 
 static void known_w(hmpc_state *s, const real *w) {
 #if HMPC_NW > 0
@@ -25,13 +30,31 @@ static int any_finite(const real *y) {
   return any;
 }
 
-static void measured(const real *z, const real *u, const real *w, real *y) {
+/* Outputs of an estimate, and how they answer to it. */
+static void measured(const real *z, const real *u, const real *w, real *y, real (*slope)[HMPC_NE]) {
   real v[HMPC_NU];
   for (int i = 0; i < HMPC_NU; ++i) {
     v[i] = u[i];
     for (int j = 0; j < HMPC_ND; ++j) v[i] += disturbs_u[i][j] * z[HMPC_NZ + j];
   }
+  memset(slope, 0, sizeof(real) * HMPC_NY * HMPC_NE);
+#if HMPC_CURVED
+  real by_x[HMPC_NY][HMPC_NX], by_u[HMPC_NY][HMPC_NU];
+  output_slopes(z, v, w, y, by_x[0], by_u[0]);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    memcpy(slope[i], by_x[i], sizeof by_x[i]);
+    for (int j = 0; j < HMPC_ND; ++j) {
+      slope[i][HMPC_NZ + j] = disturbs_y[i][j];
+      for (int k = 0; k < HMPC_NU; ++k) slope[i][HMPC_NZ + j] += by_u[i][k] * disturbs_u[k][j];
+    }
+  }
+#else
   outputs(z, v, w, y);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    memcpy(slope[i], output_x[i], sizeof output_x[i]);
+    for (int j = 0; j < HMPC_ND; ++j) slope[i][HMPC_NZ + j] = output_d[i][j];
+  }
+#endif
   for (int i = 0; i < HMPC_NY; ++i)
     for (int j = 0; j < HMPC_ND; ++j) y[i] += disturbs_y[i][j] * z[HMPC_NZ + j];
 }
@@ -59,40 +82,128 @@ static void together(hmpc_state *s, const real *share) {
   if (HMPC_ND > 0) memcpy(s->d, z + HMPC_NZ, sizeof s->d);
 }
 
-/* Product of what two outputs show of the states, these in the squares of the sizes that distances count in. */
-static real shown(int i, int j) {
-  real sum = R(0.0);
-  for (int k = 0; k < HMPC_NX; ++k) sum += output_x[i][k] * start_weight[k] * output_x[j][k];
+/* The step x that leaves the least of rows x - error, the shortest of these: rows made orthogonal by rotations, which
+   turn the errors too; what is left of dependent ones is rounding. */
+static void start_step(real (*rows)[HMPC_NX], real *error, real *x) {
+  real largest = R(0.0);
+  for (int sweep = 0; sweep < START_SWEEPS; ++sweep) {
+    int turned = 0;
+    for (int i = 0; i < HMPC_NY; ++i)
+      for (int j = i + 1; j < HMPC_NY; ++j) {
+        const real a = hmpc_dot(rows[i], rows[i], HMPC_NX), b = hmpc_dot(rows[j], rows[j], HMPC_NX);
+        const real both = hmpc_dot(rows[i], rows[j], HMPC_NX);
+        if (!(hmpc_abs(both) > HMPC_TARGET_ROUNDING * hmpc_sqrt(a) * hmpc_sqrt(b))) continue;
+        const real ratio = (b - a) / (R(2.0) * both);
+        const real tangent = R(1.0) / (hmpc_abs(ratio) + hmpc_sqrt(R(1.0) + ratio * ratio));
+        const real c = R(1.0) / hmpc_sqrt(R(1.0) + tangent * tangent), d = ratio < R(0.0) ? -c * tangent : c * tangent;
+        for (int k = 0; k < HMPC_NX; ++k) {
+          const real one = rows[i][k], other = rows[j][k];
+          rows[i][k] = c * one - d * other;
+          rows[j][k] = d * one + c * other;
+        }
+        const real one = error[i], other = error[j];
+        error[i] = c * one - d * other;
+        error[j] = d * one + c * other;
+        turned = 1;
+      }
+    if (!turned) break;
+  }
+  for (int i = 0; i < HMPC_NY; ++i) largest = hmpc_max(largest, hmpc_dot(rows[i], rows[i], HMPC_NX));
+  for (int k = 0; k < HMPC_NX; ++k) x[k] = R(0.0);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    const real size = hmpc_dot(rows[i], rows[i], HMPC_NX);
+    if (hmpc_sqrt(size) > HMPC_START_DEPENDENT * hmpc_sqrt(largest)) hmpc_add(x, error[i] / size, rows[i], HMPC_NX);
+  }
+}
+
+/* Errors of the outputs at x in deviations of the sensors, and the outputs' slopes there, in these over what 1 means of
+   the states; returned is the sum of the errors' squares. */
+static real start_lacks(const real *x, const real *y, const real *w, int mode, real *error, real (*rows)[HMPC_NX]) {
+  real y_hat[HMPC_NY], sum = R(0.0);
+#if HMPC_CURVED
+  real by_x[HMPC_NY][HMPC_NX], by_u[HMPC_NY][HMPC_NU];
+  output_slopes(x, u_rest, w, y_hat, by_x[0], by_u[0]);
+#else
+  const real(*const by_x)[HMPC_NX] = output_x;
+  outputs(x, u_rest, w, y_hat);
+#endif
+  for (int i = 0; i < HMPC_NY; ++i) {
+    const int seen = hmpc_finite(y[i]);
+    const real sigma = hmpc_sqrt(noise_y[mode][i]);
+    error[i] = seen ? (y[i] - y_hat[i]) / sigma : R(0.0);
+    sum += error[i] * error[i];
+    for (int k = 0; k < HMPC_NX; ++k) rows[i][k] = seen ? by_x[i][k] * start_size[mode][k] / sigma : R(0.0);
+  }
   return sum;
 }
 
-/* Estimate at rest: the state nearest to the operating point's with these outputs. */
-void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
-  real z[HMPC_LE] = {R(0.0)}, z_next[HMPC_LZ] = {R(0.0)};
-  known_w(s, w);
-  memcpy(z, x_rest, sizeof s->x);
-  for (int pass = 0; pass < 2; ++pass) { /* the second for what rounding left */
-    real error[HMPC_NY], l[HMPC_NY][HMPC_NY];
-    measured(z, u_rest, s->w, error);
-    for (int i = 0; i < HMPC_NY; ++i) error[i] = hmpc_finite(y[i]) ? y[i] - error[i] : R(0.0);
-    for (int i = 0; i < HMPC_NY; ++i) {
-      real sum = error[i];
-      for (int j = 0; j <= i; ++j) {
-        const int both = hmpc_finite(y[i]) && hmpc_finite(y[j]);
-        real rest = both ? shown(i, j) : i == j ? R(1.0) : R(0.0);
-        for (int k = 0; k < j; ++k) rest -= l[i][k] * l[j][k];
-        /* an output of states that are known exactly moves none */
-        l[i][j] = i != j ? rest / l[j][j] : rest > R(0.0) ? hmpc_sqrt(rest) : R(INFINITY);
-        if (j < i) sum -= l[i][j] * error[j];
-      }
-      error[i] = sum / l[i][i];
+/* x moved to where the outputs are y, by Newton's method; whole = 0: a step had to be shortened. Returned is what lacks.
+   One step if the outputs are linear in the state. */
+static real start_newton(real *x, const real *y, const real *w, int mode, int *whole) {
+  real error[HMPC_NY], rows[HMPC_NY][HMPC_NX], after[HMPC_NY], there[HMPC_NY][HMPC_NX], step[HMPC_NX], moved[HMPC_NX];
+  real size = start_lacks(x, y, w, mode, error, rows), share = R(1.0), less = R(0.0);
+  *whole = 1;
+  for (int round = 0; round < START_ROUNDS; ++round) {
+    real most = R(0.0);
+    for (int i = 0; i < HMPC_NY; ++i)
+      if (!(hmpc_abs(error[i]) <= most)) most = hmpc_abs(error[i]);
+    if (!hmpc_all_finite(rows[0], HMPC_NY * HMPC_NX) || most < HMPC_START_EXACT) break;
+    start_step(rows, error, step);
+    int halving = 0;
+    for (share = R(1.0); halving < START_HALVINGS; ++halving, share *= R(0.5)) {
+      for (int k = 0; k < HMPC_NX; ++k) moved[k] = x[k] + start_size[mode][k] * step[k] * share;
+      less = start_lacks(moved, y, w, mode, after, there);
+      if (less < size) break;
+      if (size < HMPC_START_FITS) return size; /* what is left is rounding */
+      *whole = 0;
     }
-    for (int i = HMPC_NY - 1; i >= 0; --i) {
-      for (int j = i + 1; j < HMPC_NY; ++j) error[i] -= l[j][i] * error[j];
-      error[i] /= l[i][i];
-      for (int k = 0; k < HMPC_NX && hmpc_finite(y[i]); ++k) z[k] += error[i] * output_x[i][k] * start_weight[k];
-    }
+    if (halving == START_HALVINGS) break;
+    memcpy(x, moved, sizeof moved);
+    memcpy(error, after, sizeof error);
+    memcpy(rows, there, sizeof rows);
+    size = less;
   }
+  return hmpc_finite(size) ? size : HMPC_HUGE;
+}
+
+/* The state nearest to the operating point's whose outputs are y where these are finite; where no step straight from
+   there gets to one, sought from one deviation beside it too. */
+static void start_fitting(const real *y, const real *w, int mode, real *x) {
+  enum { TRIED = 2 * HMPC_NX + 1 };
+  real found[TRIED][HMPC_NX], size[TRIED], least = HMPC_HUGE, nearest = R(INFINITY);
+  int whole;
+  for (int n = 0; n < TRIED; ++n) {
+    memcpy(found[n], x_rest, sizeof found[n]);
+    if (n > 0) {
+      const int k = (n - 1) % HMPC_NX;
+      found[n][k] += n <= HMPC_NX ? hmpc_sqrt(first_variance[mode][k]) : -hmpc_sqrt(first_variance[mode][k]);
+    }
+    size[n] = start_newton(found[n], y, w, mode, &whole);
+    if (n == 0 && whole && size[0] < HMPC_START_FITS) {
+      memcpy(x, found[0], sizeof found[0]);
+      return;
+    }
+    least = hmpc_min(least, size[n]);
+  }
+  const real most = hmpc_max(least * (R(1.0) + HMPC_START_EXACT), HMPC_START_FITS);
+  memcpy(x, x_rest, sizeof found[0]);
+  for (int n = 0; n < TRIED; ++n) {
+    real distance = R(0.0);
+    for (int k = 0; k < HMPC_NX; ++k) {
+      const real scale = start_size[mode][k] > R(0.0) ? start_size[mode][k] : R(1.0);
+      distance += (found[n][k] - x_rest[k]) / scale * ((found[n][k] - x_rest[k]) / scale);
+    }
+    if (!(size[n] <= most) || !(distance < nearest)) continue;
+    nearest = distance;
+    memcpy(x, found[n], sizeof found[n]);
+  }
+}
+
+/* (x, h, d) at rest: the state that fits the outputs, the hidden state run to rest there. */
+static void start_at(const hmpc_state *s, const real *y, int mode, real *z) {
+  real z_next[HMPC_LZ] = {R(0.0)};
+  memset(z, 0, sizeof(real) * HMPC_LE);
+  start_fitting(y, s->w, mode, z);
   for (int i = 0; i < HMPC_DELAYED; ++i) z[HMPC_NX + i] = u_rest[i % HMPC_NU];
   for (int k = 0; k < START_LIMIT && HMPC_NH > 0; ++k) {
     real moved = R(0.0);
@@ -103,8 +214,15 @@ void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
     }
     if (!(moved > R(1e-10))) break;
   }
+}
+
+/* Estimate at rest: the state nearest to the operating point's with these outputs. */
+void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
+  real z[HMPC_LE];
+  known_w(s, w);
   for (int m = 0; m < HMPC_MODES; ++m) {
     hmpc_filter *const f = &s->filter[m];
+    if (m < HMPC_START_MODES) start_at(s, y, m, z); /* the others begin alike */
     memset(f, 0, sizeof *f);
     memcpy(f->z, z, sizeof f->z);
     for (int i = 0; i < HMPC_NE; ++i) f->p[i][i] = first_variance[m][i];
@@ -147,22 +265,22 @@ static void predict(hmpc_state *s, const hmpc_filter *from, const real *u, int m
 }
 
 /* After the sample, in Joseph form; what is not finite is left out. */
-static void correct(hmpc_state *s, hmpc_filter *f, const real *y, const real *u) {
-  real y_hat[HMPC_NY], step[HMPC_NE] = {R(0.0)}, size = R(0.0);
-  measured(f->z, u, s->w, y_hat);
+static void correct(hmpc_state *s, hmpc_filter *f, const real *y, const real *u, int mode) {
+  real y_hat[HMPC_NY], slope[HMPC_NY][HMPC_NE], step[HMPC_NE] = {R(0.0)}, size = R(0.0);
+  const real *const noise_of = noise_y[mode];
+  measured(f->z, u, s->w, y_hat, slope);
   f->nis = R(0.0);
   for (int i = 0; i < HMPC_NY; ++i) {
-    real c[HMPC_NE] = {R(0.0)}, pc[HMPC_NE], kalman[HMPC_NE];
+    real pc[HMPC_NE], kalman[HMPC_NE];
+    const real *const c = slope[i];
     if (!hmpc_finite(y[i])) continue;
-    memcpy(c, output_x[i], sizeof s->x);
-    for (int j = 0; j < HMPC_ND; ++j) c[HMPC_NZ + j] = output_d[i][j];
     for (int k = 0; k < HMPC_NE; ++k) pc[k] = hmpc_dot(f->p[k], c, HMPC_NE);
-    const real variance = hmpc_dot(c, pc, HMPC_NE) + noise_y[i];
+    const real variance = hmpc_dot(c, pc, HMPC_NE) + noise_of[i];
     const real error = (y[i] - y_hat[i]) - hmpc_dot(c, step, HMPC_NE);
     for (int k = 0; k < HMPC_NE; ++k) kalman[k] = pc[k] / variance;
     for (int k = 0; k < HMPC_NE; ++k) hmpc_add(f->p[k], -kalman[k], pc, HMPC_NE);
     for (int k = 0; k < HMPC_NE; ++k) {
-      const real left = hmpc_dot(f->p[k], c, HMPC_NE) - noise_y[i] * kalman[k];
+      const real left = hmpc_dot(f->p[k], c, HMPC_NE) - noise_of[i] * kalman[k];
       hmpc_add(f->p[k], -left, kalman, HMPC_NE);
       step[k] += kalman[k] * error;
     }
@@ -225,7 +343,7 @@ void hmpc_estimate_update(hmpc_state *s, const real *y, const real *u_prev, cons
   }
   real largest = -R(INFINITY);
   for (int j = 0; j < HMPC_MODES; ++j) {
-    correct(s, &s->filter[j], y, u_prev);
+    correct(s, &s->filter[j], y, u_prev, j);
     if (hmpc_finite(s->filter[j].likelihood)) largest = hmpc_max(largest, s->filter[j].likelihood);
   }
   for (int j = 0; j < HMPC_MODES; ++j) {

@@ -85,6 +85,8 @@ static hmpb_goal backup_goal(const hmpc_goal *goal) {
     own.weight = goal->weight;
     own.u_min = goal->u_min;
     own.u_max = goal->u_max;
+    own.w = goal->w;
+    own.w_rows = goal->w_rows;
   }
   return own;
 }

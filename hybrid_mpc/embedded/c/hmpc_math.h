@@ -129,6 +129,34 @@ static inline void hmpc_add(real *to, real factor, const real *from, int n) {
   for (int i = 0; i < n; ++i) to[i] += factor * from[i];
 }
 
+/* Layers of a network: y = weight x, where rows of weight have n entries. */
+static inline void hmpc_layer(const real *weight, int rows, int n, const real *x, real *y) {
+  for (int i = 0; i < rows; ++i) y[i] = hmpc_dot(weight + i * n, x, n);
+}
+
+/* Derivatives of y, rows of width: weight times those of x, of which a few are looked at one by one and rows that are
+   full are taken whole. */
+static inline void hmpc_layer_slope(const real *weight, int rows, int n, const real *by, int width, const int *few,
+                                    const int *column, int fews, const int *full, int fulls, real *to) {
+  for (int i = 0; i < rows; ++i) {
+    real *const row = to + i * width;
+    memset(row, 0, sizeof(real) * (size_t)width);
+    for (int e = 0; e < fews; ++e) row[column[e]] += weight[i * n + few[e]] * by[few[e] * width + column[e]];
+    for (int e = 0; e < fulls; ++e) hmpc_add(row, weight[i * n + full[e]], by + full[e] * width, width);
+  }
+}
+
+/* Adds to rows at of others what reaches them through products from: factors times these products' derivatives, whose
+   columns are columns onto there. */
+static inline void hmpc_layer_pass(const int *at, const int *from, const real *factor, int count, const real *through,
+                                   int width, const int *onto, int n, real *to, int stride) {
+  for (int e = 0; e < count; ++e) {
+    const real *const row = through + from[e] * width;
+    real *const sum = to + at[e] * stride;
+    for (int c = 0; c < n; ++c) sum[onto[c]] += factor[e] * row[c];
+  }
+}
+
 enum { HMPC_ROWS = 2, HMPC_COLUMNS = 8 }; /* of the block of a product that stays in registers */
 
 /* c = a b for the first columns, rounded up to eight; rows of a are length apart, those of b and c stride. All but
@@ -151,7 +179,7 @@ static inline void hmpc_multiply(const real *restrict a, int length, const real 
       for (int p = 0; p < HMPC_ROWS; ++p)
         for (int q = 0; q < HMPC_COLUMNS; ++q) c[(i + p) * stride + j + q] = sum[p][q];
     }
-    if (i < rows) { /* the last of an odd number */
+    if (rows % HMPC_ROWS) { /* the last of an odd number */
       real sum[HMPC_COLUMNS];
       for (int q = 0; q < HMPC_COLUMNS; ++q) sum[q] = R(0.0);
       for (int l = 0; l < inner; ++l) {

@@ -62,6 +62,10 @@ void hmpc_model(const real *z, const real *u, const real *w, real *z_next) {
   reduce(c.next, out);
   model_after(z, u, w, out, z_next);
   memcpy(z_next + HMPC_HIDDEN_NEXT, c.next, sizeof c.next);
+#elif HMPC_PRODUCTS > 0
+  real m[HMPC_PRODUCTS];
+  layers(z, u, w, m);
+  model_after(z, u, w, m, z_next);
 #else
   model_after(z, u, w, (const real *)0, z_next);
 #endif
@@ -100,6 +104,11 @@ void hmpc_model_slope(const real *z, const real *u, const real *w, real *z_next,
   memcpy(z_next + HMPC_HIDDEN_NEXT, c.next, sizeof c.next);
   for (int k = 0; k < HMPC_CORRECTED; ++k)
     for (int i = 0; i < HMPC_HEAD; ++i) hmpc_add(slope + corrected[k] * HMPC_LJ, by_out[k][i], through[i], HMPC_LJ);
+#elif HMPC_PRODUCTS > 0
+  real m[HMPC_PRODUCTS], through[HMPC_DIM(HMPC_THROUGH)], by_out[HMPC_DIM(HMPC_PASSED)];
+  layers_slope(z, u, w, m, through);
+  model_after_slope(z, u, w, m, z_next, slope, by_out);
+  layers_after(by_out, through, slope);
 #else
   model_after_slope(z, u, w, (const real *)0, z_next, slope, (real *)0);
 #endif
@@ -114,6 +123,10 @@ void hmpc_rates(const real *z, const real *u, const real *w, real *xdot) {
   gru(seen, z + HMPC_HIDDEN, &c);
   for (int k = 0; k < HMPC_RATE_HEAD; ++k) out[k] = hmpc_dot(rate_head[k], c.next, HMPC_UNITS);
   rates_after(z, u, w, out, xdot);
+#elif HMPC_RATE_PRODUCTS > 0
+  real m[HMPC_RATE_PRODUCTS];
+  rate_layers(z, u, w, m);
+  rates_after(z, u, w, m, xdot);
 #else
   rates_after(z, u, w, (const real *)0, xdot);
 #endif

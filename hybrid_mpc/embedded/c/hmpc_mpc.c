@@ -4,6 +4,8 @@
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
 
+enum { COST_SWEEPS = 30 }; /* of Jacobi's rotations */
+
 /* What acts: inputs with what the unmeasured disturbances add to them. */
 static void acting(const real *u, const real *d, real *v) {
   for (int i = 0; i < HMPC_NU; ++i) {
@@ -84,7 +86,7 @@ static void add_product(real (*hessian)[HMPC_LD], real factor, const real *a, co
   for (int i = 0; i < n; ++i) hmpc_add(hessian[i], factor * a[i], b, i + 1);
 }
 
-#if HMPC_OUTPUT_COST
+#if HMPC_OUTPUT_ROWS
 /* Derivative of an output of period k by the unknowns; returned is how many of them it depends on. */
 static int output_row(const hmpc_linear *linear, int k, int i, real *row) {
   const int first = block_of[k] * HMPC_NU;
@@ -107,6 +109,105 @@ static void output_error(const hmpc_state *s, int k, real *error) {
 }
 #endif
 
+#if HMPC_STAGE_COST
+/* What the costs that are no squares of states and inputs depend on in period k, besides them: parameters, and where
+   outputs are weighed their references. */
+static const real *cost_p(const hmpc_goal *goal, int k) {
+  static const real none[HMPC_DIM(HMPC_NP)];
+  return HMPC_NP > 0 && goal && goal->p ? goal->p + (k < goal->rows ? k : goal->rows - 1) * HMPC_NP : none;
+}
+
+static const real *cost_y(const hmpc_state *s, int k) {
+#if HMPC_OUTPUT_COST
+  return s->target.y[k];
+#else
+  (void)s;
+  (void)k;
+  return (const real *)0;
+#endif
+}
+
+/* Eigenvalues of a symmetric matrix, which become its diagonal, and eigenvectors, the rows of v, by Jacobi's rotations.
+   Source: Golub and Van Loan, Matrix Computations, 2013, section 8.5. */
+static void eigen(real (*a)[HMPC_NC], real (*v)[HMPC_NC]) {
+  for (int i = 0; i < HMPC_NC; ++i)
+    for (int j = 0; j < HMPC_NC; ++j) v[i][j] = i == j ? R(1.0) : R(0.0);
+  for (int sweep = 0; sweep < COST_SWEEPS; ++sweep) {
+    int turned = 0;
+    for (int i = 0; i < HMPC_NC; ++i)
+      for (int j = i + 1; j < HMPC_NC; ++j) {
+        const real off = a[i][j];
+        /* it changes no digit of either */
+        if (!(hmpc_abs(off) > HMPC_TARGET_ROUNDING * R(0.1) * (hmpc_abs(a[i][i]) + hmpc_abs(a[j][j])))) continue;
+        const real ratio = (a[j][j] - a[i][i]) / (R(2.0) * off);
+        const real size = R(1.0) / (hmpc_abs(ratio) + hmpc_sqrt(R(1.0) + ratio * ratio));
+        const real tangent = ratio < R(0.0) ? -size : size;
+        const real c = R(1.0) / hmpc_sqrt(R(1.0) + tangent * tangent), d = c * tangent;
+        for (int k = 0; k < HMPC_NC; ++k) {
+          const real one = a[i][k], other = a[j][k];
+          a[i][k] = c * one - d * other;
+          a[j][k] = d * one + c * other;
+        }
+        for (int k = 0; k < HMPC_NC; ++k) {
+          const real one = a[k][i], other = a[k][j], first = v[i][k], second = v[j][k];
+          a[k][i] = c * one - d * other;
+          a[k][j] = d * one + c * other;
+          v[i][k] = c * first - d * second;
+          v[j][k] = d * first + c * second;
+        }
+        turned = 1;
+      }
+    if (!turned) return;
+  }
+}
+
+/* Derivatives of these costs along the plan; what curves down counts as flat, directions counted in the sizes of states
+   and inputs. */
+static void make_costs(hmpc_state *s, const hmpc_goal *goal) {
+  hmpc_linear *const linear = &s->linear;
+  for (int k = 0; k < HMPC_N; ++k) {
+    real a[HMPC_NC][HMPC_NC], v[HMPC_NC][HMPC_NC], (*const curve)[HMPC_NC] = linear->cost_curve[k];
+    stage_cost_slopes(linear->z[k], linear->u[k], linear->w[k], s->d, cost_p(goal, k), cost_y(s, k),
+                      linear->cost_slope[k], curve[0]);
+    for (int i = 0; i < HMPC_NC; ++i)
+      for (int j = 0; j < HMPC_NC; ++j) a[i][j] = curve[i > j ? i : j][i > j ? j : i] * cost_size[i] * cost_size[j];
+    if (!hmpc_all_finite(a[0], HMPC_NC * HMPC_NC)) continue; /* neither is what is made of it */
+    eigen(a, v);
+    memset(curve, 0, sizeof linear->cost_curve[k]);
+    for (int e = 0; e < HMPC_NC; ++e)
+      for (int i = 0; i < HMPC_NC && a[e][e] > R(0.0); ++i)
+        for (int j = 0; j < HMPC_NC; ++j) curve[i][j] += a[e][e] * v[e][i] * v[e][j] / (cost_size[i] * cost_size[j]);
+  }
+}
+
+/* Derivatives of state and input of period k by the unknowns; returned is how many of them these are. */
+static int stage_rows(const hmpc_linear *linear, int k, real (*rows)[HMPC_LD]) {
+  const int first = block_of[k] * HMPC_NU;
+  memcpy(rows, linear->from_u[k], sizeof linear->from_u[k]);
+  memset(rows[HMPC_NX], 0, sizeof(real) * HMPC_NU * HMPC_LD);
+  for (int j = 0; j < HMPC_NU; ++j) rows[HMPC_NX + j][first + j] = u_scale[j];
+  return first + HMPC_NU;
+}
+
+static void add_stage(const hmpc_linear *linear, int k, real (*hessian)[HMPC_LD]) {
+  real rows[HMPC_NC][HMPC_LD];
+  const int m = stage_rows(linear, k, rows);
+  for (int i = 0; i < HMPC_NC; ++i) {
+    real all[HMPC_LD] = {R(0.0)};
+    for (int j = 0; j < HMPC_NC; ++j) hmpc_add(all, linear->cost_curve[k][i][j], rows[j], m);
+    add_product(hessian, R(1.0), rows[i], all, m);
+  }
+}
+
+static void add_stage_gradient(const hmpc_state *s, int k, real *gradient) {
+  const hmpc_linear *const linear = &s->linear;
+  real rows[HMPC_NC][HMPC_LD];
+  const int m = stage_rows(linear, k, rows);
+  for (int i = 0; i < HMPC_NC; ++i)
+    hmpc_add(gradient, linear->cost_slope[k][i] + hmpc_dot(linear->cost_curve[k][i], s->dz[k], HMPC_NX), rows[i], m);
+}
+#endif
+
 static void make_hessian(hmpc_state *s) {
   hmpc_linear *const linear = &s->linear;
   hmpc_qp *const qp = &s->qp;
@@ -118,7 +219,10 @@ static void make_hessian(hmpc_state *s) {
       if (factor < R(0.0) || factor > R(0.0))
         add_product(qp->hessian, factor, linear->from_u[k][i], linear->from_u[k][i], (block_of[k - 1] + 1) * HMPC_NU);
     }
-#if HMPC_OUTPUT_COST
+#if HMPC_STAGE_COST
+  for (int k = 0; k < HMPC_N; ++k) add_stage(linear, k, qp->hessian);
+#endif
+#if HMPC_OUTPUT_ROWS
   for (int k = 0; k < HMPC_N; ++k)
     for (int i = 0; i < HMPC_NY; ++i) {
       real row[HMPC_LD];
@@ -209,7 +313,12 @@ static void linearize(hmpc_state *s, int append) {
     }
   }
   condense(s);
+#if HMPC_STAGE_COST && !HMPC_COST_MOVES
+  make_costs(s, (const hmpc_goal *)0);
+#endif
+#if !HMPC_COST_MOVES
   make_hessian(s);
+#endif
 #if HMPC_SOFT > 0 && HMPC_NP == 0
   make_soft(s, linear->d, (const hmpc_goal *)0);
 #endif
@@ -330,13 +439,13 @@ static void set_soft(hmpc_state *s) {
 #endif
 }
 
-/* Cost of the plan that qp.step makes of the prepared one, and the largest violations of soft and of hard bounds. */
 /* The input that a plan is drawn to: that of the set-point's steady state, or else the operating point's. */
 static real input_goal(const real *u_goal, int period, int input) {
   return u_goal ? u_goal[period * HMPC_NU + input] : u_rest[input];
 }
 
-static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_goal) {
+/* Cost of the plan that qp.step makes of the prepared one, and the largest violations of soft and of hard bounds. */
+static void assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int rows, const real *u_goal) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
   real total = R(0.0), error[HMPC_NX], before[HMPC_NU];
@@ -347,6 +456,13 @@ static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_go
     for (int i = 0; i < HMPC_NX; ++i)
       error[i] = linear->z[k][i] + s->dz[k][i] + hmpc_dot(linear->from_u[k][i], step, m) - goal[i];
     if (k == HMPC_N) break;
+#if HMPC_STAGE_COST
+    real x[HMPC_NX], acts[HMPC_NU], cost;
+    for (int i = 0; i < HMPC_NX; ++i) x[i] = error[i] + goal[i];
+    for (int j = 0; j < HMPC_NU; ++j) acts[j] = linear->u[k][j] + step[block_of[k] * HMPC_NU + j] * u_scale[j];
+    stage_cost(x, acts, linear->w[k], s->d, cost_p(goals, k), cost_y(s, k), &cost);
+    total += cost;
+#endif
     for (int i = 0; i < HMPC_NX; ++i) total += linear->weight[k][i] * q_x[i] * error[i] * error[i];
     for (int j = 0; j < HMPC_NU; ++j) {
       const real u = linear->u[k][j] + step[block_of[k] * HMPC_NU + j] * u_scale[j];
@@ -357,7 +473,8 @@ static void assess(hmpc_state *s, const real *x_goal, int rows, const real *u_go
   }
   for (int i = 0; i < HMPC_NX; ++i)
     for (int j = 0; j < HMPC_NX; ++j) total += error[i] * linear->terminal[i][j] * error[j];
-#if HMPC_OUTPUT_COST
+  (void)goals;
+#if HMPC_OUTPUT_ROWS
   for (int k = 0; k < HMPC_N; ++k) {
     real row[HMPC_LD], off[HMPC_NY];
     output_error(s, k, off);
@@ -420,7 +537,14 @@ static hmpc_status failed(hmpc_state *s, hmpc_status status) {
   return s->status = status;
 }
 
-hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows) {
+/* What a plan is drawn to: states, the input (NULL: the operating point's), and how many rows of states there are. */
+typedef struct {
+  const real *x, *u;
+  int rows;
+} drawn_to;
+
+/* The QP of the prepared plan for the estimate, the goal and the measured disturbances; 0 if a number is not finite. */
+static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows, drawn_to *to) {
   hmpc_linear *const linear = &s->linear;
   hmpc_qp *const qp = &s->qp;
 #if HMPC_OUTPUT_COST
@@ -430,13 +554,23 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
   const real *const u_goal = (const real *)0, *const x_goal = goal && goal->x ? goal->x : x_rest;
   const int rows = goal && goal->x ? goal->rows : 1;
 #endif
-  if (!s->prepared) hmpc_prepare(s, goal);
+  to->x = x_goal;
+  to->u = u_goal;
+  to->rows = rows;
 #if HMPC_NW > 0
   int other = 0;
+  real now[HMPC_NW];
+  memcpy(now, s->w, sizeof now);
   for (int k = 0; k < HMPC_N; ++k) {
-    const real *const now = w ? row_of(w, w_rows, k, HMPC_NW) : s->w;
-    other |= memcmp(linear->w[k], now, sizeof(real) * HMPC_NW) != 0;
-    memcpy(linear->w[k], now, sizeof(real) * HMPC_NW);
+    if (w) {
+      memcpy(now, row_of(w, w_rows, k, HMPC_NW), sizeof now);
+    } else if (k > 0 && goal && goal->w && goal->w_rows > 0) {
+      const real *const ahead = row_of(goal->w, goal->w_rows, k, HMPC_NW);
+      for (int i = 0; i < HMPC_NW; ++i)
+        if (hmpc_finite(ahead[i])) now[i] = ahead[i];
+    }
+    other |= memcmp(linear->w[k], now, sizeof now) != 0;
+    memcpy(linear->w[k], now, sizeof now);
   }
   if (other) linearize(s, 0);
 #else
@@ -445,6 +579,10 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
 #endif
 #if HMPC_OUTPUT_COST
   hmpc_aim(s, goal);
+#endif
+#if HMPC_COST_MOVES /* with references and parameters */
+  make_costs(s, goal);
+  make_hessian(s);
 #endif
   s->prepared = 0;
   memcpy(s->plan.d, s->d, sizeof s->plan.d);
@@ -466,7 +604,10 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
       slope += linear->terminal[i][j] * (linear->z[HMPC_N][j] + s->dz[HMPC_N][j] - last[j]);
     hmpc_add(qp->gradient, R(2.0) * slope, linear->from_u[HMPC_N][i], HMPC_NV);
   }
-#if HMPC_OUTPUT_COST
+#if HMPC_STAGE_COST
+  for (int k = 0; k < HMPC_N; ++k) add_stage_gradient(s, k, qp->gradient);
+#endif
+#if HMPC_OUTPUT_ROWS
   for (int k = 0; k < HMPC_N; ++k) {
     real row[HMPC_LD], error[HMPC_NY];
     output_error(s, k, error);
@@ -494,10 +635,18 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
   int fine = hmpc_all_finite(qp->gradient, HMPC_NV) && hmpc_all_finite(s->x, HMPC_NX) &&
              hmpc_all_finite(s->d, HMPC_ND) && hmpc_all_finite(s->h, HMPC_NH) && hmpc_all_finite(qp->value, HMPC_SOFT);
   for (int k = 0; k <= HMPC_N; ++k) fine = fine && hmpc_all_finite(row_of(x_goal, rows, k, HMPC_NX), HMPC_NX);
-  if (!fine) return failed(s, HMPC_NOT_FINITE);
-  const hmpc_status status = hmpc_qp_solve(qp, &s->working, linear);
+  return fine;
+}
+
+hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows) {
+  const hmpc_linear *const linear = &s->linear;
+  const hmpc_qp *const qp = &s->qp;
+  drawn_to to;
+  if (!s->prepared) hmpc_prepare(s, goal);
+  if (!embed(s, goal, w, w_rows, &to)) return failed(s, HMPC_NOT_FINITE);
+  const hmpc_status status = hmpc_qp_solve(&s->qp, &s->working, linear);
   if (status != HMPC_SOLVED) return failed(s, status);
-  assess(s, x_goal, rows, u_goal);
+  assess(s, goal, to.x, to.rows, to.u);
   if (!hmpc_finite(s->plan.cost)) return failed(s, HMPC_NOT_FINITE);
   for (int k = 0; k < HMPC_N; ++k) {
     real low[HMPC_NU], high[HMPC_NU];
@@ -667,21 +816,61 @@ void hmpc_take_over(hmpc_state *s, const real *plan, const real *held) {
   s->age = 0;
 }
 
+/* Iterations of a first plan, which has no predecessor, from the inputs u, the last row held; 0 if one failed. */
+static int iterate(hmpc_state *s, const hmpc_goal *goal, const real *u, int rows) {
+  s->working.count = 0;
+  hmpc_run_free(s, u, rows);
+  for (int i = 1; i < HMPC_FIRST; ++i) {
+    delay_plan(s, s->u);
+    if (hmpc_feedback(s, goal, (const real *)0, 0) != HMPC_SOLVED) return 0;
+    hmpc_complete(s);
+  }
+  return 1;
+}
+
+#if HMPC_STARTS > 0
+/* Cost of the plan's inputs on a run of the model. */
+static real cost_of_run(hmpc_state *s, const hmpc_goal *goal, const real *u) {
+  hmpc_linear *const linear = &s->linear;
+  drawn_to to;
+  hmpc_run_free(s, u, HMPC_N);
+  memcpy(linear->u, s->plan.u, sizeof linear->u);
+  memcpy(linear->z, s->plan.z, sizeof linear->z);
+  memcpy(linear->w, s->plan.w, sizeof linear->w);
+  memcpy(linear->d, s->plan.d, sizeof linear->d);
+  memcpy(linear->u_prev, s->u, sizeof linear->u_prev);
+  hmpc_linearize(s, goal);
+  if (!embed(s, goal, (const real *)0, 0, &to)) return R(INFINITY);
+  memset(s->qp.step, 0, sizeof s->qp.step);
+  assess(s, goal, to.x, to.rows, to.u);
+  return hmpc_finite(s->plan.cost) ? s->plan.cost : R(INFINITY);
+}
+#endif
+
 void hmpc_begin(hmpc_state *s, const real *applied, const hmpc_goal *goal) {
   for (int i = 0; i < HMPC_NU; ++i)
     s->u[i] = hmpc_clip(applied && hmpc_finite(applied[i]) ? applied[i] : u_rest[i], u_min[i], u_max[i]);
   s->source = HMPC_HELD;
   s->age = 0;
+  int solved = iterate(s, goal, s->u, 1);
+#if HMPC_STARTS > 0 /* the cheapest plan of those from here and from elsewhere */
+  real best[HMPC_N][HMPC_NU], inputs[HMPC_N][HMPC_NU], least = R(INFINITY);
+  for (int n = 0; n <= HMPC_STARTS; ++n) {
+    if (n > 0) solved = iterate(s, goal, starts[n > 0 ? n - 1 : 0], HMPC_N);
+    memcpy(inputs, s->plan.u, sizeof inputs);
+    const real cost = solved ? cost_of_run(s, goal, inputs[0]) : R(INFINITY);
+    if (!(cost < least)) continue;
+    least = cost;
+    memcpy(best, inputs, sizeof best);
+  }
+  solved = least < R(INFINITY);
+  if (solved) hmpc_run_free(s, best[0], HMPC_N);
   s->working.count = 0;
-  hmpc_run_free(s, s->u, 1);
-  for (int i = 0; i < HMPC_FIRST; ++i) { /* the first plan has no predecessor: it is iterated */
+#endif
+  if (solved) {
     delay_plan(s, s->u);
-    if (i == HMPC_FIRST - 1) break;
-    if (hmpc_feedback(s, goal, (const real *)0, 0) != HMPC_SOLVED) {
-      hmpc_run_free(s, s->u, 1);
-      break;
-    }
-    hmpc_complete(s);
+  } else {
+    hmpc_run_free(s, s->u, 1);
   }
   hmpc_decide(s, goal, (const real *)0);
 }

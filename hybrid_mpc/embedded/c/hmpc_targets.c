@@ -11,6 +11,14 @@
 
 #if HMPC_OUTPUT_COST
 
+#if HMPC_CURVED /* slopes of the outputs at a point */
+#define OUTPUT_X(at) ((at)->by_x)
+#define OUTPUT_U(at) ((at)->by_u)
+#else
+#define OUTPUT_X(at) output_x
+#define OUTPUT_U(at) output_u
+#endif
+
 enum {
   NT = HMPC_NT,
   HALVINGS = 10, /* of a step that does not help */
@@ -35,7 +43,11 @@ static void look(const hmpc_state *s, const real *v, const real *goal, const rea
     p->rest[i] = next[i] - v[i];
     p->lacks += hmpc_abs(p->rest[i] / target_scale[i]);
   }
+#if HMPC_CURVED
+  output_slopes(z, acts, w, p->y, p->by_x[0], p->by_u[0]);
+#else
   outputs(z, acts, w, p->y);
+#endif
   for (int i = 0; i < HMPC_NY; ++i) {
     for (int j = 0; j < HMPC_ND; ++j) p->y[i] += disturbs_y[i][j] * s->search.d[j];
     if (q_y[i] > R(0.0)) off += target_root[i] * target_root[i] * (p->y[i] - goal[i]) * (p->y[i] - goal[i]);
@@ -333,8 +345,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   for (int i = 0; i < HMPC_NY; ++i) {
     if (!(q_y[i] > R(0.0))) continue;
     for (int j = 0; j < NT; ++j) row[j] = R(0.0);
-    for (int j = 0; j < HMPC_NX; ++j) row[j] = output_x[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) row[HMPC_NZ + j] = output_u[i][j] * target_scale[HMPC_NZ + j];
+    for (int j = 0; j < HMPC_NX; ++j) row[j] = OUTPUT_X(at)[i][j] * target_scale[j];
+    for (int j = 0; j < HMPC_NU; ++j) row[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
     for (int k = 0; k < m; ++k) sees[tracked][k] = target_root[i] * hmpc_dot(row, work->along[k], NT);
     error[tracked] = target_root[i] * (goal[i] - at->y[i] - hmpc_dot(row, onto, NT));
     ++tracked;
@@ -385,8 +397,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   }
   for (int i = 0; i < HMPC_NY && bounded; ++i) {
     real slope[NT] = {R(0.0)};
-    for (int j = 0; j < HMPC_NX; ++j) slope[j] = output_x[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) slope[HMPC_NZ + j] = output_u[i][j] * target_scale[HMPC_NZ + j];
+    for (int j = 0; j < HMPC_NX; ++j) slope[j] = OUTPUT_X(at)[i][j] * target_scale[j];
+    for (int j = 0; j < HMPC_NU; ++j) slope[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
     for (int k = 0; k < m; ++k) row[k] = hmpc_dot(slope, work->along[k], NT);
     const real now = at->y[i] + hmpc_dot(slope, onto, NT);
     if (!bounds(work, m, row, now, target_y_range[i][0], target_y_range[i][1], &count)) return 0;

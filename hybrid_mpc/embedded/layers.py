@@ -1,0 +1,313 @@
+"""A model's networks as products with constant matrices, with scalar code between them: any network of nn_export."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.embedded.scalar import SMALL, c_function, table
+from hybrid_mpc.errors import InputError
+from nn_export.errors import last_line
+
+Array = NDArray[np.float64]
+FEW = 4
+"""Derivatives of a layer's argument, in a row, up to which they are looked at one by one."""
+
+
+Entry = tuple[int, int, ca.SX]
+"""Row, column and expression of a derivative."""
+Owner = tuple[int, int, int, tuple[int, ...]]
+"""Of a layer the first product, their number, the place of its derivatives, and by which columns these are."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """The product of ``weight`` ``(n, k)`` with ``seen`` ``(x, h, u, w, products of the layers before) -> (k,)``."""
+
+    weight: Array
+    seen: ca.Function
+
+
+def split(point: Sequence[ca.MX], value: ca.MX, what: str) -> tuple[tuple[Layer, ...], ca.Function]:
+    """The layers of an expression at ``point``, in order, and ``(*point, all products) -> value``.
+
+    Raises:
+        InputError: If what lies between them is no scalar code.
+    """
+    whole = written_out(point, value)
+    products = _products(point, whole)
+    given: list[ca.MX] = []
+    weights: list[Array] = []
+    seen: list[ca.MX] = []
+    old: list[ca.MX] = []
+    new: list[ca.MX] = []
+    for node in products:
+        bias, left, right = (node.dep(i) for i in range(3))
+        turned = bool(ca.symvar(left))  # X W' of samples in rows
+        weight = ca.evalf(right.T if turned else left).full()
+        samples, addend = ca.graph_substitute([left.T if turned else right, bias], old, new)
+        columns = []
+        for column in ca.horzsplit(samples):
+            given.append(ca.MX.sym(f"m{len(given)}", len(weight)))
+            weights.append(weight)
+            seen.append(column)
+            columns.append(given[-1])
+        product = ca.horzcat(*columns)
+        old.append(node)
+        new.append(addend + (product.T if turned else product))
+    (after,) = ca.graph_substitute([whole], old, new)
+    layers, m = [], ca.MX.sym("m", sum(v.numel() for v in given))
+    ends = np.cumsum([0, *(v.numel() for v in given)])
+    parts = [m[int(a) : int(b)] for a, b in pairwise(ends)]
+    results = ca.graph_substitute([*seen, after], given, parts) if given else [after]
+    for weight, own in zip(weights, results[:-1], strict=True):
+        layers.append(Layer(weight, _scalar(what, [*point, m], own)))
+    return tuple(layers), _scalar(what, [*point, m], results[-1])
+
+
+def _scalar(what: str, given: Sequence[ca.MX], value: ca.MX) -> ca.Function:
+    f = ca.Function("layer", list(given), [ca.densify(value)])
+    try:
+        return f.expand()
+    except RuntimeError as error:
+        raise InputError(f"{what} is no scalar code: {last_line(error)}") from error
+
+
+def written_out(point: Sequence[ca.MX], value: ca.MX, but: str = "\0") -> ca.MX:
+    """An expression whose calls of graphs are written out, but for functions whose names end with ``but``."""
+    while True:
+        whole = ca.Function("whole", list(point), [value])
+        for k in range(whole.n_instructions()):
+            call = whole.instruction_MX(k)
+            if whole.instruction_id(k) != ca.OP_CALL:
+                continue
+            f = call.which_function()
+            if f.is_a("MXFunction") and not f.name().endswith(but):
+                break
+        else:
+            return value
+        inner = ca.graph_substitute(_results(f), f.mx_in(), [call.dep(i) for i in range(f.n_in())])
+        (value,) = ca.graph_substitute([value], [call.get_output(i) for i in range(f.n_out())], inner)
+
+
+def _products(point: Sequence[ca.MX], value: ca.MX) -> list[ca.MX]:
+    """Products with large constant matrices, in order."""
+    whole = ca.Function("whole", list(point), [value])
+    nodes = [(whole.instruction_id(k), whole.instruction_MX(k)) for k in range(whole.n_instructions())]
+    return [n for code, n in nodes if code == ca.OP_MTIMES and _large(n)]
+
+
+def _large(product: ca.MX) -> bool:
+    constant = [not ca.symvar(product.dep(i)) for i in (1, 2)]
+    return any(c and product.dep(i + 1).numel() > SMALL for i, c in enumerate(constant)) and not all(constant)
+
+
+def _results(f: ca.Function) -> list[ca.MX]:
+    """What a graph computes of its own symbols; a call of a function that is not to be inlined would not say."""
+    slots: dict[int, Any] = {}
+    found: list[list[ca.MX]] = [[] for _ in range(f.n_out())]
+    inputs = [ca.vec(v) for v in f.mx_in()]
+    for k in range(f.n_instructions()):
+        code, taken, made = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        node = f.instruction_MX(k)
+        if code == ca.OP_OUTPUT:  # what is joined there comes in pieces, in order
+            found[made[0]].append(ca.vec(slots[taken[0]]))
+        elif code == ca.OP_INPUT:
+            first = int(node.info()["offset"])
+            piece = inputs[taken[0]][first : first + node.numel()]
+            slots[made[0]] = ca.reshape(piece, *node.shape)
+        else:
+            for i, place in enumerate(made):
+                if place >= 0:
+                    slots[place] = node.get_output(i) if node.has_output() else node
+    return [ca.reshape(ca.vertcat(*pieces), *f.size_out(i)) for i, pieces in enumerate(found)]
+
+
+@dataclass(frozen=True)
+class LayerCode:
+    """C of layers: tables and functions, the number of products, and reals that their derivatives take."""
+
+    text: str
+    products: int
+    through: int
+    operations: dict[str, int]
+    owners: tuple[Owner, ...]
+    """Of each layer."""
+
+
+def layer_code(
+    name: str, layers: Sequence[Layer], symbols: Sequence[ca.SX], places: Sequence[int], *, slopes: bool = True,
+    known: Mapping[bytes, str] | None = None,
+) -> LayerCode:  # fmt: skip
+    """Functions ``{name}(z, u, w, m)``, and with ``slopes`` ``{name}_slope(z, u, w, m, through)``.
+
+    Args:
+        name: What names begin with.
+        layers: In order.
+        symbols: ``z, u, w`` of the model, as scalars.
+        places: Columns of the Jacobian by ``(z, u)``.
+        slopes: Whether derivatives are needed, too.
+        known: Weights that have a table, by their content (:func:`tables_of`). Default: none.
+
+    Raises:
+        InputError: If an operation has no C, or there are too many.
+    """
+    z, u, w = symbols
+    sizes = [len(layer.weight) for layer in layers]
+    first = np.cumsum([0, *sizes])
+    m, v = ca.SX.sym("m", int(first[-1])), ca.vertcat(z, u)
+    read = {"z": z, "u": u, "w": w, "m": m}
+    arguments = [f"const real *{key}" for key in read]
+    n_x = layers[0].seen.numel_in(0) if layers else 0
+    texts, operations, shared = [], dict[str, int](), dict(known or {})
+    owners: list[Owner] = []
+    forward, backward, through = [], [], 0
+    for i, layer in enumerate(layers):
+        own, (rows, columns) = f"{name}{i}", layer.weight.shape
+        seen = layer.seen(z[:n_x], z[n_x:], u, w, m)
+        outs = [(f"seen[{k}]", seen[k]) for k in range(columns)]
+        text, operations[f"{own}_seen"] = c_function(f"{own}_seen", [*arguments, "real *seen"], read, outs)
+        key = _key(layer)
+        if key not in shared:
+            shared[key] = f"{own}_weight"
+            texts.append(table(shared[key], layer.weight))
+        weight = f"{shared[key]}[0], {rows}, {columns}"
+        at = f"m + {first[i]}"
+        texts.append(text)
+        forward.append(
+            f"  {{\n    real seen[{columns}];\n    {own}_seen(z, u, w, m, seen);\n"
+            f"    hmpc_layer({weight}, seen, {at});\n  }}\n"
+        )
+        if not slopes:
+            continue
+        by_v, by_m = ca.jacobian(seen, v), ca.jacobian(seen, m)
+        passed = _passed(by_m, owners)
+        active = sorted(
+            {places[c] for c in by_v.sparsity().get_triplet()[1]} | {c for k in passed for c in owners[k][3]}
+        )
+        where = {c: k for k, c in enumerate(active)}
+        n, entries = max(1, len(active)), _entries(by_v)
+        pattern = np.zeros((columns, n), dtype=bool)
+        for r, c, _ in entries:
+            pattern[r, where[places[c]]] = True
+        slope_outs = [(f"by_v[{k}]", value) for k, (*_, value) in enumerate(entries)]
+        steps, count = [], len(entries)
+        texts.append(table(f"{own}_row", [r for r, *_ in entries], "int"))
+        texts.append(table(f"{own}_column", [where[places[c]] for _, c, _ in entries], "int"))
+        for k, chosen in passed.items():
+            text, step = _pass(
+                f"{own}_{k}", owners[k], chosen, [where[c] for c in owners[k][3]], count, "g[0]", n
+            )
+            texts.append(text)
+            steps.append(step)
+            slope_outs += [(f"by_v[{count + j}]", value) for j, (*_, value) in enumerate(chosen)]
+            count += len(chosen)
+            for r, *_ in chosen:
+                pattern[r, [where[c] for c in owners[k][3]]] = True
+        full = np.flatnonzero(pattern.sum(axis=1) > FEW)
+        pattern[full] = False
+        rest = np.argwhere(pattern)
+        texts += [
+            table(f"{own}_few", rest[:, 0], "int"), table(f"{own}_by", rest[:, 1], "int"),
+            table(f"{own}_full", full, "int"),
+        ]  # fmt: skip
+        text, operations[f"{own}_slopes"] = c_function(
+            f"{own}_slopes", [*arguments, "real *seen", "real *by_v"], read, outs + slope_outs
+        )
+        texts.append(text)
+        backward.append(
+            f"  {{\n    real seen[{columns}], by_v[{max(1, count)}], g[{columns}][{n}];\n"
+            f"    {own}_slopes(z, u, w, m, seen, by_v);\n    memset(g, 0, sizeof g);\n"
+            f"    for (int e = 0; e < {len(entries)}; ++e) g[{own}_row[e]][{own}_column[e]] = by_v[e];\n"
+            f"{''.join(steps)}    hmpc_layer({weight}, seen, {at});\n"
+            f"    hmpc_layer_slope({weight}, g[0], {n}, {own}_few, {own}_by, {len(rest)}, {own}_full, {full.size}, "
+            f"through + {through});\n  }}\n"
+        )
+        operations[f"{own}_products"] = 2 * rows * (len(rest) + full.size * n) + 2 * rows * columns
+        owners.append((int(first[i]), rows, through, tuple(active)))
+        through += rows * n
+    unused = "".join(f"  (void){key};\n" for key in read)
+    texts.append(
+        f"static inline void {name}(const real *z, const real *u, const real *w, real *m) {{\n{unused}"
+    )
+    texts.append("".join(forward) + "}\n")
+    if slopes:
+        texts.append(
+            f"static inline void {name}_slope(const real *z, const real *u, const real *w, real *m, real *through) {{\n"
+            f"{unused}  (void)through;\n{''.join(backward)}}}\n"
+        )
+    return LayerCode("".join(texts), int(first[-1]), through, operations, tuple(owners))
+
+
+def tables_of(name: str, layers: Sequence[Layer]) -> dict[bytes, str]:
+    """Names of the tables that :func:`layer_code` makes of weights, by their content."""
+    found: dict[bytes, str] = {}
+    for i, layer in enumerate(layers):
+        found.setdefault(_key(layer), f"{name}{i}_weight")
+    return found
+
+
+def _key(layer: Layer) -> bytes:
+    return layer.weight.tobytes() + str(layer.weight.shape).encode()
+
+
+def _entries(matrix: ca.SX) -> list[Entry]:
+    """Row, column and expression of what is not always zero."""
+    rows, columns = matrix.sparsity().get_triplet()
+    return [(r, c, matrix[r, c]) for r, c in zip(rows, columns, strict=True)]
+
+
+def _passed(by_m: ca.SX, owners: Sequence[Owner]) -> dict[int, list[Entry]]:
+    """Derivatives by products, by the layer that these are of."""
+    found: dict[int, list[Entry]] = {}
+    ends = [first + n for first, n, *_ in owners]
+    for r, c, value in _entries(by_m):
+        k = int(np.searchsorted(ends, c, side="right"))
+        found.setdefault(k, []).append((r, c, value))
+    return found
+
+
+def _pass(
+    name: str, owner: Owner, chosen: Sequence[Entry], onto: Sequence[int],
+    at: int, to: str, stride: int | str,
+) -> tuple[str, str]:  # fmt: skip
+    """Tables and the statement that adds a layer's derivatives, times those by its products, to others."""
+    first, _, through, active = owner
+    text = table(f"{name}_at", [r for r, *_ in chosen], "int")
+    text += table(f"{name}_from", [c - first for _, c, _ in chosen], "int") + table(
+        f"{name}_onto", onto, "int"
+    )
+    n = max(1, len(active))
+    return text, (
+        f"    hmpc_layer_pass({name}_at, {name}_from, by_v + {at}, {len(chosen)}, through + {through}, {n}, "
+        f"{name}_onto, {len(active)}, {to}, {stride});\n"
+    )
+
+
+def after_code(
+    name: str, value: ca.SX, m: ca.SX, code: LayerCode
+) -> tuple[str, list[tuple[str, ca.SX]], list[int]]:
+    """A function ``{name}(by_v, through, slope)`` that adds to a Jacobian what goes through the layers; the derivatives
+    by products that it takes; the rows that it adds to.
+    """
+    texts, steps, rows = [], [], set[int]()
+    outs: list[tuple[str, ca.SX]] = []
+    for k, chosen in _passed(ca.jacobian(value, m), code.owners).items():
+        text, step = _pass(
+            f"{name}_{k}", code.owners[k], chosen, code.owners[k][3], len(outs), "slope", "HMPC_LJ"
+        )
+        texts.append(text)
+        steps.append(step)
+        outs += [(f"by_out[{len(outs) + j}]", v) for j, (*_, v) in enumerate(chosen)]
+        rows |= {r for r, *_ in chosen}
+    texts.append(
+        f"static inline void {name}(const real *by_v, const real *through, real *slope) {{\n"
+        f"  (void)by_v;\n  (void)through;\n  (void)slope;\n{''.join(steps)}}}\n"
+    )
+    return "".join(texts), outs, sorted(rows)
