@@ -39,7 +39,7 @@ from scipy.stats import t as student
 from unknown.case_plants import case_plants
 from unknown.cases import Case, cases
 from unknown.common import Machine
-from unknown.loops import Made, Ran, drawn, made, ran, tuned_rival
+from unknown.loops import Made, Ran, made, ran, trials_of, tuned_rival
 from unknown.motion import MOTION
 from unknown.plants import PLANTS, Plant
 from unknown.processes import PROCESSES
@@ -105,8 +105,7 @@ def compared(name: str, plant: Plant, own: Made, seeds: int) -> dict[str, Any]:
         }
     make, what = tuned_rival(name, own)
     pairs, offs = list[tuple[Ran, Ran]](), list[float]()
-    for seed in range(seeds):
-        trial = drawn(name, plant, own, seed)
+    for trial in trials_of(name, plant, own, 0, seeds):
         offs.append(trial.off)
         pairs.append((ran(plant, own, trial, own.loop()), ran(plant, own, trial, make())))
     both = [(a, b) for a, b in pairs if np.isfinite(a.cost) and np.isfinite(b.cost)]

@@ -12,7 +12,7 @@ from hybrid_mpc import OCP, DataSpec, HybridModel, Parameter, Prior, Scenario, S
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 import unknown_loops as own
-from unknown.loops import HOLDS, Made, Trial, drawn, ran
+from unknown.loops import HOLDS, Made, Trial, ran, trials_of
 from unknown.motion import MOTION
 from unknown.plants import PLANTS, Plant
 from unknown.processes import PROCESSES
@@ -95,7 +95,7 @@ def rivals(made):
 
 def test_all_controllers_hold_a_lag_of_another_gain_under_a_load():
     made = made_of_lag()
-    trial = drawn("lag", LAG, made, 0)
+    (trial,) = trials_of("lag", LAG, made, 0, 1)
     assert trial.off == 0.2
     assert abs(trial.p.gain - 1.0) == pytest.approx(0.2)
     costs = {}

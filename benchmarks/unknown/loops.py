@@ -46,8 +46,10 @@ OFFSET, SCATTER = 1.0, 5.0
 DRAWS = 60
 """Draws of set-points, parameters and loads at most. From half of them on inputs are drawn, and set-points are what the
 plant makes of them: some machines can hold little of what was recorded."""
-TUNED_ON = (1000, 1001)
-"""Seeds of the loops on the prior by which a rival's free number is chosen."""
+TUNED_FROM, TUNED = 1000, 2
+"""First seed of the loops on the prior by which a rival's free number is chosen, and how many there are."""
+TRIED = 4
+"""Seeds that are tried at most, over those that are wanted: of some no draw can hold its set-points."""
 
 
 @dataclass(frozen=True)
@@ -252,8 +254,26 @@ def slow_gain(plant: Plant, p: Any, held: Sequence[int], w: Array, x: Array, u: 
     return np.asarray(slopes(plant.measure, x)[list(held)] @ np.linalg.solve(rate * np.eye(len(x)) - a, b))
 
 
-def drawn(name: str, plant: Plant, own: Made, seed: int) -> Trial:
-    """A trial; set-points, parameters and loads are drawn until the machine can hold what it is asked to.
+def trials_of(name: str, plant: Plant, own: Made, first: int, number: int) -> list[Trial]:
+    """So many trials from a first seed on; seeds without a draw that fits are left out.
+
+    Raises:
+        RuntimeError: If there are fewer.
+    """
+    found: list[Trial] = []
+    for seed in range(first, first + TRIED * number):
+        trial = drawn(name, plant, own, seed)
+        found += [] if trial is None else [trial]
+        if len(found) == number:
+            return found
+    raise RuntimeError(
+        f"{name}: {len(found)} of {number} trials whose set-points can be held within the limits"
+    )
+
+
+def drawn(name: str, plant: Plant, own: Made, seed: int) -> Trial | None:
+    """A trial; set-points, parameters and loads are drawn until the machine can hold what it is asked to. None: no draw
+    fits.
 
     That is: the inputs can, within their limits and with the load; and the outputs answer to the inputs in the long run
     as those of the prior do. Of a machine that answers the other way round no controller of the prior holds an output
@@ -296,7 +316,7 @@ def drawn(name: str, plant: Plant, own: Made, seed: int) -> Trial:
                 for at, goal in zip(found, goals, strict=True)
             ):
                 return Trial(seed, goals, load, p, *found[0], off)
-    raise RuntimeError(f"{name}, seed {seed}: no draw can hold its set-points within the limits")
+    return None
 
 
 def _answers_alike(
@@ -440,7 +460,7 @@ def tuned_rival(name: str, own: Made) -> tuple[Callable[[], Rival], str]:
                 return Regulator(point, c, held, at, factor * own.noise[1], own.sigma, seconds)
 
             tries.append((f"LQR ({why}), {share:g} horizons, noise {factor:g}", two))
-    trials = [drawn(f"{name} prior", prior_of_signs(prior, own), own, seed) for seed in TUNED_ON]
+    trials = trials_of(f"{name} prior", prior_of_signs(prior, own), own, TUNED_FROM, TUNED)
     costs = []
     for _, make in tries:
         try:
