@@ -4,10 +4,12 @@
 
 Golf robot and disk are those of ``tests/golden`` with their trained networks. The others are priors with nominal
 parameters and small networks with random weights of several kinds; the tanks' sensor is bent. Each loop begins alike,
-tracks the machine's task over and over, and has a frozen sensor and an input that is off. "own" is the largest
-difference of the input, of its range, of C that goes on from its own plans after the first, "handed" that of C that
-goes on from Python's plan in each period; "state" and "reading" are those of the estimate and of the monitor in the
-first of the two. The script ends with an error where an alarm, a mode, a source or a status differs in any period.
+tracks the machine's task over and over, and has a frozen sensor and an input that is off. C gets Python's samples and
+the inputs that acted there: without these it would be a controller whose input nobody applies, and one with integral
+action adds rounding up. "own" is the largest difference of the input, of its range, of C that goes on from its own
+plans after the first, "handed" that of C that goes on from Python's plan in each period; "state" and "reading" are
+those of the estimate and of the monitor in the first of the two. The script ends with an error where an alarm, a mode,
+a source or a status differs in any period.
 """
 
 from __future__ import annotations
@@ -35,9 +37,10 @@ from hybrid_mpc import (
     OCP,
     CondensedController,
     Fault,
-    ResidualMonitor,
+    Monitor,
+    ResidualReadings,
     SafeController,
-    learn_residuals,
+    learn_limits,
     load_scenario,
 )
 from hybrid_mpc.control.sizes import Sizes
@@ -119,14 +122,15 @@ def with_network(model, ocp, net, seed=0):
 def watched(case, model, weak, learned=300):
     """The case with residuals whose limits are learned in loops without faults, a guard that rests, and faults."""
     nominal = [replays.run(replace(case, seed=50 + i, periods=learned))[1] for i in range(2)]
-    limits = learn_residuals(model, case.estimator, nominal)
+    readings = ResidualReadings(model)
+    limits = learn_limits(readings, case.estimator, nominal)
     t = case.periods * model.dt
     faults = (
         replays.freezes(0.96 * t, 0.965 * t, model.outputs[0].name),
         Fault(0.3 * t, 0.35 * t, "input_offset", weak, model.inputs[0].name),
     )
     guard = make_resting_guard(model) if case.safe.safe_input is not None else None
-    return replace(case, monitor=ResidualMonitor(model, limits=limits), guard=guard, faults=faults)
+    return replace(case, monitor=Monitor(readings, limits), guard=guard, faults=faults)
 
 
 def stored(m: Machine, periods):
@@ -141,7 +145,8 @@ def stored(m: Machine, periods):
 def made(m: Machine, periods):
     """A prior with a random network, in the loop of its scenario's task."""
     changes = {} if m.control is None else {
-        "control": m.control, "sensor_sigma": (m.sigma,), "safe_input": tuple(np.clip(0.0, m.control.u_min, m.control.u_max)),
+        "control": m.control, "sensor_sigma": (m.sigma,),
+        "safe_input": tuple(np.clip(0.0, m.control.u_min, m.control.u_max)),
     }  # fmt: skip
     scenario, kit = of_prior(m.name, **changes)
     prior = kit.models["prior"]
@@ -175,7 +180,9 @@ MACHINES = (
     Machine("race_car", lambda: Cells(nn.RNNCell, 8), "slalom", periods=320),
     Machine("coupled_drives", lambda: Deep(8, 12), "speeds"),
     Machine("emps", gru(), reference=sine((0.1, 2.0)), control=EMPS, sigma=1e-5, learned=1500),
-    Machine("xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False),
+    Machine(
+        "xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False
+    ),
     Machine("torque_pendulum", gru(), reference=sine((0.25, 2.0))),
 )
 

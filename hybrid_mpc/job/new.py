@@ -607,18 +607,39 @@ def horizon_of(draft: Draft) -> tuple[int, str]:
     return periods, why
 
 
+def first_limits(span: tuple[float, float], growth: float) -> tuple[float, float]:
+    """Limits of an input in a first control problem: what was recorded.
+
+    An unstable machine falls where its input stays at a limit. Where its input was moved to both sides of zero, it may
+    be moved as far to either side: a recording from one start may hold much of one side alone.
+
+    Args:
+        span: Smallest and largest recorded value.
+        growth: Rate [1/s] at which the machine leaves its rest; 0: it does not.
+
+    Example:
+        >>> first_limits((-4.8, 14.0), 5.0), first_limits((-4.8, 14.0), 0.0), first_limits((0.0, 14.0), 5.0)
+        ((-14.0, 14.0), (-4.8, 14.0), (0.0, 14.0))
+    """
+    low, high = span
+    if growth > 0 and low < 0 < high:
+        return -max(-low, high), max(-low, high)
+    return low, high
+
+
 def _first_control(draft: Draft, n_x: int) -> list[str]:
     """A control problem for a first loop, commented out: what only the user knows is marked.
 
     Outputs are weighed by one over the square of a twentieth of what was recorded, changes of inputs of a tenth
-    (Bryson's rule); inputs stay within what was recorded.
+    (Bryson's rule); for the limits of inputs see :func:`first_limits`.
     """
     horizon, why = horizon_of(draft)
 
     def each(columns: Sequence[Column], share: float) -> str:
         return _tuple(_rounded(share * float(np.ptp(c.span))) + "**-2" for c in columns)
 
-    low, high = (_tuple(near(c.span[i], np.ptp(c.span) / 500) for c in draft.inputs) for i in (0, 1))
+    limits = [(first_limits(c.span, draft.growth), np.ptp(c.span) / 500) for c in draft.inputs]
+    low, high = (_tuple(near(ends[i], step) for ends, step in limits) for i in (0, 1))
     free = f"q={_tuple(['0.0'] * n_x)}, r={_tuple(['0.0'] * len(draft.inputs))}"
     sigma = _tuple(_rounded(0.005 * float(np.ptp(c.span))) for c in draft.outputs)
     return [

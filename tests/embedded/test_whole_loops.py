@@ -18,14 +18,15 @@ from replay_parts import Case, Whole, replay
 import hybrid_mpc as hm
 from hybrid_mpc import (
     CondensedController,
+    DelayCompensation,
     ExtendedKalmanFilter,
     Guard,
     InputError,
     Limits,
     Mode,
     SafeController,
-    guard_monitor,
     load_scenario,
+    make_monitor,
 )
 from hybrid_mpc.embedded.generate import CORE, make_sources, sources_of
 from hybrid_mpc.kit.parts import loop_settings, read_parts, save_loop
@@ -99,6 +100,16 @@ def test_a_loop_with_faults_replayed(name, tmp_path):
     case = make()
     told = replay(Whole(tmp_path, case), case)
     assert set(told.modes) == modes
+    assert told.alarms > 20
+    assert told.input < TOLERANCE
+    assert told.estimate < TOLERANCE
+    assert told.reading < TOLERANCE
+
+
+def test_a_loop_of_its_own_plans(tmp_path):
+    """C that goes on from its own plans, told which inputs acted: nothing adds up."""
+    case = tanks()
+    told = replay(Whole(tmp_path, case), case, own=True)
     assert told.alarms > 20
     assert told.input < TOLERANCE
     assert told.estimate < TOLERANCE
@@ -229,17 +240,14 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
     case = replays.arm_case(10)
     model, plain = case.safe.controller.model, replace(case, guard=None)
     refused(plain, "a monitor of another kind.*object", monitor=object())
-    refused(plain, "a history for a diagnosis", monitor=guard_monitor(model, diagnose=True))
     refused(plain, "a monitor without an estimator", estimator=None)
-    other = guard_monitor(parts.online_models.pendulum_model())
+    other = make_monitor(parts.online_models.pendulum_model())
     refused(plain, "a monitor of another model", monitor=other)
     refused(case, "a guard without a monitor", monitor=None)
     bare = SafeController(case.safe.controller, model)
     both = "mode REST without a safe input.*a backup by another solver.*its guard's backup: no C"
-    twice = CondensedController(
-        model, case.safe.controller.ocp.changed(starts=[np.zeros((12, 2))]), iterations=2
-    )
-    guard = Guard(backup=twice, backup_estimator=case.estimator)
+    twice = CondensedController(model, case.safe.controller.ocp, iterations=2)
+    guard = Guard(backup=twice, backup_estimator=DelayCompensation(case.estimator))
     refused(case, both, safe=bare, guard=guard)
 
 
@@ -251,8 +259,8 @@ def test_a_kits_monitor_and_guard(noisy_artifact, tmp_path, call):
     save_loop(run, loop_settings(golf, read_parts(run).loop.process_noise))
     code, _, err = call("export", "c", run, "--guard", "--out", tmp_path / "early")
     assert code == 2
-    assert "detector" in err
-    hm.set_calibration(run, machine("golf_robot").calibration)
+    assert "no limits of energy" in err
+    hm.set_limits(run, {"hybrid": [machine("golf_robot").limits]})
     sizes = {}
     for words in ((), ("--no-monitor",), ("--guard",), ("--adapt",)):
         folder = tmp_path / "-".join(["c", *words])
