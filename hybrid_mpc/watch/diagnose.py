@@ -185,8 +185,8 @@ class Diagnoser:
             estimates: The estimates along it.
         """
         model = self.model
-        frozen = trace.frozen[alarm : alarm + self.after + 1].any(axis=0)
         frozen = np.atleast_1d(trace.frozen[alarm : alarm + self.after + 1].any(axis=0))
+        stuck = [name for name, on in zip(trace.outputs, frozen, strict=True) if on]
         if stuck:
             return f"the sensor of {', '.join(stuck)} repeats itself while motion is predicted"
         on = [c.name for c, alarms in zip(trace.channels, trace.on[alarm], strict=True) if alarms]
