@@ -41,6 +41,7 @@ from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
 from hybrid_mpc.identify.explain import explain
 from hybrid_mpc.identify.fit import smoothed
+from hybrid_mpc.identify.simulation import required_substeps
 from hybrid_mpc.identify.smooth import Smoother, fit_smoother
 
 GOLF = "golf_robot"
@@ -89,9 +90,11 @@ def row(name: str, fold: int, scenario: Scenario, files: list[Path], kind: str) 
             told = explain(make, fit.values, known, dt=dt, length=length)
             seconds = time.process_time() - began
             better = told.prior(told.values)
-            acting = shifted([*train, *valid], fit.delay)
+            acting, substeps = shifted([*train, *valid], fit.delay), required_substeps(better, dt)
             smoother = (
-                fit_smoother(better, acting, dt, time_unit=unit) if told.steps else fit.smoother(fitted, dt)
+                fit_smoother(better, acting, dt, time_unit=unit, substeps=substeps)
+                if told.steps
+                else fit.smoother(fitted, dt)
             )
             found["explained"] = (
                 error(better, smoother, held, warm, spec.free_run, spread) if told.steps else found["fitted"]

@@ -1,7 +1,7 @@
 """The guard's monitor on the torque pendulum's real recordings: ``python benchmarks/guard_real.py --model RUN
 [--data ../shared/data/torque_pendulum] [--models hybrid prior] [--rate 12] [--out FILE.json] [--pictures FOLDER]``.
 
-RUN is what ``hybrid-mpc run torque_pendulum`` has left. Each recording is judged by a detector learned from the clean
+RUN is what ``hybrid-mpc run torque_pendulum`` has left. Each recording is judged by limits learned from the clean
 windows of the other five alone, from blocks of 1 s (there is a minute of clean data in all). A window is clean where
 the recordings' own description says that no hand was on the pendulum. Printed by recording: alarms that begin in clean
 windows, and the highest that the scores get there, as shares of their thresholds; samples of clean windows in which an
@@ -23,20 +23,23 @@ from types import SimpleNamespace
 import numpy as np
 
 from hybrid_mpc import (
-    Detector,
     InputError,
-    guard_monitor,
+    Trace,
+    WatchLimits,
     load,
     load_trajectories,
     make_estimator,
+    make_monitor,
+    make_readings,
     replay,
     rest_speeds,
 )
 from hybrid_mpc.files import write_json
-from hybrid_mpc.monitor.learn import DRIFT, learn_detector
-from hybrid_mpc.monitor.lengths import SETTLING_S
-from hybrid_mpc.monitor.replay import MonitorTrace
 from hybrid_mpc.records import plain
+from hybrid_mpc.watch.learn import limits_of
+from hybrid_mpc.watch.lengths import SETTLING_S
+from hybrid_mpc.watch.monitor import Monitor
+from hybrid_mpc.watch.replay import with_alarms
 from scenarios.torque_pendulum import scenario
 
 CLEAN = {
@@ -60,11 +63,11 @@ TINY = 1e-6
 
 @dataclass(frozen=True)
 class HeldOut:
-    """A recording, watched with the detector of all others; ``clean`` ``(n,)`` is true in its own clean windows."""
+    """A recording, watched with the limits of all others; ``clean`` ``(n,)`` is true in its own clean windows."""
 
     name: str
-    detector: Detector
-    trace: MonitorTrace
+    limits: WatchLimits
+    trace: Trace
     clean: np.ndarray
 
     @property
@@ -87,8 +90,9 @@ class HeldOut:
     @property
     def highest(self) -> tuple[float, float]:
         """Largest shares of the thresholds, forces and power, in clean windows but for their beginning."""
-        scores = self.trace.scores[
-            settled_windows(self.trace.t, self.clean, SETTLING_S * self.detector.time_unit)
+        tops = [one.threshold for one in self.limits.channels]
+        scores = np.abs(self.trace.levels / tops)[
+            settled_windows(self.trace.t, self.clean, SETTLING_S * self.limits.time_unit)
         ]
         return (float(scores[:, 0].max()), float(scores[:, 1].max())) if len(scores) else (0.0, 0.0)
 
@@ -100,7 +104,7 @@ def leave_one_out(
     model, estimator, recordings, windows: Mapping[str, Sequence[tuple[float, float]]], *, rate: float,
     resolution: Sequence[float], block_s: float, data_hash: str,
 ) -> list[HeldOut]:  # fmt: skip
-    """Every recording by a detector that was learned from the clean windows of all others.
+    """Every recording by limits that were learned from the clean windows of all others.
 
     Each is replayed as a whole, as it would have run online: what happens between the windows is in the monitor's
     memory when the next one begins. Nothing is learned from the first of the machine's seconds of a window.
@@ -116,32 +120,22 @@ def leave_one_out(
     undisturbed = [
         SimpleNamespace(y=y) for r, c in zip(recordings, clean, strict=True) for y in stretches(r.y, c)
     ]
-    monitor = guard_monitor(model, resolution=resolution, rest_speed=rest_speeds(undisturbed, model))
-    traces = [replay(monitor, estimator, r) for r in recordings]
-    settling = SETTLING_S * model.time_unit
-    runs = [
-        stretches(trace.numbers, settled_windows(trace.t, c, settling))
-        for trace, c in zip(traces, clean, strict=True)
-    ]
+    readings = make_readings(model, rest_speed=rest_speeds(undisturbed, model))
+    traces = [replay(Monitor(readings), estimator, r) for r in recordings]
     found = []
     for recording, stem, trace, inside in zip(recordings, stems, traces, clean, strict=True):
-        others = [run for own, other in zip(runs, stems, strict=True) if other != stem for run in own]
-        detector = learn_detector(
-            others, model.dt, model.n_y, drift=DRIFT, false_alarms_per_hour=rate, rest_speed=monitor.rest_speed,
-            data_hash=data_hash, time_unit=model.time_unit, block_s=block_s,
+        others = [i for i, other in enumerate(stems) if other != stem]
+        limits = limits_of(
+            readings, [recordings[i].y for i in others], [traces[i] for i in others], false_alarms_per_hour=rate,
+            nominal=[clean[i] for i in others], resolution=resolution, data_hash=data_hash, block_s=block_s,
         )  # fmt: skip
-        found.append(HeldOut(recording.name, detector, with_detector(detector, trace), inside))
+        found.append(HeldOut(recording.name, limits, with_limits(model, limits, trace), inside))
     return found
 
 
-def with_detector(detector: Detector, trace: MonitorTrace) -> MonitorTrace:
-    """The trace with the scores and alarms of a detector; frozen sensors and blind monitors remain alarms."""
-    state, scores, alarm = detector.initial(), [], []
-    for numbers in trace.numbers.tolist():
-        state, score, detected = detector.update(state, numbers)
-        scores.append(score)
-        alarm.append(detected)
-    return replace(trace, scores=np.array(scores), alarm=np.array(alarm) | trace.frozen | trace.blind)
+def with_limits(model, limits: WatchLimits, trace: Trace) -> Trace:
+    """The trace with the levels and alarms of other limits."""
+    return with_alarms(make_monitor(model, limits), trace)
 
 
 def clean_samples(t, windows: Sequence[tuple[float, float]]):
@@ -175,7 +169,7 @@ def read(folder: Path, model):
 
 
 def judge(model, sigma_x, data, rate: float = RATE) -> list[HeldOut]:
-    """Every recording, by the detector of the others."""
+    """Every recording, by the limits of the others."""
     return leave_one_out(
         model, make_estimator(model, scenario, np.asarray(sigma_x)), data.whole, CLEAN,
         rate=rate, resolution=[RESOLUTION], block_s=BLOCK_S, data_hash=data.hash,
@@ -194,7 +188,7 @@ def row_of(found: HeldOut, dt: float) -> dict:
         "outside_s": float((~found.clean).sum() * dt),
         "alarms_outside": found.outside,
         "share_outside": float(found.trace.alarm[~found.clean].mean()) if not found.clean.all() else None,
-        "detector": plain(found.detector),
+        "limits": plain(found.limits),
     }
 
 
@@ -217,15 +211,19 @@ def table(rows) -> list[str]:
 
 
 def picture(found: HeldOut, y, path: Path, title: str) -> None:
-    """Everything the monitor says, alarms shaded; clean windows as bars at the top."""
-    from hybrid_mpc.plots.monitor import overview
+    """Everything the monitor says, alarms shaded; clean windows as bars at the bottom."""
+    from hybrid_mpc.plots.monitor import channels
     from hybrid_mpc.plots.style import save
     from scenarios.torque_pendulum.prior import TorquePendulumPrior
 
-    figure = overview(found.trace, y, outputs=TorquePendulumPrior.outputs, force_unit="J/rad", title=title)
-    for start, end in CLEAN[found.name]:
-        for ax in figure.axes:
-            ax.axvspan(start, min(end, found.trace.t[-1]), ymin=0.94, color="#009E73", alpha=0.7, linewidth=0)
+    figure = channels(
+        found.trace,
+        y,
+        outputs=TorquePendulumPrior.outputs,
+        limits=found.limits,
+        windows=CLEAN[found.name],
+        title=title,
+    )
     save(figure, path)
 
 
@@ -253,7 +251,7 @@ def main() -> None:
         if given.pictures is not None:
             for f, recording in zip(found, data.whole, strict=True):
                 path = given.pictures / f"guard_torque_pendulum_{f.name}_{name}.png"
-                picture(f, recording.y[:, 0], path, f"{f.name}, {name}, calibrated on the others")
+                picture(f, recording.y, path, f"{f.name}, {name}, calibrated on the others")
     if given.out is not None:
         write_json(given.out, result)
 

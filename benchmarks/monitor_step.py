@@ -1,8 +1,8 @@
-"""Processor time of an update of the energy monitor: ``python benchmarks/monitor_step.py [--model DIR] [--rounds 7]``.
+"""Processor time of an update of the monitor: ``python benchmarks/monitor_step.py [--model DIR] [--rounds 7]``.
 
-A hybrid along 6 s of a sinusoid of 0.6 rad (a quarter of it near rest, where the residual's dead band asks for more
-accelerations), for the main job's monitor and the guard's, by turns: median and largest of the rounds' means, and
-their ratio to the CasADi function alone [us]. Without ``--model`` a network of 32 random units.
+A hybrid along 6 s of a sinusoid of 0.6 rad (a quarter of it near rest, where the force's dead band asks for more
+accelerations), for the energy without and with limits and for residuals with limits, by turns: median and largest of
+the rounds' means, and their ratio to the CasADi function alone [us]. Without ``--model`` a network of 32 random units.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from time import process_time
 import numpy as np
 from parts import arguments, deployed, estimate, hybrid_step, report
 
-from hybrid_mpc import Detector, guard_monitor, load, make_monitor
+from hybrid_mpc import ChannelLimit, WatchLimits, load, make_monitor
 
 SAMPLES = 300
 
@@ -42,7 +42,7 @@ def casadi_time(monitor) -> float:
     """Mean processor time [us] of the CasADi function at its last arguments."""
     begin = process_time()
     for _ in range(SAMPLES):
-        monitor._function()
+        monitor.readings._function()
     return 1e6 * (process_time() - begin) / SAMPLES
 
 
@@ -53,11 +53,22 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     given = parser.parse_args()
     model = load(given.model).models["hybrid"] if given.model else deployed(hybrid_step(32))
-    detector = Detector(model.dt, ((0.01, 0.0, 0.0, 0.0),), (0.01, 0.0, 0.0, 0.0), 2.0, 20.0, 4.0)
+    scale = (0.01, 0.0, 0.0, 0.0)
+    force = ChannelLimit("force of phi", "N m", 0, 20.0, 10.0, scale, 2.0)
+    power = ChannelLimit("power of the free run", "W", 1, 4.0, 2.0, scale)
+    energy = WatchLimits("energy", model.dt, (force, power), (4.5e-3,), (0,))
+    readings = make_monitor(model, kind="residuals").readings
+    channels = tuple(
+        ChannelLimit(
+            readings.channels[test.channel].name, readings.channels[test.channel].unit, test.length, 9.0, 4.5
+        )
+        for test in readings.tests
+    )
+    residuals = WatchLimits("residuals", model.dt, channels, (1.0,), (9,))
     monitors = {
-        "main job": make_monitor(model, None),
-        "guard": guard_monitor(model, detector, resolution=[1.5e-3]),
-        "guard with history": guard_monitor(model, detector, resolution=[1.5e-3], diagnose=model.n_p > 0),
+        "energy, no limits": make_monitor(model),
+        "energy": make_monitor(model, energy),
+        "residuals": make_monitor(model, residuals),
     }
     rows, found = samples(model), {name: [] for name in monitors}
     for _ in range(given.rounds):

@@ -1,4 +1,4 @@
-"""Faults in recordings of real machines: found by the monitor of residuals or not, by which channel, how late.
+"""Faults in recordings of real machines: found by the monitor's residuals or not, by which channel, how late.
 
     python benchmarks/recorded_faults.py DATA [--out FILE.json]
 
@@ -25,18 +25,20 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import (
+    Diagnoser,
     ExtendedKalmanFilter,
     HybridModel,
-    ResidualDiagnoser,
-    ResidualMonitor,
+    Monitor,
+    ResidualReadings,
     Scenario,
+    Trace,
     Trajectory,
     fit_prior,
-    learn_residuals,
+    learn_limits,
     load_scenario,
     model_info,
     process_noise,
-    replay_residuals,
+    replay,
 )
 from hybrid_mpc.data.scales import noise_of, time_unit
 from hybrid_mpc.estimate.tuning import most_likely
@@ -44,11 +46,10 @@ from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import with_states
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.job.benchmark_runs import benchmark_of, read_test, read_training
-from hybrid_mpc.job.stages.monitor import rates
+from hybrid_mpc.job.stages.watch import rates
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import first_deviations
-from hybrid_mpc.monitor.calibrate import stretches
-from hybrid_mpc.monitor.residuals import ResidualTrace
+from hybrid_mpc.watch.replay import stretches
 
 SCALES = (0.3, 1.0, 3.0, 10.0)
 """Candidate factors on the model's errors of a period; the likeliest on the training recording gives the noise."""
@@ -194,21 +195,19 @@ def identified(
     return model, filter_of(chosen), known.valid
 
 
-def watched(
-    monitor: ResidualMonitor, estimator: ExtendedKalmanFilter, recording: Trajectory
-) -> tuple[ResidualTrace, list]:
+def watched(monitor: Monitor, estimator: ExtendedKalmanFilter, recording: Trajectory) -> tuple[Trace, list]:
     """Trace and estimates of a recording."""
     estimates: list = []
-    trace = replay_residuals(monitor, estimator, recording, on_sample=lambda k, e: estimates.append(e))
+    trace = replay(monitor, estimator, recording, on_sample=lambda k, e: estimates.append(e))
     return trace, estimates
 
 
 def judged(
-    known: Known, trace: ResidualTrace, estimates: list, recording: Trajectory, diagnoser: ResidualDiagnoser
+    known: Known, trace: Trace, estimates: list, recording: Trajectory, diagnoser: Diagnoser
 ) -> tuple[float | None, str, str, str]:
     """Delay [s], channels, diagnosis and what of the fault it names."""
     on = np.hstack([trace.on, trace.frozen])
-    names = (*trace.channels, *(f"{name} frozen" for name in trace.outputs))
+    names = trace.names
     rises = on & ~np.vstack([np.zeros_like(on[:1]), on[:-1]])
     within = (trace.t >= known.start - 1e-6) & (trace.t < known.end - 1e-6)
     found = np.flatnonzero(rises.any(axis=1) & within)
@@ -243,11 +242,11 @@ def study(name: str, data: Path) -> list[Row]:
     rows: list[Row] = []
     for own, other in (machine.clean, machine.clean[::-1]):
         learned = [given(run) for run in held] + clean[own]
-        limits = learn_residuals(model, estimator, learned, false_alarms_per_hour=rates(model))
-        monitor, diagnoser = ResidualMonitor(model, limits=limits), ResidualDiagnoser(model, limits)
-        print(
-            f"limits from {own}: {limits.method}; {dict(zip(limits.channels, limits.threshold, strict=True))}"
-        )
+        readings = ResidualReadings(model)
+        limits = learn_limits(readings, estimator, learned, false_alarms_per_hour=rates(model))
+        monitor, diagnoser = Monitor(readings, limits), Diagnoser(model, limits)
+        told = "; ".join(f"{c.channel} {c.words(limits.dt)}" for c in limits.channels)
+        print(f"limits from {own}: {limits.method}; {told}")
         label = f"{', '.join(machine.train)} (not fitted to), {own}"
         for run in clean[other]:
             trace, _ = watched(monitor, estimator, run)

@@ -28,9 +28,10 @@ from hybrid_mpc import (
     OCP,
     CondensedController,
     Fault,
-    ResidualMonitor,
+    Monitor,
+    ResidualReadings,
     SafeController,
-    learn_residuals,
+    learn_limits,
     load,
     load_scenario,
     model_info,
@@ -61,10 +62,9 @@ def watched(kit, plant, reference, x0, periods, faults, seed, task=""):
     safe = SafeController(CondensedController(model, ocp), model, safe_input=kit.safe_input)
     case = Case(estimator, safe, None, None, plant, reference, x0, periods, seed=seed)
     nominal = [replays.run(replace(case, seed=seed + 50 + i, periods=max(periods, 400)))[1] for i in range(2)]
-    limits = learn_residuals(model, estimator, nominal)
-    return replace(
-        case, monitor=ResidualMonitor(model, limits=limits), guard=make_resting_guard(model), faults=faults
-    )
+    readings = ResidualReadings(model)
+    limits = learn_limits(readings, estimator, nominal)
+    return replace(case, monitor=Monitor(readings, limits), guard=make_resting_guard(model), faults=faults)
 
 
 def temperature_lab(periods, seed):

@@ -127,7 +127,7 @@ def loop_parts(folder: Path | None, seeds: int) -> list[dict]:
                 result = simulate(
                     scenario.plant(), estimator, controller, task.reference, weight=task.weight, dt=model.dt,
                     duration=task.duration, x0=np.array(task.x0), seed=seed, faults=task.faults,
-                    monitor=make_monitor(model, None),
+                    monitor=make_monitor(model),
                 )  # fmt: skip
                 loops.append({part: spent[1:] for part, spent in result.timing_ms.items()})
         total = np.median(np.concatenate([loop["total"] for loop in loops]))

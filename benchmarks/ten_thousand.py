@@ -37,9 +37,10 @@ from hybrid_mpc import (
     OCP,
     CondensedController,
     Fault,
-    ResidualMonitor,
+    Monitor,
+    ResidualReadings,
     SafeController,
-    learn_residuals,
+    learn_limits,
     load_scenario,
 )
 from hybrid_mpc.control.sizes import Sizes
@@ -121,14 +122,15 @@ def with_network(model, ocp, net, seed=0):
 def watched(case, model, weak, learned=300):
     """The case with residuals whose limits are learned in loops without faults, a guard that rests, and faults."""
     nominal = [replays.run(replace(case, seed=50 + i, periods=learned))[1] for i in range(2)]
-    limits = learn_residuals(model, case.estimator, nominal)
+    readings = ResidualReadings(model)
+    limits = learn_limits(readings, case.estimator, nominal)
     t = case.periods * model.dt
     faults = (
         replays.freezes(0.96 * t, 0.965 * t, model.outputs[0].name),
         Fault(0.3 * t, 0.35 * t, "input_offset", weak, model.inputs[0].name),
     )
     guard = make_resting_guard(model) if case.safe.safe_input is not None else None
-    return replace(case, monitor=ResidualMonitor(model, limits=limits), guard=guard, faults=faults)
+    return replace(case, monitor=Monitor(readings, limits), guard=guard, faults=faults)
 
 
 def stored(m: Machine, periods):

@@ -17,7 +17,7 @@ import numpy as np
 from parts import arguments, deployed, hybrid_step, problem, report
 from steps import SIGMA_X
 
-from hybrid_mpc import Detector, guard_monitor, make_estimator
+from hybrid_mpc import ChannelLimit, WatchLimits, make_estimator, make_monitor
 from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.embedded.generate import SOURCES
 from scenarios.golf_robot import scenario
@@ -69,10 +69,11 @@ def watched_controller(folder: Path, z: int, single: bool, n: int = 50, **limits
     """The C of the golf robot with ``z`` random units, its observer and the guard's monitor."""
     model, ocp = deployed(hybrid_step(z)), problem(n, **limits)
     estimator = make_estimator(model, scenario, np.array(SIGMA_X), ocp)
-    rest = (0.05,)
     scale = (0.01, 0.01, 0.01, 0.01)
-    detector = Detector(model.dt, (scale,), scale, 2.0, 20.0, 4.0, rest_speed=rest)
-    monitor = guard_monitor(model, detector, resolution=[1.5e-3])
+    force = ChannelLimit("force of phi", "N m", 0, 20.0, 10.0, scale, 2.0)
+    power = ChannelLimit("power of the free run", "W", 1, 4.0, 2.0, scale)
+    limits = WatchLimits("energy", model.dt, (force, power), (4.5e-3,), (0,), rest_speed=(0.05,))
+    monitor = make_monitor(model, limits)
     write_controller(
         folder, model, ocp, estimator=estimator, safe_input=model.u0, single=single, monitor=monitor
     )

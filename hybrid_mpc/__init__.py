@@ -107,13 +107,13 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.kit.artifact import Kit as Kit, load as load, save_artifact as save_artifact
     from hybrid_mpc.kit.assembly import (
         make_adaptive_guard as make_adaptive_guard, make_controller as make_controller,
-        make_estimator as make_estimator, make_monitor as make_monitor, make_ocp as make_ocp,
+        make_estimator as make_estimator, make_ocp as make_ocp,
         make_resting_guard as make_resting_guard,
     )
     from hybrid_mpc.kit.export_c import generate_controller as generate_controller
     from hybrid_mpc.kit.parts import (
         LoopSettings as LoopSettings, ModelInfo as ModelInfo, Provenance as Provenance,
-        set_calibration as set_calibration, set_process_noise as set_process_noise,
+        set_limits as set_limits, set_process_noise as set_process_noise,
     )
     from hybrid_mpc.kit.promises import Promise as Promise
     from hybrid_mpc.loop.faults import (
@@ -144,22 +144,20 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         HybridModel as HybridModel, kinematics as kinematics, longer_period as longer_period,
     )
     from hybrid_mpc.model.riccati import dare as dare, lqr as lqr
-    from hybrid_mpc.monitor.calibrate import Calibration as Calibration, count_alarms as count_alarms
-    from hybrid_mpc.monitor.detector import Detector as Detector
-    from hybrid_mpc.monitor.diagnose import Diagnoser as Diagnoser
-    from hybrid_mpc.monitor.energy import EnergyMonitor as EnergyMonitor
-    from hybrid_mpc.monitor.explain import ResidualDiagnoser as ResidualDiagnoser
-    from hybrid_mpc.monitor.learn import guard_monitor as guard_monitor, learn_from as learn_from
-    from hybrid_mpc.monitor.lengths import rest_speeds as rest_speeds
-    from hybrid_mpc.monitor.replay import replay as replay
-    from hybrid_mpc.monitor.residuals import (
-        ResidualLimits as ResidualLimits, ResidualMonitor as ResidualMonitor,
-        learn_residuals as learn_residuals, replay_residuals as replay_residuals,
-    )
     from hybrid_mpc.scenario import (
         DEFAULT_BUDGETS as DEFAULT_BUDGETS, Budget as Budget, Scenario as Scenario, Task as Task,
         load_scenario as load_scenario,
     )
+    from hybrid_mpc.watch.detector import ChannelLimit as ChannelLimit, WatchLimits as WatchLimits
+    from hybrid_mpc.watch.diagnose import Diagnoser as Diagnoser
+    from hybrid_mpc.watch.energy import EnergyReadings as EnergyReadings
+    from hybrid_mpc.watch.learn import learn_limits as learn_limits
+    from hybrid_mpc.watch.lengths import rest_speeds as rest_speeds
+    from hybrid_mpc.watch.monitor import (
+        Monitor as Monitor, make_monitor as make_monitor, make_readings as make_readings,
+    )
+    from hybrid_mpc.watch.replay import Trace as Trace, count_alarms as count_alarms, replay as replay
+    from hybrid_mpc.watch.residuals import ResidualReadings as ResidualReadings
 # fmt: on
 
 try:
@@ -231,11 +229,11 @@ _ROOMS = {
     "job.study_run": ("dry_run", "run_study"),
     "kit.artifact": ("Kit", "load", "save_artifact"),
     "kit.assembly": (
-        "make_adaptive_guard", "make_controller", "make_estimator", "make_monitor", "make_ocp",
+        "make_adaptive_guard", "make_controller", "make_estimator", "make_ocp",
         "make_resting_guard",
     ),
     "kit.export_c": ("generate_controller",),
-    "kit.parts": ("LoopSettings", "ModelInfo", "Provenance", "set_calibration", "set_process_noise"),
+    "kit.parts": ("LoopSettings", "ModelInfo", "Provenance", "set_limits", "set_process_noise"),
     "kit.promises": ("Promise",),
     "loop.faults": ("Fault", "check_plant_faults", "corrupt_input", "corrupt_measurement"),
     "loop.guard": ("Guard", "Mode"),
@@ -254,16 +252,15 @@ _ROOMS = {
     "model.equilibrium": ("Steady", "holding_input"),
     "model.model": ("HybridModel", "kinematics", "longer_period"),
     "model.riccati": ("dare", "lqr"),
-    "monitor.calibrate": ("Calibration", "count_alarms"),
-    "monitor.detector": ("Detector",),
-    "monitor.diagnose": ("Diagnoser",),
-    "monitor.energy": ("EnergyMonitor",),
-    "monitor.explain": ("ResidualDiagnoser",),
-    "monitor.learn": ("guard_monitor", "learn_from"),
-    "monitor.lengths": ("rest_speeds",),
-    "monitor.replay": ("replay",),
-    "monitor.residuals": ("ResidualLimits", "ResidualMonitor", "learn_residuals", "replay_residuals"),
     "scenario": ("Budget", "DEFAULT_BUDGETS", "Scenario", "Task", "load_scenario"),
+    "watch.detector": ("ChannelLimit", "WatchLimits"),
+    "watch.diagnose": ("Diagnoser",),
+    "watch.energy": ("EnergyReadings",),
+    "watch.learn": ("learn_limits",),
+    "watch.lengths": ("rest_speeds",),
+    "watch.monitor": ("Monitor", "make_monitor", "make_readings"),
+    "watch.replay": ("Trace", "count_alarms", "replay"),
+    "watch.residuals": ("ResidualReadings",),
 }  # fmt: skip
 """Public names by the module that defines them."""
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}

@@ -38,9 +38,14 @@ class MissingPackage(InputError, ImportError):
 EXTRAS = {
     **dict.fromkeys(("torch", "optuna", "filelock"), "train"),
     **dict.fromkeys(("typer", "rich"), "cli"),
-    **dict.fromkeys(("matplotlib", "PIL", "bokeh", "jinja2", "markupsafe", "pandas"), "report"),
+    **dict.fromkeys(("matplotlib", "PIL", "bokeh", "jinja2", "markupsafe"), "report"),
+    **dict.fromkeys(("pandas", "openpyxl", "pyarrow", "h5py"), "tables"),
+    **dict.fromkeys(
+        ("asammdf", "nptdms", "rosbags", "mcap", "mcap_ros1", "mcap_ros2", "pyulog", "can", "cantools"),
+        "loggers",
+    ),
     "control": "analysis",
-    **dict.fromkeys(("dask", "distributed", "pyarrow", "yaml"), "studies"),
+    **dict.fromkeys(("dask", "distributed", "yaml"), "studies"),
     "pysindy": "sindy",
     "mujoco": "mujoco",
 }
@@ -64,7 +69,7 @@ def named_extra(what: str = "") -> Iterator[None]:
         ...     raise ModuleNotFoundError("No module named 'pandas'", name="pandas")
         Traceback (most recent call last):
         ...
-        hybrid_mpc.errors.MissingPackage: a table needs pandas, ... pip install 'hybrid-mpc[report]'
+        hybrid_mpc.errors.MissingPackage: a table needs pandas, ... pip install 'hybrid-mpc[tables]'
     """
     try:
         yield

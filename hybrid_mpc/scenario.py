@@ -182,12 +182,14 @@ class Scenario:
         figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a
             :class:`~hybrid_mpc.job.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
-            for :class:`~hybrid_mpc.monitor.diagnose.Diagnoser`. Default: each by itself.
+            for :class:`~hybrid_mpc.watch.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` evaluates the machine's models on recordings; default: not at all.
         beyond_recordings: Whether tasks go where no recording was. The filters on the hybrid then assume no less
             process noise than those on the prior; see also ``Budget.prior_replay``. Default: no.
         disturbance_model: What unmeasured disturbances are added to, as estimators and controllers assume them. As many
-            as there are outputs leave no offset (:func:`~hybrid_mpc.estimate.offset_free.offset_free`). Default: one at
+            as there are outputs leave no offset (:func:`~hybrid_mpc.estimate.offset_free.offset_free`). Default: as
+            many as outputs where the control problem weighs outputs, one at each input and at each output that is not
+            weighed, as far as they are found (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`); else one at
             each input.
 
     Raises:

@@ -39,7 +39,7 @@ def loop_row(task="a", controller="prior", seed=0, cost=1.0, **fields):
     none = {
         "tracking_rmse": {"phi [rad]": 0.0}, "largest_x": {}, "largest_u": {}, "limits": {}, "excess": {},
         "sources": {s.name: float(s is Source.MPC) for s in Source}, "figures": {}, "alarms": None, "alarm_share": None,
-        "largest_level": None, "invalid_s": 0.0, "switches": (), "timing_ms": {}, "seconds": 1.0,
+        "largest_violation": None, "invalid_s": 0.0, "switches": (), "timing_ms": {}, "seconds": 1.0,
     }  # fmt: skip
     return LoopRow(task, controller, seed, cost=cost, **{**none, **fields})
 
@@ -140,7 +140,7 @@ class ScriptedReading:
     alarm: bool
     frozen: bool = False
     violation_w: float = 0.0
-    level_w: float = 0.0
+    share: float = 0.0
 
 
 class ScriptedMonitor:

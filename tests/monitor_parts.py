@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from hybrid_mpc import HybridModel, Parameter, Signal
+from hybrid_mpc import ChannelLimit, EnergyReadings, HybridModel, Monitor, Parameter, Signal, WatchLimits
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 
@@ -37,6 +37,25 @@ def pendulum(
             Parameter("gamma", friction, "N m s", 0.0, 100.0),
         ),
     )  # fmt: skip
+
+
+def energy(model=None, limits=None, *, resolution=None, window=5, free_run=0.0, **options) -> Monitor:
+    """A monitor of the energy, by default with the shortest window and without free runs."""
+    readings = EnergyReadings(model or pendulum(), window=window, free_run=free_run, **options)
+    return Monitor(readings, limits, resolution=resolution)
+
+
+def by_hand(*channels: ChannelLimit, dt=DT, **options) -> WatchLimits:
+    """Limits of the energy of one degree of freedom, and no test for freezing."""
+    return WatchLimits("energy", dt, channels, (np.inf,), (0,), **options)
+
+
+def of_force(threshold, release=None, scale=1.0, drift=0.0, length=0) -> ChannelLimit:
+    """A limit of the pendulum's force; ``scale`` is its constant variance [N^2 m^2]."""
+    coefficients = (scale, 0.0, 0.0, 0.0)
+    return ChannelLimit(
+        "force of phi", "N m", length, threshold, release or 0.5 * threshold, coefficients, drift
+    )
 
 
 @dataclass(frozen=True)

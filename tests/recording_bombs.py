@@ -164,12 +164,12 @@ HOLES = {
 """Begins of files, and how long a hole makes them."""
 
 BOMBS = {
-    "quote.csv": (lambda: text() + b'\n"' + 2**20 * b"1,\n", "field larger than field limit"),
+    "quote.csv": (lambda: text() + b'\n"' + 2**20 * b"1,\n", "quotation mark is not closed"),
     "columns.csv": (lambda: text(200_000), "a row of more than"),
     "wide.csv": (lambda: text(5_000).replace(b"phi", b"ph", 1), "and 4970 more.* Did you mean 'ph'"),
     "digits.csv": (lambda: with_cell(100_000 * b"7"), r"row 21, column 'tau' is '7+' \(100000 characters\)"),
     "exponent.csv": (lambda: with_cell(b"1e" + 100_000 * b"9"), "row 21, column 'tau'"),
-    "nul.csv": (lambda: with_cell(b"0.\x001"), r"row 21, column 'tau' is '0.\\x001'"),
+    "nul.csv": (lambda: with_cell(b"0.\x001"), "row 21 is no text"),
     "blank.csv": (lambda: 5 * 2**20 * b"\n", "empty"),
     "packed.csv": (lambda: b"\x1f\x8b\x08\x00" + text(), "unpack it"),
     "uneven.csv": (uneven, "sampling is uneven"),

@@ -15,7 +15,7 @@ from hybrid_mpc.errors import EXTRAS, MissingPackage, named_extra
 from hybrid_mpc.job.step_response import step_response
 
 TRAIN = ("torch", "optuna")
-REPORT = ("matplotlib", "PIL", "bokeh", "jinja2", "markupsafe", "pandas")
+REPORT = ("matplotlib", "PIL", "bokeh", "jinja2", "markupsafe")
 BLOCKED = """
 import contextlib, importlib.metadata, io, json, sys
 blocked = set(sys.argv[1].split(","))
@@ -177,7 +177,7 @@ def test_every_package_that_an_extra_brings_is_known():
 
 
 def test_a_missing_package_is_both_an_input_error_and_an_import_error():
-    said = r"a table needs pandas.*hybrid-mpc\[report\]"
+    said = r"a table needs pandas.*hybrid-mpc\[tables\]"
     with pytest.raises(MissingPackage, match=said) as caught, named_extra("a table"):
         raise ModuleNotFoundError("No module named 'pandas.io'", name="pandas.io")
     assert isinstance(caught.value, hm.InputError)

@@ -26,18 +26,18 @@ ROOMS = {
     "control": "nn_export errors rules records model estimate",
     "loop": "errors rules records model estimate control",
     "scenario": "errors rules records machine model control loop",
-    "monitor": "errors rules data model",
-    "embedded": "nn_export errors rules files model estimate control loop monitor",
+    "watch": "errors rules machine data model",
+    "embedded": "nn_export errors rules files model estimate control loop watch",
     "analyze": "nn_export errors data model estimate control loop",
-    "kit": "nn_export errors rules records files machine data model estimate control embedded loop scenario monitor",
+    "kit": "nn_export errors rules records files machine data model estimate control embedded loop scenario watch",
     "identify": "nn_export errors rules records files machine data model kit",
-    "plots": "errors files machine monitor",
+    "plots": "errors files machine watch",
     "report": "errors rules files plots",
-    "job": "nn_export errors rules records files machine data model estimate control loop scenario monitor analyze kit "
+    "job": "nn_export errors rules records files machine data model estimate control loop scenario watch analyze kit "
     "identify plots report",
     "cli": "errors rules records files machine data scenario kit identify job",
     "scenarios.paper": "errors rules records files machine data scenario identify plots job cli",
-    "scenarios.golf_robot.monitor_study": "errors records files loop scenario monitor kit plots report job cli",
+    "scenarios.golf_robot.monitor_study": "errors records files loop scenario watch kit plots report job cli",
     "scenarios": "nn_export",
 }
 """What each room may import, besides itself. A room imports only rooms above its own line, so there are no circles.
@@ -71,7 +71,7 @@ TORCH = (
     "scenarios/paper/step.py",
 )
 # rooms that run beside a machine and so must not even import torch lazily
-ONLINE = ("model", "estimate", "control", "embedded", "loop", "monitor", "analyze", "kit", "plots", "report")
+ONLINE = ("model", "estimate", "control", "embedded", "loop", "watch", "analyze", "kit", "plots", "report")
 
 
 @cache
@@ -250,7 +250,7 @@ model, prior, task = artifact.models["hybrid"], artifact.models["prior"], scenar
 result = simulate(
     scenario.plant(), make_estimator(model, scenario, np.array([1e-4, 1e-2])),
     make_controller(model, prior, scenario.control), task.reference,
-    dt=model.dt, duration=2.0, x0=np.array(task.x0), seed=0, monitor=make_monitor(model, None))
+    dt=model.dt, duration=2.0, x0=np.array(task.x0), seed=0, monitor=make_monitor(model))
 assert "torch" not in sys.modules
 assert not {"scipy.stats", "scipy.signal", "pandas", "matplotlib"} & loaded, loaded
 print(result.source.count("MPC"), float(np.abs(result.x[:, 0] - result.reference[:, 0]).max()))

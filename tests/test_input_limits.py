@@ -22,17 +22,17 @@ from hybrid_mpc import (
     Scenario,
     Signal,
     TrueState,
-    guard_monitor,
     load_scenario,
     make_controller,
     make_estimator,
+    make_monitor,
     make_resting_guard,
     simulate,
 )
 from hybrid_mpc.job.analyze import driving_input, input_range, responses_of, state_range
 from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.job.loops import excess, limits_used
-from hybrid_mpc.job.stages.monitor import unknown_load
+from hybrid_mpc.job.nominal import unknown_load
 from hybrid_mpc.kit.assembly import sensor_steps, working_point
 from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.model.limits import share_used
@@ -76,7 +76,7 @@ def test_a_whole_loop_with_its_figures(limits):
     result = simulate(
         PendulumPlant(), estimator, controller, lambda t: np.tile([0.3, 0.0], (len(t), 1)), dt=0.02,
         duration=1.0, x0=[0.0, 0.0], seed=0, guard=make_resting_guard(model),
-        monitor=guard_monitor(
+        monitor=make_monitor(
             model, resolution=sensor_steps(machine.sensor_sigma), input_range=control.input_range
         ),
     )  # fmt: skip
@@ -93,9 +93,7 @@ def test_a_whole_loop_with_its_figures(limits):
     assert left[model.inputs[0].label] == 0.0
     assert left[model.states[0].label] == max(0.0, -1.0 - result.x[:, 0].min())
     assert working_point(model, control)[1] == rest
-    load = unknown_load(control, model, 6.0)
-    assert (load.start, load.channel) == (3.0, u)
-    assert load.value == pytest.approx(0.1 * span)
+    assert unknown_load(control) == pytest.approx(0.1 * span)
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,7 @@ import pytest
 
 import hybrid_mpc as hm
 from hybrid_mpc import (
-    Calibration,
     CondensedController,
-    Detector,
     ExtendedKalmanFilter,
     Fault,
     LoopSettings,
@@ -23,7 +21,7 @@ from hybrid_mpc import (
     load_scenario,
     make_controller,
     make_estimator,
-    set_calibration,
+    set_limits,
     set_process_noise,
     simulate,
 )
@@ -33,10 +31,8 @@ from hybrid_mpc.kit.parts import loop_settings, read_description, read_parts, sa
 README = Path(__file__).parents[1] / "README.md"
 GOLF = load_scenario("golf_robot")
 NOISE = {name: [1e-4, 1e-2] for name in ("prior", "prior_observer", "hybrid", "hybrid_observer")}
-DETECTOR = Detector(
-    0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (1e-5, 0.0, 0.0, 1e-5), 2.0, 4.0, 4.0, rest_speed=(0.2,)
-)
-CALIBRATION = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, DETECTOR, rest_speed=(0.2,))
+FORCE = hm.ChannelLimit("force of phi", "N m", 0, 4.0, 2.0, (1e-4, 1e-4, 0.0, 1e-4), 2.0)
+LIMITS = hm.WatchLimits("energy", 0.02, (FORCE,), (0.01,), (0,), 1.0, 0.1, "by hand", rest_speed=(0.2,))
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +42,7 @@ def run(golf_artifact, tmp_path_factory):
     model = shutil.copytree(golf_artifact, folder / "model")
     save_loop(model, loop_settings(GOLF))
     set_process_noise(model, NOISE)
-    set_calibration(model, CALIBRATION)
+    set_limits(model, {"hybrid": [LIMITS]})
     return folder
 
 
@@ -76,7 +72,7 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
     assert isinstance(kit.observer(), SwitchingFilter)
     assert isinstance(kit.observer("prior", load=False), ExtendedKalmanFilter)
     assert kit.controller("prior").controller.model.n_h == 0
-    assert kit.monitor().detector == DETECTOR
+    assert kit.monitor().limits == LIMITS
     assert kit.guard(adapt=True).on_model is Mode.BACKUP
     assert (kit.name, kit.causes) == ("", GOLF.causes)
     assert kit.safe_input == (0.0,)
@@ -91,15 +87,14 @@ def test_every_part_is_made_from_the_folder(run, tmp_path):
 
 def test_a_monitor_that_cannot_alarm_is_refused(run):
     kit = hm.load(run)
-    reason = hm.Calibration.without("too little data", (0.2,))
-    for learned in (None, reason):
-        blind = replace(kit, calibration=learned)
-        for kind in ("", "energy", "guard", "residuals"):
-            with pytest.raises(hm.InputError, match=r"kind=|detector"):
-                blind.monitor(kind=kind)
-        for kind in ("own", "readings"):
-            blind.monitor(kind=kind)
-    assert replace(kit, calibration=replace(CALIBRATION, detector=None)).monitor().calibration is not None
+    assert kit.monitor().limits == kit.limits() == LIMITS
+    assert kit.monitor(kind="own").limits is None
+    for kind in ("", "energy", "guard", "residuals"):
+        with pytest.raises(hm.InputError, match=r"kind=.*own"):
+            replace(kit, watch={}).monitor(kind=kind)
+    with pytest.raises(hm.InputError, match=r"no limits of residuals for the model hybrid.*stage watch"):
+        kit.monitor(kind="residuals")
+    replace(kit, watch={}).monitor(kind="own")
 
 
 def test_a_kit_is_printed_short(run):
@@ -247,7 +242,9 @@ def test_parts_of_two_models_are_refused_before_the_loop_begins(run):
     kit = hm.load(run)
     with pytest.raises(hm.InputError, match=r"the monitor's model hybrid has .*give both the same"):
         hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor())
-    hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor("prior"))
+    hm.Loop(kit.observer("prior"), kit.controller("prior"), monitor=kit.monitor("prior", kind="own"))
+    with pytest.raises(hm.InputError, match="no limits of energy for the model prior"):
+        kit.monitor("prior")
 
 
 def test_a_state_of_other_parts_is_refused(run):
@@ -275,7 +272,7 @@ def test_a_kit_refuses_what_is_no_name_no_flag_and_no_folder(run):
             lambda v=value: kit.observer(v), lambda v=value: kit.observer(task=v), lambda v=value: kit.observer(load=v),
             lambda v=value: kit.controller(v), lambda v=value: kit.controller(task=v),
             lambda v=value: kit.controller(solver=v), lambda v=value: kit.monitor(v),
-            lambda v=value: kit.monitor(kind=v), lambda v=value: kit.monitor(diagnose=v),
+            lambda v=value: kit.monitor(kind=v), lambda v=value: kit.diagnoser(v),
             lambda v=value: kit.guard(adapt=v), lambda v=value: kit.on(v),
         ):  # fmt: skip
             with pytest.raises(hm.InputError):

@@ -10,7 +10,7 @@ from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.job import monitor as monitor_job
 from hybrid_mpc.job.loops import LoopSpec, excess, limits_used, row_of
 from hybrid_mpc.job.tasks import repeated
-from hybrid_mpc.kit.parts import loop_settings, set_residuals
+from hybrid_mpc.kit.parts import WatchFile, loop_settings, set_limits
 
 DT = 10.0
 
@@ -119,10 +119,24 @@ def test_a_task_of_outputs_is_repeated_without_speeds():
     np.testing.assert_allclose(twice.w(np.array([50.0, 210.0, 140.0]))[:, 0], [5e-4, 5e-4, 1e-3])
 
 
-LIMITS = hm.ResidualLimits(
-    ("lower", "inflow", "free run of lower"), DT, ((2e-3, 1e-3), (2e-5, 2e-5), (4e-3, 3e-3)),
-    ((1e-3, 5e-4), (1e-5, 1e-5), (2e-3, 1.5e-3)), (5e-3,), (2,), 1.0, 1.0,
-)  # fmt: skip
+NUMBERS = {
+    "lower": ("m", (2e-3, 1e-3), (1e-3, 5e-4)), "inflow": ("m^3/s", (2e-5, 2e-5), (1e-5, 1e-5)),
+    "free run of lower": ("m", (4e-3, 3e-3), (2e-3, 1.5e-3)),
+}  # fmt: skip
+LIMITS = hm.WatchLimits(
+    "residuals",
+    DT,
+    tuple(
+        hm.ChannelLimit(name, unit, length, top, end)
+        for name, (unit, tops, ends) in NUMBERS.items()
+        for length, top, end in zip((3, 30), tops, ends, strict=True)
+    ),
+    (5e-3,),
+    (2,),
+    1.0,
+    1.0,
+    time_unit=1.0,
+)
 
 
 def test_limits_of_residuals_are_kept_and_make_the_monitor(kit, tmp_path):
@@ -131,11 +145,11 @@ def test_limits_of_residuals_are_kept_and_make_the_monitor(kit, tmp_path):
         tmp_path, {"prior": prior_programs(prior, DT)}, hm.model_info(prior, DT), loop=kit.loop,
         recommended="prior",
     )  # fmt: skip
-    with pytest.raises(hm.InputError, match=r"residuals: no model 'hybrid'; there are: prior"):
-        set_residuals(tmp_path, {"hybrid": LIMITS})
-    set_residuals(tmp_path, {"prior": LIMITS})
+    with pytest.raises(hm.InputError, match=r"watch: no model 'hybrid'; there are: prior"):
+        set_limits(tmp_path, {"hybrid": [LIMITS]})
+    set_limits(tmp_path, {"prior": [LIMITS]})
     learned = hm.load(tmp_path)
-    assert learned.residuals == {"prior": LIMITS}
+    assert learned.watch == {"prior": WatchFile({"residuals": LIMITS})}
     for kind in ("", "guard", "residuals"):
         assert learned.monitor(kind=kind).limits == LIMITS
     assert learned.monitor(kind="own").limits is None
@@ -143,14 +157,14 @@ def test_limits_of_residuals_are_kept_and_make_the_monitor(kit, tmp_path):
         with pytest.raises(hm.InputError, match="holds no limits of residuals"):
             kit.monitor(kind=kind)
     assert kit.monitor(kind="own").limits is None
-    with pytest.raises(hm.InputError, match="the outputs of model prior must be its positions"):
+    with pytest.raises(hm.InputError, match="no limits of energy"):
         learned.monitor(kind="energy")
 
 
 def test_a_guard_listens_to_residuals_in_a_loop(kit):
     """A level sensor that is off by 0.1 m from 300 s on: the alarm names it, and the guard goes over to rest."""
     model = kit.models["prior"]
-    monitor = hm.ResidualMonitor(model, limits=LIMITS)
+    monitor = hm.make_monitor(model, LIMITS)
     fault = hm.Fault(300.0, np.inf, "measurement_offset", 0.1, "lower")
     result = hm.simulate(
         MachinePlant(model), kit.observer(), kit.controller(), [0.3], dt=DT, duration=600.0, x0=model.x0, seed=0,
@@ -201,7 +215,7 @@ def test_recordings_are_watched_by_their_channels(kit, tmp_path):
     assert "of lower" in first.diagnosis
     text = (out / "off.csv").read_text().splitlines()
     assert len(text) == 1 + len(job.data.whole[0].t)
-    assert "free_run_of_lower_short_m" in text[0]
+    assert "free_run_of_lower_mean_3_m" in text[0]
     assert (out / "off.png").is_file()
-    with pytest.raises(hm.InputError, match="holds no detector"):
-        monitor_job.read_detector(tmp_path / "calibration.json")
+    with pytest.raises(hm.InputError, match="holds no limits of energy"):
+        monitor_job.read_limits(tmp_path / "calibration.json", "energy")

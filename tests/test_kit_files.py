@@ -11,25 +11,31 @@ from types import SimpleNamespace
 import pytest
 
 import hybrid_mpc as hm
-from hybrid_mpc import Calibration, Detector, InputError, RunSettings, load_scenario
+from hybrid_mpc import InputError, RunSettings, load_scenario
 from hybrid_mpc.files import read_document, sha256, write_document
 from hybrid_mpc.job import run as job
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, TASKS, ExportResult, NoiseResult, put_noise
-from hybrid_mpc.job.stages.guard import GUARD, GuardResult, GuardTest, put_detector
-from hybrid_mpc.job.stages.monitor import MONITOR, MonitorResult, put_calibration
 from hybrid_mpc.job.stages.promises import PROMISES, PromisesResult, put_promises
-from hybrid_mpc.job.stages.residuals import RESIDUALS, CleanAlarms, ResidualsResult, put_residuals
+from hybrid_mpc.job.stages.watch import WATCH, WatchResult, put_limits
 from hybrid_mpc.kit import parts as files
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.kit.migrate import migrate_kit
+from hybrid_mpc.kit.migrate import (
+    OldCalibration,
+    OldChannels,
+    OldDetector,
+    OldEnergy,
+    OldGuard,
+    OldResidualLimits,
+    migrate_kit,
+)
 from hybrid_mpc.kit.parts import (
-    ENERGY,
     MODELS,
     OBSERVER,
     OLD_FILE,
     OWNERS,
     PROGRAMS,
+    WatchFile,
     read_description,
     read_parts,
     save_loop,
@@ -45,17 +51,12 @@ ROOT = Path(__file__).parents[1]
 GOLF = load_scenario("golf_robot")
 GOLF = replace(GOLF, tasks=tuple(task for task in GOLF.tasks if task.name in ("track_sine", "track_step")))
 STEP = next(task.control for task in GOLF.tasks if task.control is not None)
-DETECTOR = Detector(
-    0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (1e-5, 0.0, 0.0, 1e-5), 2.0, 4.0, 4.0, rest_speed=(0.2,)
-)
-CALIBRATION = Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, rest_speed=(0.2,))
-LIMITS = hm.ResidualLimits(
-    ("phi", "energy", "free run of phi"), 0.02, ((1.0, 1.0),) * 3, ((0.5, 0.5),) * 3, (1.0,), (3,), 1.0, 1.0
-)
+FORCE = hm.ChannelLimit("force of phi", "N m", 0, 4.0, 2.0, (1e-4, 1e-4, 0.0, 1e-4), 2.0)
+LIMITS = hm.WatchLimits("energy", 0.02, (FORCE,), (0.01,), (0,), 1.0, 0.1, "by hand", rest_speed=(0.2,))
+WATCHED = "watch/hybrid.json"
 WRITERS = {
     "export": ("save_models", "write_description"), "noise": ("write_observer",), "tasks": ("write_tasks",),
-    "monitor": ("write_energy",), "residuals": ("write_residuals",), "guard": ("write_guard",),
-    "promises": ("write_promises",),
+    "watch": ("write_watch",), "promises": ("write_promises",),
 }  # fmt: skip
 """Functions that write a kit's files, by the stage that may call them."""
 MODULES = {"noise": "export", "tasks": "export"}
@@ -64,7 +65,7 @@ MODULES = {"noise": "export", "tasks": "export"}
 
 # a run whose stages take no time: what each writes says what it was made of
 
-KINDS = ("export", "noise", "tasks", "promises", "residuals", "monitor", "guard")
+KINDS = ("export", "noise", "tasks", "promises", "watch")
 VERSIONS = dict.fromkeys(KINDS, 0)
 """Of what a stage reads beside other stages: an edit adds one."""
 
@@ -108,21 +109,10 @@ def fake_stages(sources):
             NoiseResult({"hybrid_observer": (sigma, 1e-2)}, read_parts(context.out / "model").models),
         )
 
-    def monitor(context):
-        calibration = replace(CALIBRATION, threshold_w=limit(context))
-        return kept(put_calibration, context, MonitorResult(calibration, (), of=of(context)))
-
-    def guard(context):
-        detector = replace(DETECTOR, force_threshold=limit(context))
-        return kept(
-            put_detector, context, GuardResult("", (), GuardTest(0.0, 0, ()), detector, of=of(context))
-        )
-
-    def residuals(context):
-        limits = {"hybrid": replace(LIMITS, threshold=((limit(context), 1.0),) * 3)}
-        return kept(
-            put_residuals, context, ResidualsResult(limits, "", (), CleanAlarms(), of={"hybrid": of(context)})
-        )
+    def watch(context):
+        limits = replace(LIMITS, channels=(replace(FORCE, threshold=limit(context)),))
+        held = {"hybrid": WatchFile({"energy": limits}, of=of(context))}
+        return kept(put_limits, context, WatchResult(held, "energy"))
 
     def promises(context):
         rows = (Promise("p", "shown", f"{limit(context):g}"),)
@@ -133,8 +123,7 @@ def fake_stages(sources):
         return found
 
     computes = {
-        "export": export, "noise": noise, "tasks": TASKS.compute, "promises": promises, "residuals": residuals,
-        "monitor": monitor, "guard": guard,
+        "export": export, "noise": noise, "tasks": TASKS.compute, "promises": promises, "watch": watch,
     }  # fmt: skip
 
     found = {}
@@ -150,7 +139,7 @@ def fake_stages(sources):
     return tuple(found.values())
 
 
-LOOPS = (PROMISES, RESIDUALS, MONITOR, GUARD)
+LOOPS = (PROMISES, WATCH)
 """Stages that read the control problem."""
 
 
@@ -159,8 +148,8 @@ def light_kit(context):
     folder = context.out / "model"
     found = read_parts(folder)
     return Kit(
-        {}, found.calibration, found.description.provenance, found.description.model.input_delay, found.loop,
-        residuals=found.residuals, programs_sha256=found.description.programs_sha256,
+        {}, found.watch, found.description.provenance, found.description.model.input_delay, found.loop,
+        programs_sha256=found.description.programs_sha256,
         promised=read_promises(folder), lacks=found.lacks,
     )  # fmt: skip
 
@@ -212,12 +201,8 @@ def check(folder):
         noise = found.loop.process_noise["hybrid_observer"][0]
         assert noise in [noise_for(found.description.programs_sha256, version) for version in (0, 1)]
     limit = None if horizon is None or noise is None else limit_for(noise, horizon)
-    if ENERGY not in found.lacks:
-        assert found.calibration.threshold_w == limit
-    if files.GUARD not in found.lacks:
-        assert found.calibration.detector.force_threshold == limit
-    if files.RESIDUALS not in found.lacks:
-        assert found.residuals["hybrid"].threshold[0][0] == limit
+    if WATCHED not in found.lacks and files.WATCH not in found.lacks:
+        assert found.watch["hybrid"].limits["energy"].channels[0].threshold == limit
     rows = light_kit(SimpleNamespace(out=folder.parent)).promises
     assert rows[0].verdict == "not promised" or rows[0].evidence == f"{limit:g}"
 
@@ -282,9 +267,10 @@ def test_what_was_left_out_is_named_with_its_stage(patched, tmp_path, skipped):
     run(out, resume=False, skip=[skipped])
     lacks = read_parts(out / "model").lacks
     missing = {skipped, *(needing if skipped == "noise" else ())} - {"promises"}
-    assert {OWNERS[file] for file in lacks} == missing
+    owners = {file: OWNERS.get(file, "watch") for file in lacks}
+    assert set(owners.values()) == missing
     for file, why in lacks.items():
-        assert f"stage {OWNERS[file]}" in why
+        assert f"stage {owners[file]}" in why
 
 
 # one stage, one file
@@ -302,7 +288,7 @@ def test_no_stage_writes_another_stage_s_file():
     for stage, names in WRITERS.items():
         for name in names:
             allowed.setdefault(name, set()).add(MODULES.get(stage, stage))
-    by_hand = {"set_calibration", "set_process_noise", "set_residuals", "save_artifact", "save_loop"}
+    by_hand = {"set_limits", "set_process_noise", "save_artifact", "save_loop"}
     for path in sorted((ROOT / "hybrid_mpc" / "job").rglob("*.py")):
         for name in calls_of(path):
             assert name not in by_hand, f"{path.name} patches: {name}"
@@ -333,7 +319,8 @@ def test_each_stage_writes_its_own_files_once(patched, sources, tmp_path):
     run(tmp_path / "run", resume=False)
     assert len({file for _, file in written}) == len(written)
     for stage, file in written:
-        assert OWNERS.get(file, OWNERS["tasks/*.json"] if file.startswith("tasks/") else "") == stage
+        place, _, _ = file.partition("/")
+        assert OWNERS.get(file, OWNERS.get(f"{place}/*.json")) == stage
     assert {stage for stage, _ in written} == set(KINDS)
     kept = len(written)
     run(tmp_path / "run")
@@ -347,17 +334,14 @@ def test_each_stage_writes_its_own_files_once(patched, sources, tmp_path):
 def whole(golf_artifact, tmp_path_factory):
     folder = shutil.copytree(golf_artifact, tmp_path_factory.mktemp("kit") / "model")
     save_loop(folder, replace(files.loop_settings(GOLF), process_noise={"hybrid_observer": (1e-4, 1e-2)}))
-    hm.set_calibration(folder, replace(CALIBRATION, detector=DETECTOR))
-    files.set_residuals(folder, {"hybrid": LIMITS})
+    hm.set_limits(folder, {"hybrid": [LIMITS]})
     return folder
 
 
 @pytest.mark.parametrize(
     ("file", "use", "stage"),
     [
-        (ENERGY, lambda kit: kit.monitor(kind="energy"), "monitor"),
-        (files.GUARD, lambda kit: kit.monitor(kind="guard"), "guard"),
-        (files.RESIDUALS, lambda kit: kit.monitor(kind="residuals"), "residuals"),
+        (WATCHED, lambda kit: kit.monitor(), "watch"),
         (OBSERVER, lambda kit: kit.observer(), "noise"),
         (TASK_LIST, lambda kit: kit.controller(), "tasks"),
     ],
@@ -367,7 +351,7 @@ def test_what_a_folder_lacks_is_named_where_it_is_needed(whole, tmp_path, file, 
     folder = shutil.copytree(whole, tmp_path / "model")
     (folder / file).unlink()
     kit = hm.load(folder)
-    assert list(kit.lacks) == [file]
+    assert list(kit.lacks) == [files.WATCH if file == WATCHED else file]
     with pytest.raises(InputError, match=f"stage {stage}"):
         use(kit)
 
@@ -386,7 +370,22 @@ def test_a_half_written_set_of_tasks_is_missing(whole, tmp_path):
         kit.problem(path.stem)
 
 
-# the former format
+# former formats
+
+DETECTOR = OldDetector(
+    0.02,
+    ((1e-4, 1e-4, 0.0, 1e-4),),
+    (1e-5, 0.0, 0.0, 1e-5),
+    2.0,
+    4.0,
+    5.0,
+    rest_speed=(0.2,),
+    interval=(3, 5, 4, 6),
+)
+CALIBRATION = OldCalibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, rest_speed=(0.2,))
+RESIDUALS = OldResidualLimits(
+    ("phi", "energy", "free run of phi"), 0.02, ((1.0, 2.0),) * 3, ((0.5, 1.0),) * 3, (1.0,), (3,), 1.0, 1.0
+)
 
 
 def old_kit(folder, **loop):
@@ -398,27 +397,58 @@ def old_kit(folder, **loop):
     path = folder / OLD_FILE
     document = read_document(path)
     settings = replace(files.loop_settings(GOLF), process_noise={"hybrid_observer": (1e-4, 1e-2)})
-    document |= {"loop": plain(settings), "residuals": plain({"hybrid": LIMITS})}
+    document |= {"loop": plain(settings), "residuals": plain({"hybrid": RESIDUALS})}
     document["calibration"] = plain(replace(CALIBRATION, detector=DETECTOR))
     write_document(path, document)
     return folder
 
 
-def test_a_kit_of_the_former_format_is_migrated_or_refused_with_the_line(tmp_path, call):
+def split_kit(new, folder):
+    """A kit of version 5: the present files but for those in ``watch``, and their former ones."""
+    shutil.copytree(new, folder)
+    for path in (folder / "watch").glob("*.json"):
+        path.unlink()
+    of = read_parts(new).observer("hybrid")
+    held = {
+        "watch/energy.json": OldEnergy(CALIBRATION, of),
+        "watch/residuals.json": OldChannels({"hybrid": RESIDUALS}, {"hybrid": of}),
+        "guard.json": OldGuard(DETECTOR, "", of),
+    }
+    for name, content in held.items():
+        write_document(folder / name, {"schema_version": 5, **plain(content)})
+    for path in [*folder.glob("*.json"), *(folder / "tasks").glob("*.json")]:
+        if path.name != "promises.json":
+            write_document(path, read_document(path) | {"schema_version": 5})
+    return folder
+
+
+def test_a_kit_of_a_former_format_is_migrated_or_refused_with_the_line(tmp_path, call):
     old = old_kit(tmp_path / "old")
-    with pytest.raises(InputError, match=f"hybrid-mpc export kit {old} --out NEW"):
-        hm.load(old)
-    code, _, error = call("export", "kit", old, "--out", tmp_path / "new")
-    assert code == 0, error
-    kit = hm.load(tmp_path / "new")
-    assert kit.lacks == {}
-    assert kit.loop == replace(files.loop_settings(GOLF), process_noise={"hybrid_observer": (1e-4, 1e-2)})
-    assert kit.calibration == replace(CALIBRATION, detector=DETECTOR)
-    assert kit.residuals == {"hybrid": LIMITS}
-    assert kit.programs_sha256 == sha256(old / "programs.json")
-    assert kit.monitor().detector == DETECTOR
-    for place, told in ((tmp_path / "new", "former format"), (tmp_path / "none", "former format")):
-        with pytest.raises(InputError, match=told):
+    for version, place in ((4, old), (5, tmp_path / "split")):
+        if version == 5:
+            split_kit(tmp_path / "new4", place)
+        with pytest.raises(InputError, match=f"hybrid-mpc export kit {place} --out NEW"):
+            hm.load(place)
+        new = tmp_path / f"new{version}"
+        code, _, error = call("export", "kit", place, "--out", new)
+        assert code == 0, error
+        kit = hm.load(new)
+        assert kit.lacks == {}
+        assert kit.loop == replace(files.loop_settings(GOLF), process_noise={"hybrid_observer": (1e-4, 1e-2)})
+        assert kit.programs_sha256 == sha256(old / "programs.json")
+        assert kit.rest_speed == (0.2,)
+        force, power = kit.monitor().limits.channels
+        assert (force.channel, force.threshold, force.release) == ("force of phi", 4.0, 2.0)
+        assert (force.scale, force.drift, force.interval) == (DETECTOR.force[0], 2.0, (3, 5))
+        assert (power.channel, power.length, power.threshold) == ("power of the free run", 1, 5.0)
+        assert kit.monitor().limits.travel == pytest.approx((3 * 12**0.5 * GOLF.sensor_sigma[0],))
+        own = kit.monitor(kind="residuals").limits
+        assert [(c.channel, c.unit, c.length, c.threshold) for c in own.channels][:2] == [
+            ("phi", "rad", 15, 1.0), ("phi", "rad", 150, 2.0),
+        ]  # fmt: skip
+        assert (own.travel, own.repeats) == ((1.0,), (3,))
+    for place in (tmp_path / "new5", tmp_path / "none"):
+        with pytest.raises(InputError, match="former format"):
             migrate_kit(place, tmp_path / "again")
     document = read_document(old / OLD_FILE)
     write_document(old / OLD_FILE, document | {"schema_version": 3})

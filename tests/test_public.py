@@ -88,7 +88,7 @@ def test_nothing_is_loaded_before_it_is_used():
         "print({'numpy', 'scipy', 'pandas', 'matplotlib', 'casadi', 'torch'} & set(sys.modules))\n"
         "hm.DataSpec, hm.Scenario, hm.Parameter, hm.InputError\n"
         "print({'casadi', 'torch', 'pandas', 'matplotlib'} & set(sys.modules))\n"
-        "hm.OCP, hm.HybridModel, hm.load, hm.Loop, hm.simulate, hm.Runner, hm.EnergyMonitor, hm.linearize\n"
+        "hm.OCP, hm.HybridModel, hm.load, hm.Loop, hm.simulate, hm.Runner, hm.Monitor, hm.linearize\n"
         "print('torch' in sys.modules)\n"
         "hm.Prior, hm.MechanicalPrior, hm.fit_prior\nprint('torch' in sys.modules)\n"
         "hm.TorchPrior\nprint('torch' in sys.modules)\n"

@@ -12,6 +12,10 @@ import numpy as np
 
 from hybrid_mpc import DataSpec, MechanicalPrior, OperatingPoint, Parameter, Prior, Signal
 from unknown.common import Array, Machine, drop_outs, levels, quantised, run
+from unknown.plants import PLANTS
+
+NONE: Array = np.zeros(0)
+"""Measured disturbances of a machine without any."""
 
 G = 9.81
 
@@ -43,21 +47,13 @@ class FlexibleShaft(Prior):
 def flexible_shaft(seed: int) -> Array:
     """A shaft that stiffens, dry friction on the load."""
     rng = np.random.default_rng([seed, 11])
-    n, dt = 3000, 0.002
+    n, dt, plant = 3000, 0.002, PLANTS["flexible_shaft"]
     volts = levels(rng, n, -8, 8, 20, 200)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        m, load, q = x
-        shaft = 1.4 * q + 3.0 * q**3 + 0.006 * (m - load)
-        return np.array(
-            [
-                (0.04 * u[0] - 0.0028 * m - shaft) / 7e-4,
-                (shaft - 0.02 * np.tanh(load / 1.0)) / 4.2e-3,
-                m - load,
-            ]
-        )
+        return plant.rates(x, u, NONE, plant.p)
 
-    t, u, y = run(rates, np.zeros(3), lambda k, y: volts[k : k + 1], lambda x: x[:2], dt, n, 2)
+    t, u, y = run(rates, np.array(plant.start), lambda k, y: volts[k : k + 1], plant.measure, dt, n, 2)
     y = drop_outs(quantised(y + 0.2 * rng.standard_normal(y.shape), 0.1), rng, 0.02)
     return np.column_stack([t, u, y])
 
@@ -88,14 +84,12 @@ class MagneticLevitation(Prior):
 def magnetic_levitation(seed: int) -> Array:
     """An inductance that depends on the gap, a weight of its own, held by PID with a current loop."""
     rng = np.random.default_rng([seed, 12])
-    n, dt = 6000, 0.001
+    n, dt, plant = 6000, 0.001, PLANTS["magnetic_levitation"]
     goal, push = levels(rng, n, 9.0, 11.0, 300, 900), levels(rng, n, -2.0, 2.0, 8, 60)
     memory = np.array([10.0, 0.0, 0.0])
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        gap, v, i = x
-        pull = 2.1e6 * (i / (gap + 4.5)) ** 2
-        return np.array([v, 9810 - pull, (u[0] - 6.5 * i) / (0.12 + 0.4 / (gap + 4.5))])
+        return plant.rates(x, u, NONE, plant.p)
 
     def control(k: int, y: Array) -> Array:
         last, speed, total = memory
@@ -107,8 +101,8 @@ def magnetic_levitation(seed: int) -> Array:
 
     noise = iter(rng.standard_normal((2 * n, 2)) * [0.005, 0.004])
     t, u, y = run(
-        rates, np.array([10.0, 0.0, 0.99]), control,
-        lambda x: quantised(x[[0, 2]] + next(noise), np.array([0.005, 0.002])), dt, n, 2,
+        rates, np.array(plant.start), control,
+        lambda x: quantised(plant.measure(x) + next(noise), np.array([0.005, 0.002])), dt, n, 2,
     )  # fmt: skip
     return np.column_stack([t, u, drop_outs(y, rng, 0.01)])
 
@@ -152,18 +146,12 @@ class CartPole(MechanicalPrior):
 def cart_pole(seed: int) -> Array:
     """Another length and mass, dry friction, held by state feedback."""
     rng = np.random.default_rng([seed, 13])
-    n, dt = 2500, 0.01
-    m_c, m, half, j, b = 0.7, 0.28, 0.25, 0.0075, 1.6
+    n, dt, plant = 2500, 0.01, PLANTS["inverted_pendulum"]
     goal, push = levels(rng, n, -0.5, 0.5, 200, 500), levels(rng, n, -2.0, 2.0, 10, 60)
     memory = np.zeros(4)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        _, phi, sd, pd = x
-        a, c, e = m_c + m, m * half * np.cos(phi), j + m * half * half
-        f1 = u[0] - b * sd - 0.4 * np.tanh(sd / 0.02) + m * half * np.sin(phi) * pd**2
-        f2 = m * G * half * np.sin(phi) - 0.002 * pd
-        det = a * e - c * c
-        return np.array([sd, pd, (e * f1 - c * f2) / det, (a * f2 - c * f1) / det])
+        return plant.rates(x, u, NONE, plant.p)
 
     def control(k: int, y: Array) -> Array:
         speed = memory[2:] + 0.4 * ((y - memory[:2]) / dt - memory[2:])
@@ -202,20 +190,13 @@ class Ship(Prior):
 def ship(seed: int) -> Array:
     """A cubic damping, a rudder of limited speed, waves; an autopilot steers."""
     rng = np.random.default_rng([seed, 14])
-    n, dt = 1800, 1.0
+    n, dt, plant = 1800, 1.0, PLANTS["ship"]
     goal, push = levels(rng, n, -40, 40, 100, 300), levels(rng, n, -6, 6, 15, 60)
     memory = [0.0, 0.0]
     waves = 0.02 * np.cumsum(rng.standard_normal(n)) * 0.05
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        _, r, d = x
-        return np.array(
-            [
-                r,
-                (0.055 * (d - 1.2) - r - 0.8 * r**3) / 28 + waves[min(int(t), n - 1)] / 28,
-                np.clip((u[0] - d) / 1.5, -3.0, 3.0),
-            ]
-        )
+        return plant.rates(x, u, waves[min(int(t), n - 1)][None], plant.p)
 
     def control(k: int, y: Array) -> Array:
         memory[1] += 0.3 * ((y[0] - memory[0]) / dt - memory[1])
@@ -249,14 +230,12 @@ class BallAndBeam(Prior):
 def ball_and_beam(seed: int) -> Array:
     """A beam of second order, rolling friction, centrifugal force; PD control."""
     rng = np.random.default_rng([seed, 15])
-    n, dt = 2500, 0.02
+    n, dt, plant = 2500, 0.02, PLANTS["ball_and_beam"]
     goal, push = levels(rng, n, -0.25, 0.25, 100, 250), levels(rng, n, -0.05, 0.05, 10, 50)
     memory = [0.0, 0.0]
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        s, v, q, w = x
-        a = 5 / 7 * (s * w * w - G * np.sin(q - 0.012)) - 0.25 * v - 0.03 * np.tanh(v / 0.01)
-        return np.array([v, a, w, 15.0**2 * (u[0] - q) - 2 * 0.8 * 15.0 * w])
+        return plant.rates(x, u, NONE, plant.p)
 
     def control(k: int, y: Array) -> Array:
         memory[1] += 0.3 * ((y[0] - memory[0]) / dt - memory[1])
@@ -304,20 +283,11 @@ class HydraulicCylinder(Prior):
 def hydraulic_cylinder(seed: int) -> Array:
     """Leakage, dry friction, a valve with a lag; position control."""
     rng = np.random.default_rng([seed, 16])
-    n, dt = 3000, 0.005
+    n, dt, plant = 3000, 0.005, PLANTS["hydraulic_cylinder"]
     goal, push = levels(rng, n, -0.15, 0.15, 150, 500), levels(rng, n, -1.5, 1.5, 10, 60)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        _, v, p, q = x
-        flow = 3.6e-6 * q * np.sqrt(max(70 - np.sign(q) * p, 1e-3)) - 2.0e-7 * p
-        return np.array(
-            [
-                v,
-                (100 * p - 2900 * v - 150 * np.tanh(v / 0.005)) / 140,
-                1000 * 220 * (flow - 1e-3 * v),
-                (u[0] - q) / 0.006,
-            ]
-        )
+        return plant.rates(x, u, NONE, plant.p)
 
     def control(k: int, y: Array) -> Array:
         return np.clip(np.atleast_1d(40.0 * (goal[k] - y[0]) + push[k]), -10, 10)

@@ -12,6 +12,10 @@ import numpy as np
 
 from hybrid_mpc import DataSpec, OperatingPoint, Parameter, Prior, Signal
 from unknown.common import Array, Machine, drop_outs, levels, quantised, run
+from unknown.plants import PLANTS
+
+NONE: Array = np.zeros(0)
+"""Measured disturbances of a machine without any."""
 
 
 class HeatExchanger(Prior):
@@ -46,22 +50,13 @@ class HeatExchanger(Prior):
 def heat_exchanger(seed: int) -> Array:
     """Six cells a side with walls, heat transfer that grows with the flow, losses."""
     rng = np.random.default_rng([seed, 1])
-    n, dt, m = 1500, 1.0, 6
+    n, dt, plant = 1500, 1.0, PLANTS["heat_exchanger_2"]
     flows = np.stack([levels(rng, n, 2, 9, 30, 150), levels(rng, n, 2, 9, 30, 150)], 1)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        hot, wall, cold = x[:m], x[m : 2 * m], x[2 * m :]
-        qh, qc = u / 60
-        k = 7.5 / 60 / m * (u / 5) ** 0.6
-        from_hot, from_cold = np.r_[80.0, hot[:-1]], np.r_[15.0, cold[:-1]]
-        return np.concatenate([
-            (qh * (from_hot - hot) - k[0] * (hot - wall)) / (1.1 / m),
-            (k[0] * (hot - wall) + k[1] * (cold[::-1] - wall)) / (0.3 / m),
-            (qc * (from_cold - cold) + k[1] * (wall[::-1] - cold) - 0.01 / 60 * (cold - 20)) / (1.8 / m),
-        ])  # fmt: skip
+        return plant.rates(x, u, NONE, plant.p)
 
-    start = np.concatenate([np.linspace(75, 55, m), np.linspace(60, 40, m), np.linspace(18, 42, m)])
-    t, u, y = run(rates, start, lambda k, y: flows[k], lambda x: x[[m - 1, -1]], dt, n, 8)
+    t, u, y = run(rates, np.array(plant.start), lambda k, y: flows[k], plant.measure, dt, n, 8)
     y = drop_outs(quantised(y + 0.1 * rng.standard_normal(y.shape), 0.1), rng, 0.02)
     return np.column_stack([t, u, y])
 
@@ -96,18 +91,13 @@ class QuadrupleTank(Prior):
 def quadruple_tank(seed: int) -> Array:
     """Outlets that differ, an exponent below a half, pumps that need a voltage before they pump."""
     rng = np.random.default_rng([seed, 2])
-    n, dt = 1200, 2.0
+    n, dt, plant = 1200, 2.0, PLANTS["quadruple_tank"]
     volts = np.stack([levels(rng, n, 2, 6, 30, 120), levels(rng, n, 2, 6, 30, 120)], 1)
-    a = np.array([0.0044, 0.0040, 0.0062, 0.0070])
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        out = a * np.maximum(x, 0.0) ** 0.47
-        q = np.array([6.0e-4, 7.0e-4]) * np.maximum(u - 0.5, 0.0)
-        return np.array([
-            0.65 * q[0] + out[2] - out[0], 0.6 * q[1] + out[3] - out[1], 0.4 * q[1] - out[2], 0.35 * q[0] - out[3],
-        ])  # fmt: skip
+        return plant.rates(x, u, NONE, plant.p)
 
-    t, u, y = run(rates, np.array([0.3, 0.3, 0.03, 0.03]), lambda k, y: volts[k], lambda x: x[:2], dt, n, 4)
+    t, u, y = run(rates, np.array(plant.start), lambda k, y: volts[k], plant.measure, dt, n, 4)
     y = drop_outs(quantised(y + 1e-3 * rng.standard_normal(y.shape), 5e-4), rng, 0.03, 10)
     return np.column_stack([t, u, y])
 
@@ -135,15 +125,13 @@ class Bioreactor(Prior):
 def bioreactor(seed: int) -> Array:
     """Growth inhibited by substrate (Haldane) and maintenance."""
     rng = np.random.default_rng([seed, 3])
-    n, dt = 720, 600.0
+    n, dt, plant = 720, 600.0, PLANTS["bioreactor"]
     feed = levels(rng, n, 0.05, 0.34, 18, 72)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        b, s = np.maximum(x, 0.0)
-        mu = 0.62 * s / (1.3 + s + s * s / 60)
-        return np.array([(mu - u[0] - 0.01) * b, u[0] * (20 - s) - mu * b / 0.47 - 0.02 * b]) / 3600
+        return plant.rates(x, u, NONE, plant.p)
 
-    t, u, y = run(rates, np.array([7.0, 2.0]), lambda k, y: feed[k : k + 1], lambda x: x[:1], dt, n, 4)
+    t, u, y = run(rates, np.array(plant.start), lambda k, y: feed[k : k + 1], plant.measure, dt, n, 4)
     y = drop_outs(quantised(y + 0.05 * rng.standard_normal(y.shape), 0.02), rng, 0.05)
     return np.column_stack([t / 3600, u, y])
 
@@ -184,7 +172,7 @@ class Evaporator(Prior):
 def evaporator(seed: int) -> Array:
     """The level by a PI controller; heater and condenser saturate, the heater lags."""
     rng = np.random.default_rng([seed, 4])
-    n, dt = 1500, 12.0
+    n, dt, plant = 1500, 12.0, PLANTS["evaporator"]
     steam, cooling, feed = (
         levels(rng, n, 150, 250, 30, 120),
         levels(rng, n, 150, 260, 40, 160),
@@ -193,18 +181,7 @@ def evaporator(seed: int) -> Array:
     goal, memory = levels(rng, n, 0.8, 1.3, 150, 400), [0.0]
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        _, conc, p, lag = x
-        f1 = feed[min(int(t / dt), n - 1)]
-        t2 = 0.5616 * p + 0.3126 * conc + 48.43
-        f4 = 0.2 * (0.1538 * lag + 90.0 - t2)
-        ua = 0.0118 * u[2] * 0.07 / (1 + 0.0008 * u[2])
-        f5 = ua * (0.507 * p + 55.0 - 25.0)
-        return (
-            np.array(
-                [(f1 - f4 - u[0]) / 28, (f1 * 5.0 - u[0] * conc) / 26, (f4 - f5) / 3.0, (u[1] - lag) / 0.8]
-            )
-            / 60
-        )
+        return plant.rates(x, u, feed[min(int(t / dt), n - 1)][None], plant.p)
 
     def control(k: int, y: Array) -> Array:
         off = y[0] - goal[k]
@@ -215,9 +192,9 @@ def evaporator(seed: int) -> Array:
     count = iter(noise)
     t, u, y = run(
         rates,
-        np.array([1.0, 22.0, 50.0, 195.0]),
+        np.array(plant.start),
         control,
-        lambda x: quantised(x[[0, 2]] + next(count), np.array([0.005, 0.1])),
+        lambda x: quantised(plant.measure(x) + next(count), np.array([0.005, 0.1])),
         dt,
         n,
         3,
@@ -258,27 +235,18 @@ class Column(Prior):
 def column(seed: int) -> Array:
     """Eight stages of less holdup and less volatility."""
     rng = np.random.default_rng([seed, 5])
-    n, dt, m, at = 1200, 30.0, 8, 4
+    n, dt, plant = 1200, 30.0, PLANTS["column"]
     reflux, feed = levels(rng, n, 2.4, 3.0, 30, 150), levels(rng, n, 0.45, 0.55, 80, 300)
     boil = reflux + levels(rng, n, 0.4, 0.6, 40, 200)
 
     def rates(x: Array, u: Array, t: float) -> Array:
-        f, (down, v) = feed[min(int(t / dt), n - 1)], u
-        y = 1.9 * x / (1 + 0.9 * x)
-        liquid = np.where(np.arange(m) <= at, down + 1.0, down)
-        out = np.zeros(m)
-        out[0] = (liquid[1] * x[1] - (liquid[1] - v) * x[0] - v * y[0]) / 14
-        for i in range(1, m - 1):
-            into = (down if i == at else liquid[i + 1]) * x[i + 1] + (f if i == at else 0.0)
-            out[i] = (into - liquid[i] * x[i] + v * (y[i - 1] - y[i])) / 1.5
-        out[-1] = v * (y[-2] - x[-1]) / 15
-        return out / 60
+        return plant.rates(x, u, feed[min(int(t / dt), n - 1)][None], plant.p)
 
     t, u, y = run(
         rates,
-        np.linspace(0.15, 0.85, m),
+        np.array(plant.start),
         lambda k, y: np.array([reflux[k], boil[k]]),
-        lambda x: x[[0, -1]],
+        plant.measure,
         dt,
         n,
         4,
@@ -315,7 +283,7 @@ class Building(Prior):
 def building(seed: int) -> Array:
     """Four heat stores, infiltration that the user forgot, a thermostat at times."""
     rng = np.random.default_rng([seed, 6])
-    n, dt = 1440, 600.0
+    n, dt, plant = 1440, 600.0, PLANTS["building"]
     hours = dt / 3600 * np.arange(n)
     outside = 5 + 6 * np.sin(2 * np.pi * (hours - 15) / 24) + np.cumsum(rng.standard_normal(n)) * 0.1
     sun = (
@@ -326,24 +294,9 @@ def building(seed: int) -> Array:
 
     def rates(x: Array, u: Array, t: float) -> Array:
         k = min(int(t / dt), n - 1)
-        i, m, e, h = x
-        im, me, eo, hi = 0.7 * (i - m), 0.6 * (m - e), 0.55 * (e - outside[k]), 1.4 * (h - i)
-        leak = 0.06 * (i - outside[k])
-        return (
-            np.array(
-                [
-                    (hi + 2.2 * sun[k] - im - leak) / 1.6,
-                    (im - me + 0.8 * sun[k]) / 9,
-                    (me - eo) / 8,
-                    (u[0] - hi) / 0.25,
-                ]
-            )
-            / 3600
-        )
+        return plant.rates(x, u, np.array([outside[k], sun[k]]), plant.p)
 
-    t, u, y = run(
-        rates, np.array([20.0, 18.0, 12.0, 22.0]), lambda k, y: power[k : k + 1], lambda x: x[:1], dt, n, 8
-    )
+    t, u, y = run(rates, np.array(plant.start), lambda k, y: power[k : k + 1], plant.measure, dt, n, 8)
     y = drop_outs(quantised(y + 0.05 * rng.standard_normal(y.shape), 0.0625), rng, 0.03, 12)
     return np.column_stack([t, u, outside + 0.1 * rng.standard_normal(n), sun, y])
 

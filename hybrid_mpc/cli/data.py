@@ -1,42 +1,90 @@
-"""``hybrid-mpc data``: the recordings of a simulated machine."""
+"""``hybrid-mpc data``: a look into a recording's file, or the recordings of a simulated machine."""
 
 from __future__ import annotations
 
 import csv
 import inspect
 import shlex
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import EmptyFolder, ScenarioName
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.rules import MOST_SEED, markdown
+from hybrid_mpc.rules import MOST_SEED, markdown, printable
 
 if TYPE_CHECKING:
     from hybrid_mpc.scenario import Scenario
 
 EXAMPLES = (
     "Examples:\n\n"
+    "  hybrid-mpc data monday.csv\n\n"
+    "  hybrid-mpc data monday.mf4 --plot\n\n"
     "  hybrid-mpc data golf_robot --out recordings\n\n"
     "  hybrid-mpc data golf_robot --out recordings_a --set a --seed 1 --budget quick"
 )
 
 
 def data(
-    scenario: ScenarioName,
-    out: EmptyFolder,
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE|SCENARIO", help="A recording; or a machine that makes its own, with --out."
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Folder to make; an existing one must be empty.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the recordings.", min=0, max=MOST_SEED)] = 0,
     budget: Annotated[str, typer.Option(help="Amount: quick or full.")] = "full",
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
+    plot: Annotated[bool, typer.Option("--plot", help="Open a picture of the recording.")] = False,
 ) -> None:
-    """Write a simulated machine's recordings as CSV or npz files, with a README on units, sampling and roles."""
+    """Look into a recording: columns, units, ranges, time, gaps, and what stands out. Nothing is written.
+
+    With --out: write a simulated machine's recordings as CSV or npz files, with a README on units, sampling and roles.
+    """
+    if out is None:
+        if not Path(source).exists() and Path(source).suffix in ("", ".py"):
+            raise typer.BadParameter(
+                f"{source}: there is no such file; a machine's own recordings need --out"
+            )
+        tell(Path(source), plot)
+        return
     from hybrid_mpc.scenario import load_scenario
 
-    files = write_data(load_scenario(scenario), out, seed, budget, data_set)
+    files = write_data(load_scenario(source), out, seed, budget, data_set)
     print(f"{len(files)} recordings and README.md in {out.resolve()}")
+
+
+def tell(path: Path, plot: bool) -> None:
+    """Print what is in a file; open a picture of it if asked to."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from hybrid_mpc.job.look import look, picture
+
+    found, console = look(path), Console(highlight=False)
+    console.print(printable(f"{path.name}: {found.rows} rows, {len(found.columns)} columns"), markup=False)
+    console.print(printable(f"time: {found.time}"), markup=False, soft_wrap=True)
+    table = Table(
+        "column", "unit", "numbers", "from", "to", "", box=None, header_style="bold", pad_edge=False
+    )
+    for one in found.columns:
+        words = (one.name, one.unit, str(one.count), one.low, one.high, one.note)
+        table.add_row(*(Text(printable(word)) for word in words))
+    console.print(table)
+    for title, texts in (("as it was read", found.notes), ("doubtful", found.findings)):
+        if texts:
+            console.print(f"\n{title}")
+        for text in texts:
+            console.print(printable(f"  {text}"), markup=False, soft_wrap=True)
+    if plot:
+        with tempfile.NamedTemporaryFile(prefix=f"{path.stem}-", suffix=".png", delete=False) as file:
+            picture(found).savefig(file, format="png")
+        print(f"\npicture: {file.name}")
+        typer.launch(file.name)
 
 
 def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: str = "") -> list[Path]:

@@ -40,7 +40,7 @@ def monitor(
     ] = 0.0,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="calibration.json with a detector or limits. Default: the model's own."),
+        typer.Option(help="calibration.json with limits. Default: the model's own."),
     ] = None,
     residuals: Annotated[
         bool,
@@ -85,9 +85,9 @@ def monitor(
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)
         line = f"learned from {60 * found.hours:.1f} min, for {found.false_alarms_per_hour:g} false alarms an hour"
-        if not getattr(found, "rated", True):
+        if not found.rated:
             line = f"learned from {60 * found.hours:.1f} min: {found.method}"
-        print_summary([line], out / "calibration.json", "detector" if job.energy else "limits")
+        print_summary([line], out / "calibration.json", "limits")
         return
     say(watching(job))
     with make_progress() as progress:
@@ -99,30 +99,17 @@ def monitor(
 
 def watching(job: MonitorJob) -> str:
     """What decides on alarms, in a line."""
-    if not job.energy:
-        if job.limits is None:
-            return (
-                "the artifact holds no limits of residuals: nothing alarms but a monitor without valid readings (see "
-                "--learn)"
-            )
+    limits = job.limits
+    if limits is None:
+        why = next((text for file, text in job.kit.lacks.items() if file.startswith("watch/")), "")
         return (
-            f"watched by residuals of {', '.join(job.limits.channels)}; limits learned from "
-            f"{60 * job.limits.hours:.1f} min, {job.limits.method}"
+            f"the kit holds no limits of {job.kind}{f' ({why})' if why else ''}: nothing alarms but a monitor without "
+            "valid readings (see --learn)"
         )
-    detector, calibration = job.detector, job.monitor.calibration
-    if detector is not None:
-        return (
-            f"watched with a detector for {detector.false_alarms_per_hour:g} false alarms an hour, learned from "
-            f"{60 * detector.hours:.1f} min (hash {detector.data_hash[:16] or 'unknown'})"
-        )
-    if calibration is None or calibration.threshold_w is None:
-        why = f" ({calibration.method.rstrip('.')})" if calibration is not None else ""
-        return (
-            f"the artifact holds no detector and no thresholds{why}: nothing alarms but a monitor without valid "
-            "readings (see --learn)"
-        )
+    channels = ", ".join(dict.fromkeys(one.channel for one in limits.channels))
     return (
-        "watched with the artifact's thresholds of violation and residual; it holds no detector (see --learn)"
+        f"watched: {channels}; limits for {limits.false_alarms_per_hour:g} false alarms an hour, learned from "
+        f"{60 * limits.hours:.1f} min: {limits.method}"
     )
 
 

@@ -37,6 +37,7 @@ def new(
     inputs, outputs, disturbances = named
     draft = write_scenario(path, data, inputs, outputs, time_column, disturbances)
     lines = [
+        *(f"{name}, as it was read: {note}" for name, notes in draft.notes.items() for note in notes),
         f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.period:.4g} s",
         *([f"  to decide: {draft.doubt}"] if draft.doubt else []),
         f"inputs: {', '.join(c.full for c in draft.inputs)}",

@@ -12,7 +12,7 @@ from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordin
 from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.stages.results import Control, Guard, Identification, OnModel, Residuals, Results
+    from hybrid_mpc.job.stages.results import Control, Identification, OnModel, Results, Watch
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -63,10 +63,10 @@ def run(
         list[str] | None, typer.Option(help="Stage after the export that is not to run, once for each.")
     ] = None,
 ) -> None:
-    """Fit the prior, train, export, close the loop, monitor, learn the guard, analyze, and write a report.
+    """Fit the prior, train, export, close the loop, learn what to alarm by, analyze, and write a report.
 
     The stages are data, prior, training, choice, evaluation, export, noise, control, on_model, estimation, promises,
-    residuals, monitor, guard, analysis and report. With --resume a stage runs again only where something that it reads
+    watch, analysis and report. With --resume a stage runs again only where something that it reads
     has changed. Exit code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
@@ -108,10 +108,7 @@ def summary(results: Results) -> list[str]:
             )
     lines += comparison_lines(results.control)
     lines += on_model_lines(results.on_model)
-    lines += residual_lines(results.residuals)
-    if results.monitor.alarms is None:
-        lines.append(f"energy monitor: {results.monitor.reason}")
-    lines += guard_lines(results.guard)
+    lines += watch_lines(results.watch)
     if results.promises.rows is None:
         return [*lines, f"promises of the kit: not examined: {results.promises.reason}"]
     return lines + promise_lines(results.promises.rows)
@@ -178,42 +175,28 @@ def tracking(errors: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g} {unit}" for name, unit, value in split)
 
 
-def residual_lines(found: Residuals) -> list[str]:
-    """What the run says of its monitor of residuals.
+def watch_lines(found: Watch) -> list[str]:
+    r"""What the run says of its monitor.
 
     Example:
-        >>> from hybrid_mpc.job.stages.results import FaultedChannel, Residuals
-        >>> row = FaultedChannel("input_gain", "pump", 0.8, "levels", 450.0, None, (), "", 1)
-        >>> print(*residual_lines(Residuals(alarms=(), faults=(row,)))[1:])
-          input_gain of pump: never seen (alarms before it: 1)
+        >>> from hybrid_mpc.job.stages.results import FaultedLoop, Watch
+        >>> row = FaultedLoop("weak_pump", "the pump weakens", "levels", 450.0, None, (), "", 1)
+        >>> watch = Watch("residuals", 2.0, 0.1, 0.0, (), (row,))
+        >>> print(*watch_lines(watch), sep="\n")
+        monitor of residuals: learned from 6.0 min for 2 false alarms an hour; 0 alarms on recordings
+          weak_pump: never seen (alarms before it: 1)
     """
-    if found.alarms is None:
-        return [f"monitor of residuals: {found.reason}"]
+    if found.alarms is None or found.hours is None:
+        return [f"monitor: {found.reason}"]
     lines = [
-        f"monitor of residuals: learned from {found.details.source}; {len(found.alarms)} alarms on recordings"
+        f"monitor of {found.kind}: learned from {60 * found.hours:.1f} min for {found.wanted_per_hour:g} false alarms "
+        f"an hour; {len(found.alarms)} alarms on recordings"
     ]
     for row in found.faults or ():
         seen = "never seen" if row.delay_s is None else f"seen after {row.delay_s:.3g} s"
         seen += f" in {row.channels[0]}" if row.channels else ""
         before = f" (alarms before it: {row.false_alarms})" if row.false_alarms else ""
-        lines.append(
-            f"  {row.fault} of {row.channel}: {seen}{before}"
-            + (f": {row.diagnosis}" if row.diagnosis else "")
-        )
-    return lines
-
-
-def guard_lines(guard: Guard) -> list[str]:
-    """What the run says of its energy guard."""
-    if guard.data_hash is None or guard.hours is None:
-        return [f"energy guard: {guard.reason}"]
-    lines = [
-        f"energy guard: learned from {60 * guard.hours:.1f} min for {guard.false_alarms_per_hour:g} false alarms "
-        "an hour"
-    ]
-    for row in guard.faults or ():
-        seen = "never seen" if row.delay_s is None else f"seen after {row.delay_s:.2f} s"
-        lines.append(f"  {row.fault}: {seen}" + (f": {row.diagnosis}" if row.diagnosis else ""))
+        lines.append(f"  {row.fault}: {seen}{before}" + (f": {row.diagnosis}" if row.diagnosis else ""))
     return lines
 
 

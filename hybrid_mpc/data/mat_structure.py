@@ -63,13 +63,13 @@ def version(content: bytes) -> str:
     return "7.3" if content[125 if mark == b"IM" else 124] == 2 else "5"
 
 
-def check_structure(content: bytes, budget: int) -> tuple[str, ...]:
+def check_structure(content: bytes, budget: int) -> tuple[tuple[str, str], ...]:
     """Follow all elements of a file of level 4 or 5; a compressed variable is decompressed as far as the budget allows.
 
     ``budget`` is the most bytes of numbers that the file may hold, each counted as 8 of them; ValueError if there are
-    more, or an element is damaged. Returned are the names of MATLAB's objects, which scipy does not tell apart.
+    more, or an element is damaged. Returned are names and classes of MATLAB's objects, which scipy does not tell apart.
     """
-    left, objects = Left(budget), list[str]()
+    left, objects = Left(budget), list[tuple[str, str]]()
     if version(content) == "4":
         _check_4(content, left)
         return ()
@@ -137,8 +137,8 @@ def _elements(data: bytes, begin: int, end: int, order: str, left: Left) -> Iter
         begin = after
 
 
-def _check_matrix(data: bytes, matrix: Element, order: str, depth: int, left: Left) -> list[str]:
-    """The name of what it is if that is an object."""
+def _check_matrix(data: bytes, matrix: Element, order: str, depth: int, left: Left) -> list[tuple[str, str]]:
+    """Name and class of what it is if that is an object."""
     if matrix.kind != MATRIX:
         raise ValueError(f"an element of type {matrix.kind} where a variable is due")
     if depth > DEEPEST:
@@ -161,7 +161,11 @@ def _check_matrix(data: bytes, matrix: Element, order: str, depth: int, left: Le
             raise ValueError(f"an element of type {part.kind} in a variable")
     if kind != OPAQUE or len(parts) < 2:
         return []
-    return [data[parts[1].begin : parts[1].end].decode("ascii", errors="replace")]
+    name, made_of = (
+        data[p.begin : p.end].decode("ascii", errors="replace")
+        for p in (parts[1], parts[min(3, len(parts) - 1)])
+    )
+    return [(name, made_of)]
 
 
 def _check_head(parts: list[Element]) -> None:

@@ -11,7 +11,7 @@ import unicodedata
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-from hybrid_mpc.data.files import name_and_unit
+from hybrid_mpc.data.source import name_and_unit
 from hybrid_mpc.machine.units import time_factor
 
 Kind = Literal["time", "step", "count", ""]
@@ -23,11 +23,12 @@ def _plain(text: str) -> str:
     return "".join(c for c in unicodedata.normalize("NFKD", whole) if not unicodedata.combining(c))
 
 
-def _words(text: str) -> frozenset[str]:
+def words_of(text: str) -> frozenset[str]:
+    """Words of a list, in small letters, without accents."""
     return frozenset(_plain(text).split())
 
 
-TIME = _words(
+TIME = words_of(
     "time times timestamp timestamps stamp tout datetime date dates clock elapsed runtime uptime walltime simtime "
     "rostime systime daytime epoch t zeit zeiten zeitstempel zeitpunkt zeitachse uhrzeit datum messzeit laufzeit "
     "systemzeit versuchszeit temps heure horodatage horodate tiempo tempo hora fecha instante orario tijd "
@@ -36,21 +37,21 @@ TIME = _words(
     "secondi"
 )
 """Words for time; a name of these, of units and of ``AROUND`` says time."""
-STAMPS = _words("timestamp timestamps datetime zeitstempel horodatage tijdstempel tidsstempel")
+STAMPS = words_of("timestamp timestamps datetime zeitstempel horodatage tijdstempel tidsstempel")
 """Words that say time whatever stands beside them."""
 WITHIN = tuple(_plain(text) for text in ("时间", "時間", "时刻", "時刻", "시간"))
 """The same where a language does not separate words."""
-DATES = _words("datetime date dates datum fecha дата")
+DATES = words_of("datetime date dates datum fecha дата")
 """Words for dates: their numbers may count days."""
-AROUND = _words(
+AROUND = words_of(
     "elapsed relative rel absolute abs sim simulation simulated ros unix posix utc gmt local system sys since "
     "start from begin recording recorded record log logger logging measurement measured meas test run real wall "
     "host pc plc device header stamp field total global master base axis vector in the of at and day"
 )
 """What may stand beside them."""
-PERHAPS = _words("T ts s ms us ns min h d data")
+PERHAPS = words_of("T ts s ms us ns min h d data")
 """Single words that may say time: decided by their numbers."""
-COUNT = _words(
+COUNT = words_of(
     "index indices idx sample samples row rows record records seq sequence unnamed datapoint datapoints messpunkt "
     "zeile"
 )
@@ -62,9 +63,9 @@ STEP = (
     {"sampling", "time"}, {"sample", "time"}, {"sampling", "period"}, {"sample", "period"}, {"sampling", "interval"},
 )  # fmt: skip
 """Words for the sampling time."""
-BESIDE = _words("number no nr num nummer id count counter of the s ms")
+BESIDE = words_of("number no nr num nummer id count counter of the s ms")
 """What may stand beside them."""
-COUNT_PERHAPS = _words(
+COUNT_PERHAPS = words_of(
     "n i j k no nr num number nummer count counter id step steps point points frame scan cycle line x"
 )
 """Single words that may be a count: decided by their numbers."""
@@ -153,42 +154,42 @@ Role = Literal[
 """What a column is by its name: ``command`` is an input for certain, ``actuator`` probably; ``answer`` is what an
 actuator's sensor shows, ``label`` an entry about the recording (a fault, a correction), ``measured`` what a sensor
 shows, ``quantity`` something that machines reach and surroundings have, too."""
-SET_POINT = _words(
+SET_POINT = words_of(
     "ref refs reference references referencia referencias referenz set setpoint setpoints setpt setvalue sp target "
     "targets desired des goal goals wanted soll sollwert fuhrungsgrosse consigne consigna riferimento demand planned "
 )
 """Words for what a machine is asked to reach."""
-FLAG = _words(
+FLAG = words_of(
     "flag enable enabled enabling status alarm valid invalid active mode trigger event marker bool boolean ok ready "
     "fehler freigabe moving running busy"
 )
 """Words for switches of the recording or the controller."""
-LABEL = _words(
+LABEL = words_of(
     "feedforward ff offset fault faults label anomaly correction bias calibration error err residual residuum deviation"
 )
 """Words for what somebody computed, noted down, or adds to a command."""
-COMMAND = _words(
+COMMAND = words_of(
     "u command commands cmd commanded control controle controller ctrl input inputs eingang stellgrosse stellwert "
     "steuerung manipulated mv op actuation actuator excitation entrada entree commande comando mando pwm duty dac"
 )
 """Words for what somebody commands."""
-ACTUATOR = _words(
+ACTUATOR = words_of(
     "pump valve heater heating cooler cooling coolant voltage volt volts torque tau force thrust throttle "
     "steering steer brake fan pumpe ventil heizung spannung drehmoment moment kraft bomba valvula tensao "
     "tension chauffage pompe vanne power burner damper rudder elevator aileron propeller rotor"
 )
 """Words for what moves a machine."""
-DISTURBANCE = _words(
+DISTURBANCE = words_of(
     "ambient outside outdoor environment umgebung aussen weather wind disturbance disturbances disturb supply battery "
     "mains reservoir storung sun solar radiation irradiance push kick"
 )
 """Words for what acts on a machine and is not commanded."""
-MEASURED = _words(
+MEASURED = words_of(
     "output outputs ausgang saida sortie salida measured measure measurement meas mes actual ist istwert sensor pv "
     "feedback fb encoder enc tacho gyro imu"
 )
 """Words for what a sensor shows, whatever it measures."""
-QUANTITY = _words(
+QUANTITY = words_of(
     "temperature temp temperatur temperatura level fullstand niveau nivel position pos angle ang winkel angulo "
     "speed vel velocity geschwindigkeit drehzahl velocidade rate pressure druck concentration height altitude "
     "heading yaw pitch roll theta phi psi alpha beta gamma q dq qd x z omega distance displacement "

@@ -9,14 +9,16 @@ import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.files import Columns, MissingColumn, Source, name_and_unit, opened
+from hybrid_mpc.data.files import opened
+from hybrid_mpc.data.source import Columns, MissingColumn, Source, name_and_unit, restarts
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
@@ -100,7 +102,7 @@ class Finding:
     concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
     """
 
-    kind: Literal["wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
+    kind: Literal["read", "clock", "wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
     file: str
     channel: str
     start: float
@@ -208,7 +210,7 @@ def read_recording(
     prior: Signals,
     spec: DataSpec,
 ) -> Recording:
-    """Read one recording (CSV, ``.npz`` or ``.mat``) and check what would mislead an identification.
+    """Read one recording, whatever its format (:func:`hybrid_mpc.data.files.opened`), and check what would mislead.
 
     Columns that ``spec`` does not name are ignored; ``spec.units``, or units in brackets behind a column's name, are
     turned into the signals' own. A blank cell or NaN in the column of an output or a disturbance is a missing sample. A
@@ -444,16 +446,20 @@ def _recording(
         blanks = set(found[1 + len(inputs) :]) - set(found[: 1 + len(inputs)])
         columns = source.read(None, found[1:], blanks)
         values = np.column_stack([spec.time * np.arange(len(columns.values)), columns.values])
-    values[:, 0] = even(values[:, 0])
+    columns, values, findings = _one_clock(path.name, columns, values, spec, found[0])
+    if source.notes and len(values):
+        done = "; ".join(source.notes)
+        findings.append(
+            Finding("read", path.name, "", float(values[0, 0]), len(source.notes), f"as it was read: {done}")
+        )
     first, split = 1 + len(inputs), 1 + len(inputs) + len(disturbances)
     problems = list(columns.problems)
-    findings: list[Finding] = []
     unclear: set[int] = set()  # columns whose unit is none of their signal's
     cuts: set[int] = set()
     raw = values.copy()
     codes = [
         None,
-        *(_code(column) for column in values.T[1:]),
+        *(missing_code(column) for column in values.T[1:]),
     ]  # as the file has them, before units are converted
     with np.errstate(over="ignore"):  # what overflows is out of its range
         for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
@@ -495,7 +501,7 @@ def _recording(
                 findings.append(_folded(path.name, name, signal, t[there], values[there, j], *found_parts))
         if clean and j >= first and (found_bits := _overflow(t[there], raw[there, j], spec.max_gap)):
             findings.append(_overflowing(path.name, name, t[there], raw[there, j], *found_bits))
-        if clean and j and codes[j] is None and (odd := _outliers(values[:, j])) is not None:
+        if clean and j and codes[j] is None and (odd := outliers(values[:, j])) is not None:
             findings.append(_outlying(path.name, name, signal, t, values[:, j], odd))
         if clean and j >= first and there.any() and not there.all():
             findings.append(_missing(path.name, name, t, there))
@@ -522,6 +528,47 @@ def _recording(
         censored=censored,
         cuts=tuple(sorted(cuts)),
     )
+
+
+def _one_clock(
+    file: str, columns: Columns, values: Array, spec: DataSpec, found: str
+) -> tuple[Columns, Array, list[Finding]]:
+    """The same without rows that stand twice, and with time stamps that count on where they begin anew, behind a gap.
+
+    Stamps that are uneven by rounding alone are made even. ``found`` is the full name of the time's column.
+    """
+    findings, name = [], _stamps(spec)
+    twice = np.r_[False, (values[1:] == values[:-1]).all(axis=1)][: len(values)]
+    if isinstance(spec.time, str) and twice.any():
+        k = int(np.argmax(twice))
+        message = (
+            f"{columns.place(k)}, {name}: {int(twice.sum())} rows are those before them once more, this one the first. "
+            "They are left out."
+        )
+        findings.append(
+            Finding("clock", file, str(spec.time), float(values[k, 0]), int(twice.sum()), message)
+        )
+        numbers = [columns.numbers[j] for j in np.flatnonzero(~twice).tolist()]
+        columns, values = replace(columns, values=columns.values[~twice], numbers=numbers), values[~twice]
+    t, begins = values[:, 0].copy(), restarts(values[:, 0])
+    seconds = (
+        _converted(spec, spec.time, found, Signal("time", "s"))[0].factor
+        if isinstance(spec.time, str)
+        else 1.0
+    )
+    pause = 3 * spec.max_gap / seconds  # in the column's unit
+    for a, b in pairwise([0, *begins, len(t)]):
+        own = even(t[a:b])
+        values[a:b, 0] = own if a == 0 else own - own[0] + values[a - 1, 0] + pause
+    if begins:
+        k, count = begins[0], len(begins)
+        message = (
+            f"{columns.place(k)}, {name}: time begins anew ({t[k - 1]:.10g}, then {t[k]:.10g}"
+            f"{f'; {count} such rows' if count > 1 else ''}): the logger was started again. The recording is cut "
+            f"there; its later samples count on from {values[k, 0]:.6g}. Split the file to give its parts other roles."
+        )
+        findings.append(Finding("clock", file, str(spec.time), float(values[k, 0]), count, message))
+    return columns, values, findings
 
 
 def censored_of(y: Array, outputs: Sequence[Signal]) -> Flags:
@@ -649,7 +696,7 @@ def _range_problems(signal: Signal, name: str, column: Array, columns: Columns, 
     ]
 
 
-def _code(column: Array) -> float | None:
+def missing_code(column: Array) -> float | None:
     """A number that logging programs write for a missing value, as the file has it, where a column has it, be it once,
     far from all others; None without.
 
@@ -872,7 +919,7 @@ def _overflowing(file: str, name: str, t: Array, raw: Array, bits: int, jumps: N
     return Finding("wrapped", file, name, float(t[k]), count, message, refused=True)
 
 
-def _outliers(column: Array) -> NDArray[np.intp] | None:
+def outliers(column: Array) -> NDArray[np.intp] | None:
     """The few samples that are away from all others by ``OUTLYING`` times what these span; None without."""
     known = np.abs(column) <= ABSURD
     others, most = np.sort(column[known]), max(1, min(MOST_ODD, int(0.01 * known.sum())))

@@ -151,7 +151,7 @@ def load_trajectories(
     equations. Parts by ``fractions`` keep ``spec.smoothing`` apart; ``windows`` should, too.
 
     Args:
-        paths: CSV, ``.npz`` or ``.mat`` files with different stems, of any lengths.
+        paths: Files with different stems, of any formats and lengths.
         prior: The prior, its class, or a model: its signals say which columns there must be, in which order, whether
             the outputs are positions, and what is plausible.
         spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s], delays and the split.

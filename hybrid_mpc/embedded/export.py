@@ -27,7 +27,6 @@ from hybrid_mpc.embedded.generate import (
     template,
 )
 from hybrid_mpc.embedded.scalar import table
-from hybrid_mpc.embedded.watch import Watch
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.estimate.switching import Filter
@@ -35,6 +34,7 @@ from hybrid_mpc.files import replacing_folder, write_text
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.rules import markdown
+from hybrid_mpc.watch.monitor import Monitor, Reading
 
 Array = NDArray[np.float64]
 VECTORS = 25
@@ -77,7 +77,7 @@ class Footprint:
 def write_controller(
     folder: Path, model: HybridModel, ocp: OCP, *, estimator: Filter | None = None,
     fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
-    monitor: Watch | None = None, guard: Guard | None = None, check: bool = False,
+    monitor: Monitor | None = None, guard: Guard | None = None, check: bool = False,
 ) -> Sources:  # fmt: skip
     """Write the C of a controller, its test and its README; arguments as :func:`make_sources` takes them.
 
@@ -105,7 +105,7 @@ def write_controller(
     return found
 
 
-def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monitor: Watch | None) -> str:
+def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monitor: Monitor | None) -> str:
     """A short loop from the operating point towards a set-point beside it, on the model itself."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.sizes.states
@@ -154,14 +154,9 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monit
     )
 
 
-def _numbers(reading: Any) -> Array:
-    """What of a monitor's reading the test program compares: whether it alarms, and its levels."""
-    levels = (
-        [reading.level_w, reading.residual_level]
-        if hasattr(reading, "residual_level")
-        else reading.level[:, 0]
-    )
-    return np.concatenate([[float(reading.alarm)], levels, reading.residual])
+def _numbers(reading: Reading) -> Array:
+    """What of a monitor's reading the test program compares: whether it alarms, and its values."""
+    return np.array([float(reading.alarm), *reading.values])
 
 
 def _noise(estimator: Filter) -> Array:
@@ -206,9 +201,9 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
 
 
 def _watching(n: Mapping[str, int], code: Mapping[str, int], step: int) -> int:
-    """Operations of a period of the monitor, near rest, where the energy monitor asks the model most."""
+    """Operations of a period of the monitor, near rest, where the energy asks the model most."""
     if n["MONITOR"] == 2:
-        return 3 * step + code.get("watched_balances", 0) + n["CHANNELS"] * (n["SHORT"] + n["LONG"])
+        return 3 * step + code.get("watched_balances", 0) + n["LIMITS"] * n["LONGEST"]
     rows = n["WINDOW"] * (7 * n["NX"] + 2 * (n["NU"] + n["NW"]))
     return (
         3 * step

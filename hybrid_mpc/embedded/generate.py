@@ -21,7 +21,6 @@ from hybrid_mpc.embedded.layers import after_code, layer_code
 from hybrid_mpc.embedded.scalar import c_function, comment, number, table
 from hybrid_mpc.embedded.watch import (
     NOTHING,
-    Watch,
     Watched,
     guard_parts,
     monitor_parts,
@@ -36,6 +35,7 @@ from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model import equilibrium
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
+from hybrid_mpc.watch.monitor import Monitor
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ class Sources:
 
 def make_sources(
     model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
-    safe_input: Array | None = None, single: bool = False, monitor: Watch | None = None, guard: Guard | None = None,
+    safe_input: Array | None = None, single: bool = False, monitor: Monitor | None = None, guard: Guard | None = None,
     max_age: int = MAX_AGE,
 ) -> Sources:  # fmt: skip
     """The generated files of a controller; with a guard's backup all files of that one, too.

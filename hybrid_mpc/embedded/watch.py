@@ -18,15 +18,14 @@ from hybrid_mpc.embedded.scalar import c_function, table
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.loop.guard import TINY, Guard, Mode
 from hybrid_mpc.model.model import HybridModel
-from hybrid_mpc.monitor.detector import CAP
-from hybrid_mpc.monitor.energy import FROZEN_STEPS, EnergyMonitor
-from hybrid_mpc.monitor.energy_readings import HELD_SHARE, energy_balance, inertia_of, weights
-from hybrid_mpc.monitor.residuals import ResidualMonitor
+from hybrid_mpc.watch.detector import CAP
+from hybrid_mpc.watch.energy import HELD_SHARE, EnergyReadings, energy_balance, inertia_of, weights
+from hybrid_mpc.watch.monitor import Monitor
+from hybrid_mpc.watch.residuals import ResidualReadings
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
-Watch = EnergyMonitor | ResidualMonitor
-KINDS = {EnergyMonitor: 1, ResidualMonitor: 2}
+KINDS = {EnergyReadings: 1, ResidualReadings: 2}
 """What ``HMPC_MONITOR`` says."""
 
 
@@ -48,16 +47,11 @@ NOTHING = Watched({"MONITOR": 0, "RATES": 0}, {}, "", "", {})
 
 def refused_monitor(monitor: object, model: HybridModel) -> list[str]:
     """What of a monitor has no C, in words."""
-    if type(monitor) not in KINDS:
-        return [
-            f"a monitor of another kind than EnergyMonitor and ResidualMonitor ({type(monitor).__name__})"
-        ]
-    assert isinstance(monitor, Watch)
+    if type(monitor) is not Monitor or type(monitor.readings) not in KINDS:
+        return [f"a monitor of another kind than Monitor ({type(monitor).__name__})"]
     found = []
     if not _alike(monitor.model, model):
         found.append(f"a monitor of another model ({monitor.model.name}) than the one that plans")
-    if isinstance(monitor, EnergyMonitor) and monitor.layout.history:
-        found.append("a monitor that keeps a history for a diagnosis (diagnose=True)")
     return found
 
 
@@ -86,7 +80,7 @@ def solves_once(safe: SafeController) -> bool:
     return not controller.converges and getattr(controller, "iterations", 1) == 1
 
 
-def monitor_parts(monitor: Watch | None, model: HybridModel, parts: Cut) -> Watched:
+def monitor_parts(monitor: Monitor | None, model: HybridModel, parts: Cut) -> Watched:
     """What a monitor adds; ``parts`` is the model's step cut at its cell.
 
     Raises:
@@ -94,9 +88,39 @@ def monitor_parts(monitor: Watch | None, model: HybridModel, parts: Cut) -> Watc
     """
     if monitor is None:
         return NOTHING
-    return (
-        _energy(monitor, model, parts) if isinstance(monitor, EnergyMonitor) else _residuals(monitor, model)
+    readings = monitor.readings
+    if isinstance(readings, EnergyReadings):
+        own = _energy(readings, model, parts)
+    else:
+        assert isinstance(readings, ResidualReadings)
+        own = _residuals(readings, model)
+    limits = () if monitor.limits is None else monitor.limits.channels
+    sizes = {
+        "MONITOR": KINDS[type(readings)], "CHANNELS": len(monitor.channels), "LIMITS": len(limits),
+        "TERMS": readings.n_terms, "LONGEST": max((one.length for one in limits), default=1) or 1,
+        "BLIND_AFTER": readings.patience, "REPEATS": int(np.max(monitor.frozen_repeats)) + 1,
+    }  # fmt: skip
+    tables = table("frozen_travel", monitor.frozen_travel) + table(
+        "frozen_repeats", monitor.frozen_repeats, "int"
     )
+    if limits:
+        reals = {
+            "limit_threshold": np.array([one.threshold for one in limits]),
+            "limit_release": np.array([one.release for one in limits]),
+            "limit_drift": np.array([one.drift for one in limits]),
+        }  # fmt: skip
+        if readings.n_terms:
+            reals["limit_scale"] = np.array(
+                [one.scale or (1.0, *(0.0,) * (readings.n_terms - 1)) for one in limits]
+            )
+        whole = {
+            "limit_channel": [monitor.channels.index(one.channel) for one in limits],
+            "limit_length": [one.length for one in limits],
+        }
+        tables += "".join(table(name, values) for name, values in reals.items())
+        tables += "".join(table(name, np.array(values), "int") for name, values in whole.items())
+    numbers = {"DT": model.dt, "SUM_CAP": CAP, **own.numbers}
+    return Watched({**sizes, **own.sizes}, numbers, own.tables + tables, own.code, own.operations)
 
 
 def guard_parts(guard: Guard | None, model: HybridModel) -> tuple[dict[str, int], str]:
@@ -154,41 +178,16 @@ def _scalar(what: str, given: list[ca.MX], value: ca.MX) -> ca.Function:
         raise InputError(f"no C for this monitor: {what} is no scalar code: {last_line(error)}") from error
 
 
-def _energy(monitor: EnergyMonitor, model: HybridModel, parts: Cut) -> Watched:
-    layout, window, detector, n_q = monitor.layout, monitor.window, monitor.detector, model.n_x // 2
-    c, dt = monitor.calibration, model.dt
-    power = c is not None and c.threshold_w is not None and c.release_w is not None
-    force = power and c is not None and c.residual_threshold is not None and c.residual_release is not None
-    sizes = {
-        "MONITOR": 1, "RATES": 1, "WINDOW": window, "AVERAGE": monitor.average, "FREE_RUN": layout.length,
-        "DETECTOR": int(detector is not None), "POWER_LEVEL": int(power), "FORCE_LEVEL": int(force),
-        "ENERGY_LEARNED": int(detector is not None and bool(detector.energy)),
-    }  # fmt: skip
-    numbers: dict[str, float] = {"DT": dt, "HELD_SHARE": HELD_SHARE}
-    if power and c is not None:
-        numbers |= {"POWER_THRESHOLD": c.threshold_w or 0.0, "POWER_RELEASE": c.release_w or 0.0}
-    if force and c is not None:
-        numbers |= {
-            "RESIDUAL_THRESHOLD": c.residual_threshold or 0.0,
-            "RESIDUAL_RELEASE": c.residual_release or 0.0,
-        }
+def _energy(readings: EnergyReadings, model: HybridModel, parts: Cut) -> Watched:
+    window, n_q, dt = readings.window, model.n_x // 2, model.dt
+    sizes = {"RATES": 1, "WINDOW": window, "FREE_RUN": readings.layout.length}
+    numbers = {"HELD_SHARE": HELD_SHARE, "SHORTEST": readings.shortest}
     position, speed, acceleration, kernel, slope = weights(window, dt)
-    steps = np.array(monitor.resolution) if monitor.resolution else np.full(n_q, np.inf)
     reals: dict[str, Array] = {
         "fit_position": position, "fit_speed": speed, "fit_acceleration": acceleration, "kernel_speed": kernel[1:],
         "kernel_position": slope, "kernel_mean": 0.5 * dt * (kernel[:-1] + kernel[1:]),
-        "rest_speed": np.array(monitor.rest_speed), "input_span": monitor.input_range,
-        "frozen_travel": FROZEN_STEPS * steps,
+        "rest_speed": np.array(readings.rest_speed), "input_span": readings.input_range,
     }  # fmt: skip
-    if detector is not None:
-        numbers |= {
-            "SUM_CAP": CAP, "DRIFT": detector.drift, "FORCE_THRESHOLD": detector.force_threshold,
-            "ENERGY_THRESHOLD": detector.energy_threshold, "RELEASE": detector.release, "SHORTEST": detector.shortest,
-        }  # fmt: skip
-        reals |= {
-            "force_scale": np.array(detector.force), "rest_speed_learned": np.array(detector.rest_speed),
-            "energy_scale": np.array(detector.energy or (1.0, 0.0, 0.0, 0.0)),
-        }  # fmt: skip
     rates, rate_sizes, operations = _rates(model, parts)
     s = _symbols(model)
     x, u, w = (ca.MX.sym(name, v.numel()) for name, v in s.items())
@@ -250,18 +249,12 @@ def _rates(model: HybridModel, parts: Cut) -> tuple[str, dict[str, int], dict[st
     return "\n".join([*texts, text]), sizes, operations
 
 
-def _residuals(monitor: ResidualMonitor, model: HybridModel) -> Watched:
-    limits, names = monitor.limits, model.balances
+def _residuals(readings: ResidualReadings, model: HybridModel) -> Watched:
+    names = model.balances
     sizes = {
-        "MONITOR": 2, "RATES": 0, "CHANNELS": len(monitor.channels), "BALANCES": len(names),
-        "SHORT": monitor.short, "LONG": monitor.long, "SETTLING": monitor.settling, "FREE_RUN": monitor.free_run,
-        "LIMITS": int(limits is not None), "REPEATS": int(np.max(monitor.frozen_repeats)) + 1,
+        "RATES": 0, "BALANCES": len(names), "SETTLING": readings.settling, "FREE_RUN": readings.free_run,
     }  # fmt: skip
-    reals = {"frozen_travel": monitor.frozen_travel, "sensor_end": monitor.sensor_ends}
-    if limits is not None:
-        reals |= {"level_threshold": np.array(limits.threshold), "level_release": np.array(limits.release)}
-    tables = "".join(table(name, values) for name, values in reals.items())
-    tables += table("frozen_repeats", monitor.frozen_repeats, "int")
+    tables = table("sensor_end", readings.sensor_ends)
     code, operations = "", {}
     if names:
         s, r = _symbols(model), ca.SX.sym("r", model.n_x)
@@ -274,4 +267,4 @@ def _residuals(monitor: ResidualMonitor, model: HybridModel) -> Watched:
         results = [(f"violation[{i}]", values[i]) for i in range(values.numel())]
         inputs = {"x": s["x"], "r": r, "u": s["u"], "w": s["w"]}
         code, operations["watched_balances"] = c_function("watched_balances", arguments, inputs, results)
-    return Watched(sizes, {"DT": model.dt}, tables, code, operations)
+    return Watched(sizes, {}, tables, code, operations)

@@ -76,8 +76,8 @@ from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.equilibrium import hidden_equilibrium, holding_input
 from hybrid_mpc.model.model import HybridModel, positions_of
-from hybrid_mpc.monitor.lengths import machine_second
 from hybrid_mpc.scenario import Scenario, scenario_of
+from hybrid_mpc.watch.lengths import machine_second
 from nn_export import Program, load_programs
 
 Array = NDArray[np.float64]

@@ -31,11 +31,11 @@ from hybrid_mpc.job.analyze import (
 )
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.model import HybridModel, positions_of
-from hybrid_mpc.monitor.lengths import machine_second
 from hybrid_mpc.plots import analysis as plots
 from hybrid_mpc.plots.style import ratio_unit, save
 from hybrid_mpc.records import plain
 from hybrid_mpc.report.page import Cell, KeyFigure, Report, Section, Table, words, write_report
+from hybrid_mpc.watch.lengths import machine_second
 
 MODES = 6
 """Modes of each linearization in the page's table; the CSV has all."""

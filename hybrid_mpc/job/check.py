@@ -22,6 +22,7 @@ from hybrid_mpc.job.check_prior import DRIFT, Report, check_prior
 from hybrid_mpc.job.default_tasks import default_tasks
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import make_controller, make_estimator
+from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.kit.parts import loop_settings
 from hybrid_mpc.loop.faults import check_channels, install
 from hybrid_mpc.loop.loop import Loop
@@ -184,7 +185,10 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
         substeps = required_substeps(prior, dt)
         programs = {f"prior/{name}": p for name, p in prior_programs(prior, dt).items()}
         model = build_model("prior", programs, model_info(prior, dt))
-        model = replace(model, disturbance_model=scenario.disturbance_model)
+        chosen = scenario.disturbance_model
+        if chosen is None and scenario.control is not None and scenario.control.n_x == model.n_x:
+            chosen = default_disturbances(model, scenario.control)
+        model = replace(model, disturbance_model=chosen)
     if model is None:
         return None, None
     modes = np.linalg.eigvals(flow_slope(prior.equations.xdot)(x, u, w, prior.p).full()).astype(np.complex128)

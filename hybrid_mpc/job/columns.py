@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.files import Columns, Source, name_and_unit
 from hybrid_mpc.data.names import FIELD, Said, said_by, unit_behind
+from hybrid_mpc.data.source import Columns, Source, name_and_unit
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.job.first_model import FEWEST
 from hybrid_mpc.machine.signals import Signal
@@ -95,7 +95,7 @@ class Column:
 def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, str]]:
     """Columns whose numbers move, and why the others are no signals, by full name."""
     found: dict[str, Column] = {}
-    tables = [_read(source) for source in sources]
+    tables = [read_all(source) for source in sources]
     usual = [_usual_length(read) for read, _ in tables]
     left_out: dict[str, str] = {}
     diverged: list[str] = []
@@ -192,7 +192,7 @@ def _diverges(values: Array) -> int | None:
     return int(known[int(np.argmax(large))])
 
 
-def _read(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
+def read_all(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
     """Each column, where blank cells are none; and why the others cannot be read, by full name."""
     read: dict[str, Columns] = {}
     counts = Counter(source.header)
@@ -202,14 +202,15 @@ def _read(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
         if count > 1
     }
     names = [name for name, count in counts.items() if count == 1]
-    if source.path.suffix.lower() not in (".npz", ".mat"):
+    try:
         whole = source.read(None, names, names) if names else None
         if whole is not None:
-            refuse([f"{source.path}: {fault}" for name, fault in whole.faults.items() if not name])
-            for j, name in enumerate(names):
-                read[name] = replace(whole, values=whole.values[:, j : j + 1])
-        return read, reasons
-    for name in names:  # vectors may be of any length and kind
+            return {
+                name: replace(whole, values=whole.values[:, j : j + 1]) for j, name in enumerate(names)
+            }, reasons
+    except InputError:  # below, column by column
+        pass
+    for name in names:  # vectors may be of any length and kind: each says what is wrong with it
         try:
             read[name] = source.read(None, [name], [name])
         except InputError as error:
@@ -366,6 +367,7 @@ def _sampling_time(source: Source, full: str, said: Said) -> Clock | None:
         values = source.read(None, [full], ()).values[:, 0]
     except InputError:
         return None
+    values = values[np.isfinite(values)]
     if not (len(values) and 0 < values[0] < math.inf and (values == values[0]).all()):
         return None
     if said.unit and said.seconds is None:

@@ -25,14 +25,13 @@ from hybrid_mpc.kit.parts import Provenance
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.faults import fault_text
 from hybrid_mpc.loop.realtime import percentiles
-from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.watch.detector import WatchLimits
 
 Array = NDArray[np.float64]
 NOUN = "control"
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,10 @@ class Origin:
 class ControlResults:
     """What ``results.json`` of ``hybrid-mpc control`` holds (docs/control.md): what was run, every loop, and means.
 
-    ``guard`` is the detector where a guard reacts, ``residuals`` the limits of residuals, of which it hears where the
-    energy cannot be watched, ``reaction`` what it does; ``step_ms`` are percentiles of the
-    durations of steps by controller, ``summary`` is by task and controller. ``on_model`` names the model that stood in
-    for the machine, by controller, where there is no plant: then nothing here is of the machine, and controllers, which
-    met different plants, are not to be compared. ``promises`` are those of the model's folder.
+    ``guard`` are the limits of the monitor that a guard listens to, ``reaction`` what it does; ``step_ms`` are
+    percentiles of the durations of steps by controller, ``summary`` is by task and controller. ``on_model`` names the
+    model that stood in for the machine, by controller, where there is no plant: then nothing here is of the machine,
+    and controllers, which met different plants, are not to be compared. ``promises`` are those of the model's folder.
     """
 
     schema: str
@@ -73,8 +71,7 @@ class ControlResults:
     seeds: int
     seed: int
     faults: tuple[FaultNote, ...]
-    guard: Detector | None
-    residuals: ResidualLimits | None
+    guard: WatchLimits | None
     reaction: str
     model: Origin
     noise: NoiseNote
@@ -155,8 +152,7 @@ def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[Loop
         seeds=len(study.loop_seeds),
         seed=study.run_seed,
         faults=tuple(FaultNote(f.target, f.value, f.channel, f.start, f.end) for f in faults),
-        guard=kit.calibration.detector if study.guard and kit.calibration is not None else None,
-        residuals=kit.residuals.get("hybrid") if study.guard else None,
+        guard=kit.limits("hybrid") if study.guard else None,
         reaction=study.guard,
         model=Origin(kit.provenance),
         noise=NoiseNote(model.noise_source, {name: tuple(kit.noise(name).tolist()) for name in filters}),

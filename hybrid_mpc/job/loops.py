@@ -29,11 +29,10 @@ from hybrid_mpc.loop.simulate import ClosedLoopResult, Step, simulate
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel, kinematics
-from hybrid_mpc.monitor.calibrate import alarm_intervals
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.residuals import ResidualMonitor
 from hybrid_mpc.records import known, plain, record
 from hybrid_mpc.scenario import Scenario, Task, load_scenario, registered_scenarios
+from hybrid_mpc.watch.monitor import Monitor
+from hybrid_mpc.watch.replay import alarm_intervals
 
 Array = NDArray[np.float64]
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
@@ -41,7 +40,7 @@ MODEL = "model"
 """Label of the model on the bench where there is one."""
 MONITORS = (*WATCHES, "none")
 """What watches a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`; or nothing does."""
-ALARMING = ("energy", "guard", "residuals")
+ALARMING = ("guard", "energy", "residuals")
 """Monitors that alarm."""
 GUARDS = ("", "rest", "adapt", "prior")
 """What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
@@ -215,7 +214,7 @@ class LoopRow:
         figures: The task's own figures.
         alarms: Alarms of the monitor; one that is on at the end ends there. None where nothing could alarm.
         alarm_share: Share of periods with an alarm; None where nothing could alarm.
-        largest_level: Largest level of the monitor [W]; None without one.
+        largest_violation: Largest violation of the energy balance [W]; None where the monitor does not read it.
         invalid_s: Time in which the monitor had no valid level [s]; None without one.
         switches: Changes of the guard's mode.
         timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
@@ -238,7 +237,7 @@ class LoopRow:
     figures: Mapping[str, float]
     alarms: tuple[Interval, ...] | None
     alarm_share: float | None
-    largest_level: float | None
+    largest_violation: float | None
     invalid_s: float | None
     switches: tuple[ModeChange, ...]
     timing_ms: Mapping[str, Mapping[str, float]]
@@ -265,7 +264,7 @@ class LoopRow:
             **{f"given_way {name}": share for name, share in self.given_way.items()},
             "alarm_share": nan if self.alarm_share is None else self.alarm_share,
             "first_alarm_s": self.alarms[0].start_s if self.alarms else nan,
-            "largest_level_w": nan if self.largest_level is None else self.largest_level,
+            "largest_violation_w": nan if self.largest_violation is None else self.largest_violation,
             **{f"timing_{kind}_{k}_ms": v for kind, name in times for k, v in self.timing_ms[name].items()},
         }
 
@@ -344,7 +343,7 @@ class Bench:
         self._built.move_to_end(key)
         return self._built[key]
 
-    def monitor(self, spec: LoopSpec) -> EnergyMonitor | ResidualMonitor | None:
+    def monitor(self, spec: LoopSpec) -> Monitor | None:
         """What watches the loop of a specification; refused if the model lacks what it needs."""
         if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
             return None
@@ -388,7 +387,7 @@ class Bench:
         spec: LoopSpec,
         *,
         task: Task | None = None,
-        monitor: EnergyMonitor | ResidualMonitor | None = None,
+        monitor: Monitor | None = None,
         on_step: Callable[[Step], None] | None = None,
     ) -> tuple[LoopRow, ClosedLoopResult]:
         """Run one loop.
@@ -508,7 +507,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         tracked = [s.label for s, weight in zip(model.outputs, problem.q_y, strict=True) if weight > 0]
         errors = errors[problem.q_y > 0]
     inputs = [signal.label for signal in model.inputs]
-    level = r.level[np.isfinite(r.level)]
+    violation = r.violation[np.isfinite(r.violation)]
     watched = spec.monitor != "none" and CONTROLLERS[spec.controller].model == "hybrid"
     can_alarm = watched and spec.monitor in ALARMING
     return LoopRow(
@@ -526,7 +525,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         figures=dict(task.figures(r)) if task.figures is not None else {},
         alarms=tuple(Interval(a, b) for a, b in alarm_intervals(r.alarm, r.dt)) if can_alarm else None,
         alarm_share=float(np.mean(r.alarm)) if can_alarm else None,
-        largest_level=float(level.max()) if level.size else None,
+        largest_violation=float(violation.max()) if violation.size else None,
         invalid_s=float(np.sum(~r.valid)) * r.dt if watched else None,
         switches=tuple(ModeChange(s.t, s.before.name, s.after.name, s.why) for s in r.switches),
         timing_ms={key: percentiles(r.timing_ms[key]) for key in TIMES},

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.excitation import check_excitation
-from hybrid_mpc.data.files import Source, name_and_unit, opened
+from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.names import ANGLES
 from hybrid_mpc.data.recording import MIN_SCORED, read_recordings
+from hybrid_mpc.data.source import Source, name_and_unit
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_text
@@ -56,7 +57,7 @@ class Draft:
     ``disturbances`` are measured and act on the machine, but nobody commands them. ``verdicts`` say by column why it
     has its role. ``loop`` says how a closed loop is seen, empty if none is; ``growth`` [1/s] is the rate at which the
     machine leaves its rest, zero if it does not; ``lags`` are first models of the outputs. ``length`` is that of the
-    shortest recording [s].
+    shortest recording [s]. ``notes`` say by file what was done to read it.
     """
 
     time: Column | None
@@ -73,6 +74,7 @@ class Draft:
     growth: float = 0.0
     length: float = 0.0
     lags: tuple[Lag, ...] = ()
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def unsure(self) -> dict[str, str]:
@@ -143,7 +145,7 @@ def write_scenario(
 
     Args:
         path: Python file to make; there must be none.
-        data: The recording (CSV, npz, mat), or several of one machine. Signals are the columns that all have.
+        data: The recording, or several of one machine. Signals are the columns that all have.
         inputs: Columns of the inputs. Default: those that look commanded (:mod:`hybrid_mpc.job.roles`).
         outputs: Columns of the outputs. Default: those that look measured.
         time: Column of the time. Default: one whose name says so, or else one that rises evenly.
@@ -256,7 +258,8 @@ def drafted(
     left_out |= {c.full: verdicts[c.full].reason for c in free if c.full not in used}
     runs = draft.runs
     lags = [first_lag(runs, i, draft.period, len(draft.inputs)) for i in range(len(draft.outputs))]
-    return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags)))
+    notes = {one.path.name: one.notes for one in sources if one.notes}
+    return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags), notes=notes))
 
 
 def _left_to_user(
@@ -604,18 +607,39 @@ def horizon_of(draft: Draft) -> tuple[int, str]:
     return periods, why
 
 
+def first_limits(span: tuple[float, float], growth: float) -> tuple[float, float]:
+    """Limits of an input in a first control problem: what was recorded.
+
+    An unstable machine falls where its input stays at a limit. Where its input was moved to both sides of zero, it may
+    be moved as far to either side: a recording from one start may hold much of one side alone.
+
+    Args:
+        span: Smallest and largest recorded value.
+        growth: Rate [1/s] at which the machine leaves its rest; 0: it does not.
+
+    Example:
+        >>> first_limits((-4.8, 14.0), 5.0), first_limits((-4.8, 14.0), 0.0), first_limits((0.0, 14.0), 5.0)
+        ((-14.0, 14.0), (-4.8, 14.0), (0.0, 14.0))
+    """
+    low, high = span
+    if growth > 0 and low < 0 < high:
+        return -max(-low, high), max(-low, high)
+    return low, high
+
+
 def _first_control(draft: Draft, n_x: int) -> list[str]:
     """A control problem for a first loop, commented out: what only the user knows is marked.
 
     Outputs are weighed by one over the square of a twentieth of what was recorded, changes of inputs of a tenth
-    (Bryson's rule); inputs stay within what was recorded.
+    (Bryson's rule); for the limits of inputs see :func:`first_limits`.
     """
     horizon, why = horizon_of(draft)
 
     def each(columns: Sequence[Column], share: float) -> str:
         return _tuple(_rounded(share * float(np.ptp(c.span))) + "**-2" for c in columns)
 
-    low, high = (_tuple(near(c.span[i], np.ptp(c.span) / 500) for c in draft.inputs) for i in (0, 1))
+    limits = [(first_limits(c.span, draft.growth), np.ptp(c.span) / 500) for c in draft.inputs]
+    low, high = (_tuple(near(ends[i], step) for ends, step in limits) for i in (0, 1))
     free = f"q={_tuple(['0.0'] * n_x)}, r={_tuple(['0.0'] * len(draft.inputs))}"
     sigma = _tuple(_rounded(0.005 * float(np.ptp(c.span))) for c in draft.outputs)
     return [

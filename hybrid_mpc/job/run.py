@@ -20,20 +20,18 @@ from hybrid_mpc.job.stages.compare import CONTROL
 from hybrid_mpc.job.stages.estimate import ESTIMATION
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT, NOISE, TASKS
-from hybrid_mpc.job.stages.guard import GUARD
 from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
-from hybrid_mpc.job.stages.monitor import MONITOR
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.job.stages.promises import PROMISES
 from hybrid_mpc.job.stages.report import REPORT, report_so_far
-from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import Results, read_results
+from hybrid_mpc.job.stages.watch import WATCH
 from hybrid_mpc.records import known
 from hybrid_mpc.scenario import load_scenario
 
 STAGES: tuple[Stage[Any], ...] = (
     DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, TASKS, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES,
-    RESIDUALS, MONITOR, GUARD, ANALYSIS, REPORT,
+    WATCH, ANALYSIS, REPORT,
 )  # fmt: skip
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
@@ -42,7 +40,7 @@ ALWAYS = (TASKS.name, REPORT.name)
 SECONDS = {
     "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4, "tasks": 1,
     "control": 42,
-    "on_model": 14, "estimation": 1, "promises": 6, "residuals": 6, "monitor": 6, "guard": 20, "analysis": 1,
+    "on_model": 14, "estimation": 1, "promises": 6, "watch": 36, "analysis": 1,
     "report": 9,
 }  # fmt: skip
 """What each stage of `make demo` takes on two idle cores [s], ``on_model`` where there is no plant: how long the rest

@@ -27,7 +27,7 @@ class RunSettings:
 
     Args:
         scenario: Registered name or path of a user's Python file.
-        data: Recordings of the user (CSV, npz, mat), in order; empty for a simulated machine.
+        data: Recordings of the user, in order; empty for a simulated machine.
         seed: Seed of data, training and closed loops.
         budget: Name of the scenario's budget.
         inputs: Columns that replace the scenario's inputs; default: the scenario's.

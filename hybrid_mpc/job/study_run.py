@@ -107,7 +107,7 @@ def load_models(
         kit = load(folder)
         check_kit(scenario, kit, str(folder))
         _check_plant(scenario, study, kit)
-        for kind in {"energy", "guard", "residuals"}.intersection(study.monitors):
+        for kind in {"guard", "energy", "residuals"}.intersection(study.monitors):
             kit.on(scenario).monitor("hybrid", kind=kind)
         if study.guard == "adapt":
             adaptable(kit.models["hybrid"], scenario.causes)

@@ -21,37 +21,35 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.kit.assembly import (
-    energy_is_watched,
     make_adaptive_guard,
     make_controller,
     make_estimator,
-    make_monitor,
     make_resting_guard,
-    sensor_steps,
 )
 from hybrid_mpc.kit.at_use import ModelsAtUse
+from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.kit.parts import (
     AGAIN,
     BALANCE,
-    ENERGY,
-    GUARD,
     HYBRID,
     KIT,
     MODELS,
     OBSERVER,
     PROGRAMS,
-    RESIDUALS,
     TASKS,
+    WATCH,
     Description,
     LoopSettings,
     ModelInfo,
     Provenance,
+    WatchFile,
     artifact_folder,
     loop_settings,
     read_parts,
     save_loop,
-    set_calibration,
+    set_limits,
     tuples,
+    watch_file,
     write_description,
 )
 from hybrid_mpc.kit.prediction import Predicting
@@ -61,14 +59,13 @@ from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import check_flag
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
-from hybrid_mpc.monitor.calibrate import Calibration
-from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.learn import guard_monitor
-from hybrid_mpc.monitor.lengths import SHARE
-from hybrid_mpc.monitor.residuals import ResidualLimits, ResidualMonitor
 from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.diagnose import Diagnoser
+from hybrid_mpc.watch.lengths import SHARE
+from hybrid_mpc.watch.monitor import Monitor, make_monitor, reads_energy
+from hybrid_mpc.watch.readings import ENERGY, RESIDUALS
 
 FUNCTIONS = ("step", "xdot", "output")
 INPUTS = {
@@ -81,11 +78,11 @@ OWN = ("step", "xdot")
 """Functions of a single network that are its own; the others are those of the prior that it stands on."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
-WATCHES = ("own", "energy", "readings", "guard", "residuals")
+WATCHES = ("own", "guard", "energy", "residuals")
 """Kinds of monitor, see :meth:`Kit.monitor`."""
 
 WITHOUT = (
-    'go without alarms: kind="own" records levels, monitor=None (export c: --no-monitor) watches nothing'
+    'go without alarms: kind="own" records readings, monitor=None (export c: --no-monitor) watches nothing'
 )
 
 
@@ -94,7 +91,7 @@ def save_artifact(
     programs: Mapping[str, Mapping[str, nn_export.Program]],
     info: ModelInfo,
     *,
-    calibration: Calibration | None = None,
+    limits: Mapping[str, Sequence[WatchLimits]] | None = None,
     provenance: Provenance | None = None,
     loop: LoopSettings | None = None,
     recommended: str = "",
@@ -108,7 +105,7 @@ def save_artifact(
         programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``, and of each of its
             balances, ``programs["hybrid"]["balance/energy"]``.
         info: Period and signals, the same for all models.
-        calibration: Thresholds of the energy, and the guard's detector. Default: none are written.
+        limits: By what monitors alarm, by model. Default: none are written.
         provenance: What the models were made from.
         loop: What loops need beside the models. Default: nothing is written.
         recommended: Model that a loop is made of where none is named. Default: the hybrid.
@@ -129,8 +126,8 @@ def save_artifact(
     )
     if loop is not None:
         save_loop(folder, loop)
-    if calibration is not None:
-        set_calibration(folder, calibration)
+    if limits is not None:
+        set_limits(folder, limits)
 
 
 def save_models(
@@ -254,8 +251,8 @@ def load(folder: str | Path) -> Kit:
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
     return Kit(
-        models, parts.calibration, found.provenance, found.model.input_delay, parts.loop,
-        found.recommended or (HYBRID if HYBRID in models else found.models[0]), parts.residuals,
+        models, parts.watch, found.provenance, found.model.input_delay, parts.loop,
+        found.recommended or (HYBRID if HYBRID in models else found.models[0]),
         members, found.predicting, found.programs_sha256, read_promises(folder), parts.lacks,
     )  # fmt: skip
 
@@ -281,12 +278,11 @@ class Kit:
 
     Args:
         models: Deployed models by name (``"hybrid"``, ``"prior"``).
-        calibration: Calibration of the energy monitor, or None.
+        watch: By what monitors alarm, by model.
         provenance: What the models were made from.
         input_delay: Delay [s] that the models hold. Default: none.
         loop: Control problems, noise and what else loops need. Default: nothing.
         recommended: Model that observer, controller and monitor are made of where none is named. Default: the hybrid.
-        residuals: Limits of the monitor of residuals, by model. Default: none were learned.
         members: The networks that the hybrid is the mean of, by name, the best first. Default: none.
         predicting: What :func:`hybrid_mpc.predict` needs beside the models. Default: there can be no predictions.
         programs_sha256: Hash of the models' programs. Default: not known.
@@ -301,12 +297,11 @@ class Kit:
     """
 
     models: Mapping[str, HybridModel]
-    calibration: Calibration | None = field(repr=False)
+    watch: Mapping[str, WatchFile] = field(repr=False)
     provenance: Provenance
     input_delay: float = 0.0
     loop: LoopSettings = field(default_factory=LoopSettings, repr=False)
     recommended: str = "hybrid"
-    residuals: Mapping[str, ResidualLimits] = field(default_factory=dict, repr=False)
     members: Mapping[str, HybridModel] = field(default_factory=dict, repr=False)
     predicting: Predicting | None = field(default=None, repr=False)
     programs_sha256: str = field(default="", repr=False)
@@ -379,7 +374,7 @@ class Kit:
     @property
     def rest_speed(self) -> tuple[float, ...] | None:
         """Speeds ``(n_q,)`` below which friction may stick, learned from recordings; None: unknown."""
-        return None if self.calibration is None else self.calibration.rest_speed
+        return next((own.rest_speed for own in self.watch.values() if own.rest_speed), None)
 
     @property
     def known_rest(self) -> tuple[float, ...] | None:
@@ -400,11 +395,22 @@ class Kit:
         return replace(self, loop=replace(self.loop, process_noise=tuples(noise)))
 
     def on(self, scenario: Scenario) -> Kit:
-        """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now."""
+        """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now; where
+        it names no disturbances, the default ones (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`).
+        """
         if not isinstance(scenario, Scenario):
             raise InputError(f"on: a Scenario is needed, got {type(scenario).__name__}")
-        models = ModelsAtUse(tuple(self.models), partial(_disturbed, self.models, scenario.disturbance_model))
-        return replace(self, models=models, loop=loop_settings(scenario, self.loop.process_noise))
+        chosen, problem = scenario.disturbance_model, scenario.control
+        if chosen is None and problem is not None and problem.n_y:
+            name = "prior" if "prior" in self.models else self.recommended
+            chosen = default_disturbances(_disturbed(self.models, None, name), problem)
+        return replace(self, loop=loop_settings(scenario, self.loop.process_noise)).with_disturbances(chosen)
+
+    def with_disturbances(self, chosen: Sequence[Disturbance] | None) -> Kit:
+        """The kit with another disturbance model (see ``Scenario``); None: one at each input."""
+        own = None if chosen is None else tuple(chosen)
+        models = ModelsAtUse(tuple(self.models), partial(_disturbed, self.models, own))
+        return replace(self, models=models, loop=replace(self.loop, disturbance_model=own))
 
     def problem(self, task: str = "") -> OCP:
         """The control problem of a task; of one without a problem of its own, and where no task is named, the common
@@ -442,15 +448,26 @@ class Kit:
             raise InputError(f"the model's process noise of {estimator} must be {n_x} numbers; train it anew")
         return sigma
 
-    def detector(self) -> Detector:
-        """The detector that the guard listens to; InputError if the folder holds none."""
-        found = None if self.calibration is None else self.calibration.detector
-        if found is None:
+    def limits(self, model: str = "", kind: str = "") -> WatchLimits:
+        """By what a monitor alarms.
+
+        Args:
+            model: Name of the model that is compared with the machine. Default: the recommended one.
+            kind: Kind of readings, ``"energy"`` or ``"residuals"``. Default: the energy where it can be read.
+
+        Raises:
+            InputError: If the folder holds none.
+        """
+        watched, name = self._model(model), model or self.recommended
+        kind = kind or (ENERGY if reads_energy(watched) else RESIDUALS)
+        own = self.watch.get(name)
+        if own is None or kind not in own.limits:
+            lack = self._lack(watch_file(name)) or self._lack(WATCH)
             raise InputError(
-                f"{self._whose} holds no detector for the guard, which the run's stage guard learns; run the main job "
-                f"again with it{self._lack(GUARD)}"
+                f"{self._whose} holds no limits of {kind} for the model {name}, which the run's stage watch learns: "
+                f"run the main job again with it, take learn_limits, or {WITHOUT}{lack}"
             )
-        return found
+        return own.limits[kind]
 
     def observer(self, model: str = "", *, task: str = "", load: bool = True) -> Filter:
         """The estimator of a model's state, hidden state and, with ``load``, an unknown load at its inputs.
@@ -488,9 +505,7 @@ class Kit:
             safe_input=self.safe_input,
         )  # fmt: skip
 
-    def monitor(
-        self, model: str = "", *, kind: str = "", task: str = "", diagnose: bool = False
-    ) -> EnergyMonitor | ResidualMonitor:
+    def monitor(self, model: str = "", *, kind: str = "", task: str = "") -> Monitor:
         """What watches a loop or a recording, with what the run has learned.
 
         A mechanical model whose positions are measured is watched by its energy, any other by the residuals of its
@@ -498,48 +513,35 @@ class Kit:
 
         Args:
             model: Name of the model that is compared with the machine. Default: the recommended one.
-            kind: ``"guard"``: what a guard listens to: of the energy the detector, with its test for frozen sensors, of
-                any other machine the residuals; ``"energy"``: the energy, which alarms by thresholds;
-                ``"residuals"``: the residuals, of a mechanical machine too; ``"own"``: records levels, and alarms only
-                where it has no valid reading; ``"readings"``: what a detector reads, without one. Default: the
-                detector, else thresholds; the residuals where the energy cannot be watched.
+            kind: ``"guard"``: the readings that fit the model, with their limits; ``"energy"`` or ``"residuals"``:
+                these readings, with theirs; ``"own"``: the readings that fit, without limits, so that only a monitor
+                without a valid reading alarms. Default: ``"guard"``.
             task: Whose control problem gives the inputs' ranges. Default: the common one.
-            diagnose: Whether the energy monitor remembers what a diagnosis of its alarms needs. Default: no.
 
         Raises:
             InputError: If there is no such model, task or kind, nothing was learned by which the monitor could alarm
-                (all kinds but ``"own"`` and ``"readings"``), or the energy of a model is asked for that has none.
+                (all kinds but ``"own"``), or the energy of a model is asked for that has none.
         """
-        check_flag(diagnose, "diagnose")
-        watched, learned = self._model(model), self.calibration
-        energy = energy_is_watched(watched)
-        detects = learned is not None and learned.detector is not None and self.control is not None
-        default = ("guard" if detects else "energy") if energy else "residuals"
-        kind = known(_named(kind, "kind of monitor") or default, WATCHES, "kind of monitor")
-        if kind == "residuals" or (kind in ("guard", "own") and not energy):
-            limits = self.residuals.get(model or self.recommended)
-            if kind != "own" and limits is None:
-                raise InputError(
-                    f"{self._whose} holds no limits of residuals of {watched.name}, which the run's stage residuals "
-                    f"learns: run the main job again with it, take learn_residuals, or {WITHOUT}{self._lack(RESIDUALS)}"
-                )
-            return ResidualMonitor(watched, limits=None if kind == "own" else limits)
-        if kind == "energy":
-            if energy and (learned is None or learned.threshold_w is None):
-                why = f" ({learned.method.rstrip('.')})" if learned is not None and learned.method else ""
-                raise InputError(
-                    f"{self._whose} holds no thresholds of the energy{why}: run the main job again with its stage "
-                    f"monitor, or {WITHOUT}{self._lack(ENERGY)}"
-                )
-            return make_monitor(watched, learned)
-        if kind == "own":
-            return make_monitor(watched, None, rest_speed=self.known_rest)
-        if kind == "readings":
-            return guard_monitor(watched, rest_speed=self.known_rest)
-        return guard_monitor(
-            watched, self.detector(), resolution=sensor_steps(self.sensor_sigma),
-            input_range=self.problem(task).input_range, diagnose=diagnose and watched.n_p > 0,
-        )  # fmt: skip
+        watched = self._model(model)
+        kind = known(_named(kind, "kind of monitor") or "guard", WATCHES, "kind of monitor")
+        of = kind if kind in (ENERGY, RESIDUALS) else ""
+        limits = None if kind == "own" else self.limits(model, of)
+        span = self.problem(task).input_range if self.loop.control or task else None
+        rest = self.known_rest if limits is None else None
+        return make_monitor(watched, limits, kind=of, rest_speed=rest, input_range=span)
+
+    def diagnoser(self, model: str = "") -> Diagnoser:
+        """What explains the alarms of a monitor with a model: changes of the prior's parameters, actuators or sensors.
+
+        Args:
+            model: Name of the model. Default: the recommended one.
+
+        Raises:
+            InputError: If there is no such model.
+        """
+        watched, own = self._model(model), self.watch.get(model or self.recommended)
+        limits = None if own is None else own.limits.get(RESIDUALS)
+        return Diagnoser(watched, limits, self.causes or None, prior=self.models.get("prior"))
 
     def guard(self, *, adapt: bool = False, task: str = "") -> Guard:
         """What a loop does on alarms: no input while the sensor is frozen; the rest is recorded, or adapted to.

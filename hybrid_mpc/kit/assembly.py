@@ -22,11 +22,7 @@ from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_stat
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import FOUND, load_left, most_likely
 from hybrid_mpc.loop.guard import Guard, Mode
-from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian, positions_of
-from hybrid_mpc.monitor.calibrate import Calibration
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.energy_readings import check_model
-from hybrid_mpc.monitor.lengths import LEVEL_S, half_window, samples
+from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 from hybrid_mpc.records import known
 from nn_export.errors import CompileError
 
@@ -65,7 +61,7 @@ DWELL_S, QUIET_S = 0.5, 1.0
 """A guard's shortest time in a mode, and the time without alarm before it goes back [the machine's seconds]."""
 PATIENCE_S = 0.8
 """[The machine's seconds.] A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the
-observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/energy-guard.md)."""
+observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/results/guard.md)."""
 GAIN = "gain of "
 
 
@@ -419,38 +415,6 @@ def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
         crossing = tolerated[position] / (control.horizon * model.dt)
         x[speed] += tolerated[speed] if tolerated[speed] > 0 else crossing
     return x, u
-
-
-def energy_is_watched(model: HybridModel) -> bool:
-    """Whether the energy monitor can read a model: a mechanical one whose outputs are its positions."""
-    try:
-        positions_of(model)
-        check_model(model)
-    except InputError:
-        return False
-    return True
-
-
-def make_monitor(
-    model: HybridModel, calibration: Calibration | None, *, rest_speed: ArrayLike | None = None
-) -> EnergyMonitor:
-    """The energy monitor with its default window: about 0.3 of the machine's seconds for derivative and level.
-
-    Args:
-        model: The model that is compared with the machine.
-        calibration: Its thresholds; None: its levels raise no alarm.
-        rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: the calibration's.
-
-    Raises:
-        InputError: If the model's energy cannot be watched (:func:`energy_is_watched`).
-
-    Example:
-        ``make_monitor(artifact.models["hybrid"], None)``
-    """
-    return EnergyMonitor(
-        model, window=2 * half_window(LEVEL_S, model) + 1, average=samples(LEVEL_S, model), calibration=calibration,
-        rest_speed=rest_speed,
-    )  # fmt: skip
 
 
 def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:

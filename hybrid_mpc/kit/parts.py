@@ -7,9 +7,7 @@ file                           what                                             
 ``models/``                    programs and weights of the models                            ``export``
 ``observer.json``              noise of sensors and states, disturbance model                ``noise``
 ``tasks.json``, ``tasks/``     common control problem, safe input; problems of single tasks  ``tasks``
-``watch/energy.json``          thresholds of the energy                                      ``monitor``
-``watch/residuals.json``       limits of outputs and balances, by model                      ``residuals``
-``guard.json``                 detector that the guard listens to                            ``guard``
+``watch/NAME.json``            limits of all channels that watch with a model                ``watch``
 ``promises.json``              what the kit promises (:mod:`hybrid_mpc.kit.promises`)        ``promises``
 =============================  ============================================================  ==============
 
@@ -20,7 +18,7 @@ whose estimates they were learned on. :func:`read_parts` composes what fits and 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -36,9 +34,6 @@ from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import numbers
-from hybrid_mpc.monitor.calibrate import Calibration
-from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import Fields, plain, record
 from hybrid_mpc.rules import (
     Duration,
@@ -53,20 +48,24 @@ from hybrid_mpc.rules import (
     Unit,
 )
 from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.watch.detector import WatchLimits
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Version of the format of the whole folder; docs/kit.md describes it."""
 KIT, MODELS, OBSERVER, TASKS = "kit.json", "models", "observer.json", "tasks.json"
-ENERGY, RESIDUALS, GUARD = "watch/energy.json", "watch/residuals.json", "guard.json"
+WATCH = "watch/*.json"
 PROGRAMS, WEIGHTS = f"{MODELS}/programs.json", f"{MODELS}/weights.safetensors"
 OWNERS: Mapping[str, str] = {
     KIT: "export", PROGRAMS: "export", WEIGHTS: "export", OBSERVER: "noise", TASKS: "tasks", "tasks/*.json": "tasks",
-    ENERGY: "monitor", RESIDUALS: "residuals", GUARD: "guard", "promises.json": "promises",
+    WATCH: "watch", "promises.json": "promises",
 }  # fmt: skip
 """The stage of a run that writes a file; no other does."""
 OLD_FILE, OLD_SCHEMA = "model.json", 4
-"""The description of a kit in the former format, of one file; see :mod:`hybrid_mpc.kit.migrate`."""
+"""The description of a kit in a former format, of one file; see :mod:`hybrid_mpc.kit.migrate`."""
+SPLIT_SCHEMA = 5
+"""The former format of several files, which can be migrated, too."""
 OLD_FILES = (OLD_FILE, "programs.json", "weights.safetensors")
+SPLIT_FILES = ("watch/energy.json", "watch/residuals.json", "guard.json")
 BENCHMARK_NOTE = "benchmark_model.json"
 """File of a benchmark's model, which is no artifact."""
 MOST_MODELS = 16
@@ -326,43 +325,19 @@ class TaskProblem:
 
 
 @dataclass(frozen=True)
-class EnergyLimits:
-    """What ``watch/energy.json`` holds.
+class WatchFile:
+    """What ``watch/NAME.json`` holds: by what a monitor with the model of that name alarms.
 
     Args:
-        calibration: Thresholds of the energy, or why there are none; without detector.
-        of: Digest of the observer that they were learned with (:func:`observer_digest`). Empty: by hand, of any.
+        limits: WatchLimits by kind of readings (:mod:`hybrid_mpc.watch.readings`).
+        reason: Why some are missing. Default: none is.
+        rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: unknown.
+        of: Digest of the observer that they were learned with (:meth:`Parts.observer`). Empty: by hand, of any.
     """
 
-    calibration: Calibration
-    of: Line = ""
-
-
-@dataclass(frozen=True)
-class ChannelLimits:
-    """What ``watch/residuals.json`` holds.
-
-    Args:
-        limits: Limits by model.
-        of: Digests of the observers that they were learned with, by model. A model without: by hand, of any.
-    """
-
-    limits: Mapping[Name, ResidualLimits]
-    of: Mapping[Name, Line] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class GuardLimits:
-    """What ``guard.json`` holds.
-
-    Args:
-        detector: The detector; None: there is none, and ``reason`` says why.
-        reason: Why there is none. Default: there is one.
-        of: Digest of the observer that it was learned with. Empty: by hand, of any.
-    """
-
-    detector: Detector | None
+    limits: Mapping[Name, WatchLimits]
     reason: Text = ""
+    rest_speed: tuple[Positive, ...] = ()
     of: Line = ""
 
 
@@ -373,15 +348,13 @@ class Parts:
     Args:
         description: ``kit.json``.
         loop: Control problems, noise and what else loops need.
-        calibration: Thresholds of the energy, and the detector; None: neither is there.
-        residuals: Limits of outputs and balances by model.
+        watch: By what monitors alarm, by model.
         lacks: What is missing, and the stage that gives it, by file.
     """
 
     description: Description
     loop: LoopSettings
-    calibration: Calibration | None
-    residuals: Mapping[str, ResidualLimits]
+    watch: Mapping[str, WatchFile]
     lacks: Mapping[str, str]
 
     @property
@@ -404,9 +377,9 @@ class Parts:
 
 
 def write_description(folder: Path, description: Description) -> None:
-    """Write ``kit.json``; what a kit of the former format has left in the folder goes."""
+    """Write ``kit.json``; what a kit of a former format has left in the folder goes."""
     _write(folder, KIT, description)
-    for name in OLD_FILES:
+    for name in (*OLD_FILES, *SPLIT_FILES):
         (folder / name).unlink(missing_ok=True)
 
 
@@ -428,19 +401,18 @@ def write_tasks(folder: Path, loop: LoopSettings) -> None:
             path.unlink()
 
 
-def write_energy(folder: Path, limits: EnergyLimits) -> None:
-    """Write ``watch/energy.json``, unless it is there."""
-    _write_once(folder, ENERGY, limits)
+def write_watch(folder: Path, watch: Mapping[str, WatchFile]) -> None:
+    """Write ``watch/NAME.json`` of each model, unless it is there; files of other models go."""
+    for name, limits in watch.items():
+        _write_once(folder, watch_file(name), limits)
+    for path in (folder / "watch").glob("*.json"):
+        if path.stem not in watch:
+            path.unlink()
 
 
-def write_residuals(folder: Path, limits: ChannelLimits) -> None:
-    """Write ``watch/residuals.json``, unless it is there."""
-    _write_once(folder, RESIDUALS, limits)
-
-
-def write_guard(folder: Path, limits: GuardLimits) -> None:
-    """Write ``guard.json``, unless it is there."""
-    _write_once(folder, GUARD, limits)
+def watch_file(model: str) -> str:
+    """Place of what a monitor with a model alarms by."""
+    return f"watch/{model}.json"
 
 
 def save_loop(folder: Path, loop: LoopSettings) -> None:
@@ -464,28 +436,24 @@ def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
     write_observer(folder, replace(held, process_noise=tuples(noise), of=""))
 
 
-def set_calibration(folder: Path, calibration: Calibration) -> None:
-    """Write the energy's thresholds and the guard's detector by hand: ``watch/energy.json`` and ``guard.json``.
-
-    Raises:
-        InputError: If the folder holds no artifact.
-        StorageError: If it cannot be written.
-    """
-    read_description(folder)
-    write_energy(folder, EnergyLimits(replace(calibration, detector=None)))
-    detector = calibration.detector
-    write_guard(folder, GuardLimits(detector, "" if detector else "set_calibration was given no detector"))
-
-
-def set_residuals(folder: Path, residuals: Mapping[str, ResidualLimits]) -> None:
-    """Write the limits of outputs and balances, by model, by hand: ``watch/residuals.json``.
+def set_limits(folder: Path, limits: Mapping[str, Sequence[WatchLimits]]) -> None:
+    """Write by hand what monitors alarm by: limits of one or more kinds of readings, by model.
 
     Raises:
         InputError: If the folder holds no artifact, or no such model.
         StorageError: If it cannot be written.
     """
-    _check_models(residuals, read_description(folder))
-    write_residuals(folder, ChannelLimits(dict(residuals)))
+    _check_models(limits, read_description(folder))
+    write_watch(
+        folder,
+        {
+            model: WatchFile(
+                {one.kind: one for one in own},
+                rest_speed=next((one.rest_speed for one in own if one.rest_speed), ()),
+            )
+            for model, own in limits.items()
+        },
+    )
 
 
 def tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:
@@ -516,34 +484,27 @@ def read_parts(folder: Path) -> Parts:
         control, observer.sensor_sigma, observer.first_sigma, observer.process_noise, tasks.causes, tasks.safe_input,
         tasks.tasks, observer.disturbance_model,
     )  # fmt: skip
-    parts = Parts(found, loop, None, {}, lacks)
+    parts = Parts(found, loop, {}, lacks)
     if held is None:
         lacks[OBSERVER] = _absent(OBSERVER)
     elif observer.of not in ("", parts.models):
         lacks[OBSERVER] = _stale(OBSERVER, "models")
         parts = replace(parts, loop=replace(loop, process_noise={}))
-    energy, guard = _read(folder, ENERGY, EnergyLimits), _read(folder, GUARD, GuardLimits)
-    calibration = None
-    if energy is None or energy.of not in ("", parts.observer(HYBRID)):
-        lacks[ENERGY] = _absent(ENERGY) if energy is None else _stale(ENERGY, "observer")
-    else:
-        calibration = energy.calibration
-        if calibration.threshold_w is None:
-            lacks[ENERGY] = f"{ENERGY} holds no thresholds: {calibration.method.rstrip('.')}"
-    if guard is None or guard.of not in ("", parts.observer(HYBRID)):
-        lacks[GUARD] = _absent(GUARD) if guard is None else _stale(GUARD, "observer")
-    elif guard.detector is None:
-        lacks[GUARD] = f"{GUARD} holds no detector: {guard.reason.rstrip('.')}"
-    else:
-        calibration = replace(calibration or Calibration.without(lacks[ENERGY]), detector=guard.detector)
-    channels = _read(folder, RESIDUALS, ChannelLimits) or ChannelLimits({})
-    _check_models(channels.limits, found)
-    residuals = {
-        m: own for m, own in channels.limits.items() if channels.of.get(m, "") in ("", parts.observer(m))
-    }
-    if not residuals:
-        lacks[RESIDUALS] = _stale(RESIDUALS, "observer") if channels.limits else _absent(RESIDUALS)
-    return replace(parts, calibration=calibration, residuals=residuals)
+    names = [path.stem for path in sorted((folder / "watch").glob("*.json"))]
+    _check_models(names, found)
+    watch = {}
+    for name in names:
+        file = watch_file(name)
+        own = _read(folder, file, WatchFile)
+        if own is None or own.of not in ("", parts.observer(name)):
+            lacks[file] = _stale(WATCH, "observer").replace(WATCH, file)
+            continue
+        watch[name] = own
+        if own.reason:
+            lacks[file] = f"{file} lacks limits: {own.reason.rstrip('.')}"
+    if not names:
+        lacks[WATCH] = _absent(WATCH)
+    return replace(parts, watch=watch)
 
 
 def _read_tasks(folder: Path, lacks: dict[str, str]) -> tuple[TaskList, dict[str, OCP]]:
@@ -577,9 +538,9 @@ def _stale(file: str, other: str) -> str:
     return f"the numbers in {file} {whose} than this kit's; the run's stage {OWNERS[file]} writes new ones: {AGAIN}"
 
 
-def _check_models(limits: Mapping[str, ResidualLimits], found: Description) -> None:
-    if strange := [name for name in limits if name not in found.models]:
-        raise InputError(f"residuals: no model {strange[0]!r}; there are: {', '.join(found.models)}")
+def _check_models(names: Collection[str], found: Description) -> None:
+    if strange := [name for name in names if name not in found.models]:
+        raise InputError(f"watch: no model {strange[0]!r}; there are: {', '.join(found.models)}")
 
 
 def _write(folder: Path, file: str, content: object) -> None:
@@ -607,9 +568,10 @@ def _read(folder: Path, file: str, kind: type[R]) -> R | None:
     if not is_file(path):
         return None
     if (version := read_object(path).get("schema_version")) != SCHEMA_VERSION:
+        remedy = _anew(folder) if version == SPLIT_SCHEMA else "train the models anew"
         raise InputError(
             f"{path} is of version {version!r} of the format (field schema_version); this version of hybrid-mpc reads "
-            f"{SCHEMA_VERSION}: train the models anew"
+            f"{SCHEMA_VERSION}: {remedy}"
         )
     again = "" if file == KIT else f"; or delete it, and {AGAIN}"
     document = read_document(path, f"take the folder from its run again{again}")
@@ -617,10 +579,18 @@ def _read(folder: Path, file: str, kind: type[R]) -> R | None:
     return record(kind, document, str(path))
 
 
+def _anew(folder: Path) -> str:
+    return f"Write it in the present one with: hybrid-mpc export kit {folder} --out NEW"
+
+
 def artifact_files(folder: Path) -> tuple[str, ...]:
     """All files of an artifact but its promises, of which no loop depends; others in its folder do not belong to it."""
     known = [name for name in OWNERS if "*" not in name and name != "promises.json"]
-    own = [path.relative_to(folder).as_posix() for path in sorted((folder / "tasks").glob("*.json"))]
+    own = [
+        path.relative_to(folder).as_posix()
+        for part in ("tasks", "watch")
+        for path in sorted((folder / part).glob("*.json"))
+    ]
     return tuple(name for name in (*known, *own) if is_file(folder / name))
 
 
@@ -643,10 +613,7 @@ def artifact_folder(folder: Path) -> Path:
             return place
     for place in (folder, folder / "model"):
         if is_file(place / OLD_FILE):
-            raise InputError(
-                f"{place / OLD_FILE}: this kit has the former format of one file. Write it in the present one with: "
-                f"hybrid-mpc export kit {place} --out NEW"
-            )
+            raise InputError(f"{place / OLD_FILE}: this kit has a former format, of one file. {_anew(place)}")
         if is_file(place / BENCHMARK_NOTE):
             raise InputError(
                 f"{folder} is the folder of a benchmark: its model ({place / BENCHMARK_NOTE}) predicts and has no "

@@ -49,11 +49,11 @@ class Reading(Protocol):
 
     @property
     def violation_w(self) -> float:
-        """Energy violation [W]."""
+        """Violation of the energy balance [W]; NaN where the energy is not read."""
 
     @property
-    def level_w(self) -> float:
-        """Level above which it counts [W]."""
+    def share(self) -> float:
+        """Largest level over its threshold [-]; NaN without limits."""
 
     @property
     def alarm(self) -> bool:

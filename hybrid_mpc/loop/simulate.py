@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-UNITS = {"stage_cost": "1/s", "violation": "W", "level": "W"}
+UNITS = {"stage_cost": "1/s", "violation": "W", "share": "-"}
 
 
 @dataclass(frozen=True)
@@ -241,11 +241,10 @@ def _result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> Cl
         status=tuple(row.status for row in rows),
         timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
         violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
-        level=np.array([np.nan if r is None else r.level_w for r in readings]),
+        share=np.array([np.nan if r is None else r.share for r in readings]),
         alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
         valid=np.array([r is not None and not getattr(r, "validity", 0) for r in readings]),
         switches=switches,
-        numbers=np.array([getattr(r, "numbers", ()) for r in readings], dtype=np.float64),
         w=np.array([row.w for row in rows]),
         y_ref=np.array([row.y_ref for row in rows]),
         reached=np.array([row.reached for row in rows]),
@@ -336,14 +335,13 @@ class ClosedLoopResult:
             weight factors of that instant and without penalties of soft bounds.
         timing_ms: Durations ``(n,)`` [ms] of ``estimate``, ``solve``, ``monitor``, ``prepare`` and ``total``. The only
             field in which two runs may differ.
-        violation: Energy violation ``(n,)`` [W]; NaN without a monitor.
-        level: Alarm level ``(n,)`` [W]; NaN without a monitor.
+        violation: Violation of the energy balance ``(n,)`` [W]; NaN where a monitor does not read it.
+        share: Largest level of the monitor over its threshold ``(n,)`` [-]; NaN without limits.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode, in their order. Default: none.
         valid: ``(n,)``, True where the monitor's reading was valid. Default: unknown.
         innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN where it had none. Default: unknown.
         nis: Normalised innovations squared ``(n,)`` [-]; NaN where there was none. Default: unknown.
-        numbers: The monitor's readings as numbers ``(n, columns)``, from which detectors are learned. Default: none.
         w: Measured disturbances ``(n, n_w)`` that acted from ``t_k`` on. Default: none.
         y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN where references are the states'. Default: unknown.
         reached: ``(n,)``, False where the set-point cannot be reached. Default: unknown.
@@ -373,13 +371,12 @@ class ClosedLoopResult:
     stage_cost: Array
     timing_ms: Mapping[str, Array]
     violation: Array
-    level: Array
+    share: Array
     alarm: NDArray[np.bool_]
     switches: tuple[Switch, ...] = ()
     valid: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     innovation: Array = field(default_factory=lambda: np.zeros((0, 0)))
     nis: Array = field(default_factory=lambda: np.zeros(0))
-    numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
     y_ref: Array = field(default_factory=lambda: np.zeros((0, 0)))
     reached: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
@@ -434,7 +431,7 @@ class ClosedLoopResult:
                 continue
             labels = _labels(name, values.shape[1], model)
             columns.update({label: values[:, i] for i, label in enumerate(labels)})
-        for name in ("source", "status", "stage_cost", "violation", "level", "alarm"):
+        for name in ("source", "status", "stage_cost", "violation", "share", "alarm"):
             unit = "" if model is None or name not in UNITS else f" [{UNITS[name]}]"
             columns[name + unit] = getattr(self, name)
         for name in sorted({name for period in self.given_way for name in period}):

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.plots.estimation import innovations
     from hybrid_mpc.plots.fit import BalanceRun, curves, errors_bar, free_run, parity, prediction
     from hybrid_mpc.plots.loops import Motion, closed_loops, solve_times
-    from hybrid_mpc.plots.monitor import overview
+    from hybrid_mpc.plots.monitor import channels
     from hybrid_mpc.plots.studies import differences, distributions, pareto
 
 __all__ = [
@@ -51,7 +51,7 @@ __all__ = [
     "innovations",
     "BalanceRun", "errors_bar", "free_run", "parity", "prediction",
     "Motion", "closed_loops", "solve_times",
-    "overview",
+    "channels",
     "Scene",
     "differences", "distributions", "pareto",
     "curves",
@@ -66,7 +66,7 @@ _MODULES = {
     "estimation": ("innovations",),
     "fit": ("BalanceRun", "curves", "errors_bar", "free_run", "parity", "prediction"),
     "loops": ("Motion", "closed_loops", "solve_times"),
-    "monitor": ("overview",),
+    "monitor": ("channels",),
     "studies": ("differences", "distributions", "pareto"),
 }  # fmt: skip
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

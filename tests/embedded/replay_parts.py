@@ -12,19 +12,20 @@ from online_models import rk4
 
 from hybrid_mpc import (
     OCP,
+    ChannelLimit,
     CondensedController,
-    Detector,
-    EnergyMonitor,
     Fault,
     Guard,
     HybridModel,
     Limits,
     Mode,
-    ResidualMonitor,
+    Monitor,
+    ResidualReadings,
     SafeController,
     Signal,
-    guard_monitor,
-    learn_residuals,
+    WatchLimits,
+    learn_limits,
+    make_monitor,
     simulate,
 )
 from hybrid_mpc.embedded.generate import sources_of
@@ -52,13 +53,8 @@ void whole_plan(hmpc_state *s, int backup, const hmpc_real *held, const hmpc_rea
   hmpc_load_plan(s, u, z, d, w);
 }
 """
-ENERGY = {
-    "violation_w": "violation", "level_w": "level", "residual": "residual", "residual_level": "residual_level",
-    "energy_j": "energy", "energy_s": "seconds", "scores": "score", "dE_model_w": "model_balance",
-    "dE_measured_w": "measured_balance",
-}  # fmt: skip
+READ = {"values": "value", "levels": "level", "share": "share", "travel": "travel"}
 """Names of a reading's numbers in Python and in C."""
-RESIDUALS = {"residual": "residual", "level": "level", "share": "share", "travel": "travel"}
 WIDE = 1e-9
 SAID = ("alarm", "frozen", "blind", "validity")
 
@@ -107,22 +103,16 @@ class Whole:
             self.view[name] = found_bytes.view(kind).reshape(shape)
 
     def _fields(self, sizes, case):
-        n_q, m = self.model.n_x // 2, self.model
+        m = self.model
         found = {name: (name, np.float64, (n,)) for name, n in (("x", m.n_x), ("d", m.n_d), ("u", m.n_u))}
         found |= {name: (name, np.int32, ()) for name in ("status", "source", "age")}
         if case.guard is not None:
             found |= {f"guard_{name}": (f"guard.{name}", np.int32, ()) for name in ("mode", "wanted")}
-        shapes = dict.fromkeys((*ENERGY.values(), "share"), ())
-        if isinstance(case.monitor, EnergyMonitor):
-            shapes |= {"residual": (n_q,), "score": (2,)}
-            names = ENERGY.values()
-        elif case.monitor is not None:
-            n = sizes["CHANNELS"]
-            shapes |= {"residual": (n,), "level": (n, 2), "travel": (m.n_y,)}
-            names = RESIDUALS.values()
-        else:
+        if case.monitor is None:
             return found
-        found |= {f"monitor_{name}": (f"monitor.{name}", np.float64, shapes[name]) for name in names}
+        shapes = {"value": (sizes["CHANNELS"],), "share": (), "travel": (m.n_y,)}
+        shapes |= {"level": (sizes["LIMITS"],)} if sizes["LIMITS"] else {}
+        found |= {f"monitor_{name}": (f"monitor.{name}", np.float64, shape) for name, shape in shapes.items()}
         return found | {f"monitor_{name}": (f"monitor.{name}", np.int32, ()) for name in SAID}
 
     def call(self, name, *given):
@@ -185,7 +175,7 @@ def replay(whole, case, *, own=False, told=True, known=None):
     )
     forecast = Forecast(case.w, ocp, model.n_w, model.dt)
     size = case.safe.controller.problem.sizes.states
-    names = ENERGY if isinstance(case.monitor, EnergyMonitor) else RESIDUALS
+    names = {name: own for name, own in READ.items() if f"monitor_{own}" in view}
     found, wanted = {name: [] for name in names}, {name: [] for name in names}
     largest_u = largest_x = 0.0
     wide = 0
@@ -223,8 +213,6 @@ def replay(whole, case, *, own=False, told=True, known=None):
     largest = 0.0
     for name in names:
         got, want = (np.array(v).reshape(len(steps), -1) for v in (found[name], wanted[name]))
-        if name == "scores" and case.monitor.detector is None:
-            continue
         np.testing.assert_array_equal(np.isnan(got), np.isnan(want), err_msg=name)
         scale = np.max(np.abs(np.nan_to_num(want)), axis=0)
         off = np.nan_to_num(np.abs(got - want)) / np.where(scale > 0, scale, 1.0)
@@ -275,8 +263,10 @@ def arm_case(periods, seed=0):
     model = arm()
     ocp = OCP(12, [40.0, 40.0, 0.5, 0.5], [0.2, 0.2], [0.1, 0.1], [-2.0, -2.0], [2.0, 2.0], du_max=[0.8, 0.8])
     size = (0.02**2, 0.02**2, 0.02**2, 0.02**2)
-    detector = Detector(model.dt, (size, size), size, 1.0, 12.0, 6.0, rest_speed=(0.05, 0.08))
-    monitor = guard_monitor(model, detector, resolution=[1e-3, 1e-3])
+    force = [ChannelLimit(f"force of {q}", "N m", 0, 12.0, 6.0, size, 1.0) for q in ("q1", "q2")]
+    power = ChannelLimit("power of the free run", "W", 1, 6.0, 3.0, size)
+    limits = WatchLimits("energy", model.dt, (*force, power), (3e-3, 3e-3), (0, 0), rest_speed=(0.05, 0.08))
+    monitor = make_monitor(model, limits)
     guard = Guard(Mode.LIMITED, Mode.REST, limits=Limits([-1.0, -1.2], [1.0, 0.9]), dwell=0.3, quiet=0.4)
     safe = SafeController(CondensedController(model, ocp), model, safe_input=[0.0, 0.0])
     t = periods * model.dt
@@ -304,8 +294,8 @@ def residual_case(make, reference, guard, faults, sigma, periods, seed=0):
     plant = MachinePlant(model, sigma=sigma)
     case = Case(estimator, safe, None, None, plant, reference, model.x0, periods, seed=seed)
     nominal = [run(replace(case, seed=100 + i))[1] for i in range(2)]
-    limits = learn_residuals(model, estimator, nominal)
-    return replace(case, monitor=ResidualMonitor(model, limits=limits), guard=guard, faults=faults)
+    limits = learn_limits(ResidualReadings(model), estimator, nominal)
+    return replace(case, monitor=Monitor(ResidualReadings(model), limits), guard=guard, faults=faults)
 
 
 def tanks_case(periods, seed=0):

@@ -18,7 +18,7 @@ from embedded_parts import needs_compiler
 
 import hybrid_mpc as hm
 import nn_export.files
-from hybrid_mpc import Calibration, CondensedController, InputError, set_calibration
+from hybrid_mpc import ChannelLimit, CondensedController, InputError, WatchLimits, set_limits
 from hybrid_mpc.embedded import export
 from hybrid_mpc.embedded.export import OTHERS, TOLERANCE
 from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, _config, make_sources
@@ -276,7 +276,8 @@ def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     code, _, err = call("export", "c", run, "--out", folder)  # the run has learned nothing to alarm by
     assert code == 2
     assert "--no-monitor" in err
-    set_calibration(run, Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand"))
+    violation = ChannelLimit("violation", "W", 1, 0.2, 0.1)
+    set_limits(run, {"hybrid": [WatchLimits("energy", 0.02, (violation,), (5e-3,), (0,))]})
     code, out, err = call("export", "c", run, "--out", folder)
     assert code == 0, err
     assert "nothing of it was compiled or run" in out

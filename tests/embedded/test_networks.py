@@ -9,7 +9,7 @@ import pytest
 from embedded_parts import needs_compiler
 from online_models import pendulum_rhs, rk4
 
-from hybrid_mpc import OCP, CondensedController, HybridModel, Signal, TrueState, guard_monitor
+from hybrid_mpc import OCP, CondensedController, HybridModel, Signal, TrueState, make_monitor
 from hybrid_mpc.embedded.cut import cut
 from hybrid_mpc.embedded.generate import make_sources
 from hybrid_mpc.embedded.native import NativeController, load_library
@@ -137,7 +137,7 @@ def test_steps_slopes_rates_and_inputs(name):
     model = model_of(name)
     assert (cut(model).cell is not None) == (name in ONE_CELL)
     found = make_sources(
-        model, OCP_, estimator=parts.filters_of(model, OCP_), fallback=None, monitor=guard_monitor(model)
+        model, OCP_, estimator=parts.filters_of(model, OCP_), fallback=None, monitor=make_monitor(model)
     )
     c, rng = load_library(found, parts.QUICK).c, np.random.default_rng(0)
     n, wide = 2 + model.n_h, -(-(2 + model.n_h) // 8) * 8
@@ -177,7 +177,7 @@ def test_equal_weights_are_there_once():
     """Of a step and its rates, which hold the same network: less than twice the size of one."""
     model = model_of("lstm")
     with_rates = make_sources(
-        model, OCP_, estimator=parts.filters_of(model, OCP_), monitor=guard_monitor(model)
+        model, OCP_, estimator=parts.filters_of(model, OCP_), monitor=make_monitor(model)
     )
     text = with_rates.texts["hmpc_expressions.h"]
     assert text.count("_weight[48][12]") == 1

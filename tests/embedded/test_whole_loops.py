@@ -25,8 +25,8 @@ from hybrid_mpc import (
     Limits,
     Mode,
     SafeController,
-    guard_monitor,
     load_scenario,
+    make_monitor,
 )
 from hybrid_mpc.embedded.generate import CORE, make_sources, sources_of
 from hybrid_mpc.kit.parts import loop_settings, read_parts, save_loop
@@ -240,9 +240,8 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
     case = replays.arm_case(10)
     model, plain = case.safe.controller.model, replace(case, guard=None)
     refused(plain, "a monitor of another kind.*object", monitor=object())
-    refused(plain, "a history for a diagnosis", monitor=guard_monitor(model, diagnose=True))
     refused(plain, "a monitor without an estimator", estimator=None)
-    other = guard_monitor(parts.online_models.pendulum_model())
+    other = make_monitor(parts.online_models.pendulum_model())
     refused(plain, "a monitor of another model", monitor=other)
     refused(case, "a guard without a monitor", monitor=None)
     bare = SafeController(case.safe.controller, model)
@@ -260,8 +259,8 @@ def test_a_kits_monitor_and_guard(noisy_artifact, tmp_path, call):
     save_loop(run, loop_settings(golf, read_parts(run).loop.process_noise))
     code, _, err = call("export", "c", run, "--guard", "--out", tmp_path / "early")
     assert code == 2
-    assert "detector" in err
-    hm.set_calibration(run, machine("golf_robot").calibration)
+    assert "no limits of energy" in err
+    hm.set_limits(run, {"hybrid": [machine("golf_robot").limits]})
     sizes = {}
     for words in ((), ("--no-monitor",), ("--guard",), ("--adapt",)):
         folder = tmp_path / "-".join(["c", *words])

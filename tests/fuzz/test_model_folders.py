@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import hybrid_mpc as hm
-from hybrid_mpc import Calibration, Detector, InputError, set_calibration, set_process_noise
+from hybrid_mpc import ChannelLimit, InputError, WatchLimits, set_limits, set_process_noise
 from hybrid_mpc.files import HASH, digest
-from hybrid_mpc.kit.parts import ENERGY, GUARD, KIT, PROGRAMS, WEIGHTS
+from hybrid_mpc.kit.parts import KIT, PROGRAMS, WEIGHTS
 from tests.fuzz.forked import cheap, command, refused
 
 ODD = [
@@ -112,17 +112,17 @@ def test_fields_that_do_not_fit(folder, whole, tmp_path, seed):
     assert count > 40
 
 
-def detector_and_thresholds():
-    detector = Detector(
-        0.02, ((1e-4, 1e-4, 0.0, 1e-4),), (1e-4, 1e-4, 0.0, 1e-4), 0.5, 4.0, 4.0, rest_speed=(0.2,)
-    )
-    return Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, detector, (0.2,))
+def limits():
+    scale = (1e-4, 1e-4, 0.0, 1e-4)
+    force = ChannelLimit("force of phi", "N m", 0, 4.0, 2.0, scale, 0.5)
+    power = ChannelLimit("power of the free run", "W", 1, 4.0, 2.0, scale)
+    return WatchLimits("energy", 0.02, (force, power), (5e-3,), (0,), rest_speed=(0.2,))
 
 
 @pytest.fixture
 def watched(folder, tmp_path):
-    """An artifact with a calibration of all parts, a recording and a filter's noise."""
-    set_calibration(folder, detector_and_thresholds())
+    """An artifact with limits of all channels, a recording and a filter's noise."""
+    set_limits(folder, {"hybrid": [limits()]})
     t = 0.02 * np.arange(300)
     table = np.column_stack([t, np.sin(2 * t), 0.1 * np.cos(3 * t)])
     np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time_s,phi_rad,u_nm", comments="")
@@ -134,20 +134,20 @@ def watched(folder, tmp_path):
     return words
 
 
-def test_a_good_calibration_is_watched_with(watched):
+def test_good_limits_are_watched_with(watched):
     ended = command(*watched("out"))
     assert ended.code == 0, ended.told
-    assert "watched with a detector" in ended.told
+    assert "watched: force of phi, power of the free run" in ended.told
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(2))
-def test_calibrations_that_do_not_fit(watched, folder, seed):
+def test_limits_that_do_not_fit(watched, folder, seed):
     """Numbers that fit may be watched with, however odd; all else is refused."""
-    rng, file = random.Random(seed), (ENERGY, GUARD)[seed]
+    rng, file = random.Random(seed), "watch/hybrid.json"
     document = json.loads((folder / file).read_text())
     document.pop(HASH)
-    paths = [p for p in places(document) if p[:1] in (("calibration",), ("detector",))]
+    paths = [p for p in places(document) if p[:1] in (("limits",), ("rest_speed",))]
     refusals = 0
     for i in range(60):
         path, new = rng.choice(paths), rng.choice([*ODD, ...])

@@ -18,10 +18,8 @@ from scipy.stats import t as student
 import nn_export
 from hybrid_mpc import (
     OCP,
-    Calibration,
     CondensedController,
     DelayCompensation,
-    EnergyMonitor,
     Estimate,
     ExtendedKalmanFilter,
     Fault,
@@ -34,9 +32,10 @@ from hybrid_mpc import (
     SQPController,
     Status,
     SwitchingFilter,
-    guard_monitor,
+    WatchLimits,
     load,
     load_scenario,
+    make_monitor,
     parameter_filter,
     simulate,
     with_parameter_states,
@@ -85,8 +84,8 @@ class Machine:
         return {name: build_model(name, programs, self.info) for name in self.data["models"]}
 
     @cached_property
-    def calibration(self):
-        return record(Calibration, self.data["calibration"], "golden.json: calibration")
+    def limits(self):
+        return record(WatchLimits, self.data["limits"], "golden.json: limits")
 
     @property
     def replay(self):
@@ -154,16 +153,9 @@ class Machine:
         """The terminal weight as the problem finds it for the hybrid."""
         return self.problem(name, "riccati").terminal_weight(self.hybrid)
 
-    def level_monitor(self):
-        """The monitor with thresholds on its levels."""
-        sizes = self.data["level_monitor"]
-        return EnergyMonitor(
-            self.hybrid, window=sizes["window"], average=sizes["average"], calibration=self.calibration
-        )
-
-    def guard_monitor(self):
-        """The monitor with detector, free runs and freeze test."""
-        return guard_monitor(self.hybrid, self.calibration, **self.data["freezing"])
+    def monitor(self):
+        """The monitor of forces, free runs and frozen sensors."""
+        return make_monitor(self.hybrid, self.limits, input_range=self.data["input_range"])
 
     def guard(self, kind, problem):
         """``adapt``: a backup that estimates parameters; ``limit``: tighter limits; either rests without sensor."""
@@ -215,11 +207,11 @@ def machine(name):
 
 
 def artifact_of(folder, out):
-    """Models by name and calibration as the library's own reader finds them once a kit of the former format is migrated
+    """Models by name and limits as the library's own reader finds them once a kit of the former format is migrated
     to the folder ``out``.
     """
     found = load(migrate_kit(folder, out))
-    return found.models, found.calibration
+    return found.models, found.limits("hybrid")
 
 
 # ---- kernels: fed with frozen inputs, no plant
@@ -337,13 +329,13 @@ def converged(m, name):
     return {"u": plan.u, "x": plan.x, "cost": np.array(plan.cost), "status": np.array(plan.status.name)}
 
 
-READ = ("violation_w", "level_w", "residual_level", "energy_j", "energy_s")
+READ = ("values", "terms", "travel")
 SAID = ("alarm", "frozen", "blind", "validity")
 
 
-def readings(m, kind):
-    """What a monitor reads of the replay with its frozen estimates."""
-    monitor = m.guard_monitor() if kind == "guard" else m.level_monitor()
+def readings(m):
+    """What the monitor reads of the replay with its frozen estimates."""
+    monitor = m.monitor()
     y, u = m.arrays[f"{m.replay}/y"], m.arrays[f"{m.replay}/u"]
     before = np.vstack([np.zeros((1, u.shape[1])), u[:-1]])
     state, rows = monitor.initial(), []
@@ -352,22 +344,27 @@ def readings(m, kind):
         rows.append(reading)
     found = {name: np.array([getattr(r, name) for r in rows]) for name in READ}
     found |= {name: np.array([int(getattr(r, name)) for r in rows]) for name in SAID}
-    found["residual"] = np.array([r.residual for r in rows])
-    if kind == "guard":
-        found["numbers"] = np.array([r.numbers for r in rows])
-        found["scores"] = np.array([r.scores for r in rows])
+    found["scores"] = scores_of(m, [r.levels for r in rows])
     return found
 
 
+def scores_of(m, levels):
+    """Levels as shares of their thresholds."""
+    return np.abs(np.array(levels)) / [limit.threshold for limit in m.limits.channels]
+
+
 def detections(m):
-    """What the detector makes of the monitor's frozen numbers."""
-    detector = m.calibration.detector
-    state, rows = detector.initial(), []
-    for numbers in m.arrays["guard/numbers"].tolist():
-        state, scores, alarm = detector.update(state, numbers)
-        rows.append((*scores, *state.sums, alarm))
+    """What the detector makes of the monitor's frozen values."""
+    monitor = m.monitor()
+    state, levels, rows = monitor.detector.initial(), [], []
+    for values, terms in zip(
+        m.arrays["guard/values"].tolist(), m.arrays["guard/terms"].tolist(), strict=True
+    ):
+        state, level, _ = monitor.detector.update(state, values, terms, True)
+        levels.append(level)
+        rows.append((*state.sums, any(state.on)))
     found = np.array(rows, dtype=float)
-    return {"scores": found[:, :2], "sums": found[:, 2:-1], "alarm": found[:, -1].astype(int)}
+    return {"scores": scores_of(m, levels), "sums": found[:, :-1], "alarm": found[:, -1].astype(int)}
 
 
 # ---- closed loops
@@ -390,7 +387,7 @@ class Parts:
     def made(self):
         m = self.machine
         guard = None if self.guard is None else m.guard(self.guard, self.problem)
-        return m.filters["switching"], m.safe_controller(self.problem), m.guard_monitor(), guard
+        return m.filters["switching"], m.safe_controller(self.problem), m.monitor(), guard
 
 
 def run_loop(parts, loop, seed):
@@ -408,7 +405,7 @@ def run_loop(parts, loop, seed):
 
 def loop_values(result):
     """What is held of a closed loop: arrays, and the guard's switches in words."""
-    names = ("x", "y", "u", "x_hat", "d", "stage_cost", "violation", "level")
+    names = ("x", "y", "u", "x_hat", "d", "stage_cost", "violation")
     found = {name: getattr(result, name) for name in names}
     found |= {name: getattr(result, name).astype(int) for name in ("alarm", "valid")}
     found |= {name: np.array(getattr(result, name)) for name in ("status", "mode")}
@@ -516,7 +513,7 @@ def run_real_time(m):
     estimator = DelayCompensation(estimator, input_delay=delay) if delay else estimator
     runner = Runner(
         rig.measure, rig.actuate, estimator, m.safe_controller(loop["problem"], rig.wrap),
-        m.reference(loop["problem"]), weight=m.weight(loop["problem"]), monitor=m.guard_monitor(),
+        m.reference(loop["problem"]), weight=m.weight(loop["problem"]), monitor=m.monitor(),
         deadline=loop["deadline"] * m.dt, clock=rig.clock, guard=m.guard(loop["guard"], loop["problem"]),
         on_step=steps.append, input_delay=delay,
     )  # fmt: skip
@@ -526,8 +523,7 @@ def run_real_time(m):
     found["source"] = np.array([first_name(name) for name in report.source])
     found["d"] = np.array([s.estimate.d for s in steps])
     found["h"] = np.array([s.estimate.h for s in steps])
-    for name in ("violation_w", "level_w"):
-        found[name] = np.array([getattr(s.reading, name) for s in steps])
+    found["violation_w"] = np.array([s.reading.violation_w for s in steps])
     for name in SAID:
         found[name] = np.array([int(getattr(s.reading, name)) for s in steps])
     counts = {name: getattr(report, name) for name in ("periods", "missing", "late", "overruns", "skipped")}

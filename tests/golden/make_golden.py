@@ -119,9 +119,9 @@ RUNNER = {
 
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
-    from hybrid_mpc import ModelInfo, load, load_scenario, make_estimator, make_monitor, make_ocp
+    from hybrid_mpc import ModelInfo, load, load_scenario, make_estimator, make_ocp
     from hybrid_mpc.job.controllers import no_surer_than_prior
-    from hybrid_mpc.kit.assembly import first_controller, sensor_steps
+    from hybrid_mpc.kit.assembly import first_controller
     from hybrid_mpc.kit.parts import read_description
 
     folder, run = HERE / name, Path(run)
@@ -139,7 +139,6 @@ def freeze(name, run):
     deviations = [np.sqrt(f.noise[0]) for f in observer.filters]
     first = np.sqrt(np.diag(observer.filters[0].start(np.zeros(hybrid.n_y)).P))
     n_x, n_u = hybrid.n_x, hybrid.n_u
-    monitor = make_monitor(hybrid, artifact.calibration)
     tasks = {task.name: task for task in scenario.tasks}
     problems, arrays = {}, {}
     for short, task_name in PROBLEMS[name].items():
@@ -173,14 +172,13 @@ def freeze(name, run):
             )
         ),
         "models": list(artifact.models),
-        "calibration": plain(artifact.calibration),
+        "limits": plain(artifact.limits("hybrid", "energy")),
         "observer": {
             "sigma_y": plain(control.estimator_sigma), "sigma_x0": plain(first[:n_x]), "sigma_d0": plain(first[-n_u:]),
             "modes": [{"sigma_x": plain(s[:n_x]), "sigma_d": plain(s[-n_u:])} for s in deviations],
             "transition": plain(observer.transition),
         },
-        "level_monitor": {"window": monitor.window, "average": monitor.average},
-        "freezing": plain({"resolution": sensor_steps(scenario.sensor_sigma), "input_range": control.input_range}),
+        "input_range": plain(control.input_range),
         "problems": problems,
         "replays": REPLAYS[name],
         "loops": LOOPS[name],
@@ -219,7 +217,8 @@ def record_inputs(m):
         m.arrays[f"{replay}/y"], m.arrays[f"{replay}/u"] = result.y, result.u
         found = parts.estimates(m, replay, "switching")
         m.arrays.update({f"{replay}/switching/{key}": found[key] for key in ("x", "h", "d")})
-    m.arrays["guard/numbers"] = parts.readings(m, "guard")["numbers"]
+    found = parts.readings(m)
+    m.arrays.update({f"guard/{key}": found[key] for key in ("values", "terms")})
 
 
 def results(m):
@@ -234,8 +233,7 @@ def results(m):
         add(f"{replay}/switching", parts.estimates(m, replay, "switching"))
         add(f"{replay}/decide", parts.decisions(m, replay))
     add(f"{m.replay}/single", parts.estimates(m, m.replay, "single"))
-    for kind in ("guard", "level"):
-        add(kind, parts.readings(m, kind))
+    add("guard", parts.readings(m))
     add("detector", parts.detections(m))
     add("model", parts.model_values(m))
     for case in m.data["sqp"]:

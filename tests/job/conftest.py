@@ -108,15 +108,16 @@ def point(figure: Any, path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def run_folder(golf_artifact, tmp_path_factory) -> Path:
-    """A run's folder as far as loops look at it: an artifact with noise, and a calibration that alarms at once."""
-    from hybrid_mpc import Calibration, set_calibration, set_process_noise
+    """A run's folder as far as loops look at it: an artifact with noise, and limits that alarm at once."""
+    from hybrid_mpc import ChannelLimit, WatchLimits, set_limits, set_process_noise
 
     folder = tmp_path_factory.mktemp("run")
     model = shutil.copytree(golf_artifact, folder / "model")
     names = ("prior", "prior_observer", "hybrid", "hybrid_observer", "oracle")
     set_process_noise(model, dict.fromkeys(names, (1e-4, 2e-2)))
-    limits = {"residual_threshold": 1e9, "residual_release": 1e8}
-    set_calibration(model, Calibration(1e-9, 1e-10, 1.0, 10, 1.0, "for tests", **limits))
+    at_once = ChannelLimit("violation", "W", 1, 1e-9, 1e-10)
+    limits = WatchLimits("energy", 0.02, (at_once,), (1.0,), (0,), 1.0, 1.0, "for tests")
+    set_limits(model, {"hybrid": [limits]})
     return folder
 
 
@@ -149,5 +150,5 @@ def write_bare_tanks(folder: Path) -> None:
         table = dict(zip(short.columns, short.table("train", i + 1, 0).T, strict=True))
         path = write(folder / f"{name}.csv", table)
         words += ["--data", str(path)] if name != "later" else []
-    skipped = [word for stage in ("estimation", "residuals", "analysis") for word in ("--skip", stage)]
+    skipped = [word for stage in ("estimation", "watch", "analysis") for word in ("--skip", stage)]
     finish(folder, ["run", str(folder / "tanks.py"), *words, *skipped], drawn=False)

@@ -8,8 +8,8 @@ import pytest
 from hybrid_mpc.files import read_object
 from hybrid_mpc.job.sequential import Comparison
 from hybrid_mpc.job.stages.advice import advice
-from hybrid_mpc.job.stages.monitor import CleanAlarms
 from hybrid_mpc.job.stages.results import CandidateErrors, Results, StepTimes, read_results
+from hybrid_mpc.job.stages.watch import CleanAlarms
 from hybrid_mpc.job.summary import Mean
 from hybrid_mpc.report.page import Hint, Report, render
 
@@ -21,8 +21,8 @@ def results() -> Results:
     """A run of the golf robot in which nothing stands out."""
     found = read_results(read_object(PATH), str(PATH))
     quick = replace(found.timing, controller_step_ms=StepTimes(median=3.0, p99=5.0, max=9.0))
-    quiet = replace(found.residuals, details=replace(found.residuals.details, clean=CleanAlarms(300.0, 0)))
-    return replace(found, timing=quick, residuals=quiet)
+    quiet = replace(found.watch, details=replace(found.watch.details, clean=CleanAlarms(300.0, 0)))
+    return replace(found, timing=quick, watch=quiet)
 
 
 def changed(results: Results, **details: object) -> Results:
@@ -53,13 +53,13 @@ def test_each_finding_is_told_with_what_to_do(results):
     (said,) = bad(slow)
     assert "30.7 ms" in said
     assert "period is 20 ms" in said
-    noisy = replace(results, monitor=replace(
-        results.monitor, details=replace(results.monitor.details, clean=CleanAlarms(250.0, 4))
+    noisy = replace(results, watch=replace(
+        results.watch, details=replace(results.watch.details, clean=CleanAlarms(250.0, 4))
     ))  # fmt: skip
     (said,) = bad(noisy)
-    assert "Alarms of the energy monitor: 4 in 250 s" in said
-    within = replace(noisy.monitor.details, clean=CleanAlarms(250.0, 1))  # 0.35 are to be expected
-    assert bad(replace(noisy, monitor=replace(noisy.monitor, details=within))) == []
+    assert "Alarms of the monitor: 4 in 250 s" in said
+    within = replace(noisy.watch.details, clean=CleanAlarms(250.0, 1))  # 0.14 are to be expected
+    assert bad(replace(noisy, watch=replace(noisy.watch, details=within))) == []
     warned = replace(results, data=replace(
         results.data, details=replace(results.data.details, warnings=("monday.csv is nearly constant",))
     ))  # fmt: skip

@@ -17,8 +17,8 @@ from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.job.benchmark import refitted
 from hybrid_mpc.job.benchmark_runs import pieces, read_test, run_error, run_freely
 from hybrid_mpc.kit.artifact import build_model
-from hybrid_mpc.monitor.calibrate import calibrate, with_residual
-from hybrid_mpc.monitor.replay import with_alarms
+from hybrid_mpc.watch.learn import limits_of
+from hybrid_mpc.watch.replay import with_alarms
 from scenarios.torque_pendulum import scenario
 
 OLD = {"J": 0.15, "mgl": 2.98, "d": 0.01, "F_c": 0.15, "phi_0": 0.0, "k_u": 0.83}
@@ -91,11 +91,12 @@ def test_the_monitor_alarms_at_once_with_the_old_model(machines):
     model = build_model("prior", {f"prior/{n}": p for n, p in trace_model(step).items()}, info)
     sigma = np.array([1e-4, 2e-2])
     clean, changed = (
-        replay(make_monitor(model, None), make_estimator(model, scenario, sigma), t) for t in (before, after)
+        replay(make_monitor(model), make_estimator(model, scenario, sigma), t) for t in (before, after)
     )
-    levels = (clean.level_w, clean.residual_level)
-    calibration = with_residual(*(calibrate([v], 0.02, false_alarms_per_hour=30.0) for v in levels))
-    trace = with_alarms(make_monitor(model, calibration), changed)
+    limits = limits_of(
+        make_monitor(model).readings, [before.y], [clean], false_alarms_per_hour=30.0, trusted=True
+    )
+    trace = with_alarms(make_monitor(model, limits), changed)
     first = trace.t[np.argmax(trace.alarm)]
     assert trace.alarm.any()
-    assert first < 1.5  # s from standing still; the monitor averages over two windows of 0.3 s
+    assert first < 1.5  # s from standing still; forces are read half a window of 0.2 s late

@@ -16,7 +16,7 @@ from hybrid_mpc import (
     Signal,
     load,
     load_scenario,
-    set_calibration,
+    set_limits,
     set_process_noise,
 )
 from hybrid_mpc.job.context import Context
@@ -243,16 +243,15 @@ def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, j
 def test_loops_leave_the_limits_in_the_artifact_and_do_not_depend_on_them(run_folder, tmp_path, monkeypatch):
     out = shutil.copytree(run_folder, tmp_path / "run")
     context = Context(RunSettings("golf_robot", budget="quick"), GOLF, out)
-    learned = load(out).calibration
-    assert learned is not None
+    learned = load(out).limits("hybrid")
     spec = LoopSpec("golf_robot", MODEL, "track_sine", "hybrid_observer", duration=0.5)
     monkeypatch.setattr(type(context), "read", lambda self, stage: None)
     monkeypatch.setattr(stage, "compare", lambda context: run_specs("golf_robot", out / "model", [spec]))
     found = []
     for rest in ((0.3,), (0.02,)):
-        calibration = replace(learned, rest_speed=rest)
-        set_calibration(out / "model", calibration)
+        limits = replace(learned, rest_speed=rest)
+        set_limits(out / "model", {"hybrid": [limits]})
         found.append(control_stage(context).rows[0])
-        assert load(out).calibration == calibration
-    assert found[0].largest_level > 0
-    assert found[0].largest_level == found[1].largest_level
+        assert load(out).limits("hybrid") == limits
+    assert found[0].largest_violation > 0
+    assert found[0].largest_violation == found[1].largest_violation

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,12 +9,12 @@ import pytest
 
 from hybrid_mpc import (
     Bench,
-    Calibration,
-    Detector,
+    ChannelLimit,
     InputError,
     Study,
+    WatchLimits,
     load_scenario,
-    set_calibration,
+    set_limits,
     set_process_noise,
 )
 from hybrid_mpc.job.study_run import load_models
@@ -140,20 +139,20 @@ def test_a_fault_from_the_command_line_acts(call, short, run_folder, tmp_path):
 def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, short, run_folder, tmp_path):
     folder = shutil.copytree(run_folder, tmp_path / "run")
     # Wide scales: only the test for freezing is to speak.
-    detector = Detector(0.02, ((9.0, 0.0, 0.0, 0.0),), (9.0, 0.0, 0.0, 0.0), 2.0, 50.0, 50.0)
-    detector = replace(detector, false_alarms_per_hour=1.0)
-    calibration = Calibration(9.0, 9.0, 1.0, 1, 1.0, "by hand", detector=detector)
+    force = ChannelLimit("force of phi", "N m", 0, 50.0, 25.0, (9.0, 0.0, 0.0, 0.0), 2.0)
+    limits = WatchLimits("energy", 0.02, (force,), (5e-3,), (0,), 1.0)
+    (folder / "model" / "watch" / "hybrid.json").unlink()
     options = ["--task", "track_sine", "--seeds", 1, "--no-gif", "--fault", "measurement_freeze@1"]
     words = [short, "--model", folder, "--out"]
     code, _, error = call(*words, tmp_path / "none", *options, "--guard")
-    assert (code, "holds no detector" in error) == (2, True)
-    set_calibration(folder / "model", calibration)
+    assert (code, "holds no limits of energy" in error) == (2, True)
+    set_limits(folder / "model", {"hybrid": [limits]})
     code, told, _ = call(*words, tmp_path / "guarded", *options, "--guard")
     assert code == 0
     assert "rest from" in told
     results = json.loads((tmp_path / "guarded" / "results.json").read_text())
     assert results["controllers"] == ["hybrid_observer"]  # what the guard watches, where none is named
-    assert record(Detector, results["guard"], "") == detector
+    assert record(WatchLimits, results["guard"], "") == limits
     assert results["reaction"] == "rest"
     (loop,) = results["loops"]
     assert loop["switches"][0]["after"] == "REST"

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_mpc.job.stage import read_stage
-from hybrid_mpc.job.stages.monitor import MONITOR
 from hybrid_mpc.job.stages.results import read_results
 from scenarios.torque_pendulum import WINDOWS
 
@@ -35,10 +33,10 @@ def test_golf_robot(tmp_path):
     error = results["identification"]["error"]
     assert error["mopgrnn"] < error["phy"] < error["phy_nominal"]
     assert error["mopgrnn"] < error["rnn"]
-    load = read_stage(tmp_path / "run" / "checkpoints" / "monitor.json", MONITOR, "").result.load
-    assert load.delay_s is not None
-    assert load.delay_s < 0.5  # a fifth of the largest torque, in motion: within two monitor windows
-    assert load.false_alarms == 0
+    (load,) = (row for row in results["watch"]["faults"] if row["fault"] == "load")
+    assert load["delay_s"] is not None
+    assert load["delay_s"] < 0.5  # a fifth of the largest torque, in motion: within two monitor windows
+    assert load["false_alarms"] == 0
 
 
 @pytest.mark.full
@@ -51,7 +49,7 @@ def test_torque_pendulum_on_the_real_recordings(tmp_path):
     assert rmse["phy"][signal] < rmse["phy_nominal"][signal]
     fitted = results["identification"]["details"]["prior_parameters"]["values"]
     assert 0.75 < fitted["k_u"] < 0.95  # true torque is probably 1/1.2 of the commanded one
-    alarms = results["monitor"]["alarms"]
+    alarms = results["watch"]["alarms"]
     # by hand: two gentle pushes off the top, at almost no speed, and a strong one
     for start, end in ((7.0, 8.0), (11.0, 13.0), (16.0, 16.5)):
         assert any(a["file"] == FILES[0] and start <= a["start_s"] <= end for a in alarms), (start, end)
@@ -61,4 +59,4 @@ def test_torque_pendulum_on_the_real_recordings(tmp_path):
     # half of what the prior erred by before its smoother knew the jumps of the torque: docs/results has both
     assert rmse["phy"][signal] < 0.08
     assert rmse["mopgrnn"][signal] < rmse["phy"][signal]
-    assert results["monitor"]["details"]["clean"]["alarms"] == 0
+    assert results["watch"]["details"]["clean"]["alarms"] == 0

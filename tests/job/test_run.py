@@ -178,11 +178,13 @@ def test_damaged_artifact_is_refused(golf_artifact, tmp_path, file, damage, word
 def test_artifact_holds_data_only(finished):
     folder = finished / "model"
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    assert names == {name for name in OWNERS if "*" not in name}  # no task has a control problem of its own
+    # no task has a control problem of its own
+    watched = {"watch/hybrid.json", "watch/prior.json"}
+    assert names == {name for name in OWNERS if "*" not in name} | watched
     artifact = load(finished / "model")
     assert set(artifact.models) == {"hybrid", "prior"}
     assert artifact.models["prior"].n_h == 0
-    assert artifact.calibration is not None
+    assert artifact.limits("hybrid").hours > 0
     assert artifact.provenance.data_hash == results(finished)["data"]["hash"]
 
 
@@ -201,16 +203,14 @@ def test_the_artifact_holds_the_fitted_parameters_with_what_is_known_of_them(fin
     assert min(errors) == 0.0 or np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
-def test_the_main_job_says_what_its_guard_lacks(finished):
-    found = results(finished)["guard"]
-    assert found["data_hash"] is None
-    assert "need 2.5 min" in found["reason"]
-    assert (finished / "figures" / "guard_recorded.png").stat().st_size > 10_000
+def test_the_main_job_says_what_its_monitor_lacks(finished):
+    found = results(finished)["watch"]
+    limits = load(finished / "model").limits("hybrid")
+    assert not limits.rated
+    assert "need 2.5 min" in limits.method
+    assert (found["kind"], found["faults"]) == ("energy", None)
     page = (finished / "report.html").read_text()
-    assert "Energy guard" in page
-    assert "No detector could be learned" in page
-    stored = load(finished / "model").calibration
-    assert stored.detector is None
+    assert "1.5 x the highest nominal level" in page
 
 
 def test_the_folder_alone_is_monitored(call, machine, finished, tmp_path):

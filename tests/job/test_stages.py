@@ -71,9 +71,7 @@ def own(machine, finished, arguments, tmp_path, monkeypatch):
                 "control",
                 "on_model",
                 "promises",
-                "residuals",
-                "monitor",
-                "guard",
+                "watch",
                 "analysis",
                 "report",
             ],
@@ -126,19 +124,19 @@ def test_a_library_that_draws_otherwise_runs_the_report_alone(own, call, monkeyp
 
 def test_only_and_skip(own, call):
     _, out, command = own
-    (out / "checkpoints" / "guard.json").unlink()
-    before = {"guard": 0} | {
-        name: (out / "checkpoints" / f"{name}.json").stat().st_mtime_ns for name in NAMES if name != "guard"
+    (out / "checkpoints" / "watch.json").unlink()
+    before = {"watch": 0} | {
+        name: (out / "checkpoints" / f"{name}.json").stat().st_mtime_ns for name in NAMES if name != "watch"
     }
-    code, _, message = call(*command, "--skip", "guard")
+    code, _, message = call(*command, "--skip", "watch")
     assert code == 0, message
-    assert not (out / "checkpoints" / "guard.json").exists()
+    assert not (out / "checkpoints" / "watch.json").exists()
     results = json.loads((out / "results.json").read_text())
-    assert results["guard"]["reason"] == "stage guard was left out"
-    code, _, message = call(*command, "--only", "guard")
+    assert results["watch"]["reason"] == "stage watch was left out"
+    code, _, message = call(*command, "--only", "watch")
     assert code == 0, message
     after = stamps(out)
-    assert [name for name in NAMES if after[name] != before[name]] == ["guard", "report"]
+    assert [name for name in NAMES if after[name] != before[name]] == ["watch", "report"]
     for words, told in (
         (("--skip", "prior"), "without it there is no model"),
         (("--only", "prio"), "did you mean 'prior'"),
@@ -157,8 +155,7 @@ def test_only_control_after_an_edit_takes_the_edited_problem_and_keeps_the_monit
     assert code == 0, said + message
     after = load(out / "model")
     np.testing.assert_allclose(after.control.q, 2.0 * np.array(before.control.q))
-    assert after.calibration == before.calibration
-    assert after.residuals == before.residuals
+    assert after.watch == before.watch
     # limits of the input are the observer's too: with them a stage that control needs is out of date
     source.write_text(source.read_text().replace("changed(", "changed(u_max=[0.5], ", 1))
     kept = (out / "model" / "tasks.json").read_bytes()
@@ -175,10 +172,10 @@ def test_only_the_first_stages_of_a_new_run(own, call, tmp_path):
     """The fit alone is no error; what cannot run is refused before there is a folder."""
     _, _, command = own
     words = [*command[: command.index("--out")], "--out", str(tmp_path / "new")]
-    code, _, message = call(*words, "--only", "guard")
+    code, _, message = call(*words, "--only", "watch")
     assert code == 2
     assert "stage data has not run in" in message
-    assert "guard needs it" in message
+    assert "watch needs it" in message
     assert not (tmp_path / "new").exists()
     code, told, message = call(*words, "--only", "data", "--only", "prior")
     assert code == 0, message
@@ -198,7 +195,7 @@ def test_what_lies_outside_the_stage_s_file_is_missed(own, call):
     again = rerun(before, stamps(out))
     assert again[0] == "export"
     assert "training" not in again
-    assert load(out / "model").calibration is not None
+    assert load(out / "model").watch
     assert (out / "report.html").is_file()
     assert "stage export runs again" in said + message
 

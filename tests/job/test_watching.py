@@ -2,59 +2,57 @@
 
 from dataclasses import replace
 
-import pytest
+import numpy as np
 
-from hybrid_mpc import Calibration, ResidualLimits
-from hybrid_mpc.job.stage import Absent
-from hybrid_mpc.job.stages.guard import GuardResult, GuardTest
-from hybrid_mpc.job.stages.monitor import CleanAlarms, MonitorResult
-from hybrid_mpc.job.stages.residuals import FaultedChannel, ResidualsResult
+from hybrid_mpc import ChannelLimit, WatchLimits
+from hybrid_mpc.job.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 from hybrid_mpc.job.stages.watching import rate_words, watching_table
+from hybrid_mpc.kit.parts import WatchFile
+from hybrid_mpc.watch.readings import Channel
 
-NONE = Absent("left out")
-CHANNELS = ("level", "mass")
-LIMITS = ResidualLimits(
-    CHANNELS, 1.0, ((0.2, 0.1), (3.0, 2.0)), ((0.1, 0.1), (1.0, 1.0)), (1.0,), (3,), 1.0, 1.0
+LIMITS = WatchLimits(
+    "residuals",
+    1.0,
+    (
+        ChannelLimit("level", "m", 3, 0.2, 0.1),
+        ChannelLimit("level", "m", 30, 0.1, 0.1),
+        ChannelLimit("mass", "kg/s", 0, 9.0, 4.5, (1.0,)),
+    ),
+    (0.5,),
+    (3,),
 )
 FAULTS = (
-    FaultedChannel("input_gain", "pump", 0.8, "hold", 50.0, 4.0, ("mass", "level"), "pump -21 %", 0),
-    FaultedChannel("measurement_freeze", "level", 0.0, "hold", 50.0, None, (), "", 0),
+    FaultedLoop("weak_pump", "the pump weakens", "hold", 50.0, 4.0, ("mass", "level"), "pump -21 %", 0),
+    FaultedLoop("freeze_level", "the sensor freezes", "hold", 50.0, 2.0, ("level frozen",), "frozen", 0),
+    FaultedLoop("load", "a load", "hold", 50.0, None, (), "", 0),
 )
-RESIDUALS = ResidualsResult(
-    {"prior": LIMITS}, "", (), CleanAlarms(3600.0, 2), FAULTS,
-    by_channel={"level": CleanAlarms(3600.0, 2), "mass": CleanAlarms(3600.0, 0)}, units=("m", "kg/s"),
+HOUR = 3600.0
+FOUND = WatchResult(
+    {"prior": WatchFile({"residuals": LIMITS})}, "residuals", faults=FAULTS, clean=CleanAlarms(HOUR, 2),
+    channels=(Channel("level", "m"), Channel("mass", "kg/s"), Channel("violation", "W")),
+    by_channel={
+        "level": CleanAlarms(HOUR, 2), "mass": CleanAlarms(HOUR, 0), "violation": CleanAlarms(HOUR, 0),
+        "level frozen": CleanAlarms(HOUR, 0),
+    },
 )  # fmt: skip
 
 
-def test_every_channel_has_a_row_and_each_fault_stands_at_the_channel_that_saw_it_first():
-    table = watching_table(NONE, NONE, RESIDUALS, "")
-    assert [row[0] for row in table.rows] == ["level", "mass", "frozen sensor, or no channel"]
-    level, mass, frozen = table.rows
-    assert level[1:] == ("0.2, lasting 0.1 m", "2 (0.24 to 7.2)", "", "")
-    assert mass[1:] == (
-        "3, lasting 2 kg/s",
-        "0 (0 to 3.7)",
-        "input_gain of pump 4 s",
-        "input_gain of pump: pump -21 %",
-    )
-    assert frozen[3] == "measurement_freeze of level never"
+def test_every_channel_with_a_limit_has_a_row_and_each_fault_stands_where_it_was_seen_first():
+    level, mass, frozen, all_of_them = watching_table(FOUND).rows
+    assert level == ("level", "0.2 m, mean over 3 s; 0.1 m, mean over 30 s", "2 (0.24 to 7.2)", "", "")
+    assert mass == ("mass", "9 deviations, summed", "0 (0 to 3.7)", "weak_pump 4 s", "weak_pump: pump -21 %")
+    assert frozen[0] == "level frozen"
+    assert frozen[3:] == ("freeze_level 2 s", "freeze_level: frozen")
+    assert (all_of_them[2], all_of_them[3], all_of_them[4]) == ("2 (0.24 to 7.2)", "load never", "")
 
 
-def test_energy_and_guard_stand_in_the_same_table():
-    energy = MonitorResult(
-        Calibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.3, 0.1), (), clean=CleanAlarms(300.0, 0)
-    )
-    without = GuardResult("", (), GuardTest(0.0, 0, ()), None, "too little")
-    table = watching_table(energy, without, NONE, "N m")
-    assert [row[:2] for row in table.rows] == [("energy", "0.2 W"), ("residual force", "0.3 N m")]
-    assert "0 (0 to 44)" in table.rows[0][2]
-
-
-@pytest.mark.parametrize("empty", [NONE, MonitorResult(Calibration.without("too little"), ())])
-def test_without_limits_there_is_no_table(empty):
-    assert watching_table(empty, NONE, replace(RESIDUALS, limits={}), "") is None
+def test_without_limits_there_is_no_table():
+    assert watching_table(replace(FOUND, watch={})) is None
+    assert watching_table(replace(FOUND, watch={"prior": WatchFile({}, "too little")})) is None
 
 
 def test_the_interval_of_a_count():
     """Garwood's exact limits of one event: 0.0253 and 5.572."""
     assert rate_words(1, 3600.0) == "1 (0.025 to 5.6)"
+    assert rate_words(0, 0.0) == "not watched"
+    assert np.isclose(CleanAlarms(HOUR, 2).expected(2.0), 2.0)

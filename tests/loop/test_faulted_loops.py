@@ -51,7 +51,7 @@ def loops(request, golf_artifact):
         result = simulate(
             scenario.plant(), make_estimator(model, scenario, np.array(SIGMA_X), control), controller,
             task.reference, weight=task.weight, dt=DT, duration=PERIODS * DT, x0=np.array(task.x0), seed=seed,
-            faults=faults, monitor=make_monitor(model, None), late=lambda t, at=late: round(t / DT) in at,
+            faults=faults, monitor=make_monitor(model), late=lambda t, at=late: round(t / DT) in at,
         )  # fmt: skip
         done.append((faults, late, start, result, controller.controller.ocp))
     return done

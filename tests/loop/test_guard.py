@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from closed_loop_parts import DT, Rig, ScriptedMonitor, make_ekf, make_runner, make_safe, run
+from monitor_parts import energy
 from online_models import PendulumPlant, pendulum_model
 
-from hybrid_mpc import EnergyMonitor, Fault, Guard, InputError, Limits, Mode
+from hybrid_mpc import Fault, Guard, InputError, Limits, Mode
 
 DU = 0.4
 
@@ -131,7 +132,7 @@ def test_a_frozen_encoder_brings_the_machine_to_rest():
             return getattr(self.plant, name)
 
     model = pendulum_model()
-    monitor = EnergyMonitor(model, window=5, average=5, resolution=[step])
+    monitor = energy(model, resolution=[step])
     results = [
         run(model, make_safe(model, du_max=DU), plant=Counting(PendulumPlant(noise=0.0)), duration=3.0,
             monitor=monitor, guard=guard, faults=[Fault(1.0, np.inf, "measurement_freeze")])

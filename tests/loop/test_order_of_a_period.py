@@ -6,13 +6,13 @@ import casadi as ca
 import numpy as np
 import pytest
 from closed_loop_parts import DT, LateRig, Rig, ScriptedMonitor, hold, make_ekf, make_safe, run, sine
+from monitor_parts import by_hand, energy, of_force
 from online_models import PendulumPlant, pendulum_model
 
 from hybrid_mpc import (
     OCP,
     CondensedController,
     DelayCompensation,
-    EnergyMonitor,
     Fault,
     Guard,
     InputError,
@@ -49,7 +49,7 @@ def drive(loop, rig=None, n=N, finish=lambda k: True, begun=False):
 
 
 def monitored(model):
-    return EnergyMonitor(model, window=5, average=3)
+    return energy(model, by_hand(of_force(1e9), dt=model.dt))
 
 
 def test_ten_lines_are_simulate(model, safe):
@@ -57,7 +57,7 @@ def test_ten_lines_are_simulate(model, safe):
     want = run(model, safe, monitor=monitored(model))
     np.testing.assert_array_equal(drive(loop), want.u)
     np.testing.assert_array_equal(loop.estimate.x, want.x_hat[-1])
-    assert loop.reading.level_w == want.level[-1]
+    assert loop.reading.share == want.share[-1] > 0.0
     assert loop.t == want.t[-1]
 
 
@@ -127,10 +127,12 @@ def test_a_state_is_frozen(model, safe):
     loop = make_loop(model, safe, monitor=monitored(model))
     drive(loop, n=5)
     state = loop.state
-    copies = state.estimate.x.copy(), state.decision.u.copy(), state.monitor.memory.copy()
+    copies = state.estimate.x.copy(), state.decision.u.copy(), state.monitor.readings.memory.copy()
     rig = Rig()
     drive(loop, rig, 8, begun=True)
-    for now, before in zip((state.estimate.x, state.decision.u, state.monitor.memory), copies, strict=True):
+    for now, before in zip(
+        (state.estimate.x, state.decision.u, state.monitor.readings.memory), copies, strict=True
+    ):
         np.testing.assert_array_equal(now, before)
     with pytest.raises(AttributeError):
         state.k = 3
@@ -293,7 +295,7 @@ def test_delays(model, safe):
 
     loop = make_loop(model, safe, estimator=ekf, input_delay=1, monitor=monitored(model))
     np.testing.assert_array_equal(drive(loop, LateRig()), want.u)
-    assert loop.reading.level_w == want.level[-1]
+    assert loop.reading.share == want.share[-1] > 0.0
 
 
 def test_warming_up_leaves_nothing(model, safe):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from closed_loop_parts import DT, Recorder, ScriptedReading, hold, make_ekf, make_safe, run, sine
 from machines import MachinePlant
+from monitor_parts import energy
 from online_models import PendulumPlant, linear_model, pendulum_model
 
 from hybrid_mpc import (
@@ -13,7 +14,6 @@ from hybrid_mpc import (
     ClosedLoopResult,
     CondensedController,
     DelayCompensation,
-    EnergyMonitor,
     ExtendedKalmanFilter,
     Fault,
     HardBound,
@@ -28,7 +28,7 @@ from hybrid_mpc.loop.plant import SimulatedMachine
 
 def test_two_runs_differ_in_nothing_but_durations(model, safe):
     def once(controller):
-        monitor = EnergyMonitor(model, window=5, average=3)
+        monitor = energy(model)
         faults = [Fault(0.2, 0.3, "measurement_dropout"), Fault(0.3, 0.5, "input_gain", 0.5)]
         return run(model, controller, monitor=monitor, faults=faults, seed=3)
 
@@ -149,7 +149,7 @@ class CountingMonitor:
 
     def update(self, state, y, u_prev, estimate):
         self.calls.append((state, y.copy(), u_prev.copy(), estimate))
-        return state + 1, ScriptedReading(state >= 20, violation_w=float(state), level_w=2.0 * state)
+        return state + 1, ScriptedReading(state >= 20, violation_w=float(state), share=2.0 * state)
 
 
 def test_monitor_sees_each_period_with_the_input_held_before(model, safe):
@@ -161,7 +161,7 @@ def test_monitor_sees_each_period_with_the_input_held_before(model, safe):
     np.testing.assert_array_equal(before, np.vstack([[0.0], result.u[:-1]]))
     assert all(seen is step.estimate for seen, step in zip(estimates, steps, strict=True))
     np.testing.assert_array_equal(result.violation, np.arange(30))
-    np.testing.assert_array_equal(result.level, 2 * np.arange(30))
+    np.testing.assert_array_equal(result.share, 2 * np.arange(30))
     np.testing.assert_array_equal(result.alarm, np.arange(30) >= 20)
     assert [step.k for step in steps] == list(range(30))
 

@@ -10,10 +10,12 @@ import numpy as np
 
 from hybrid_mpc import Signal
 from hybrid_mpc.job.stages.report import TITLES
-from hybrid_mpc.monitor.replay import MonitorTrace
 from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import name_of, save
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, words, write_report
+from hybrid_mpc.watch.detector import ChannelLimit, WatchLimits
+from hybrid_mpc.watch.readings import Channel
+from hybrid_mpc.watch.replay import Trace
 
 STATES = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
 INPUTS = (Signal("tau", "N m"),)
@@ -120,6 +122,20 @@ def innovations_figure():
     )
 
 
+def monitor_trace(t, values, levels, share, frozen=False):
+    """A trace of a violation and of a mean of a force."""
+    n, none = len(t), np.zeros((len(t), 1))
+    alarm = share > 1.0
+    return Trace(
+        t, (Channel("violation", "W"), Channel("force of phi", "N m")), ("phi",), values, np.zeros((n, 2, 0)), levels,
+        share, np.column_stack([alarm & False, alarm]), (none > 0) | frozen, none, none.astype(int), none < 1,
+        np.ones(n, bool), alarm, np.zeros(n, int), alarm & False,
+    )  # fmt: skip
+
+
+LIMITS = WatchLimits("energy", 0.02, (ChannelLimit("force of phi", "N m", 50, 0.06, 0.03),), (0.01,), (0,))
+
+
 def monitor_figure():
     t = np.arange(0.0, 60.0, 0.02)
     rng = np.random.default_rng(3)
@@ -127,10 +143,11 @@ def monitor_figure():
     violation = np.abs(0.02 * rng.standard_normal(len(t))) + 0.4 * push * np.abs(np.sin(4 * t))
     level = np.convolve(violation, np.full(50, 0.02))[: len(t)]
     level[t < 1.0] = np.nan
-    alarm = level > 0.06
+    values = np.column_stack([violation, violation])
+    trace = monitor_trace(t, values, level[:, None], np.nan_to_num(level) / 0.06)
     y = swing(t)[:, 0] + 0.8 * push
     windows = ((0.0, 20.0), (48.0, 60.0))
-    return monitor.trace(t, violation, level, 0.06, alarm, y, outputs=OUTPUTS, windows=windows)
+    return monitor.channels(trace, y, outputs=OUTPUTS, limits=LIMITS, windows=windows)
 
 
 def poles_figure():
@@ -172,18 +189,13 @@ def parity_figure():
     return fit.parity(errors, {"values": 1e-12, "Jacobians": 1e-10})
 
 
-def guard_figure():
+def fault_figure():
     t = np.arange(0.0, 6.0, 0.02)
     late = np.maximum(t - 3.0, 0.0)
-    scores = np.column_stack([np.minimum(20 * late, 1.5), 8 * late / (1 + late)])
-    seen = MonitorTrace(
-        t, t, t, 0.02 * late, 0.01 * late, 0.1 * late, scores[:, 0] > 1, 0.2 * late, late, late < 0, scores
-    )
+    trace = monitor_trace(t, np.column_stack([0.02 * late, 0.1 * late]), 0.1 * late[:, None], 8 * late)
     marks = ((3.0, "friction doubles"), (3.1, "guard: rest"))
     title = "something breaks at 3 s"
-    return monitor.overview(
-        seen, np.sin(2 * t), outputs=OUTPUTS, force_unit="J/rad", marks=marks, title=title
-    )
+    return monitor.channels(trace, np.sin(2 * t), outputs=OUTPUTS, limits=LIMITS, marks=marks, title=title)
 
 
 FIGURES = {
@@ -197,7 +209,7 @@ FIGURES = {
     "times": times_figure,
     "innovations": innovations_figure,
     "monitor": monitor_figure,
-    "guard": guard_figure,
+    "fault": fault_figure,
     "poles": poles_figure,
     "bode": bode_figure,
 }
@@ -211,8 +223,7 @@ PLACES = {
     "control": ("loops",),
     "estimation": ("innovations",),
     "timing": ("times",),
-    "monitor": ("monitor",),
-    "guard": ("guard",),
+    "watch": ("monitor", "fault"),
     "analysis": ("poles", "bode"),
     "glossary": (),
 }

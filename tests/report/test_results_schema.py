@@ -108,22 +108,28 @@ RESULTS = {
         "period_ms": 20.0,
         "misses": 0,
     },
-    "residuals": {
-        "false_alarms_per_hour": 0.0,
-        "alarms": [{"file": "a", "start_s": 1.0, "end_s": 2.0, "channels": ["phi"]}],
-        "faults_reason": "the energy is watched",
-        "details": {"source": "recordings", "limits": {}, "clean": None},
-    },
-    "monitor": {"threshold": {"energy [W]": 0.06}, "false_alarms_per_hour": 0.0, "alarms": []},
-    "guard": {
-        "false_alarms_per_hour": 2.0,
+    "watch": {
+        "kind": "energy",
+        "wanted_per_hour": 2.0,
         "hours": 0.05,
-        "force_threshold": 20.0,
-        "energy_threshold": 5.0,
-        "data_hash": "00ff",
-        "test_seconds": 76.0,
-        "test_alarms": 0,
-        "faults": [{"fault": "friction", "start_s": 3.0, "delay_s": None, "diagnosis": ""}],
+        "false_alarms_per_hour": 0.0,
+        "alarms": [
+            {"file": "a", "start_s": 1.0, "end_s": 2.0, "channels": ["force of phi"], "diagnosis": ""}
+        ],
+        "faults": [
+            {
+                "fault": "friction",
+                "title": "friction doubles",
+                "task": "sine",
+                "start_s": 3.0,
+                "delay_s": None,
+                "channels": [],
+                "diagnosis": "",
+                "false_alarms": 0,
+                "switches": [],
+            }
+        ],
+        "details": {"sources": {"energy": "loops"}, "limits": {}, "clean": None},
     },
     "analysis": {"eigenvalues": [[0.99, 0.01]], "stabilisable": True, "detectable": True},
 }
@@ -156,8 +162,7 @@ DEFAULTS = (
     "estimation.",
     "promises.",
     "timing.controller_step_ms.",
-    "residuals.",
-    "guard.",
+    "watch.",
     "analysis.",
 )
 """Groups whose values may be left out."""
@@ -203,7 +208,7 @@ def test_null_needs_a_reason():
 
 
 def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match="this version reads 10"):
+    with pytest.raises(InputError, match="this version reads 11"):
         read_results(put("schema_version", 4))
     with pytest.raises(InputError, match="no field 'programs'"):
         read_results(put("export.programs", 3))
@@ -211,7 +216,7 @@ def test_another_version_and_unknown_keys_are_refused():
 
 def test_an_interval_that_ends_before_it_starts_is_refused():
     with pytest.raises(InputError, match="before it starts"):
-        read_results(put("monitor.alarms", [{"file": "a.csv", "start_s": 2.0, "end_s": 1.0}]))
+        read_results(put("watch.alarms", [{"file": "a.csv", "start_s": 2.0, "end_s": 1.0}]))
 
 
 def keys_of(kind):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trivial_runs
 
-from hybrid_mpc import Detector, InputError
+from hybrid_mpc import ChannelLimit, InputError, WatchLimits
 from hybrid_mpc.job.study_run import run_batch
 from hybrid_mpc.loop.faults import install
 from scenarios.golf_robot import scenario
@@ -72,10 +72,9 @@ def stand_in(monkeypatch):
         return row_of(job)
 
     model = SimpleNamespace(dt=0.02, n_p=1, delay_states=0)
-    scales = (0.01, 0.0, 0.0, 0.0)
-    learned = Detectors(
-        Detector(0.02, (scales,), scales, 2.0, 1.0, 1.0), {"forces": (3.0, 0.5)}, (1e-3,), 1.0, 700
-    )
+    force = ChannelLimit("force of phi", "N m", 0, 1.0, 0.5, (0.01, 0.0, 0.0, 0.0), 2.0)
+    limits = WatchLimits("energy", 0.02, (force,), (3e-3,), (0,))
+    learned = Detectors(limits, {"forces": (3.0, 0.5)}, (1e-3,), 1.0, 700)
     monkeypatch.setattr(
         room, "load_inputs", lambda *given: (SimpleNamespace(models=[SimpleNamespace(folder="")]), {})
     )

@@ -2,41 +2,49 @@
 
 import json
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from monitor_parts import energy
 
 from hybrid_mpc import InputError
 from hybrid_mpc.records import plain, record
-from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors, learn_detectors, with_hysteresis
+from scenarios.golf_robot.monitor_study.detection import (
+    METHODS,
+    Detectors,
+    Trace,
+    learn_detectors,
+    with_hysteresis,
+)
 
-DT, STEP, RATE = 0.02, 1.5e-3, 2.5
+STEP, RATE = 1.5e-3, 2.5
 PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second
+READINGS = energy(window=11, free_run=0.6, rest_speed=0.2).readings
 
 
 def trace(seed, force=0.0, output=0.0):
     """Noise; from the middle on a lasting force, or outputs off by so much."""
     rng = np.random.default_rng(seed)
-    speed = np.sin(0.05 * np.arange(PERIODS))
-    numbers = np.zeros((PERIODS, 11))
-    numbers[:, 3] = rng.normal(scale=0.01, size=PERIODS)
-    numbers[:, 5], numbers[:, 6] = speed, 0.1 * speed
-    numbers[:, 7], numbers[:, 10] = rng.normal(scale=0.01, size=PERIODS), 0.4
-    numbers[:, 8], numbers[:, 9] = 0.4 * speed**2, 0.004 * speed**2
+    speed, one = np.sin(0.05 * np.arange(PERIODS)), np.ones(PERIODS)
+    values = np.zeros((PERIODS, 3))
+    values[:, 1] = rng.normal(scale=0.01, size=PERIODS)
+    values[:, 2] = rng.normal(scale=0.01, size=PERIODS) / 0.4
+    of_force = np.column_stack([one, speed**2, 0.01 * speed**2, 1 / (1 + speed**2 / 0.04)])
+    of_power = np.column_stack([one, speed**2, 0.01 * speed**2, one / 0.4])
+    terms = np.stack([np.full((PERIODS, 4), np.nan), of_force, of_power], axis=1)
     innovation = rng.normal(scale=5e-4, size=(PERIODS, 1))
     half = PERIODS // 2
-    numbers[half:, 3] += force
+    values[half:, 1] += force
     innovation[half:] += output
-    level = np.abs(numbers[:, 3] * speed)
-    return SimpleNamespace(
-        numbers=numbers, level_w=level, innovation=innovation, nis=(innovation[:, 0] / 5e-4) ** 2
+    values[:, 0] = np.abs(values[:, 1] * speed)
+    return Trace(
+        values, terms, np.zeros((PERIODS, 1)), innovation, (innovation[:, 0] / 5e-4) ** 2, np.abs(speed)
     )
 
 
 @pytest.fixture(scope="module")
 def detectors():
-    return learn_detectors([trace(seed) for seed in range(2)], DT, (STEP,), rate=RATE)
+    return learn_detectors([trace(seed) for seed in range(2)], READINGS, (STEP,), rate=RATE)
 
 
 def found(detectors, which, method):
@@ -56,13 +64,13 @@ def test_each_sees_what_it_is_for(detectors):
 
 def test_a_frozen_sensor_is_one_whose_travel_passes_three_steps(detectors):
     frozen = trace(12)
-    frozen.numbers[6000:6005, 4] = 3.1 * STEP
+    frozen.travel[6000:6005] = 3.1 * STEP
     assert np.flatnonzero(found(detectors, frozen, "guard")).tolist() == list(range(6000, 6005))
 
 
 def test_rates_are_shared_and_thresholds_fall_with_them(detectors):
     assert detectors.threshold("forces", 1.0) > detectors.threshold("forces", 10.0)
-    assert detectors.detector_at(2.0).force_threshold == detectors.threshold("forces", 1.0)
+    assert detectors.limits_at(2.0).channels[0].threshold == detectors.threshold("forces", 1.0)
     for shares in METHODS.values():
         assert math.isclose(sum(shares.values()), 1.0)
 
@@ -76,12 +84,12 @@ def test_score_passes_one_where_a_part_passes_its_threshold(detectors):
 def test_round_trip(detectors):
     again = record(Detectors, json.loads(json.dumps(plain(detectors))), "")
     assert again.threshold("power", 3.0) == detectors.threshold("power", 3.0)
-    assert again.detector.force == detectors.detector.force
+    assert again.limits == detectors.limits
 
 
 def test_too_little_data_says_how_much_is_needed():
     with pytest.raises(InputError, match=r"2\.9 min of nominal loops.*needs 12\.0 min"):
-        learn_detectors([trace(0)], DT, (STEP,), rate=1.0)
+        learn_detectors([trace(0)], READINGS, (STEP,), rate=1.0)
 
 
 def test_hysteresis_is_that_of_a_loop():

@@ -170,15 +170,17 @@ PERIODS = 30
 @pytest.mark.parametrize("loops", [2, pytest.param(34, marks=pytest.mark.full)])
 @each_whole
 def test_faulted_loops_keep_the_limits_and_raise_nothing(name, loops, made):
-    """Loops of the prior's controller and the hybrid's, by turns, each watched by its monitor of residuals."""
+    """Loops of the prior's controller and the hybrid's, by turns, each watched by its residuals."""
     whole = made(name)
     scenario, kit = whole.scenario, whole.kit
     control, dt, task = scenario.control, scenario.data.dt, scenario.tasks[0]
-    limits = {m: hm.learn_residuals(kit.models[m], kit.observer(m), whole.train) for m in MODELS}
+    limits = {
+        m: hm.learn_limits(hm.ResidualReadings(kit.models[m]), kit.observer(m), whole.train) for m in MODELS
+    }
     rng = np.random.default_rng(sorted(MACHINES).index(name))
     for seed in range(loops):
         model, faults = MODELS[seed % 2], random_faults(scenario, rng, dt)
-        monitor = hm.ResidualMonitor(kit.models[model], limits=limits[model])
+        monitor = hm.make_monitor(kit.models[model], limits[model])
         result = closed(whole, task, model, seed, faults=faults, duration=PERIODS * dt, monitor=monitor)
         assert np.all(np.isfinite(result.u))
         assert np.all((result.u >= control.u_min) & (result.u <= control.u_max))

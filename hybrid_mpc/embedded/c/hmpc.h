@@ -180,39 +180,37 @@ typedef struct {
   hmpc_real z[HMPC_LZ], q[HMPC_WINDOW][HMPC_NQ], sum[3];
   int left;
 } hmpc_free_run;
+#endif
 
-/* The energy monitor: what it said last, see hybrid_mpc's MonitorReading; then what it remembers. */
+#if HMPC_MONITOR
+/* The monitor: its last reading, see hybrid_mpc's Reading; then what it remembers. Channels of the energy: violation,
+   forces, power of the free run; of residuals: outputs, balances, measured disturbances, free runs of the outputs. */
 typedef struct {
-  int alarm;                 /* any of: level, residual_level, scores, frozen, blind */
+  int alarm; /* a limit is exceeded, a sensor frozen, or the monitor blind */
   int frozen, blind;
   hmpc_validity validity;
-  hmpc_real model_balance, measured_balance, violation, level; /* W */
-  hmpc_real residual[HMPC_NQ], residual_level;
-  hmpc_real score[2];        /* of the detector, as shares of its thresholds: sum of forces, power of free runs */
-  hmpc_real energy, seconds; /* of the older free run */
-  hmpc_real shown[HMPC_NQ];  /* how far the sensors should have moved since they last did */
+  hmpc_real value[HMPC_CHANNELS], share; /* share: largest level over its threshold */
+  hmpc_real travel[HMPC_NY];             /* how far outputs were predicted to move since their sensors last moved */
+  int stuck[HMPC_NY];                    /* sensors that are frozen */
+#if HMPC_LIMITS > 0
+  hmpc_real level[HMPC_LIMITS];
+  int on[HMPC_LIMITS]; /* limits that are exceeded */
+  /* its own: sums upwards and downwards, latest values */
+  hmpc_real up[HMPC_LIMITS], down[HMPC_LIMITS], recent[HMPC_LONGEST][HMPC_CHANNELS];
+  int newest, counted;
+#endif
   /* its own */
   hmpc_real z[HMPC_LZ], w[HMPC_DIM(HMPC_NW)];
+  int repeats[HMPC_NY], seen, invalid;
+#if HMPC_MONITOR == HMPC_ENERGY
   hmpc_real y[HMPC_WINDOW][HMPC_NQ], row[HMPC_WINDOW - 1][2 * HMPC_NQ + HMPC_NU + HMPC_NW];
-  hmpc_real travel[HMPC_NQ], pushed_speed[HMPC_NQ], pushed[HMPC_NQ], before[HMPC_NU];
-  hmpc_real violations[HMPC_AVERAGE], residuals[HMPC_AVERAGE][HMPC_NQ];
+  hmpc_real ahead[HMPC_NQ], pushed_speed[HMPC_NQ], pushed[HMPC_NQ], before[HMPC_NU];
   hmpc_free_run run[2];
-  hmpc_real up[HMPC_NQ], down[HMPC_NQ];
-  int level_on, residual_on, force_on, energy_on, seen, whole, invalid;
-} hmpc_monitor;
-#elif HMPC_MONITOR == HMPC_RESIDUALS
-/* The monitor of residuals: what it said last, see hybrid_mpc's ResidualReading; then what it remembers. Channels:
-   outputs, balances, measured disturbances, free runs of the outputs. */
-typedef struct {
-  int alarm, frozen, blind;
-  hmpc_validity validity;
-  hmpc_real residual[HMPC_CHANNELS], level[HMPC_CHANNELS][2], share;
-  int on[HMPC_CHANNELS][2]; /* alarms of the short and of the long average */
-  int stuck[HMPC_NY];       /* sensors that are frozen */
-  /* its own */
-  hmpc_real z[HMPC_LZ], w[HMPC_DIM(HMPC_NW)], y[HMPC_NY], travel[HMPC_NY];
-  hmpc_real recent[HMPC_LONG][HMPC_CHANNELS], run[2][HMPC_LZ], run_d[2][HMPC_DIM(HMPC_ND)];
-  int repeats[HMPC_NY], age[2], newest, seen, invalid;
+  int whole;
+#else
+  hmpc_real y[HMPC_NY], run[2][HMPC_LZ], run_d[2][HMPC_DIM(HMPC_ND)];
+  int age[2];
+#endif
 } hmpc_monitor;
 #endif
 

@@ -1,5 +1,6 @@
-/* The monitor: how far the model lies from what is measured, and whether that is an alarm. Either of the energy, for
-   mechanical machines whose positions are measured, or of the residuals of outputs and balances, for any machine. */
+/* The monitor: channels compare the model with the machine, a detector compares each with its limits. Channels are
+   read either of the energy, for mechanical machines whose positions are measured, or of the residuals of outputs and
+   balances, for any machine. */
 #include "hmpc_math.h"
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
@@ -20,10 +21,93 @@ static void forget(real *v, int n) {
   for (int i = 0; i < n; ++i) v[i] = R(NAN);
 }
 
+static int is_number(real a) { return a <= R(0.0) || a > R(0.0); }
+
 static int all_equal(const real *a, const real *b, int n) {
   int same = 1;
   for (int i = 0; i < n; ++i) same &= a[i] <= b[i] && a[i] >= b[i];
   return same;
+}
+
+#if HMPC_LIMITS > 0
+/* Mean of a channel's latest values that are numbers; NaN where fewer than half are. */
+static real mean_of(const hmpc_monitor *m, int channel, int length) {
+  real total = R(0.0);
+  int count = 0, k = m->newest;
+  for (int i = 0; i < length; ++i) {
+    const real value = m->recent[k][channel];
+    if (hmpc_finite(value)) {
+      total += value;
+      ++count;
+    }
+    k = k > 0 ? k - 1 : HMPC_LONGEST - 1;
+  }
+  return 2 * count >= length ? total / R(count > 0 ? count : 1) : R(NAN);
+}
+
+/* A value in its nominal deviations. */
+static real scaled(const hmpc_monitor *m, int limit, real (*terms)[HMPC_DIM(HMPC_TERMS)]) {
+  const int c = limit_channel[limit];
+#if HMPC_TERMS > 0
+  real variance = R(0.0);
+  for (int j = 0; j < HMPC_TERMS; ++j) variance += limit_scale[limit][j] * terms[c][j];
+  return m->value[c] / hmpc_sqrt(variance);
+#else
+  (void)terms;
+  return m->value[c];
+#endif
+}
+#endif
+
+/* Levels of all limits, alarms, frozen sensors: what the values say; terms are those of their variances. */
+static void detect(hmpc_monitor *m, real (*terms)[HMPC_DIM(HMPC_TERMS)], int settled, const int *inside) {
+  m->alarm = m->frozen = 0;
+  m->share = R(NAN);
+#if HMPC_LIMITS > 0
+  m->share = R(0.0);
+  m->newest = m->newest + 1 < HMPC_LONGEST ? m->newest + 1 : 0;
+  forget(m->recent[m->newest], HMPC_CHANNELS);
+  if (settled) {
+    memcpy(m->recent[m->newest], m->value, sizeof m->value);
+    m->counted = more_seen(m->counted, HMPC_LONGEST);
+  }
+  for (int i = 0; i < HMPC_LIMITS; ++i) {
+    const real most = HMPC_SUM_CAP * limit_threshold[i];
+    if (limit_length[i] > 1) {
+      m->level[i] = m->counted < limit_length[i] ? R(NAN) : mean_of(m, limit_channel[i], limit_length[i]);
+    } else {
+      const real z = scaled(m, i, terms);
+      if (limit_length[i] == 1) {
+        m->level[i] = is_number(z) ? z : R(0.0);
+      } else {
+        if (is_number(z)) {
+          m->up[i] = hmpc_clip(m->up[i] + z - limit_drift[i], R(0.0), most);
+          m->down[i] = hmpc_clip(m->down[i] - z - limit_drift[i], R(0.0), most);
+        }
+        m->level[i] = hmpc_max(m->up[i], m->down[i]);
+      }
+    }
+    const real size = is_number(m->level[i]) ? hmpc_abs(m->level[i]) : R(0.0);
+    m->on[i] = size > (m->on[i] ? limit_release[i] : limit_threshold[i]);
+    m->share = hmpc_max(m->share, size / limit_threshold[i]);
+    m->alarm |= m->on[i];
+  }
+#else
+  (void)terms;
+  (void)settled;
+#endif
+  for (int i = 0; i < HMPC_NY; ++i) {
+    m->stuck[i] = inside[i] && hmpc_abs(m->travel[i]) > frozen_travel[i] && m->repeats[i] > frozen_repeats[i];
+    m->frozen |= m->stuck[i];
+  }
+}
+
+/* Whether there has been no valid reading for too long; the last of a period. */
+static void judge(hmpc_monitor *m, hmpc_validity validity) {
+  m->validity = validity;
+  m->invalid = validity == HMPC_VALID ? 0 : more_seen(m->invalid, HMPC_BLIND_AFTER + 1);
+  m->blind = m->invalid > HMPC_BLIND_AFTER;
+  m->alarm = m->alarm || m->frozen || m->blind;
 }
 #endif
 
@@ -38,8 +122,9 @@ void hmpc_watch_begin(hmpc_state *s) {
   memcpy(m->w, w_rest, sizeof m->w);
   forget(m->y[0], HMPC_WINDOW * NQ);
   forget(m->row[0], (HMPC_WINDOW - 1) * (AT_GIVEN + GIVEN));
-  forget(m->violations, HMPC_AVERAGE);
-  forget(m->residuals[0], HMPC_AVERAGE * NQ);
+#if HMPC_LIMITS > 0
+  forget(m->recent[0], HMPC_LONGEST * HMPC_CHANNELS);
+#endif
   for (int k = 0; k < 2; ++k) {
     forget(m->run[k].z, HMPC_NZ);
     forget(m->run[k].q[0], HMPC_WINDOW * NQ);
@@ -145,25 +230,6 @@ static real balance(const real *state, const real *acceleration, const real *giv
   return value;
 }
 
-/* Means of the latest violations, and length of the mean residual; NaN where fewer than half are finite. */
-static void levels(hmpc_monitor *m) {
-  real total = R(0.0), sum[HMPC_NQ] = {R(0.0)}, square = R(0.0);
-  int count = 0, rows = 0;
-  for (int k = 0; k < HMPC_AVERAGE; ++k) {
-    if (hmpc_finite(m->violations[k])) {
-      total += m->violations[k];
-      ++count;
-    }
-    if (hmpc_all_finite(m->residuals[k], HMPC_NQ)) {
-      hmpc_add(sum, R(1.0), m->residuals[k], HMPC_NQ);
-      ++rows;
-    }
-  }
-  for (int i = 0; i < NQ && rows > 0; ++i) square += sum[i] / R(rows) * (sum[i] / R(rows));
-  m->level = count > 0 && 2 * count >= HMPC_AVERAGE ? total / R(count) : R(NAN);
-  m->residual_level = rows > 0 && 2 * rows >= HMPC_AVERAGE ? hmpc_sqrt(square) : R(NAN);
-}
-
 #if HMPC_FREE_RUN > 0
 /* Free runs that have come to their end begin anew, at the estimate of a period ago. */
 static void begin_runs(hmpc_monitor *m) {
@@ -200,42 +266,6 @@ static void go_on(hmpc_free_run *run, const real *u, const real *w, const real *
 }
 #endif
 
-#if HMPC_DETECTOR
-/* Cumulative sums of scaled residual forces, and the scaled power of the older free run: whether an alarm is on. */
-static int detect(hmpc_monitor *m, const real *speed, const real *given, const real *sums) {
-  real v2 = R(0.0), u2 = R(0.0), slow = R(0.0), largest = R(0.0), power = R(0.0);
-  for (int i = 0; i < NQ; ++i) {
-    v2 += speed[i] * speed[i];
-    slow += speed[i] * speed[i] / (rest_speed_learned[i] * rest_speed_learned[i]);
-  }
-  for (int i = 0; i < HMPC_NU; ++i) u2 += given[i] * given[i];
-  const real near = R(1.0) / (R(1.0) + slow), most = HMPC_SUM_CAP * HMPC_FORCE_THRESHOLD;
-  for (int i = 0; i < NQ; ++i) {
-    const real *const a = force_scale[i];
-    const real z = m->residual[i] / hmpc_sqrt(a[0] + a[1] * v2 + a[2] * u2 + a[3] * near);
-    if (z <= R(0.0) || z > R(0.0)) { /* not NaN */
-      m->up[i] = hmpc_clip(m->up[i] + z - HMPC_DRIFT, R(0.0), most);
-      m->down[i] = hmpc_clip(m->down[i] - z - HMPC_DRIFT, R(0.0), most);
-    }
-    largest = hmpc_max(largest, hmpc_max(m->up[i], m->down[i]));
-  }
-#if HMPC_FREE_RUN > 0
-  if (HMPC_ENERGY_LEARNED && m->seconds >= HMPC_SHORTEST && (m->energy <= R(0.0) || m->energy > R(0.0))) {
-    const real *const a = energy_scale, t = m->seconds;
-    power = hmpc_abs(m->energy) / t / hmpc_sqrt(a[0] + a[1] * (sums[1] / t) + a[2] * (sums[2] / t) + a[3] / t);
-    power /= HMPC_ENERGY_THRESHOLD;
-  }
-#else
-  (void)sums;
-#endif
-  m->score[0] = largest / HMPC_FORCE_THRESHOLD;
-  m->score[1] = power;
-  m->force_on = m->score[0] > (m->force_on ? HMPC_RELEASE : R(1.0));
-  m->energy_on = m->score[1] > (m->energy_on ? HMPC_RELEASE : R(1.0));
-  return m->force_on || m->energy_on;
-}
-#endif
-
 void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   hmpc_monitor *const m = &s->monitor;
   real next[HMPC_LZ] = {R(0.0)}, *row = m->row[HMPC_WINDOW - 2];
@@ -245,8 +275,8 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   const int still = all_equal(y, before, HMPC_NQ);
   for (int i = 0; i < NQ; ++i) {
     const real moved = next[i] - m->z[i];
-    const real ahead = m->travel[i] + moved * (hmpc_abs(moved) > rest_speed[i] * HMPC_DT ? R(1.0) : R(0.0));
-    m->travel[i] = all_equal(y + i, before + i, 1) && hmpc_abs(ahead) < R(INFINITY) ? ahead : R(0.0);
+    const real ahead = m->ahead[i] + moved * (hmpc_abs(moved) > rest_speed[i] * HMPC_DT ? R(1.0) : R(0.0));
+    m->ahead[i] = all_equal(y + i, before + i, 1) && hmpc_abs(ahead) < R(INFINITY) ? ahead : R(0.0);
   }
   push(m, still, u_prev);
   memmove(m->row, m->row + 1, sizeof m->row - sizeof m->row[0]);
@@ -268,60 +298,55 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
       model[i] += m->row[k][AT_DV + i] * kernel_speed[k] - m->row[k][AT_DP + i] * kernel_position[k];
     for (int i = 0; i < GIVEN; ++i) given[i] += m->row[k][AT_GIVEN + i] * kernel_mean[k];
   }
-  m->model_balance = balance(at, model, given);
-  m->measured_balance = balance(at, measured, given);
-  m->violation = hmpc_abs(m->model_balance - m->measured_balance);
-  residual_force(at, given, given + HMPC_NU, measured, model, m->residual);
-  memmove(m->violations, m->violations + 1, sizeof m->violations - sizeof m->violations[0]);
-  m->violations[HMPC_AVERAGE - 1] = m->violation;
-  memmove(m->residuals, m->residuals + 1, sizeof m->residuals - sizeof m->residuals[0]);
-  memcpy(m->residuals[HMPC_AVERAGE - 1], m->residual, sizeof m->residual);
-  levels(m);
-  m->alarm = 0;
-#if HMPC_POWER_LEVEL
-  m->level_on = m->level > (m->level_on ? HMPC_POWER_RELEASE : HMPC_POWER_THRESHOLD);
-  m->alarm |= m->level_on;
-#endif
-#if HMPC_FORCE_LEVEL
-  m->residual_on = m->residual_level > (m->residual_on ? HMPC_RESIDUAL_RELEASE : HMPC_RESIDUAL_THRESHOLD);
-  m->alarm |= m->residual_on;
-#endif
-  m->frozen = 0;
+  real terms[HMPC_CHANNELS][HMPC_DIM(HMPC_TERMS)], *const force = m->value + 1;
+  int inside[HMPC_NQ];
+  const real measured_balance = balance(at, measured, given);
+  m->value[0] = hmpc_abs(balance(at, model, given) - measured_balance);
+  residual_force(at, given, given + HMPC_NU, measured, model, force);
+  forget(terms[0], HMPC_CHANNELS * HMPC_TERMS);
+  real v2 = R(0.0), u2 = R(0.0), slow = R(0.0);
   for (int i = 0; i < NQ; ++i) {
-    m->shown[i] = m->pushed[i] > hmpc_abs(m->travel[i]) ? m->pushed[i] : m->travel[i];
-    m->frozen |= hmpc_abs(m->shown[i]) > frozen_travel[i];
+    const real v = at[NQ + i];
+    v2 += v * v;
+    slow += v * v / (rest_speed[i] * rest_speed[i]);
   }
-  const real *older = (const real *)0;
-  m->energy = R(NAN);
-  m->seconds = R(0.0);
+  for (int i = 0; i < HMPC_NU; ++i) u2 += given[i] * given[i];
+  for (int i = 0; i < NQ; ++i) {
+    real *const own = terms[1 + i];
+    own[0] = R(1.0);
+    own[1] = v2;
+    own[2] = u2;
+    own[3] = R(1.0) / (R(1.0) + slow);
+    m->travel[i] = m->pushed[i] > hmpc_abs(m->ahead[i]) ? m->pushed[i] : m->ahead[i];
+    m->repeats[i] = inside[i] = 1;
+  }
 #if HMPC_FREE_RUN > 0
   begin_runs(m);
-  for (int k = 0; k < 2; ++k) go_on(&m->run[k], u_prev, m->w, given, at + NQ, m->measured_balance);
+  for (int k = 0; k < 2; ++k) go_on(&m->run[k], u_prev, m->w, given, at + NQ, measured_balance);
   int which = m->run[0].left <= m->run[1].left ? 0 : 1;
-  if (!(m->run[which].sum[0] <= R(0.0) || m->run[which].sum[0] > R(0.0))) which = 1 - which; /* NaN: not begun yet */
-  older = m->run[which].sum;
-  m->energy = older[0];
-  m->seconds = R(HMPC_FREE_RUN - HMPC_WINDOW + 3 - m->run[which].left) * HMPC_DT;
-  if (m->seconds < R(0.0)) m->seconds = R(0.0);
+  if (!is_number(m->run[which].sum[0])) which = 1 - which; /* NaN: not begun yet */
+  const real *const older = m->run[which].sum;
+  const real time = R(HMPC_FREE_RUN - HMPC_WINDOW + 3 - m->run[which].left) * HMPC_DT;
+  m->value[1 + NQ] = R(NAN);
+  if (time >= HMPC_SHORTEST) {
+    real *const own = terms[1 + NQ];
+    m->value[1 + NQ] = older[0] / time;
+    own[0] = R(1.0);
+    own[1] = older[1] / time;
+    own[2] = older[2] / time;
+    own[3] = R(1.0) / time;
+  }
 #endif
-#if HMPC_DETECTOR
-  m->alarm |= detect(m, at + NQ, given, older);
-#else
-  (void)older;
-#endif
+  detect(m, terms, 1, inside);
   /* whether this is a reading */
   const int missing =
       !hmpc_all_finite(y, HMPC_NY) || (m->seen > 0 && !hmpc_all_finite(u_prev, HMPC_NU));
   m->seen = more_seen(m->seen, HMPC_WINDOW);
   m->whole = missing ? 0 : more_seen(m->whole, HMPC_WINDOW);
-  if (hmpc_finite(m->violation) && hmpc_all_finite(m->residual, HMPC_NQ)) {
-    m->validity = HMPC_VALID;
-  } else {
-    m->validity = m->seen < HMPC_WINDOW ? HMPC_WARM_UP : m->whole < HMPC_WINDOW ? HMPC_MISSING : HMPC_NOT_A_READING;
-  }
-  m->invalid = m->validity == HMPC_VALID ? 0 : more_seen(m->invalid, HMPC_WINDOW + HMPC_AVERAGE + 1);
-  m->blind = m->invalid > HMPC_WINDOW + HMPC_AVERAGE;
-  m->alarm = m->alarm || m->frozen || m->blind;
+  judge(m, hmpc_all_finite(m->value, 1 + NQ) ? HMPC_VALID
+           : m->seen < HMPC_WINDOW           ? HMPC_WARM_UP
+           : m->whole < HMPC_WINDOW          ? HMPC_MISSING
+                                             : HMPC_NOT_A_READING);
   remember(s, m->z, m->w);
 }
 
@@ -335,7 +360,9 @@ void hmpc_watch_begin(hmpc_state *s) {
   forget(m->z, HMPC_NZ);
   forget(m->w, HMPC_NW);
   forget(m->y, HMPC_NY);
-  forget(m->recent[0], HMPC_LONG * HMPC_CHANNELS);
+#if HMPC_LIMITS > 0
+  forget(m->recent[0], HMPC_LONGEST * HMPC_CHANNELS);
+#endif
   for (int k = 0; k < 2; ++k) {
     forget(m->run[k], HMPC_NZ);
     forget(m->run_d[k], HMPC_ND);
@@ -387,21 +414,6 @@ static void run_free(hmpc_state *s, const real *u, const real *y, real *error) {
   }
 }
 
-/* Mean of a channel's latest residuals that are numbers; NaN where fewer than half are. */
-static real mean_of(const hmpc_monitor *m, int channel, int length) {
-  real total = R(0.0);
-  int count = 0, k = m->newest;
-  for (int i = 0; i < length; ++i) {
-    const real value = m->recent[k][channel];
-    if (hmpc_finite(value)) {
-      total += value;
-      ++count;
-    }
-    k = k > 0 ? k - 1 : HMPC_LONG - 1;
-  }
-  return 2 * count >= length ? total / R(count > 0 ? count : 1) : R(NAN);
-}
-
 void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   hmpc_monitor *const m = &s->monitor;
   real next[HMPC_LZ] = {R(0.0)}, predicted[HMPC_NY], last[HMPC_NY], rate[HMPC_NX], moved[HMPC_NY];
@@ -411,58 +423,34 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   outputs(m->z, u_prev, m->w, last);
   for (int i = 0; i < HMPC_NX; ++i) rate[i] = (s->x[i] - next[i]) / HMPC_DT;
   for (int i = 0; i < HMPC_NY; ++i) {
-    m->residual[i] = y[i] - predicted[i];
+    m->value[i] = y[i] - predicted[i];
     moved[i] = predicted[i] - last[i];
   }
 #if HMPC_BALANCES > 0
-  watched_balances(m->z, rate, u_prev, m->w, m->residual + HMPC_NY);
+  watched_balances(m->z, rate, u_prev, m->w, m->value + HMPC_NY);
 #else
   (void)rate;
 #endif
-  for (int i = 0; i < HMPC_NW; ++i) m->residual[FIRST_W + i] = s->w[i] - w_rest[i];
-  run_free(s, u_prev, y, m->residual + FIRST_FREE);
+  for (int i = 0; i < HMPC_NW; ++i) m->value[FIRST_W + i] = s->w[i] - w_rest[i];
+  run_free(s, u_prev, y, m->value + FIRST_FREE);
   for (int i = 0; i < HMPC_CHANNELS; ++i)
-    if (!hmpc_finite(m->residual[i])) m->residual[i] = R(NAN);
-  /* levels */
-  m->seen = more_seen(m->seen, HMPC_SETTLING + HMPC_LONG);
-  m->newest = m->newest + 1 < HMPC_LONG ? m->newest + 1 : 0;
-  forget(m->recent[m->newest], HMPC_CHANNELS);
-  if (m->seen > HMPC_SETTLING) memcpy(m->recent[m->newest], m->residual, sizeof m->residual);
-  m->alarm = 0;
-  m->share = HMPC_LIMITS ? R(0.0) : R(NAN);
-  for (int c = 0; c < HMPC_CHANNELS; ++c)
-    for (int j = 0; j < 2; ++j) {
-      const int length = j == 0 ? HMPC_SHORT : HMPC_LONG;
-      m->level[c][j] = m->seen < HMPC_SETTLING + length ? R(NAN) : mean_of(m, c, length);
-#if HMPC_LIMITS
-      const real size = hmpc_finite(m->level[c][j]) ? hmpc_abs(m->level[c][j])
-                        : m->level[c][j] < R(0.0) || m->level[c][j] > R(0.0) ? HMPC_HUGE : R(0.0);
-      m->on[c][j] = size > (m->on[c][j] ? level_release[c][j] : level_threshold[c][j]);
-      m->share = hmpc_max(m->share, size / level_threshold[c][j]);
-      m->alarm |= m->on[c][j];
-#endif
-    }
-  /* sensors that repeat themselves */
-  m->frozen = 0;
+    if (!hmpc_finite(m->value[i])) m->value[i] = R(NAN);
+  m->seen = more_seen(m->seen, HMPC_SETTLING + 2);
+  const int settled = m->seen > HMPC_SETTLING;
+  int inside[HMPC_NY];
   for (int i = 0; i < HMPC_NY; ++i) {
-    const int still = all_equal(y + i, m->y + i, 1) && hmpc_finite(moved[i]) && m->seen > HMPC_SETTLING;
+    const int still = all_equal(y + i, m->y + i, 1) && hmpc_finite(moved[i]) && settled;
     m->travel[i] = still ? m->travel[i] + moved[i] : R(0.0);
     m->repeats[i] = still ? more_seen(m->repeats[i], HMPC_REPEATS) : 0;
-    m->stuck[i] = y[i] > sensor_end[0][i] && y[i] < sensor_end[1][i] && hmpc_abs(m->travel[i]) > frozen_travel[i] &&
-                  m->repeats[i] > frozen_repeats[i];
-    m->frozen |= m->stuck[i];
+    inside[i] = y[i] > sensor_end[0][i] && y[i] < sensor_end[1][i];
   }
+  detect(m, (real(*)[HMPC_DIM(HMPC_TERMS)])0, settled, inside);
   /* whether this is a reading */
-  if (hmpc_all_finite(m->residual, FIRST_FREE)) {
-    m->validity = HMPC_VALID;
-  } else if (m->seen < 2) {
-    m->validity = HMPC_WARM_UP;
-  } else {
-    m->validity = hmpc_all_finite(y, HMPC_NY) && hmpc_all_finite(u_prev, HMPC_NU) ? HMPC_NOT_A_READING : HMPC_MISSING;
-  }
-  m->invalid = m->validity == HMPC_VALID ? 0 : more_seen(m->invalid, 2 * HMPC_SHORT + 1);
-  m->blind = m->invalid > 2 * HMPC_SHORT;
-  m->alarm = m->alarm || m->frozen || m->blind;
+  const int missing = !(hmpc_all_finite(y, HMPC_NY) && hmpc_all_finite(u_prev, HMPC_NU));
+  judge(m, hmpc_all_finite(m->value, FIRST_FREE) ? HMPC_VALID
+           : m->seen < 2                         ? HMPC_WARM_UP
+           : missing                             ? HMPC_MISSING
+                                                 : HMPC_NOT_A_READING);
   remember(s, m->z, m->w);
   memcpy(m->y, y, sizeof m->y);
 }

@@ -12,16 +12,8 @@ static real reading_off(int k) {
   const hmpc_monitor *const m = &state.monitor;
   const real *const wanted = vector_reading[k];
   real largest = R(0.0);
-#if HMPC_MONITOR == HMPC_ENERGY
-  enum { LEVELS = 2, RESIDUALS = HMPC_NQ };
-  const real levels[LEVELS] = {m->level, m->residual_level};
-#else
-  enum { LEVELS = HMPC_CHANNELS, RESIDUALS = HMPC_CHANNELS };
-  real levels[LEVELS];
-  for (int i = 0; i < LEVELS; ++i) levels[i] = m->level[i][0];
-#endif
-  for (int i = 0; i < 1 + LEVELS + RESIDUALS; ++i) {
-    const real found = i == 0 ? R(m->alarm) : i <= LEVELS ? levels[i - 1] : m->residual[i - 1 - LEVELS];
+  for (int i = 0; i < 1 + HMPC_CHANNELS; ++i) {
+    const real found = i == 0 ? R(m->alarm) : m->value[i - 1];
     const int known = hmpc_finite(found);
     if (known != hmpc_finite(wanted[i])) return R(INFINITY);
     if (known) largest = hmpc_max(largest, hmpc_abs(found - wanted[i]) / vector_reading_size[i]);

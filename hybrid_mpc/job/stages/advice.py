@@ -211,20 +211,12 @@ def _loops(results: Results) -> Iterator[Hint]:
 
 
 def _watching(results: Results) -> Iterator[Hint]:
-    energy, limits = results.monitor.details, tuple(results.residuals.details.limits.values())
-    promised = None if energy.calibration is None else energy.calibration.false_alarms_per_hour
-    for what, clean, rate in (
-        ("Alarms of the energy monitor", energy.clean, promised),
-        (
-            "Alarms of the monitor of residuals", results.residuals.details.clean,
-            limits[-1].false_alarms_per_hour if limits else None,
-        ),
-    ):  # fmt: skip
-        if clean is not None and rate is not None and clean.too_many(rate):
-            yield Hint(
-                "bad", f"{what}: {clean.words(rate)}.",
-                "Recordings that it learned from are too few or too unlike: look where it alarms before you act on it.",
-            )  # fmt: skip
+    clean, rate = results.watch.details.clean, results.watch.wanted_per_hour
+    if clean is not None and rate is not None and clean.too_many(rate):
+        yield Hint(
+            "bad", f"Alarms of the monitor: {clean.words(rate)}.",
+            "Recordings that it learned from are too few or too unlike: look where it alarms before you act on it.",
+        )  # fmt: skip
 
 
 def _by_output(fit: object) -> dict[str, float]:

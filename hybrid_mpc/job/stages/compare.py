@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.data.trajectories import Trajectory
     from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
     from hybrid_mpc.estimate.switching import SwitchingFilter
-    from hybrid_mpc.monitor.energy import EnergyMonitor
-    from hybrid_mpc.monitor.residuals import ResidualMonitor
+    from hybrid_mpc.watch.monitor import Monitor
 
 Array = NDArray[np.float64]
 BASELINES = ("prior", "prior_observer")
@@ -180,7 +179,7 @@ def _only_timing(context: Context) -> ControlResult:
 def time_on_recording(
     controller: SafeController,
     estimator: ExtendedKalmanFilter | SwitchingFilter,
-    monitor: EnergyMonitor | ResidualMonitor,
+    monitor: Monitor,
     trajectory: Trajectory,
     most: int,
 ) -> Array:
@@ -226,7 +225,7 @@ def run_specs(
 def _bench(scenario: str, folder: Path, content: str, learned: bool) -> Bench:
     """A bench with a run's model, of the folder with this ``content``, with what its monitors have learned or not."""
     kit = load(folder)
-    return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, calibration=None)})
+    return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, watch={})})
 
 
 def run_or_read(
@@ -264,8 +263,6 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
     """Digest of all that decides what loops of a run compute: specifications, machine, tasks, model and program."""
     parts = read_parts(context.out / "model")
     model = parts.description
-    rest = None if parts.calibration is None else parts.calibration.rest_speed
-    of_monitor = rest if any(spec.monitor == "readings" for spec in specs) else None
     scenario = context.ready
     tasks = {task.name: task for task in scenario.tasks}
     loop = loop_settings(scenario, parts.loop.process_noise)
@@ -276,7 +273,7 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
         return f"unknown {time.monotonic_ns()}"
     loops, estimators = [(spec.id, spec.keep) for spec in specs], replace(loop, control={})
     made_by = program(), context.versions
-    return digest([loops, model.programs_sha256, model.model, estimators, of_monitor, read, made_by])
+    return digest([loops, model.programs_sha256, model.model, estimators, read, made_by])
 
 
 def task_content(task: Task, dt: float, loop: LoopSettings) -> object:

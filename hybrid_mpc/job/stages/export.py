@@ -34,6 +34,7 @@ from hybrid_mpc.kit.parts import (
 )
 from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.model.disturbance import Disturbance
 
 FEW = 10
 """Samples at which a network is compared that is another one's program with its own weights; one of ten is extreme."""
@@ -52,12 +53,13 @@ class ExportResult:
 
 @dataclass(frozen=True)
 class NoiseResult:
-    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator, and the
-    digest of the models that it was estimated with.
+    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator, the
+    digest of the models that it was estimated with, and the disturbance model; None: one at each input.
     """
 
     process_noise: Mapping[str, tuple[float, ...]]
     of: str = ""
+    disturbance_model: tuple[Disturbance, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,12 @@ def noise_stage(context: Context) -> NoiseResult | Absent:
     """Tune the estimators on training recordings, by maximum likelihood."""
     of = read_parts(context.out / "model").models
     if context.scenario.control is None:
-        put_noise(context, NoiseResult({}, of))
+        put_noise(context, NoiseResult({}, of, context.scenario.disturbance_model))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
-    found = noise_of(context.scenario, context.kit, context.commanded("train"))
-    result = NoiseResult({name: tuple(sigma.tolist()) for name, sigma in found.items()}, of)
+    kit = context.kit
+    found = noise_of(context.scenario, kit, context.commanded("train"))
+    noise = {name: tuple(sigma.tolist()) for name, sigma in found.items()}
+    result = NoiseResult(noise, of, kit.loop.disturbance_model)
     put_noise(context, result)
     return result
 
@@ -162,7 +166,7 @@ def put_noise(context: Context, found: NoiseResult) -> str:
     write_observer(
         folder,
         ObserverSettings(
-            scenario.sensor_sigma, scenario.first_sigma, found.process_noise, scenario.disturbance_model,
+            scenario.sensor_sigma, scenario.first_sigma, found.process_noise, found.disturbance_model,
             found.of,
         ),
     )  # fmt: skip
@@ -191,6 +195,7 @@ def observed(context: Context) -> dict[str, object]:
         "limits of the input": None if control is None else (control.u_min, control.u_max),
         "beyond recordings": scenario.beyond_recordings,
         "disturbance model": scenario.disturbance_model,
+        "weights of outputs": None if control is None else (control.q_y, control.horizon),
         "oracle": source_of(scenario.oracle),
     }
 

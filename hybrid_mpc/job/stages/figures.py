@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,22 +15,19 @@ from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.job.context import Context
 from hybrid_mpc.job.loop_figures import curves_of, loop_figure
 from hybrid_mpc.job.loops import ON_MODEL
-from hybrid_mpc.job.monitor import thresholds_of
 from hybrid_mpc.job.stage import Absent, Stage
 from hybrid_mpc.job.stages.analyze import ANALYSIS
 from hybrid_mpc.job.stages.choose import CHOICE
 from hybrid_mpc.job.stages.compare import CONTROL, REPORTED
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.evaluate import EVALUATION
-from hybrid_mpc.job.stages.guard import GUARD, read_trace
 from hybrid_mpc.job.stages.identify import PRIOR, TRAINING, trained_models
-from hybrid_mpc.job.stages.monitor import MONITOR, clean_windows
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.job.stages.results import finite, step_times
+from hybrid_mpc.job.stages.watch import WATCH, clean_windows, read_trace
 from hybrid_mpc.job.summary import summaries
 from hybrid_mpc.job.tasks import tasks_of
 from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.interactive import over_time, write_interactive
 from hybrid_mpc.plots.style import save
@@ -44,13 +41,12 @@ OBSERVER_TITLES = {
 SHOWN_RUNS = 2
 LAGS, FEWEST_LAGS = 50, 5
 """Lags of the correlation of errors with inputs [samples], and so few that a picture of them tells nothing."""
-SHOWN_RECORDINGS = 4
 
 
 def draw_all(context: Context) -> Figures:
     """Draw every figure that the run's stages allow into ``figures/``."""
     parts = (
-        _data, _training, _free_runs, _overview, _loops, _on_model, _estimation, _timing, _monitor, guard_figures,
+        _data, _training, _free_runs, _overview, _loops, _on_model, _estimation, _timing, _watch,
         _analysis,
     )  # fmt: skip
     figures = _draw(context, parts)
@@ -313,44 +309,35 @@ def _timing(context: Context) -> Any:
         yield "timing", "step_times", loops.solve_times(times, 1e3 * context.spec.dt), caption
 
 
-def _monitor(context: Context) -> Any:
-    found = context.find(MONITOR)
-    if isinstance(found, Absent) or found.reason:
+def _watch(context: Context) -> Any:
+    """The monitor over recordings, those with alarms first, and over loops in which something breaks."""
+    found = context.find(WATCH)
+    if isinstance(found, Absent) or found.limits is None:
         return
-    arrays, outputs, calibration = found.arrays, context.scenario.prior().outputs, found.calibration
-    power, force = calibration.threshold_w, calibration.residual_threshold
-    assert power is not None
-    assert force is not None
-    for recording in _worth_showing(context):
-        keys = ("t", "violation_w", "level_w", "residual_level", "alarm", "y")
-        own = {k: arrays[f"{recording.name}/{k}"] for k in keys}
-        figure = monitor.trace(
-            own["t"], own["violation_w"], own["level_w"], power, own["alarm"], own["y"], outputs=outputs,
-            windows=clean_windows(context, recording, ("train", "valid", "test", "nominal")),
-            residual=(own["residual_level"], force, force_unit(context.kit.models["prior"])),
-            title=recording.name,
-        )  # fmt: skip
-        name = recording.name.replace("#", "-")
-        yield "monitor", f"monitor_{name}", figure, f"The monitor over the whole recording {recording.name}."
-    if found.load is not None:
-        load = found.load
-        own = {k: arrays[f"load/{k}"] for k in ("t", "violation", "level", "alarm", "y")}
-        figure = monitor.trace(
-            own["t"], own["violation"], own["level"], power, own["alarm"], own["y"], outputs=outputs,
-            windows=((0.0, load.start_s),),
-            title=f"closed loop, {load.task}: an unknown load from {load.start_s:g} s on",
-        )  # fmt: skip
-        first = context.scenario.prior().inputs[0]
-        caption = f"The monitor inside the loop: a constant load of {load.load:g} {first.unit} at {first.name} sets in."
-        yield "monitor", "monitor_load", figure, caption
+    outputs, limits = context.scenario.prior().outputs, found.limits
+    names = [s.name for s in outputs]
 
+    def drawn(name: str, **more: Any) -> Figure:
+        trace = read_trace(found.arrays, name, found, names)
+        return monitor.channels(trace, found.arrays[f"{name}/y"], outputs=outputs, limits=limits, **more)
 
-def _worth_showing(context: Context) -> list[Any]:
-    """Recordings with alarms first, then test recordings, a few in all."""
-    alarmed = {alarm.file for alarm in context.read(MONITOR).alarms}
-    tested = {t.file for t in context.trajectories("test")}
-    ranked = sorted(context.dataset.whole, key=lambda r: (r.name not in alarmed, r.file not in tested))
-    return ranked[:SHOWN_RECORDINGS]
+    whole = {r.name: r for r in context.dataset.whole}
+    for name in found.shown:
+        windows = clean_windows(context, whole[name], ("train", "valid", "test", "nominal"))
+        notes = [(a.start_s, a.diagnosis) for a in found.alarms if a.file == name and a.diagnosis]
+        figure = drawn(name, windows=windows, notes=notes, title=name)
+        yield (
+            "watch",
+            f"monitor_{name.replace('#', '-')}",
+            figure,
+            f"The monitor over the whole recording {name}.",
+        )
+    for row in found.faults or ():
+        marks = [(row.start_s, row.title), *((s.t_s, f"guard: {s.after.lower()}") for s in row.switches)]
+        seen = "no alarm" if row.delay_s is None else f"alarm after {row.delay_s:.2g} s"
+        cause = f"; the diagnosis: {row.diagnosis}" if row.diagnosis else ""
+        figure = drawn(row.fault, marks=marks, title=f"{row.task}: {row.title} at {row.start_s:g} s")
+        yield "watch", f"fault_{row.fault}", figure, f"{row.title[0].upper()}{row.title[1:]}: {seen}{cause}."
 
 
 def _analysis(context: Context) -> Any:
@@ -379,34 +366,3 @@ def _analysis(context: Context) -> Any:
             named = f"bode_{point}_from_{into.name}_to_{output.name}" if several else f"bode_{point}"
             channel = f", from {into.name} to {output.name}" if several else ""
             yield "analysis", named, figure, f"Bode plot of prior and hybrid {titles[point]}{channel}."
-
-
-def guard_figures(context: Context) -> Iterator[tuple[str, str, Figure, str]]:
-    """Each loop in which something breaks; of a machine without plant a recording with test data."""
-    found = context.find(GUARD)
-    if isinstance(found, Absent) or not (found.faults or found.shown):
-        return
-    arrays, outputs = found.arrays, context.scenario.prior().outputs
-    unit = force_unit(context.kit.models["prior"])
-    for row in found.faults or ():
-        marks = [(row.start_s, row.title), *((s.t_s, f"guard: {s.after.lower()}") for s in row.switches)]
-        figure = monitor.overview(
-            read_trace(arrays, row.fault), arrays[f"{row.fault}/y"], outputs=outputs, force_unit=unit, marks=marks,
-            title=f"{row.task}: {row.title} at {row.start_s:g} s",
-        )  # fmt: skip
-        seen = "without an alarm" if row.delay_s is None else f"alarm after {row.delay_s:.2f} s"
-        cause = f"; the diagnosis: {row.diagnosis}" if row.diagnosis else ""
-        yield "guard", f"guard_{row.fault}", figure, f"{row.title.capitalize()}: {seen}{cause}."
-    if found.faults is None and found.shown:
-        limits, stored = dict[str, float](), context.find(MONITOR)
-        if found.detector is None and not isinstance(stored, Absent):
-            limits = thresholds_of(stored.calibration)
-        figure = monitor.overview(
-            read_trace(arrays, "recorded"), arrays["recorded/y"], outputs=outputs, force_unit=unit,
-            thresholds=limits, title=found.shown,
-        )  # fmt: skip
-        by = "thresholds of the section before" if found.detector is None else "learned detector"
-        if not limits and found.detector is None:
-            by = "monitor, which has no thresholds"
-        caption = f"The recording {found.shown}, of which test data come, by the {by}."
-        yield "guard", "guard_recorded", figure, caption

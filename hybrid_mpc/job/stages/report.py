@@ -25,25 +25,18 @@ from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.job.stages.evaluate import EVALUATION
 from hybrid_mpc.job.stages.export import EXPORT
 from hybrid_mpc.job.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
-from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop
 from hybrid_mpc.job.stages.identify import DATA, MODELS, PRIOR, TRAINING, models_of, training_settings
-from hybrid_mpc.job.stages.monitor import MONITOR, RATES, MonitorResult
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.job.stages.promises import PROMISES
-from hybrid_mpc.job.stages.residuals import RESIDUALS
 from hybrid_mpc.job.stages.results import (
     REPORTED,
     Analysis,
     Control,
     Data,
     Export,
-    Guard,
     Identification,
-    Monitor,
     OnModel,
     Promises,
-    Residuals,
-    ResidualsDetails,
     Results,
     Timing,
     collect,
@@ -52,11 +45,11 @@ from hybrid_mpc.job.stages.results import (
     ratio,
     recordings,
 )
+from hybrid_mpc.job.stages.watch import RATES, WATCH, WatchResult
 from hybrid_mpc.job.stages.watching import watching_table
 from hybrid_mpc.job.step_response import step_responses
 from hybrid_mpc.job.summary import Summary
 from hybrid_mpc.job.tasks import tasks_of
-from hybrid_mpc.monitor.energy_readings import force_unit
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
 
@@ -71,9 +64,7 @@ TITLES: Mapping[str, str] = {
     "on_model": "Closed loops on the model, not the machine",
     "estimation": "Estimation: are the observers as sure as they may be",
     "timing": "Time of a controller step",
-    "residuals": "Monitor of residuals",
-    "monitor": "Energy monitor",
-    "guard": "Energy guard",
+    "watch": "Monitor",
     "analysis": "Linear analysis",
     "glossary": "Names and definitions",
 }
@@ -86,85 +77,6 @@ DRAWN_BY = (
     *(f"job/{name}.py" for name in ("loop_figures", "sequential", "step_response", "summary")),
 )
 """Modules that do, too."""
-
-# What a run says of its energy guard: in results.json, and as a section of the report.
-
-
-def guard_tables(guard: Guard) -> list[Table]:
-    """Thresholds, faults, and alarms in the recordings with test data."""
-    detector, test = guard.details.detector, guard.details.test
-    if detector is None or test is None:
-        return []
-    low = detector.interval
-    rows: list[tuple[Any, ...]] = [
-        ("sum of residual forces [deviations]", detector.force_threshold, f"{low[0]:.3g} to {low[1]:.3g}"),
-        ("power of the free run [deviations]", detector.energy_threshold, f"{low[2]:.3g} to {low[3]:.3g}"),
-    ]
-    caption = (
-        f"Thresholds for {detector.false_alarms_per_hour:g} false alarms an hour, both together; learned from "
-        f"{60 * detector.hours:.1f} min with hash {detector.data_hash[:16]}."
-    )
-    tables = [Table(("what is compared", "threshold", "5 to 95 % of a bootstrap"), rows, caption)]
-    if guard.details.faults is not None:
-        tables.append(_fault_table(guard.details.faults))
-    if test.list:
-        tables.append(
-            Table(
-                ("recording", "from [s]", "to [s]", "what explains it"),
-                [(a.file, a.start_s, a.end_s, a.diagnosis or None) for a in test.list],
-                "Alarms over the recordings that hold test data, all of each.",
-            )
-        )
-    return tables
-
-
-def _fault_table(faults: Sequence[FaultedLoop]) -> Table:
-    rows = [
-        (
-            row.title,
-            row.start_s,
-            "never" if row.delay_s is None else f"{row.delay_s:.2f}",
-            row.false_alarms,
-            row.diagnosis or None,
-            ", ".join(f"{s.after.lower()} at {s.t_s:.2f} s" for s in row.switches) or "stays normal",
-        )
-        for row in faults
-    ]
-    columns = (
-        "what breaks", "from [s]", "alarm after [s]", "alarms before", "what the diagnosis says", "guard",
-    )  # fmt: skip
-    return Table(columns, rows, f"Loops of the task {faults[0].task} in which something breaks, one each.")
-
-
-def guard_words(guard: Guard) -> tuple[str, ...]:
-    """What this run's detector was learned from, and what it does not promise."""
-    details = guard.details
-    detector, test = details.detector, details.test
-    if detector is None or test is None:
-        return (f"{guard.reason[0].upper()}{guard.reason[1:]}.",)
-    rate, wanted = detector.false_alarms_per_hour, RATES[0] / detector.time_unit
-    words = [f"The detector was learned from {details.source}."]
-    if rate > wanted:
-        alarms = "one false alarm" if wanted == 1 else f"{wanted:g} false alarms"
-        words[0] += (
-            f" They are too short for {alarms} an hour, so the thresholds are for {rate:g}; a longer run "
-            f"(budget full), or recordings of the machine with hybrid-mpc monitor --learn {wanted:g}, give better "
-            "ones."
-        )
-    if test.seconds > 0:
-        times = {0: "never", 1: "once", 2: "twice"}.get(test.alarms, f"{test.alarms} times")
-        words.append(
-            f"In {test.seconds:.0f} s of test recordings it alarmed {times}; that bounds its "
-            f"rate there at {test.at_most_per_hour:.3g} an hour (95 %)."
-        )
-        if details.loops:
-            words[-1] += (
-                " They were driven otherwise, and wider, than the loops: an alarm there says that the model is "
-                "less right where the loops do not go."
-            )
-    else:
-        words.append("No test recording is long enough to try it on.")
-    return tuple(words)
 
 
 @dataclass(frozen=True)
@@ -260,13 +172,11 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "on_model": _on_model_tables(results.on_model),
         "estimation": [_observer_table(results)],
         "timing": [_timing_table(results.timing)],
-        "residuals": [_watching(context), *_residual_tables(results.residuals)],
-        "monitor": [_alarm_table(context, results.monitor)],
-        "guard": guard_tables(results.guard),
+        "watch": _watch_tables(context),
         "analysis": [_pole_table(results.analysis)],
     }
     instead, after = _notes(context, results)
-    for key in ("estimation", "timing", "residuals", "monitor", "guard"):
+    for key in ("estimation", "timing", "watch"):
         # words about pictures that are not there help nobody
         if key in after and not figures.get(key) and not any(t is not None and t.rows for t in tables[key]):
             instead[key] = after.pop(key)
@@ -330,12 +240,11 @@ def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
     if p99 is not None:
         comment = f"period: {period:g} ms"
         yield KeyFigure("Controller step, 99th percentile", p99, "ms", comment, _verdict(p99 / period))
-    alarms, held = results.monitor.alarms, results.monitor.details
-    if alarms is not None and held.clean is not None and held.calibration is not None:
-        rate = held.calibration.false_alarms_per_hour
-        comment = held.clean.words(rate)
-        verdict: Verdict = "bad" if held.clean.too_many(rate) else "good"
-        yield KeyFigure("Alarms of the energy monitor", len(alarms), "", comment, verdict)
+    watch = results.watch
+    clean, rate = watch.details.clean, watch.wanted_per_hour
+    if watch.alarms is not None and clean is not None and rate is not None:
+        verdict: Verdict = "bad" if clean.too_many(rate) else "good"
+        yield KeyFigure("Alarms of the monitor", len(watch.alarms), "", clean.words(rate), verdict)
 
 
 def _verdict(over: float | None) -> Verdict:
@@ -392,20 +301,8 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
     if results.timing.misses is None:
         after["timing"] = (f"No step was timed: {results.timing.misses_reason.rstrip('.')}.",)
-    watched = results.residuals
-    after["residuals"] = (
-        (f"No alarms here: {watched.reason.rstrip('.')}.",)
-        if watched.alarms is None
-        else (f"Limits are from {watched.details.source}.", *_clean_words(watched.details))
-    )
-    monitor = results.monitor
-    if monitor.details.calibration is None:
-        after["monitor"] = (f"No alarms here: {monitor.reason.rstrip('.')}.",)
-    else:
-        method = monitor.details.calibration.method
-        after["monitor"] = (_monitor_words(context.read(MONITOR)), f"Calibration: {method}.")
-    after["monitor"] += coverage_words(monitor.details.recordings)
-    after["guard"] = guard_words(results.guard)
+    watched: WatchResult | Absent = context.find(WATCH)
+    after["watch"] = (*_watch_words(watched), *coverage_words(results.watch.details.recordings))
     if results.analysis.details is None:
         instead["analysis"] = (f"There is no analysis here: {results.analysis.reason.rstrip('.')}.",)
     else:
@@ -416,32 +313,34 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     return instead, after
 
 
-def _clean_words(found: ResidualsDetails) -> tuple[str, ...]:
-    """Alarms where nothing disturbs the machine, beside the rate that the limits were learned for."""
-    if found.clean is None or not found.limits:
-        return ()
-    rate = tuple(found.limits.values())[-1].false_alarms_per_hour
-    verdict = "more than they promise" if found.clean.too_many(rate) else "within what they promise"
-    return (f"Alarms there: {found.clean.words(rate)}: {verdict}.",)
+def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
+    """What limits were learned from, what they do not promise, and how many alarms there were beside those expected."""
+    if isinstance(found, Absent) or found.limits is None or found.clean is None:
+        return (f"No alarms here: {found.reason.rstrip('.')}.",)
+    limits, clean = found.limits, found.clean
+    rate, wanted = limits.false_alarms_per_hour, RATES[0] / limits.time_unit
+    learned = f"Limits were learned from {found.sources[found.kind]}, for {rate:g} false alarms an hour."
+    if not limits.rated:
+        learned = f"Limits are {limits.method}; they were learned from {found.sources[found.kind]}."
+    elif rate > wanted:
+        learned += (
+            f" Nominal data are too short for {wanted:g} an hour; a longer run (budget full), or recordings of the "
+            f"machine with hybrid-mpc monitor --learn {wanted:g}, give better limits."
+        )
+    verdict = "more than they promise" if clean.too_many(rate) else "within what they promise"
+    test = f"In the {clean.test_seconds:.0f} s of test data among them: {clean.test_alarms}."
+    words: tuple[str, ...] = (learned, f"Alarms: {clean.words(rate)}: {verdict}. {test}")
+    if found.loops:
+        words += (
+            "Recordings were driven otherwise, and wider, than the loops that limits were learned from: an alarm there "
+            "says that the model is less right where the loops do not go.",
+        )
+    return words
 
 
 def _prior_replay_text(weight: float) -> tuple[str, ...]:
     words = "Corrections were asked to fade where no recording comes near; the prior stands alone there"
     return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
-
-
-def _monitor_words(found: MonitorResult) -> str:
-    assert found.clean is not None
-    clean, load = found.clean, found.load
-    there = "was 1 alarm" if clean.alarms == 1 else f"were {clean.alarms} alarms"
-    words = (
-        f"In {clean.seconds:.0f} s known to be undisturbed there {there}, "
-        f"in the {clean.test_seconds:.0f} s of test data among them {clean.test_alarms}."
-    )
-    if load is None:
-        return words
-    seen = "never" if load.delay_s is None else f"after {load.delay_s:.2f} s"
-    return f"{words} The unknown load in the closed loop was reported {seen}."
 
 
 def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
@@ -724,47 +623,27 @@ def _timing_table(timing: Timing) -> Table | None:
     return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
 
 
-def _residual_tables(found: Residuals) -> list[Table | None]:
-    if found.alarms is None:
+def _watch_tables(context: Context) -> list[Table | None]:
+    """All that watches, the loops in which something breaks, and the alarms on recordings."""
+    found = context.find(WATCH)
+    if isinstance(found, Absent) or found.limits is None:
         return []
-    rows = [(a.file, a.start_s, a.end_s, ", ".join(a.channels)) for a in found.alarms]
-    heads = ("recording", "from [s]", "to [s]", "channels")
-    tables: list[Table | None] = [Table(heads, rows, "Alarms over the recordings.")]
+    tables = [watching_table(found)]
     if found.faults:
-        broken = [
+        heads = ("what breaks", "at [s]", "alarm after [s]", "alarms before", "guard")
+        rows = [
             (
-                f"{row.fault} of {row.channel}",
-                row.start_s,
-                "never" if row.delay_s is None else f"{row.delay_s:.3g}",
-                row.false_alarms,
-                ", ".join(row.channels),
-                row.diagnosis,
+                row.title, row.start_s, "never" if row.delay_s is None else f"{row.delay_s:.3g}", row.false_alarms,
+                ", ".join(f"{s.after.lower()} at {s.t_s:.2f} s" for s in row.switches) or "stays normal",
             )
             for row in found.faults
-        ]
-        columns = ("fault", "at [s]", "alarm after [s]", "alarms before", "channels", "taken for")
-        tables.append(Table(columns, broken, "Loops in which something breaks."))
-    return tables
-
-
-def _watching(context: Context) -> Table | None:
-    """The table of all channels; its faults stand in the tables behind it."""
-    monitor, guard, residuals = context.find(MONITOR), context.find(GUARD), context.find(RESIDUALS)
-    unit = "" if isinstance(monitor, Absent) else force_unit(context.kit.models["prior"])
-    return watching_table(monitor, guard, residuals, unit)
-
-
-def _alarm_table(context: Context, monitor: Monitor) -> Table | None:
-    calibration = monitor.details.calibration
-    if monitor.alarms is None or calibration is None:
-        return None
-    rows = [(a.file, a.start_s, a.end_s) for a in monitor.alarms]
-    unit = force_unit(context.kit.models["prior"])
-    caption = (
-        f"Alarms over the whole recordings; thresholds {calibration.threshold_w:.3g} W and "
-        f"{calibration.residual_threshold:.3g} {unit}."
-    )
-    return Table(("recording", "from [s]", "to [s]"), rows, caption)
+        ]  # fmt: skip
+        tables.append(
+            Table(heads, rows, f"Loops of the task {found.faults[0].task} in which something breaks.")
+        )
+    alarms = [(a.file, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for a in found.alarms]
+    heads = ("recording", "from [s]", "to [s]", "channels", "what explains it")
+    return [*tables, Table(heads, alarms, "Alarms over the whole recordings.")]
 
 
 def _pole_table(analysis: Analysis) -> Table | None:
@@ -786,7 +665,7 @@ def _pole_table(analysis: Analysis) -> Table | None:
 
 REPORT = Stage(
     "report", "writing the report", ReportResult, report_stage, what_report_reads,
-    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES, RESIDUALS,
-     MONITOR, GUARD, ANALYSIS),
+    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES, WATCH,
+     ANALYSIS),
     restore=report_is_there,
 )  # fmt: skip

@@ -27,23 +27,17 @@ from hybrid_mpc.job.stages.compare import BASELINES, CONTROL, REPORTED, comparis
 from hybrid_mpc.job.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecording, ObserverTest
 from hybrid_mpc.job.stages.evaluate import EVALUATION, BandScores
 from hybrid_mpc.job.stages.export import EXPORT
-from hybrid_mpc.job.stages.guard import GUARD, FaultedLoop, GuardTest, NominalLoop
 from hybrid_mpc.job.stages.identify import DATA, MODELS, BaselineScores, CutInterval
-from hybrid_mpc.job.stages.monitor import MONITOR, CleanAlarms, RecordedAlarm
 from hybrid_mpc.job.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.job.stages.promises import PROMISES
-from hybrid_mpc.job.stages.residuals import RESIDUALS, ChannelAlarm, FaultedChannel
+from hybrid_mpc.job.stages.watch import WATCH, CleanAlarms, FaultedLoop, NominalLoop, RecordedAlarm
 from hybrid_mpc.job.summary import Summary, by_task, summaries
 from hybrid_mpc.kit.promises import Promise
-from hybrid_mpc.monitor.calibrate import Calibration
-from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.residuals import ResidualLimits
 from hybrid_mpc.records import plain, record
+from hybrid_mpc.watch.detector import WatchLimits
 
 Array = NDArray[np.float64]
-SCHEMA_VERSION = 10
-ENERGY = "energy [W]"
-"""The balance that the monitor watches, with the unit of its rate."""
+SCHEMA_VERSION = 11
 Errors = Mapping[str, Mapping[str, float] | str | None]
 """Error by model, each by signal with unit; a model without one has null, and ``MODEL_reason``."""
 
@@ -279,87 +273,33 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class MonitorDetails:
-    """The monitor's thresholds, alarms where nothing disturbs the machine, and how much of each recording it saw."""
-
-    recordings: tuple[Mapping[str, float | str], ...] = ()
-    calibration: Calibration | None = None
-    clean: CleanAlarms | None = None
-
-
-@dataclass(frozen=True)
-class Monitor:
-    """The energy monitor: threshold by balance, false alarms an hour, alarms on the recordings."""
-
-    threshold: Mapping[str, float] | None
-    false_alarms_per_hour: float | None
-    alarms: tuple[RecordedAlarm, ...] | None
-    details: MonitorDetails = MonitorDetails()
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class ResidualsDetails:
-    """What limits were learned from, limits by model, and alarms where nothing disturbs the machine."""
-
-    source: str = ""
-    limits: Mapping[str, ResidualLimits] = field(default_factory=dict)
-    clean: CleanAlarms | None = None
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """The monitor of residuals: false alarms an hour, alarms on the recordings with their channels, and loops in which
-    an actuator weakens or a sensor freezes, for machines whose energy is not watched.
+class WatchDetails:
+    """What limits were learned from, limits by model and kind of readings, how much of each recording was watched, and
+    alarms where nothing disturbs the machine, in all and by channel.
     """
 
-    false_alarms_per_hour: float | None = None
-    alarms: tuple[ChannelAlarm, ...] | None = None
-    faults: tuple[FaultedChannel, ...] | None = None
-    faults_reason: str = ""
-    details: ResidualsDetails = ResidualsDetails()
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class BrokenLoop:
-    """A loop in which something breaks: what and when, time to the alarm (None: never), what it is taken for."""
-
-    fault: str
-    start_s: float
-    delay_s: float | None
-    diagnosis: str
-
-
-@dataclass(frozen=True)
-class GuardDetails:
-    """What the guard was learned from, its detector, test recordings, and loops in which something breaks."""
-
-    source: str = ""
+    sources: Mapping[str, str] = field(default_factory=dict)
     loops: tuple[NominalLoop, ...] = ()
-    detector: Detector | None = None
-    test: GuardTest | None = None
-    faults: tuple[FaultedLoop, ...] | None = None
+    limits: Mapping[str, Mapping[str, WatchLimits]] = field(default_factory=dict)
+    recordings: tuple[Mapping[str, float | str], ...] = ()
+    clean: CleanAlarms | None = None
+    by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Guard:
-    """The energy guard's detector, alarms on test recordings, and loops in which something breaks.
-
-    Wanted false alarms [1/h] and length of the nominal data [h]; an alarm starts above the sum of scaled residual
-    forces or the scaled violation of the two thresholds.
+class Watch:
+    """What watches the machine: the kind of its readings, wanted false alarms [1/h], length of the nominal data [h],
+    alarms an hour where nothing disturbs it, alarms on the recordings, and loops in which something breaks.
     """
 
-    false_alarms_per_hour: float | None = None
+    kind: str | None = None
+    wanted_per_hour: float | None = None
     hours: float | None = None
-    force_threshold: float | None = None
-    energy_threshold: float | None = None
-    data_hash: str | None = None
-    test_seconds: float | None = None
-    test_alarms: int | None = None
-    faults: tuple[BrokenLoop, ...] | None = None
+    false_alarms_per_hour: float | None = None
+    alarms: tuple[RecordedAlarm, ...] | None = None
+    faults: tuple[FaultedLoop, ...] | None = None
     faults_reason: str = ""
-    details: GuardDetails = GuardDetails()
+    details: WatchDetails = WatchDetails()
     reason: str = ""
 
 
@@ -399,9 +339,7 @@ class Results:
     estimation: Estimation
     promises: Promises
     timing: Timing
-    residuals: Residuals
-    monitor: Monitor
-    guard: Guard
+    watch: Watch
     analysis: Analysis
 
     def plain(self) -> dict[str, Any]:
@@ -435,7 +373,7 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
         )
     for group in (
-        "identification", "control", "estimation", "promises", "timing", "residuals", "monitor", "guard", "analysis",
+        "identification", "control", "estimation", "promises", "timing", "watch", "analysis",
     ):  # fmt: skip
         _check_values(values[group], group, where)
     return results
@@ -469,9 +407,7 @@ def collect(context: Context) -> Results:
         _estimation(context),
         promises(context),
         _timing(context),
-        _residuals(context),
-        _monitor(context),
-        _guard(context),
+        _watch(context),
         _analysis(context),
     )
 
@@ -684,58 +620,25 @@ def _timing(context: Context) -> Timing:
     return Timing(StepTimes(median, p95, p99, float(ms.max())), period, int((ms > period).sum()))
 
 
-def _residuals(context: Context) -> Residuals:
-    found = context.find(RESIDUALS)
+def _watch(context: Context) -> Watch:
+    found = context.find(WATCH)
     if isinstance(found, Absent):
-        return Residuals(reason=found.reason)
-    clean = found.clean
-    return Residuals(
-        clean.alarms / (clean.seconds / 3600.0) if clean.seconds else 0.0,
-        found.alarms,
-        found.faults,
-        "" if found.faults is not None else "there is no plant, no calm task, or the energy is watched",
-        ResidualsDetails(found.source, found.limits, clean),
+        return Watch(reason=found.reason)
+    limits = {model: dict(own.limits) for model, own in found.watch.items()}
+    details = WatchDetails(
+        found.sources, found.loops, limits, found.recordings, found.clean, found.by_channel
     )
-
-
-def _monitor(context: Context) -> Monitor:
-    found = context.find(MONITOR)
-    if isinstance(found, Absent):
-        return Monitor(None, None, None, reason=found.reason)
-    threshold, clean = found.calibration.threshold_w, found.clean
-    if found.reason or threshold is None or clean is None:
-        return Monitor(None, None, None, MonitorDetails(found.recordings), found.reason)
-    return Monitor(
-        {ENERGY: threshold},
-        clean.alarms / (clean.seconds / 3600.0),
-        found.alarms,
-        MonitorDetails(found.recordings, found.calibration, clean),
-    )
-
-
-def _guard(context: Context) -> Guard:
-    found = context.find(GUARD)
-    if isinstance(found, Absent):
-        return Guard(reason=found.reason)
-    detector = found.detector
-    if detector is None:
-        return Guard(reason=found.reason, details=GuardDetails(found.source, test=found.test))
+    if found.limits is None or found.clean is None:
+        return Watch(found.kind, details=details, reason=found.reason)
+    clean, own = found.clean, found.limits
     lacks = "plant that could break" if context.scenario.plant is None else "task in which nothing goes wrong"
-    loops = found.faults or ()
-    return Guard(
-        detector.false_alarms_per_hour,
-        detector.hours,
-        detector.force_threshold,
-        detector.energy_threshold,
-        detector.data_hash,
-        found.test.seconds,
-        found.test.alarms,
-        None
-        if found.faults is None
-        else tuple(BrokenLoop(row.fault, row.start_s, row.delay_s, row.diagnosis) for row in loops),
+    return Watch(
+        found.kind, own.false_alarms_per_hour, own.hours,
+        clean.alarms / (clean.seconds / 3600.0) if clean.seconds else 0.0,
+        found.alarms, found.faults,
         f"scenario {context.scenario.name} has no {lacks}" if found.faults is None else "",
-        GuardDetails(found.source, found.loops, detector, found.test, found.faults),
-    )
+        details,
+    )  # fmt: skip
 
 
 def _analysis(context: Context) -> Analysis:

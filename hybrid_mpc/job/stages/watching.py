@@ -2,40 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 
 from scipy.stats import chi2
 
-from hybrid_mpc.job.stage import Absent
-from hybrid_mpc.job.stages.guard import GuardResult
-from hybrid_mpc.job.stages.monitor import CleanAlarms, MonitorResult
-from hybrid_mpc.job.stages.residuals import ResidualsResult
+from hybrid_mpc.job.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 from hybrid_mpc.report.page import Table
 
 HEADS = ("channel", "threshold", "false alarms an hour (95 % interval)", "faults: alarm after", "taken for")
 CAPTION = (
     "All that watches the machine. False alarms are those that begin where nothing disturbs it, with the interval of a "
-    "Poisson count. Faults are those of the closed loops below."
+    "Poisson count. Each fault stands beside the channel that alarms first in a closed loop with it."
 )
-Row = tuple[str, str, str, str, str]
 
 
-def watching_table(
-    monitor: MonitorResult | Absent,
-    guard: GuardResult | Absent,
-    residuals: ResidualsResult | Absent,
-    force: str,
-) -> Table | None:
-    """The table of the channels that have limits; None where there are none.
-
-    Args:
-        monitor: Result of the stage monitor.
-        guard: Result of the stage guard.
-        residuals: Result of the stage residuals.
-        force: Unit of the level of residual forces.
-    """
-    rows = [*_energy(monitor, force), *_guard(guard), *_residuals(residuals)]
-    return Table(HEADS, rows, CAPTION) if rows else None
+def watching_table(found: WatchResult) -> Table | None:
+    """The table of the channels that have limits, of frozen sensors, and of all together; None without limits."""
+    limits = found.limits
+    if limits is None:
+        return None
+    rows, faults = [], found.faults or ()
+    for channel in found.channels:
+        own = limits.of(channel.name)
+        if own:
+            threshold = "; ".join(limit.words(limits.dt) for limit in own)
+            rows.append(_row(channel.name, threshold, found.by_channel, faults))
+    frozen = [name for name in found.by_channel if name.endswith(" frozen")]
+    for name, far, often in zip(frozen, limits.travel, limits.repeats, strict=True):
+        rows.append(_row(name, f"travel {far:.3g}, {often} repeats", found.by_channel, faults))
+    clean = found.clean or CleanAlarms()
+    never = [row for row in faults if row.delay_s is None]
+    rows.append(("all together", "", rate_words(clean.alarms, clean.seconds), *_seen(never)))
+    return Table(HEADS, rows, CAPTION)
 
 
 def rate_words(alarms: int, seconds: float) -> str:
@@ -58,53 +56,16 @@ def rate_words(alarms: int, seconds: float) -> str:
     return f"{rate} ({least} to {most})"
 
 
-def _after(delay_s: float | None) -> str:
-    return "never" if delay_s is None else f"{delay_s:.2g} s"
+def _row(
+    name: str, threshold: str, by_channel: Mapping[str, CleanAlarms], faults: Sequence[FaultedLoop]
+) -> tuple[str, str, str, str, str]:
+    own = by_channel.get(name, CleanAlarms())
+    seen = [row for row in faults if row.channels[:1] == (name,)]
+    return (name, threshold, rate_words(own.alarms, own.seconds), *_seen(seen))
 
 
-def _energy(found: MonitorResult | Absent, force: str) -> Iterator[Row]:
-    if isinstance(found, Absent) or found.calibration.threshold_w is None:
-        return
-    rate = "" if found.clean is None else rate_words(found.clean.alarms, found.clean.seconds)
-    load = "" if found.load is None else f"unknown load {_after(found.load.delay_s)}"
-    yield "energy", f"{found.calibration.threshold_w:.3g} W", f"{rate}, both levels", load, ""
-    if found.calibration.residual_threshold is not None:
-        yield "residual force", f"{found.calibration.residual_threshold:.3g} {force}", "", "", ""
-
-
-def _guard(found: GuardResult | Absent) -> Iterator[Row]:
-    if isinstance(found, Absent) or found.detector is None:
-        return
-    loops = found.faults or ()
-    delays = "; ".join(f"{row.fault} {_after(row.delay_s)}" for row in loops)
-    told = "; ".join(f"{row.fault}: {row.diagnosis or 'nothing'}" for row in loops)
-    rate = f"{rate_words(found.test.alarms, found.test.seconds)}, whole guard"
-    yield "guard: sum of forces", f"{found.detector.force_threshold:.3g} deviations", rate, delays, told
-    if found.detector.energy:
-        yield "guard: power of free runs", f"{found.detector.energy_threshold:.3g} deviations", "", "", ""
-
-
-def _residuals(found: ResidualsResult | Absent) -> Iterator[Row]:
-    if isinstance(found, Absent) or not found.limits:
-        return
-    limits = tuple(found.limits.values())[-1]
-    loops = found.faults or ()
-    for i, channel in enumerate(limits.channels):
-        unit = found.units[i] if i < len(found.units) else ""
-        short, long = limits.threshold[i]
-        own = found.by_channel.get(channel, CleanAlarms())
-        seen = [row for row in loops if channel in row.channels[:1]]
-        delays = "; ".join(f"{row.fault} of {row.channel} {_after(row.delay_s)}" for row in seen)
-        told = "; ".join(f"{row.fault} of {row.channel}: {row.diagnosis or 'nothing'}" for row in seen)
-        yield (
-            channel,
-            f"{short:.3g}, lasting {long:.3g} {unit}",
-            rate_words(own.alarms, own.seconds),
-            delays,
-            told,
-        )
-    frozen = [row for row in loops if not row.channels or row.channels[0] not in limits.channels]
-    if frozen:
-        delays = "; ".join(f"{row.fault} of {row.channel} {_after(row.delay_s)}" for row in frozen)
-        told = "; ".join(f"{row.fault} of {row.channel}: {row.diagnosis or 'nothing'}" for row in frozen)
-        yield "frozen sensor, or no channel", "", "", delays, told
+def _seen(faults: Sequence[FaultedLoop]) -> tuple[str, str]:
+    """How soon faults are seen, and what they are taken for."""
+    after = [f"{row.fault} {'never' if row.delay_s is None else f'{row.delay_s:.2g} s'}" for row in faults]
+    told = [f"{row.fault}: {row.diagnosis or 'nothing'}" for row in faults if row.delay_s is not None]
+    return "; ".join(after), "; ".join(told)

@@ -1,1 +1,1 @@
-"""The study of the energy guard on the golf robot: what it learns from, what it finds, how soon."""
+"""The study of the guard on the golf robot: what it learns from, what it finds, how soon."""

@@ -1,4 +1,4 @@
-"""``python -m scenarios.golf_robot.monitor_study``: how well the energy guard finds faults on the golf robot."""
+"""``python -m scenarios.golf_robot.monitor_study``: how well the guard finds faults on the golf robot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scenarios.golf_robot.monitor_study.run import finish, run_monitor_study
 FAILED, BAD_INPUT = 1, 2
 
 app = typer.Typer(
-    help="How well the energy guard finds faults on the golf robot.",
+    help="How well the guard finds faults on the golf robot.",
     no_args_is_help=True,
     rich_markup_mode=None,
     add_completion=False,

@@ -6,16 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.monitor.calibrate import MAX_EXTRAPOLATION, MIN_BLOCKS, block_maxima, gumbel
-from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.energy import FROZEN_STEPS
-from hybrid_mpc.monitor.learn import DRIFT, detector_levels, learn_detector
-from hybrid_mpc.monitor.lengths import SETTLING_S, WINDOW_S, block_seconds
+from hybrid_mpc.watch.detector import Detector, WatchLimits
+from hybrid_mpc.watch.learn import MAX_EXTRAPOLATION, MIN_BLOCKS, block_maxima, gumbel, levels_of, limits_of
+from hybrid_mpc.watch.lengths import AVERAGE_S, SETTLING_S, WINDOW_S, block_seconds
+from hybrid_mpc.watch.readings import FROZEN_STEPS, Readings
 
 Array = NDArray[np.float64]
 REST_SPEED = 0.2
@@ -44,28 +44,34 @@ at half the rate.
 class Trace:
     """What detectors see of a loop of n periods.
 
-    ``numbers`` are ``MonitorReading.numbers``, ``level_w`` the averaged one-step violation [W], ``speed`` the largest
-    true speed of the degrees of freedom. Innovations ``(n, n_y)`` and their normalised squares ``nis`` ``(n,)`` are
-    NaN in the first row.
+    ``values`` ``(n, channels)`` and ``terms`` ``(n, channels, 4)`` are those of the energy's readings, ``travel`` that
+    of the sensors ``(n, n_y)``, ``speed`` the largest true speed of the degrees of freedom. Innovations ``(n, n_y)``
+    and their normalised squares ``nis`` ``(n,)`` are NaN in the first row.
     """
 
-    numbers: Array
-    level_w: Array
+    values: Array
+    terms: Array
+    travel: Array
     innovation: Array
     nis: Array
     speed: Array
+
+    @property
+    def settled(self) -> NDArray[np.bool_]:
+        """All values count."""
+        return np.ones(len(self.values), dtype=bool)
 
 
 @dataclass(frozen=True)
 class Detectors:
     """All methods, learned from the same ``hours`` of nominal loops.
 
-    ``detector`` has the scales of residual forces and power; its thresholds are set by the wanted rate. ``tails`` has
+    ``limits`` have the scales of residual forces and power; their thresholds are set by the wanted rate. ``tails`` has
     by part location and scale of the Gumbel tail of its maxima in blocks (:attr:`block_s`); ``resolution`` the step
     of each sensor.
     """
 
-    detector: Detector
+    limits: WatchLimits
     tails: Mapping[str, tuple[float, float]]
     resolution: tuple[float, ...]
     hours: float = 0.0
@@ -79,12 +85,12 @@ class Detectors:
     @property
     def block_s(self) -> float:
         """Length of a block [s]."""
-        return block_seconds(self.detector.dt, self.detector.time_unit)
+        return block_seconds(self.limits.dt, self.limits.time_unit)
 
     @property
     def settling(self) -> int:
         """Samples at the beginning of a loop that do not count."""
-        return round(SETTLING_S * self.detector.time_unit / self.detector.dt)
+        return round(SETTLING_S * self.limits.time_unit / self.limits.dt)
 
     def threshold(self, part: str, rate: float) -> float:
         """Level that a part passes at that rate [1/h] on nominal data; 1 for the freeze test, a share already."""
@@ -93,25 +99,36 @@ class Detectors:
         location, scale = self.tails[part]
         return max(location - scale * math.log(rate * self.block_s / 3600.0), 1e-12)
 
-    def detector_at(self, rate: float) -> Detector:
-        """The detector with thresholds for that rate [1/h] in all, half of it for each alarm."""
+    def limits_at(self, rate: float) -> WatchLimits:
+        """The limits with thresholds for that rate [1/h] in all, half of it for forces and half for the power."""
         force, power = (self.threshold(part, 0.5 * rate) for part in ("forces", "power"))
-        return replace(
-            self.detector, force_threshold=force, energy_threshold=power, false_alarms_per_hour=rate,
-            method=f"Gumbel tail of maxima in blocks of {self.block_s:g} s",
-        )  # fmt: skip
+        tops = [force if one.length == 0 else power for one in self.limits.channels]
+        channels = tuple(
+            replace(one, threshold=top, release=RELEASE * top)
+            for one, top in zip(self.limits.channels, tops, strict=True)
+        )
+        method = f"Gumbel tail of maxima in blocks of {self.block_s:g} s"
+        return replace(self.limits, channels=channels, false_alarms_per_hour=rate, method=method)
 
     def levels(self, trace: Trace) -> dict[str, Array]:
         """Level ``(n,)`` of each part along a loop; zero where it says nothing, and while the estimator settles."""
-        n_q, window = len(self.resolution), WINDOW_S * self.detector.time_unit / self.detector.dt
-        forces, power = detector_levels(self.detector, trace.numbers)
-        travel = np.abs(trace.numbers[:, 3 + n_q : 3 + 2 * n_q]) / (FROZEN_STEPS * np.array(self.resolution))
+        unit = self.limits.time_unit / self.limits.dt
+        window, all_of_it = WINDOW_S * unit, [np.ones(len(trace.values), dtype=bool)]
+        parts = levels_of(_detector(self.limits, math.inf), [cast(Any, trace)], all_of_it)
+        of = [np.nan_to_num(runs[0]) for runs in parts]
+        forces = np.max(
+            [v for v, one in zip(of, self.limits.channels, strict=True) if one.length == 0], axis=0
+        )
+        power = np.max(
+            [v for v, one in zip(of, self.limits.channels, strict=True) if one.length == 1], axis=0
+        )
+        travel = np.abs(trace.travel) / (FROZEN_STEPS * np.array(self.resolution))
         squares = (trace.innovation**2).sum(axis=1)
         found = {
             "forces": forces,
             "power": power,
             "freeze": travel.max(axis=1),
-            "level": trace.level_w,
+            "level": _averaged(trace.values[:, 0], AVERAGE_S * unit),
             "innovation_chi2": _averaged(trace.nis, window),
             "innovation_rms": np.sqrt(_averaged(squares, window)),
         }
@@ -130,10 +147,10 @@ class Detectors:
 
     def alarm(self, levels: Mapping[str, Array], trace: Trace, method: str, rate: float) -> NDArray[np.bool_]:
         """Alarm ``(n,)`` of a method: each part's with its hysteresis, sums capped as online."""
-        parts, on = METHODS[method], np.zeros(len(trace.level_w), dtype=bool)
+        parts, on = METHODS[method], np.zeros(len(trace.values), dtype=bool)
         for part, share in parts.items():
             if part == "forces":
-                on |= self._detected(trace.numbers, 2 * share * rate)
+                on |= self._detected(trace, 2 * share * rate)
             elif part == "freeze":
                 on |= levels[part] > 1.0
             elif part != "power":
@@ -141,32 +158,41 @@ class Detectors:
         on[: self.settling] = False
         return on
 
-    def _detected(self, numbers: Array, rate: float) -> NDArray[np.bool_]:
-        detector = self.detector_at(rate)
+    def _detected(self, trace: Trace, rate: float) -> NDArray[np.bool_]:
+        detector = _detector(self.limits_at(rate), 1.0)
         state, found = detector.initial(), []
-        for row in numbers.tolist():
-            state, _, alarm = detector.update(state, row)
-            found.append(alarm)
+        for values, terms in zip(trace.values.tolist(), trace.terms.tolist(), strict=True):
+            state, _, _ = detector.update(state, values, terms, True)
+            found.append(any(state.on))
         return np.array(found, dtype=bool)
+
+
+def _detector(limits: WatchLimits, factor: float) -> Detector:
+    """The detector of limits, their thresholds times a factor; infinite: no alarm limits the sums."""
+    channels = [
+        replace(one, threshold=one.threshold * factor, release=one.release * factor)
+        for one in limits.channels
+    ]
+    names = ["violation", *(one.channel for one in limits.channels)]
+    return Detector(channels, names)
 
 
 def learn_detectors(
     traces: Sequence[Trace],
-    dt: float,
+    readings: Readings,
     resolution: Sequence[float],
     *,
     rate: float = 1.0,
-    rest_speed: ArrayLike = REST_SPEED,
-    time_unit: float = 1.0,
     data_hash: str = "",
 ) -> Detectors:
     """All methods from nominal loops, for wanted rates of false alarms down to ``rate``.
 
-    Thresholds are Gumbel tails of block maxima, as :func:`~hybrid_mpc.monitor.calibrate.calibrate` makes them. The
+    Thresholds are Gumbel tails of block maxima, as :func:`~hybrid_mpc.watch.learn.calibrate` makes them. The
     loops are known to be nominal, so a block that stands out is no reason to refuse them.
     """
+    dt, time_unit = readings.model.dt, readings.model.time_unit
     skipped, block_s = round(SETTLING_S * time_unit / dt), block_seconds(dt, time_unit)
-    runs = [trace.numbers[skipped:] for trace in traces]
+    runs = [trace.values[skipped:] for trace in traces]
     share = min(s for parts in METHODS.values() for s in parts.values() if s)
     needed = max(MIN_BLOCKS, math.ceil(3600.0 / (share * rate * block_s * MAX_EXTRAPOLATION)))
     size = round(block_s / dt)
@@ -176,12 +202,12 @@ def learn_detectors(
             f"learning: {blocks * block_s / 60:.1f} min of nominal loops in whole blocks of {block_s:g} s; a rate "
             f"of {rate:g}/h, of which a part gets {share:g}, needs {needed * block_s / 60:.1f} min"
         )
-    detector = learn_detector(
-        runs, dt, len(resolution), drift=DRIFT, false_alarms_per_hour=rate, rest_speed=rest_speed,
-        data_hash=data_hash, trusted=True, time_unit=time_unit,
+    limits = limits_of(
+        readings, [trace.travel for trace in traces], [cast(Any, trace) for trace in traces],
+        false_alarms_per_hour=rate, resolution=resolution, data_hash=data_hash, trusted=True,
     )  # fmt: skip
     hours = sum(len(run) for run in runs) * dt / 3600.0
-    detectors = Detectors(detector, {}, tuple(resolution), hours, blocks)
+    detectors = Detectors(limits, {}, tuple(resolution), hours, blocks)
     levels = [detectors.levels(trace) for trace in traces]
     tails = {}
     for part in levels[0]:

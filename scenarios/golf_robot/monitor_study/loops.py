@@ -10,19 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
-from hybrid_mpc.job.loops import MODEL, Bench, LoopSpec
+from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec
 from hybrid_mpc.job.study_run import ModelInput, local_folder
 from hybrid_mpc.job.tasks import selected_tasks
 from hybrid_mpc.kit.artifact import Kit, load
-from hybrid_mpc.loop.simulate import ClosedLoopResult
-from hybrid_mpc.monitor.detector import Detector
-from hybrid_mpc.monitor.energy import EnergyMonitor
-from hybrid_mpc.monitor.learn import guard_monitor
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario
+from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.monitor import Monitor, Reading, make_monitor
+from hybrid_mpc.watch.replay import trace_of
 from scenarios.golf_robot.monitor_study.detection import (
     METHODS,
     REST_SPEED,
@@ -99,7 +98,7 @@ class _Loops:
         reaction = {"backup": "prior"}.get(arm, arm)
         return LoopSpec(
             self._study.scenario, MODEL, self._task.name, CONTROLLER, horizon=horizon,
-            monitor="guard" if arm else "readings",
+            monitor="guard" if arm else "own",
             faults=plan.faults(self._dt), seed=plan.seed, guard=reaction,
         )  # fmt: skip
 
@@ -109,29 +108,39 @@ class _Loops:
             x0=(0.0,) * self._kit.models["hybrid"].n_x, figures=None,
         )  # fmt: skip
 
-    def _monitor(self, detector: Detector | None = None) -> EnergyMonitor:
-        rest = self._kit.rest_speed if detector is None else None
-        steps = None if detector is None else self.detectors.resolution
+    def _monitor(self, limits: WatchLimits | None = None) -> Monitor:
+        rest = rest_of(self._kit) if limits is None else None
         ranges = self._kit.problem(self._task.name).input_range
-        return guard_monitor(
-            self._kit.models["hybrid"], detector, resolution=steps, input_range=ranges, rest_speed=rest
+        return make_monitor(self._kit.models["hybrid"], limits, input_range=ranges, rest_speed=rest)
+
+    def _traced(self, spec: LoopSpec, task: Task, monitor: Monitor) -> tuple[LoopRow, Trace]:
+        """A loop's row, and what detectors see of it."""
+        readings: list[Reading] = []
+        row, result = self._bench.run(
+            spec,
+            task=task,
+            monitor=monitor,
+            on_step=lambda step: readings.append(step.reading),  # type: ignore[arg-type]
         )
+        found = trace_of(monitor, result.t, readings)
+        speed = np.abs(result.x[:, result.x.shape[1] // 2 :]).max(axis=1)
+        return row, Trace(found.values, found.terms, found.travel, result.innovation, result.nis, speed)
 
     def _nominal(self, plans: tuple[LoopPlan, ...]) -> list[Trace]:
         monitor, traces = self._monitor(), []
         for plan in plans:
             spec, task = self._spec(plan, horizon=self._study.horizon), self._follows(plan)
-            traces.append(trace_of(self._bench.run(spec, task=task, monitor=monitor)[1]))
+            traces.append(self._traced(spec, task, monitor)[1])
         return traces
 
     def _fault(self, plan: LoopPlan) -> dict[str, Any]:
-        row, result = self._bench.run(self._spec(plan), task=self._follows(plan), monitor=self._monitor())
+        row, trace = self._traced(self._spec(plan), self._follows(plan), self._monitor())
         onset = round(plan.onset(self._dt) / self._dt)
-        found = fault_figures(self._study, self.detectors, trace_of(result), onset)
+        found = fault_figures(self._study, self.detectors, trace, onset)
         return {**found, "cost": row.cost, "excess": dict(row.excess)}
 
     def _guarded(self, plan: LoopPlan, arm: str) -> dict[str, Any]:
-        monitor = self._monitor(self.detectors.detector_at(self._study.rates[0]))
+        monitor = self._monitor(self.detectors.limits_at(self._study.rates[0]))
         row, _ = self._bench.run(self._spec(plan, arm), task=self._follows(plan), monitor=monitor)
         early = sum(switch.t_s < plan.onset(self._dt) for switch in row.switches)
         return {
@@ -142,15 +151,9 @@ class _Loops:
         }
 
 
-def trace_of(result: ClosedLoopResult) -> Trace:
-    """What detectors see of a loop."""
-    speed = np.abs(result.x[:, result.x.shape[1] // 2 :]).max(axis=1)
-    return Trace(result.numbers, result.level, result.innovation, result.nis, speed)
-
-
 def nominal_figures(study: MonitorStudy, detectors: Detectors, trace: Trace) -> dict[str, Any]:
     """Of a nominal loop: false alarms by rate and method, and the largest scores of its blocks."""
-    dt, levels = detectors.detector.dt, detectors.levels(trace)
+    dt, levels = detectors.limits.dt, detectors.levels(trace)
     size = round(detectors.block_s / dt)
     counts: dict[str, dict[str, int]] = {}
     for rate in study.rates:
@@ -168,8 +171,8 @@ def nominal_figures(study: MonitorStudy, detectors: Detectors, trace: Trace) -> 
 
 def fault_figures(study: MonitorStudy, detectors: Detectors, trace: Trace, onset: int) -> dict[str, Any]:
     """Of a faulted loop: delays by rate and method, alarms before the fault, and the largest scores soon after."""
-    dt, levels = detectors.detector.dt, detectors.levels(trace)
-    moving = MOVING * max(detectors.detector.rest_speed)
+    dt, levels = detectors.limits.dt, detectors.levels(trace)
+    moving = MOVING * max(detectors.limits.rest_speed)
     moved: Array = np.cumsum(trace.speed[onset:] > moving) * np.float64(dt)
     delays: dict[str, dict[str, float]] = {}
     early: dict[str, dict[str, bool]] = {}
@@ -200,9 +203,13 @@ def learn(study: MonitorStudy, paths: list[Path], artifact: Kit) -> Detectors:
         for i in range(len(arrays) // len(Trace.__dataclass_fields__)):
             fields: Mapping[str, Any] = {name: arrays[f"{name}_{i}"] for name in Trace.__dataclass_fields__}
             traces.append(Trace(**fields))
-            hashed.update(traces[-1].numbers.tobytes())
-    model, rest = artifact.models["hybrid"], artifact.rest_speed
+            hashed.update(traces[-1].values.tobytes())
+    readings = make_monitor(artifact.models["hybrid"], rest_speed=rest_of(artifact)).readings
     return learn_detectors(
-        traces, model.dt, study.resolution, rate=min(study.rates), rest_speed=REST_SPEED if rest is None else rest,
-        time_unit=model.time_unit, data_hash=hashed.hexdigest(),
-    )  # fmt: skip
+        traces, readings, study.resolution, rate=min(study.rates), data_hash=hashed.hexdigest()
+    )
+
+
+def rest_of(kit: Kit) -> ArrayLike:
+    """Speeds below which friction may stick: what recordings gave, or what is known of this robot."""
+    return REST_SPEED if kit.rest_speed is None else kit.rest_speed

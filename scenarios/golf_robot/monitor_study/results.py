@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.monitor.lengths import BLOCK_S
+from hybrid_mpc.watch.lengths import BLOCK_S
 from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors
 from scenarios.golf_robot.monitor_study.plan import ARMS, CASES, FAULT, GUARD, NOMINAL
 

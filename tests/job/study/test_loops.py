@@ -76,8 +76,8 @@ def test_what_a_study_adds_acts(run_folder):
 def test_monitors(run_folder):
     own, none, energy = (row_of(run_folder, monitors=[m], duration=1.0) for m in ("own", "none", "energy"))
     assert own["cost"] == none["cost"] == energy["cost"]  # monitors only watch
-    assert np.isfinite(own["largest_level_w"])
-    assert np.isnan(none["largest_level_w"])
+    assert np.isfinite(own["largest_violation_w"])
+    assert np.isnan(none["largest_violation_w"])
     assert np.isnan([own["alarm_share"], none["alarm_share"]]).all()  # neither can alarm
     assert energy["alarm_share"] > 0.0
     assert 0.0 < energy["first_alarm_s"] < 1.0

@@ -1,0 +1,410 @@
+"""Cells of one column as numbers: decimal marks, dates and times of day, numbers with a unit, words for a switch.
+
+A column is read in one way throughout. What fits no way, or two, is left as it is, for a message.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.machine.units import parsed
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---")
+"""Cells that say that there is no value, in small letters."""
+PAIRS = (
+    ("off", "on"), ("false", "true"), ("no", "yes"), ("closed", "open"), ("low", "high"), ("aus", "ein"), ("aus", "an"),
+    ("zu", "auf"), ("nein", "ja"), ("falsch", "wahr"), ("arrêt", "marche"), ("non", "oui"),
+)  # fmt: skip
+"""Words for the two positions of a switch, 0 and 1, in small letters."""
+SWITCH = frozenset(word for pair in PAIRS for word in pair)
+DAY = 86400.0
+FAR = 20.0
+"""Usual steps of dates by which none is away from the next one, where the order of day and month must be told."""
+SEEN = 100
+"""Cells that are looked at before all are read as dates of ISO 8601."""
+ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}(:\d{2}([.,]\d{1,9})?)?(Z|[+-]\d{2}:?\d{2})?")
+TIMES = "times of day read as seconds"
+MONTHS = (
+    ("jan",), ("feb", "fév", "fev"), ("mar", "mär", "mrz"), ("apr", "avr"), ("may", "mai"), ("jun", "juin"),
+    ("jul", "juil"), ("aug", "aoû", "aou"), ("sep",), ("oct", "okt"), ("nov",), ("dec", "dez", "déc"),
+)  # fmt: skip
+"""How the names of months begin, in small letters."""
+_CLOCK = r"(?P<H>\d{1,3}):(?P<M>\d{2})(?::(?P<S>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?\s*(?P<ap>[AaPp]\.?[Mm]\.?)?"
+_ZONE = r"\s*(?P<z>Z|[A-Z]{2,5}|[+-]\d{2}:?\d{2})?"
+_DAYS = (
+    r"(?P<Y>\d{4})(?P<sep>[-/.])(?P<m>\d{1,2})(?P=sep)(?P<d>\d{1,2})",
+    r"(?P<a>\d{1,2})(?P<sep>[-/.])(?P<b>\d{1,2})(?P=sep)(?P<Y>\d{4}|\d{2})",
+    r"(?P<d>\d{1,2})[-/. ]\s?(?P<name>[^\W\d_]{3,9})\.?[-/. ,]\s?(?P<Y>\d{4})",
+    r"(?P<name>[^\W\d_]{3,9})\.?\s(?P<d>\d{1,2}),?\s(?P<Y>\d{4})",
+    r"(?P<Y>\d{4})(?P<m>\d{2})(?P<d>\d{2})",
+)
+"""A day: year first, year last, with the month's name, in eight digits (before a time of day)."""
+DATES = tuple(re.compile(rf"{day}(?:[T _,-]\s*{_CLOCK}{_ZONE})?") for day in _DAYS)
+TIME_OF_DAY = re.compile(_CLOCK)
+MINUTES = re.compile(r"(?P<M>\d{1,3}):(?P<S>\d{2})[.,](?P<f>\d{1,9})")
+"""Minutes and seconds: two numbers of which the second has decimals."""
+WITH_UNIT = re.compile(
+    r"(?P<number>[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\W\d_][^\d_,;]{0,11}|%|°\w?)"
+)
+THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?P<mark>[.,'’ \u00a0\u202f])\d{3})(?:(?P=mark)\d{3})*(?:[.,]\d*)?")
+"""A number with marks between thousands."""
+
+
+class Cells(NamedTuple):
+    """A column's numbers ``(m,)``, NaN where there is none, and which of its cells are ``blank``.
+
+    ``unit`` is the one that every cell has, ``"s"`` of dates; ``done`` says what was done to make numbers of them, and
+    ``fault`` why that failed for all, with a remedy.
+    """
+
+    values: Array
+    blank: Mask
+    unit: str = ""
+    done: str = ""
+    fault: str = ""
+
+
+def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
+    """The numbers in a column.
+
+    Args:
+        column: As pandas has it: numbers, dates, or texts.
+        decimal: The file's decimal mark, in cells that pandas left as texts.
+    """
+    import pandas as pd
+
+    kind = column.dtype.kind
+    if kind in "iuf" or (kind == "b" and not column.isna().any()):
+        values = column.to_numpy(np.float64, na_value=np.nan)
+        return Cells(values, np.isnan(values), done="true and false read as 1 and 0" if kind == "b" else "")
+    if kind in "Mm":
+        blank = column.isna().to_numpy()
+        whole = column.dt.tz_convert("UTC") if getattr(column.dtype, "tz", None) is not None else column
+        begin = whole[~blank].iloc[0] if kind == "M" and not blank.all() else pd.Timedelta(0)
+        since = pd.to_timedelta(whole - begin).dt.as_unit("ns").to_numpy().astype(np.int64)
+        values = np.where(blank, np.nan, since / 1e9)
+        return Cells(values, blank, "s", f"dates read as seconds since {begin}" if kind == "M" else "")
+    if kind == "c":
+        return Cells(
+            np.full(len(column), np.nan), np.zeros(len(column), bool), fault="it holds complex numbers"
+        )
+    if len(column) and all(isinstance(c, str) and ISO.fullmatch(c) for c in column.iloc[:SEEN]):
+        dates = pd.to_datetime(column, format="ISO8601", utc=True, errors="coerce")
+        if not dates.isna().any():
+            return cells_of(dates)
+    found = _of_stamps(column)
+    if found is None:
+        codes, uniques = pd.factorize(column, use_na_sentinel=False)
+        found = _of_objects(list(uniques), decimal)
+        found = found._replace(values=found.values[codes], blank=found.blank[codes])
+    values, done = found.values, found.done
+    if done == TIMES and (turned := np.cumsum(np.r_[0, np.diff(values) < -DAY / 2])).any():
+        values, done = values + DAY * turned, f"{done}, past midnight {turned[-1]} times"
+    return found._replace(values=values, done=done)
+
+
+def _of_stamps(column: pd.Series) -> Cells | None:
+    """The same where all cells are dates that are written in one way; None elsewhere."""
+    words = column.tolist()
+    if not words or not all(isinstance(one, str) and is_stamp(one) for one in words[:SEEN]):
+        return None
+    if any(not isinstance(one, str) for one in words):
+        return None
+    found = _stamps(words, np.zeros(0), ".")
+    return None if found is None or found.fault else found._replace(blank=np.zeros(len(words), bool))
+
+
+def number(cell: str) -> float:
+    """The number in a cell; NaN for what is no finite one.
+
+    Example:
+        >>> number("1e3"), number("1_000")
+        (1000.0, nan)
+    """
+    try:
+        value = float(cell)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) and "_" not in cell else math.nan
+
+
+def is_number(cell: str, decimal: str = ".") -> bool:
+    """Whether a cell is a number by itself, with the decimal mark."""
+    return math.isfinite(number(_pointed(cell, decimal)))
+
+
+def is_value(cell: str, comma: bool = True) -> bool:
+    """Whether a cell is one of a row of values, and no name: a number, a date, a switch, a number with a unit.
+
+    ``comma``: the decimal mark may be one.
+    """
+    return (
+        is_number(cell) or (comma and is_number(cell, ",")) or is_stamp(cell) or cell.casefold() in SWITCH
+        or WITH_UNIT.fullmatch(cell) is not None or THOUSANDS.fullmatch(cell) is not None
+    )  # fmt: skip
+
+
+def is_stamp(cell: str) -> bool:
+    """Whether a cell is a date or a time of day."""
+    if not cell[:1].isalnum() or len(cell) > 60:
+        return False
+    return any(pattern.fullmatch(cell) for pattern in (*DATES, TIME_OF_DAY, MINUTES))
+
+
+def is_unit(cell: str) -> bool:
+    """Whether a cell names a unit, in brackets or without, and is no mark for a missing value."""
+    bare = cell.strip().strip("[]()").strip()
+    return (
+        re.search(r"[^\W\d_]|[%°]", bare) is not None
+        and bare.casefold() not in BLANK
+        and parsed(bare) is not None
+    )
+
+
+def cause(cell: str) -> str:
+    """What a cell that is no number is, and what to write; empty where nobody knows."""
+    if THOUSANDS.fullmatch(cell):
+        return "it has a mark between thousands. Write numbers without that, with a decimal point"
+    if re.fullmatch(r"[+-]?\d*,\d+", cell):
+        return "it has a decimal comma. Write a decimal point, or separate cells by semicolons"
+    if is_stamp(cell):
+        return "it is a date or a time of day, and other cells are not. Write one of both in all rows"
+    if cell.casefold() in SWITCH:
+        return "it is a word for a switch. Write 1 and 0"
+    if found := WITH_UNIT.fullmatch(cell):
+        unit = found["unit"].strip()
+        return f"it is a number with a unit. Write the number alone and the unit into the header, e.g. 'name [{unit}]'"
+    return ""
+
+
+def _pointed(cell: str, decimal: str) -> str:
+    return cell if decimal == "." else cell.replace(".", "x").replace(",", ".")
+
+
+def _of_objects(cells: Sequence[Any], decimal: str) -> Cells:
+    """The same for different cells of any kind: texts, and what a spreadsheet holds."""
+    import pandas as pd
+
+    stamps = [
+        isinstance(c, datetime.datetime | datetime.date | pd.Timestamp) and c is not pd.NaT for c in cells
+    ]
+    times = [isinstance(c, datetime.time | datetime.timedelta) for c in cells]
+    texts = [_text(cell) for cell in cells]
+    blank = np.array([text.casefold() in BLANK for text in texts], dtype=bool)
+    values = np.array([number(_pointed(text, decimal)) for text in texts])
+    if any(stamps) and all(a or b for a, b in zip(stamps, blank, strict=True)):
+        dates = pd.Series([None if b else c for b, c in zip(blank, cells, strict=True)], dtype=object)
+        made = pd.to_datetime(dates)
+        return cells_of(made)._replace(blank=blank)
+    if any(times) or any(stamps):
+        texts = [
+            c.isoformat(" ") if isinstance(c, datetime.datetime) else t
+            for c, t in zip(cells, texts, strict=True)
+        ]
+    odd = ~np.isfinite(values) & ~blank
+    if not odd.any():
+        return Cells(values, blank)
+    words = [texts[k] for k in np.flatnonzero(odd)]
+    others = values[~odd & ~blank]
+    for make in (_switch, _stamps, _with_units, _thousands):
+        if found := make(words, others, decimal):
+            values[odd] = found.values
+            return found._replace(values=values, blank=blank)
+    return Cells(values, blank)
+
+
+def _text(cell: Any) -> str:
+    """A cell as text; a whole number as a spreadsheet has it keeps all its digits."""
+    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+        return ""
+    if isinstance(cell, datetime.timedelta):
+        return f"{cell.total_seconds():.9f}"
+    return cell.strip() if isinstance(cell, str) else str(cell)
+
+
+def _switch(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
+    small = {word.casefold() for word in words}
+    pair = next((pair for pair in PAIRS if small <= set(pair)), None)
+    if pair is None or not np.isin(others, (0.0, 1.0)).all():
+        return None
+    values = np.array([float(word.casefold() == pair[1]) for word in words])
+    return Cells(values, np.zeros(0, bool), done=f"{pair[0]!r} and {pair[1]!r} read as 0 and 1")
+
+
+def _with_units(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
+    found = [WITH_UNIT.fullmatch(word) for word in words]
+    units = {match["unit"].strip() for match in found if match}
+    if len(others) or len(units) != 1 or not all(found):
+        return None
+    values = np.array([number(_pointed(match["number"], decimal)) for match in found if match])
+    unit = units.pop()
+    return Cells(values, np.zeros(0, bool), unit, f"cells are numbers with the unit {unit!r}")
+
+
+def _thousands(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
+    """Numbers between whose thousands is a mark that cannot be a decimal one."""
+    mark = "." if decimal == "," else ","
+    sure = re.compile(rf"[+-]?\d{{1,3}}(?:([{mark}'’ \u00a0\u202f])\d{{3}})(?:\1\d{{3}})*(?:[{decimal}]\d*)?")
+    if not all(map(sure.fullmatch, words)) or not _told(words, mark):
+        return None
+    bare = [re.sub(rf"[{mark}'’ \u00a0\u202f]", "", word) for word in words]
+    values = np.array([number(_pointed(one, decimal)) for one in bare])
+    return Cells(values, np.zeros(0, bool), done="marks between thousands left out")
+
+
+def _told(words: Sequence[str], mark: str) -> bool:
+    """Whether cells show that a mark stands between thousands: twice in a cell, or beside the decimal mark."""
+    other = "," if mark == "." else "."
+    return any(mark not in word or word.count(mark) > 1 or other in word for word in words)
+
+
+# Dates
+
+
+def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
+    """Dates as seconds since the first row's; times of day as seconds."""
+    import pandas as pd
+
+    if len(others):
+        return None
+    patterns = [p for p in (*DATES, MINUTES, TIME_OF_DAY) if p.fullmatch(words[0])]
+    parts = None
+    for pattern in patterns:
+        parts = _fixed(words, pattern)
+        if parts is None and all(map(pattern.fullmatch, words)):
+            parts = pd.Series(words).str.extract(rf"^(?:{pattern.pattern})$")
+        if parts is not None:
+            break
+    if parts is None:
+        return None
+    count = {key: pd.to_numeric(parts[key]).fillna(0).to_numpy(np.int64) for key in "HMS" if key in parts}
+    none = np.zeros(len(words), np.int64)
+    hours = count.get("H", none)
+    if "ap" in parts and parts["ap"].notna().any():
+        if parts["ap"].isna().any() or (hours > 12).any() or (hours < 1).any():
+            return Cells(np.full(len(words), np.nan), none > 0, fault="AM and PM do not fit all of its cells")
+        hours = hours % 12 + 12 * parts["ap"].str.upper().str.startswith("P").to_numpy()
+    fraction = none
+    if "f" in parts and parts["f"].notna().any():
+        written = parts["f"].dtype.kind != "i"
+        fraction = (parts["f"].fillna("0").str.ljust(9, "0") if written else parts["f"]).to_numpy(np.int64)
+    within = ((hours * 60 + count.get("M", none)) * 60 + count.get("S", none)) * 10**9 + fraction
+    if pattern is TIME_OF_DAY:
+        if parts["S"].isna().all():
+            return _no_stamps(
+                words, "hours and minutes, or minutes and seconds? Write hours, minutes and seconds"
+            )
+        return Cells(within / 1e9, none > 0, "s", TIMES)
+    if pattern is MINUTES:
+        return Cells(within / 1e9, none > 0, "s", "minutes and seconds read as seconds")
+    zone = _zone(parts)
+    if zone is None:
+        return _no_stamps(words, "the names of their time zones differ. Write the offset, e.g. +02:00")
+    ways = [days * 86400 * 10**9 + within - zone for days in _days(parts)]
+    if not ways:
+        return _no_stamps(words, "there is no such day. Correct that row")
+    if any((np.diff(way) != np.diff(ways[0])).any() for way in ways[1:]):
+        ways = [way for way in ways if _goes_on(way)]
+        if len(ways) != 1:
+            return _no_stamps(words, "day or month first? Write year, month and day, e.g. 2024-01-31")
+    total = ways[0]
+    done = f"dates read as seconds since {words[0]}"
+    return Cells((total - total[0]) / 1e9, none > 0, "s", done)
+
+
+def _fixed(words: Sequence[str], pattern: re.Pattern[str]) -> pd.DataFrame | None:
+    """The parts of dates of which only digits differ, and these stand in the same places; None of any others."""
+    import pandas as pd
+
+    first = pattern.fullmatch(words[0])
+    if first is None or not words[0].isascii() or max(map(len, words)) != len(words[0]):
+        return None
+    try:
+        codes = np.array(words, dtype="S").view(np.uint8).reshape(len(words), -1)
+    except UnicodeEncodeError:
+        return None
+    digits = np.array([c.isdigit() for c in words[0]])
+    if ((codes[:, digits] - 48) > 9).any() or (codes[:, ~digits] != codes[0, ~digits]).any():
+        return None
+    parts = {}
+    for key, text in first.groupdict().items():
+        if text is not None and text.isdigit():
+            begin, end = first.span(key)
+            width = 9 if key == "f" else end - begin
+            powers = 10 ** np.arange(width - 1, width - 1 - (end - begin), -1)
+            parts[key] = (codes[:, begin:end].astype(np.int64) - 48) @ powers
+        elif (
+            text is not None
+            and (codes[:, slice(*first.span(key))] != codes[0, slice(*first.span(key))]).any()
+        ):
+            return None
+        else:
+            parts[key] = np.full(len(words), text, dtype=object)
+    return pd.DataFrame(parts)
+
+
+def _no_stamps(words: Sequence[str], fault: str) -> Cells:
+    return Cells(np.full(len(words), np.nan), np.zeros(0, bool), fault=f"its dates, as {words[0]!r}: {fault}")
+
+
+def _goes_on(stamps: NDArray[np.int64]) -> bool:
+    """Whether stamps of different rows increase, and none by far more than usual."""
+    steps = np.diff(stamps)
+    steps = steps[steps != 0]
+    return bool(len(steps) and (steps > 0).all() and steps.max() <= FAR * np.median(steps))
+
+
+def _days(parts: pd.DataFrame) -> list[NDArray[np.int64]]:
+    """Days since 1970, by every way to read the dates: none where there are no such days."""
+    year = parts["Y"].to_numpy(np.int64)
+    if "name" in parts:
+        begins = {begin: k + 1 for k, names in enumerate(MONTHS) for begin in names}
+        small = parts["name"].str.casefold()
+        month = small.map(lambda name: begins.get(name[:4]) or begins.get(name[:3]) or 0).to_numpy(np.int64)
+        return _since_1970(year, month, parts["d"].to_numpy(np.int64))
+    if "a" not in parts:
+        return _since_1970(year, parts["m"].to_numpy(np.int64), parts["d"].to_numpy(np.int64))
+    first, second = parts["a"].to_numpy(np.int64), parts["b"].to_numpy(np.int64)
+    ways = _since_1970(year, second, first)
+    if (parts["sep"] == ".").all():
+        return ways
+    ways += _since_1970(year, first, second)
+    return ways + (_since_1970(first, second, year) if (year < 100).all() else [])
+
+
+def _since_1970(
+    year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
+    if (month < 1).any() or (month > 12).any() or (day < 1).any():
+        return []
+    year = np.where(year < 100, year + 2000, year)
+    months = ((year - 1970) * 12 + month - 1).astype("datetime64[M]")
+    days = months.astype("datetime64[D]") + (day - 1)
+    return [days.astype(np.int64)] if (days.astype("datetime64[M]") == months).all() else []
+
+
+def _zone(parts: pd.DataFrame) -> NDArray[np.int64] | None:
+    """Offsets of the time zones [ns]; None where they are names that differ."""
+    codes, zones = parts["z"].fillna("").factorize()
+    found = [re.fullmatch(r"([+-])(\d{2}):?(\d{2})", zone) for zone in zones]
+    names = {zone for zone, match in zip(zones, found, strict=True) if not match} - {"Z", "UTC", "GMT"}
+    if len(names) > 1 or (names and any(found)):
+        return None
+    sizes = [
+        (-1 if match[1] == "-" else 1) * (int(match[2]) * 3600 + int(match[3]) * 60) if match else 0
+        for match in found
+    ]
+    offsets: NDArray[np.int64] = np.array(sizes, np.int64)[codes] * 10**9
+    return offsets

@@ -1,0 +1,346 @@
+"""Files of measuring programs and robots: MDF, TDMS, ROS bags, MCAP, PX4 logs, CAN logs. All signals keep their clocks.
+
+Each is read by its format's own library, of the extra ``loggers``; none may run code that a file brings.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sqlite3
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.names import said_by
+from hybrid_mpc.data.series import Series, clocked
+from hybrid_mpc.data.source import LISTED, Source, line_of
+from hybrid_mpc.data.vectors import LARGEST, vector_source
+from hybrid_mpc.errors import InputError, MissingPackage, named_extra
+from hybrid_mpc.records import shown
+
+Array = NDArray[np.float64]
+MOST_FIELDS = 64
+"""Longest array in a message whose elements are signals."""
+NUMBERS = {"2": (0, 1, 2, 6, 7, 8, 9, 65535), "3": (0, 1, 2, 6, 7, 8, 9, 65535), "4": (0, 1, 2, 4, 5, 6)}
+"""Conversions of a channel's raw numbers into numbers, by the version of an MDF file; tables of texts are not used."""
+FORMULAS = {"2": 10, "3": 10, "4": 3}
+"""The conversion that is a formula as text."""
+
+
+def logger_source(path: Path, content: bytes, sha256: str) -> Source:
+    """A logger's file as a source."""
+    begins = (one[1:] for one in _READERS if content.startswith(one[0]))
+    reader, what = next(begins, (_can, "CAN log"))
+    try:
+        with named_extra(f"reading {what}"):
+            return reader(path, content, sha256)
+    except (MissingPackage, InputError):
+        raise
+    except Exception as error:  # a damaged file raises nearly anything
+        raise InputError(
+            f"{path}: is no {what} or damaged ({line_of(error)}). Record or export it again."
+        ) from error
+
+
+def _named(name: str, unit: object) -> str:
+    text = str(unit).strip() if isinstance(unit, str) else ""
+    return f"{name} [{text}]" if text else name
+
+
+def _distinct(pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """Names of signals: their own, with the group's before it where several have it, with a number behind it else."""
+    counts, seen, found = Counter(own for _, own in pairs), Counter[str](), list[str]()
+    for group, own in pairs:
+        name = own if counts[own] == 1 else f"{group}.{own}"
+        seen[name] += 1
+        found.append(name if seen[name] == 1 else f"{name} #{seen[name]}")
+    return found
+
+
+def _source(
+    path: Path,
+    sha256: str,
+    found: Sequence[tuple[str, str, str, Array, Array]],
+    unread: Sequence[str] = (),
+    note: str = "",
+) -> Source:
+    """A source of signals: group, name, unit, stamps [s], numbers; times begin with the file's first stamp."""
+    found = [one for one in found if len(one[3])]
+    if not found:
+        raise InputError(f"{path}: has no signal with numbers. Record some, or export them as CSV.")
+    names, twice, series = _distinct([(group, own) for group, own, *_ in found]), 0, list[Series]()
+    for name, (_, _, unit, t, values) in zip(names, found, strict=True):
+        last = np.r_[np.diff(t) != 0, True]  # of samples with one stamp the last one
+        twice += int((~last).sum())
+        series.append(Series(_named(name, unit), t[last], np.asarray(values, np.float64)[last]))
+    told = f" Not read are {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
+    clocks = len({(len(one.t), *one.t[[0, -1]]) for one in series})
+    notes = (*([note] if note else []), f"{len(series)} signals, {clocks} clock{'s' * (clocks > 1)}")
+    if twice:
+        notes = (*notes, f"of samples with the same stamp the last one is read: {twice} are left out")
+    return replace(clocked(path, sha256, series, note=told), unread=tuple(unread), notes=notes)
+
+
+# MDF and TDMS
+
+
+def _mdf(path: Path, content: bytes, sha256: str) -> Source:
+    from asammdf import MDF
+
+    found, unread = [], []
+    with MDF(io.BytesIO(content)) as file:
+        for k, group in enumerate(file.groups):
+            for j, channel in enumerate(group.channels):
+                if j == file.masters_db.get(k):
+                    continue
+                kind = getattr(channel.conversion, "conversion_type", 0)
+                if kind == FORMULAS[file.version[0]]:  # it would be evaluated
+                    unread.append(channel.name)
+                    continue
+                signal = file.get(group=k, index=j, raw=kind not in NUMBERS[file.version[0]])
+                if signal.samples.ndim != 1 or signal.samples.dtype.kind not in "biuf":
+                    unread.append(channel.name)
+                    continue
+                where = getattr(group.channel_group, "acq_name", "") or f"group {k}"
+                found.append(
+                    (where, channel.name, signal.unit, signal.timestamps, signal.samples.astype(np.float64))
+                )
+    return _source(path, sha256, found, unread)
+
+
+def _tdms(path: Path, content: bytes, sha256: str) -> Source:
+    from nptdms import TdmsFile
+
+    file = TdmsFile.read(io.BytesIO(content))
+    found, plain = [], []
+    starts = [one.properties.get("wf_start_time") for group in file.groups() for one in group.channels()]
+    begin = min((one for one in starts if one is not None), default=None)
+    for group in file.groups():
+        channels = {one.name: one for one in group.channels() if len(one) and one.dtype.kind in "biufM"}
+        clock = next(
+            (name for name in channels if said_by(name).kind == "time" and not said_by(name).perhaps), None
+        )
+        for name, one in channels.items():
+            unit = one.properties.get("unit_string", "")
+            if one.properties.get("wf_increment", 0):
+                start = one.properties.get("wf_start_time")
+                late = 0.0 if start is None else float((start - begin) / np.timedelta64(1, "ns")) / 1e9
+                step, offset = one.properties["wf_increment"], one.properties.get("wf_start_offset", 0.0)
+                t = late + offset + step * np.arange(len(one))
+                found.append((group.name, name, unit, t, one[:]))
+            elif clock is not None and name != clock and len(one) == len(channels[clock]):
+                found.append((group.name, name, unit, _seconds(channels[clock][:], clock), one[:]))
+            else:
+                plain.append((group.name, _named(name, unit), one))
+    if found:
+        return _source(path, sha256, found, [name for _, name, _ in plain if said_by(name).kind != "time"])
+    names = _distinct([(group, name) for group, name, _ in plain])
+    by_name = {name: one for name, (_, _, one) in zip(names, plain, strict=True)}
+    return vector_source(path, sha256, LARGEST, tuple(by_name), lambda name: by_name[name][:], "index", 0)
+
+
+def _seconds(stamps: NDArray[Any], name: str) -> Array:
+    """Time stamps [s]: dates since the first, numbers in the unit of their name."""
+    if stamps.dtype.kind == "M":
+        return (stamps - stamps[0]).astype("timedelta64[ns]").astype(np.float64) / 1e9
+    return np.asarray(stamps, np.float64) * (said_by(name).seconds or 1.0)
+
+
+# Messages: ROS, MCAP, PX4, CAN
+
+
+class _Topics:
+    """Numbers of messages, by topic and field, with the stamps [ns] of the messages."""
+
+    def __init__(self) -> None:
+        self._fields: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        self._stamps: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
+        self._left = LARGEST // 64
+
+    def add(self, topic: str, stamp: int, message: Any) -> None:
+        """See a message."""
+        for field, value in _fields_of(message, ""):
+            self._left -= 1
+            if self._left < 0:
+                raise InputError("it holds more numbers than are read. Split the recording")
+            self._fields[topic][field].append(value)
+            self._stamps[topic][field].append(stamp)
+
+    def source(self, path: Path, sha256: str, unread: Sequence[str]) -> Source:
+        """What was seen."""
+        stamps = [s for fields in self._stamps.values() for one in fields.values() for s in one[:1]]
+        begin = min(stamps, default=0)
+        found = []
+        for topic, fields in self._fields.items():
+            for field, values in fields.items():
+                t = (np.array(self._stamps[topic][field], dtype=np.int64) - begin) / 1e9
+                order = np.argsort(t, kind="stable")
+                found.append((topic, f"{topic}.{field}", "", t[order], np.array(values)[order]))
+        return _source(path, sha256, found, sorted(set(unread)), "times as recorded, since the first message")
+
+
+def _fields_of(value: Any, name: str) -> Iterator[tuple[str, float]]:
+    """Numbers in a message, by the path of their field."""
+    if isinstance(value, bool | int | float | np.number | np.bool_):
+        yield name, float(value)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _fields_of(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple | np.ndarray):
+        if len(value) <= MOST_FIELDS:
+            for k, inner in enumerate(value):
+                yield from _fields_of(inner, f"{name}[{k}]")
+    elif hasattr(value, "__slots__"):
+        for key in value.__slots__:
+            if not key.startswith("_"):
+                yield from _fields_of(getattr(value, key), f"{name}.{key}" if name else key)
+
+
+def _mcap(path: Path, content: bytes, sha256: str) -> Source:
+    from mcap.reader import make_reader
+
+    topics, decoders, unread = _Topics(), _Decoders(), list[str]()
+    for schema, channel, message in make_reader(io.BytesIO(content), validate_crcs=True).iter_messages():
+        if channel.message_encoding == "json":
+            topics.add(channel.topic, message.log_time, json.loads(message.data))
+        elif schema is not None and (decode := decoders.of(channel.message_encoding, schema)):
+            topics.add(channel.topic, message.log_time, decode(message.data))
+        else:
+            unread.append(channel.topic)
+    return topics.source(path, sha256, unread)
+
+
+class _Decoders:
+    """What decodes messages of a type; made once a type."""
+
+    def __init__(self) -> None:
+        from mcap_ros1.decoder import DecoderFactory as First
+        from mcap_ros2.decoder import DecoderFactory as Second
+
+        self._factories, self._known = (First(), Second()), dict[tuple[str, str], Any]()
+
+    def of(self, encoding: str, schema: Any) -> Any:
+        """A function of a message's bytes; None where there is none."""
+        key = encoding, schema.name
+        if key not in self._known:
+            made = (factory.decoder_for(encoding, schema) for factory in self._factories)
+            self._known[key] = next((one for one in made if one is not None), None)
+        return self._known[key]
+
+
+def _bag(path: Path, content: bytes, sha256: str) -> Source:
+    from mcap.records import Schema
+    from rosbags.rosbag1 import Reader
+
+    topics, decoders, unread = _Topics(), _Decoders(), list[str]()
+    with Reader(path) as reader:
+        schemas = {
+            one.id: Schema(one.id, one.msgdef.data.encode(), "ros1msg", one.msgtype.replace("/msg/", "/"))
+            for one in reader.connections
+        }
+        for connection, stamp, data in reader.messages():
+            decode = decoders.of("ros1", schemas[connection.id])
+            if decode is None:
+                unread.append(connection.topic)
+            else:
+                topics.add(connection.topic, stamp, decode(data))
+    return topics.source(path, sha256, unread)
+
+
+def _db3(path: Path, content: bytes, sha256: str) -> Source:
+    """The database of a ROS 2 bag; definitions of messages that it lacks are those of ROS 2 itself."""
+    from mcap.records import Schema
+    from rosbags.typesys import Stores, get_typestore
+
+    topics, decoders, unread = _Topics(), _Decoders(), list[str]()
+    with closing(sqlite3.connect(":memory:")) as base:
+        base.deserialize(content)
+        tables = {name for (name,) in base.execute("select name from sqlite_master where type = 'table'")}
+        own = (
+            dict(base.execute("select topic_type, encoded_message_definition from message_definitions"))
+            if ("message_definitions" in tables)
+            else {}
+        )
+        store, schemas = get_typestore(Stores.LATEST), {}
+        for key, name, kind in base.execute("select id, name, type from topics"):
+            text = own.get(kind) or (store.generate_msgdef(kind)[0] if kind in store.types else "")
+            schemas[key] = name, text and Schema(id=key, name=kind, encoding="ros2msg", data=text.encode())
+        for key, stamp, data in base.execute(
+            "select topic_id, timestamp, data from messages order by timestamp"
+        ):
+            name, schema = schemas[key]
+            decode = decoders.of("cdr", schema) if schema else None
+            if decode is None:
+                unread.append(name)
+            else:
+                topics.add(name, stamp, decode(data))
+    return topics.source(path, sha256, unread)
+
+
+def _ulog(path: Path, content: bytes, sha256: str) -> Source:
+    from pyulog import ULog
+
+    log = ULog(io.BytesIO(content))
+    several = {one.name for one in log.data_list if one.multi_id > 0}
+    begin = min(
+        (int(one.data["timestamp"][0]) for one in log.data_list if len(one.data["timestamp"])), default=0
+    )
+    found = []
+    for one in log.data_list:
+        topic = f"{one.name}_{one.multi_id}" if one.name in several else one.name
+        t = (one.data["timestamp"].astype(np.int64) - begin) / 1e6
+        for field, values in one.data.items():
+            if field != "timestamp" and values.dtype.kind in "biuf":
+                found.append((topic, f"{topic}.{field}", "", t, values.astype(np.float64)))
+    return _source(path, sha256, found, (), "times since the first message")
+
+
+def _can(path: Path, content: bytes, sha256: str) -> Source:
+    """A CAN log, decoded by the database beside it: of the same name, or the only one in the folder."""
+    import can
+    import cantools
+
+    near = sorted(path.parent.glob("*.dbc"))
+    own = [one for one in near if one.stem == path.stem] or near
+    if len(own) != 1:
+        there = f"; that folder has {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
+        raise InputError(
+            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Without it nobody "
+            "knows what its bytes mean."
+        )
+    base = cantools.database.load_string(own[0].read_text(encoding="cp1252"), "dbc", strict=False)
+    known = {message.frame_id: message for message in base.messages}
+    kinds = (
+        (b"LOGG", can.BLFReader), (b"date", can.ASCReader), (b"(", can.CanutilsLogReader), (b";", can.TRCReader)
+    )  # fmt: skip
+    kind = next(one for begin, one in kinds if content.startswith(begin))
+    file = io.BytesIO(content) if kind is can.BLFReader else io.StringIO(content.decode("cp1252"))
+    stamps: dict[tuple[str, str], list[float]] = defaultdict(list)
+    values: dict[tuple[str, str], list[float]] = defaultdict(list)
+    unread: Counter[str] = Counter()
+    for frame in kind(file):
+        message = known.get(frame.arbitration_id)
+        if message is None or frame.is_error_frame or frame.is_remote_frame:
+            unread[f"0x{frame.arbitration_id:x}"] += 1
+            continue
+        for name, value in message.decode(bytes(frame.data), decode_choices=False).items():
+            stamps[message.name, name].append(frame.timestamp)
+            values[message.name, name].append(float(value))
+    begin = min((one[0] for one in stamps.values()), default=0.0)
+    units = {(m.name, s.name): s.unit or "" for m in base.messages for s in m.signals}
+    found = [(m, s, units[m, s], np.array(stamps[m, s]) - begin, np.array(values[m, s])) for m, s in stamps]
+    return _source(path, sha256, found, list(unread), f"messages decoded by {own[0].name}")
+
+
+_READERS = (
+    (b"MDF     ", _mdf, "MDF file"), (b"TDSm", _tdms, "TDMS file"), (b"\x89MCAP0", _mcap, "MCAP file"),
+    (b"#ROSBAG", _bag, "ROS bag"), (b"SQLite", _db3, "ROS 2 bag"), (b"ULog", _ulog, "PX4 log"),
+)  # fmt: skip
+"""How files begin, what reads them, and what they are; all others are CAN logs."""

@@ -1,0 +1,240 @@
+"""Excel workbooks, Parquet, Feather and HDF5 files as sources."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybrid_mpc.data.frames import HEAD, Frame, frame_source
+from hybrid_mpc.data.layout import MOST_SEEN, STEADY, Layout, Look, layout_of
+from hybrid_mpc.data.matlab import Leaf, columns_of_leaf
+from hybrid_mpc.data.source import LISTED, Source, line_of, megabytes
+from hybrid_mpc.data.vectors import LARGEST, budget_of, vector_source
+from hybrid_mpc.errors import InputError, named_extra
+from hybrid_mpc.records import shown
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+UNPACKED = 50
+"""Most bytes of a workbook's sheets for one byte of the file."""
+MOST_CELLS = 20_000_000
+"""Most cells of a sheet: each takes a hundred bytes of memory."""
+LONGER = 10
+"""Times as many rows as any other sheet that the one which is read has."""
+
+
+def excel_source(path: Path, content: bytes, sha256: str) -> Source:
+    """The table of a workbook; its formulas are not computed: their last values are read."""
+    with named_extra("reading Excel files"):
+        import openpyxl
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            size = sum(one.file_size for one in archive.infolist())
+        if size > min(LARGEST, max(2**28, UNPACKED * len(content))):
+            raise ValueError(f"it unpacks to {megabytes(size)}")
+        book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
+        sheets = {name: _cells_of(book[name]) for name in book.sheetnames if hasattr(book[name], "iter_rows")}
+    except InputError:
+        raise
+    except Exception as error:  # a damaged workbook raises nearly anything
+        raise InputError(
+            f"{path}: is no Excel workbook, damaged or too large ({line_of(error)}). Save the table as CSV (UTF-8)."
+        ) from error
+    found = {}
+    for name, rows in sheets.items():
+        looks = [Look(k, [_written(cell) for cell in row]) for k, row in enumerate(rows[:MOST_SEEN])]
+        wide = max((len(look.cells) for look in looks), default=0)
+        looks = [Look(look.row, look.cells + [""] * (wide - len(look.cells))) for look in looks]
+        score, layout = layout_of(looks, False, lambda row: [], lambda row: row + 1)
+        if score >= STEADY:
+            found[name] = len(rows), layout
+    order = sorted(found, key=lambda name: -found[name][0])
+    if not order:
+        raise InputError(
+            f"{path}: no sheet has a table of numbers. Save the table alone, with a header above it."
+        )
+    if len(order) > 1 and found[order[0]][0] < LONGER * found[order[1]][0]:
+        raise InputError(
+            f"{path}: {len(order)} sheets have tables ({', '.join(map(shown, order[:LISTED]))}). Save the one to "
+            "be read alone."
+        )
+    layout = found[order[0]][1]
+    if isinstance(layout, str):
+        raise InputError(f"{path}: sheet {shown(order[0])}: {layout}")
+    note = [f"sheet {shown(order[0])}"] if len(sheets) > 1 else []
+    return frame_source(path, sha256, _frame_of(sheets[order[0]], layout, note))
+
+
+def _cells_of(sheet: Any) -> list[tuple[Any, ...]]:
+    rows, count = [], 0
+    for row in sheet.iter_rows(values_only=True):
+        count += len(row)
+        if count > MOST_CELLS:
+            raise ValueError(f"a sheet has more than {MOST_CELLS} cells")
+        rows.append(row)
+    return rows
+
+
+def _written(cell: Any) -> str:
+    return "" if cell is None else str(cell).strip()
+
+
+def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[str]) -> Frame:
+    """The rows of a sheet below its header, without those that are blank and those behind the table."""
+    import pandas as pd
+
+    numbers = [k for k in range(layout.first, len(rows)) if any(_written(cell) for cell in rows[k])]
+    closing: list[int] = []
+    while (
+        len(numbers) > 2
+        and isinstance(_first(rows[numbers[-1]]), str)
+        and not isinstance(_first(rows[numbers[0]]), str)
+    ):
+        closing.append(numbers.pop() + 1)
+    notes = [*notes, *layout.notes]
+    if closing:
+        notes.append(f"rows from {closing[-1]} on are no rows of the table: left out")
+    seen = [j for j, name in enumerate(layout.names) if name]
+
+    def cell(k: int, j: int) -> Any:
+        row = rows[numbers[k]]
+        return row[seen[j]] if seen[j] < len(row) else None
+
+    def columns(places: Sequence[int], most: int | None = None) -> list[pd.Series]:
+        return [pd.Series([cell(k, j) for k in range(len(numbers[:most]))]) for j in places]
+
+    return Frame(
+        tuple(layout.names[j] for j in seen),
+        columns,
+        columns(range(len(seen)), HEAD),
+        [k + 1 for k in numbers],
+        lambda k, j: _written(cell(k, j)),
+        notes=tuple(notes),
+    )
+
+
+def _first(row: Sequence[Any]) -> Any:
+    return next((cell for cell in row if cell is not None), None)
+
+
+# Columns of Arrow
+
+
+def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
+    """A Parquet or Feather file; what it declares is looked at before any of it is unpacked."""
+    with named_extra("reading Parquet and Feather files"):
+        import pandas as pd
+        import pyarrow
+    try:
+        if content.startswith(b"PAR1"):
+            from pyarrow.parquet import ParquetFile
+
+            file = ParquetFile(io.BytesIO(content))
+            schema, rows = file.schema_arrow, file.metadata.num_rows
+
+            def read(name: str) -> Any:
+                return file.read([name]).column(0)
+        else:
+            whole = pyarrow.ipc.open_file(io.BytesIO(content))
+            schema = whole.schema
+            none = pyarrow.ipc.IpcReadOptions(included_fields=[])
+            rows = pyarrow.ipc.open_file(io.BytesIO(content), options=none).read_all().num_rows
+
+            def read(name: str) -> Any:
+                one = pyarrow.ipc.IpcReadOptions(included_fields=[schema.get_field_index(name)])
+                return pyarrow.ipc.open_file(io.BytesIO(content), options=one).read_all().column(0)
+    except Exception as error:  # a damaged file raises nearly anything
+        raise InputError(
+            f"{path}: is no Parquet or Feather file, or damaged ({line_of(error)}). Write it again, e.g. with pandas."
+        ) from error
+    if 8 * rows > LARGEST:
+        raise InputError(f"{path}: has {rows} rows, more than are read. Split the recording.")
+    kinds = pyarrow.types
+    names = tuple(
+        field.name
+        for field in schema
+        if not kinds.is_nested(field.type)
+        and schema.names.count(field.name) == 1
+        and not kinds.is_binary(field.type)
+    )
+
+    def columns(places: Sequence[int]) -> list[pd.Series]:
+        try:
+            return [pd.Series(read(names[j]).to_pandas()) for j in places]
+        except Exception as error:
+            raise InputError(
+                f"{path}: cannot be read ({line_of(error)}). Write it again, e.g. with pandas."
+            ) from error
+
+    whole_columns = columns(range(len(names)))
+    return frame_source(
+        path,
+        sha256,
+        Frame(
+            names,
+            lambda places: [whole_columns[j] for j in places],
+            [column.iloc[:HEAD] for column in whole_columns],
+            range(1, rows + 1),
+            lambda k, j: _written(whole_columns[j].iloc[k]),
+        ),
+    )
+
+
+# HDF5
+
+
+def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
+    """Datasets of an HDF5 file: vectors, columns of matrices, fields of tables; links to other files are left alone."""
+    with named_extra("reading HDF5 files"):
+        import h5py
+    try:
+        leaves = list(_walked(h5py.File(io.BytesIO(content), "r"), "", 0))
+    except Exception as error:  # a damaged file raises nearly anything
+        raise InputError(f"{path}: is no HDF5 file or damaged ({line_of(error)}). Write it again.") from error
+    vectors: dict[str, Callable[[], Any]] = {}
+    for leaf in leaves:
+        vectors |= dict(columns_of_leaf(leaf))
+    return vector_source(
+        path, sha256, budget_of(len(content)), tuple(vectors), lambda name: vectors[name](), "index", 0
+    )
+
+
+def _walked(group: Any, prefix: str, depth: int) -> Iterator[Leaf]:
+    import h5py
+
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        item, full = group[name], f"{prefix}{name}"
+        if isinstance(item, h5py.Group):
+            if depth < 8:
+                yield from _walked(item, f"{full}.", depth + 1)
+            continue
+        if not isinstance(item, h5py.Dataset) or item.shape is None:
+            continue
+        unit = next(
+            (str(item.attrs[key]) for key in ("units", "unit") if isinstance(item.attrs.get(key), str)), ""
+        )
+        named = f"{full} [{unit}]" if unit else full
+        if item.dtype.names:
+            for field in item.dtype.names:
+                if item.dtype[field].kind in "biuf":
+                    yield Leaf(f"{full}.{field}", item.shape, partial(_numbers, item, field))
+        elif item.dtype.kind in "biufc":
+            yield Leaf(named, item.shape, partial(_numbers, item))
+
+
+def _numbers(item: Any, field: str = "") -> np.ndarray[Any, Any]:
+    """A dataset's numbers, or those of a field of its records; what it declares is looked at first."""
+    if max(8, item.dtype.itemsize) * item.size > budget_of(item.file.id.get_filesize()):
+        raise InputError(
+            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file"
+        )
+    return np.asarray(item[()][field] if field else item[()])

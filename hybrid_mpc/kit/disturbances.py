@@ -1,0 +1,197 @@
+"""The disturbance model of a machine whose scenario names none: as many disturbances as there are outputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
+from hybrid_mpc.estimate.offset_free import RANK, distinguishable, offset_free
+from hybrid_mpc.model.disturbance import Disturbance
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
+from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
+
+Array = NDArray[np.float64]
+OFF = 0.2
+"""Share by which each parameter may be off: that of the wrong models on which a kit's promises are tried."""
+CARRIES = 1.0
+"""Largest disturbance, over its size, that errors of the parameters may ask for. Inputs that need more have so little
+effect at rest that a load at them explains no error: its estimate wanders off."""
+EXPLAINED = 0.01
+"""Largest deviation of an output, over its size, that is no offset."""
+QUARTER, RUN, STILL = 0.25, 5000, 1e-6
+"""Share of its range by which an input is moved; longest run to rest [periods]; change a period, over a state's size,
+at which it rests."""
+REACH = 0.5
+"""Share of the horizon within which a rate's disturbance of its size moves the state by the size of that."""
+
+
+def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance, ...] | None:
+    """What unmeasured disturbances are added to where nobody says it; None: one at each input.
+
+    Disturbances of held outputs act at the inputs. Where errors of the parameters ask for larger ones than the inputs'
+    ranges, they act on the rates of the states that held outputs show. An output that no weight holds has a disturbance
+    of its own where errors of the parameters move it in a way that no load at an input explains: without, they leave an
+    offset in the held ones. There are never more disturbances than outputs, which could not be told apart. A problem
+    with references of states has one at each input.
+
+    Args:
+        model: The fitted prior.
+        control: The control problem.
+
+    Source: Pannocchia and Rawlings, *Disturbance models for offset-free model-predictive control*, AIChE J. 49 (2003).
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> from hybrid_mpc.machine.signals import Parameter
+        >>> x, u, p = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("p")
+        >>> level, flow = Signal("level", "m", 0.0, 2.0), Signal("flow", "l/s", 0.0, 5.0)
+        >>> tank = HybridModel.of("tank", 1.0, (level, flow), (Signal("valve", "-"),), (level, flow), x=x, u=u, y=x,
+        ...     p=p, parameters=(Parameter("share", 0.1, "-", 0.01, 1.0),), nominal_x=(1.0, 1.0), nominal_u=(0.5,),
+        ...     x_next=ca.vertcat(0.9 * x[0] + p * x[1], 0.5 * x[1] + u), xdot=x)
+        >>> problem = OCP(10, [0.0, 0.0], [0.0], [1.0], [0.0], [1.0], q_y=[4.0, 0.0])
+        >>> [(d.at, d.signal) for d in default_disturbances(tank, problem)]
+        [('input', 'valve'), ('output', 'flow')]
+    """
+    if control.n_y != model.n_y or not control.n_y:
+        return None
+    held = np.flatnonzero(control.q_y > 0).tolist()
+    n_in, sizes = min(model.n_u, model.n_y), Sizes(model, control)
+    free = [i for i in range(model.n_y) if i not in held]
+    own = [
+        Disturbance("output", model.outputs[i].name, float(sizes.outputs[i]))
+        for i in [*free, *held][: model.n_y - n_in]
+    ]
+    if own and unexplained(replace(model, disturbance_model=None), control) <= EXPLAINED:
+        own = []
+    at_inputs = [_with_inputs(model, way, own) for way in combinations(range(model.n_u), n_in)]
+    found = [one for one in at_inputs if distinguishable(one, sizes.states).detectable]
+    best = min(found, key=lambda one: needed(one, control), default=None)
+    if best is not None and needed(best, control) <= CARRIES:
+        return _plain(best)
+    others = _with_rates(model, control, held, sizes)
+    if others is not None and offset_free(others).detectable:
+        return others.disturbance_model
+    return None if best is None else _plain(best)
+
+
+def _plain(model: HybridModel) -> tuple[Disturbance, ...] | None:
+    """The disturbance model; None where it is one at each input."""
+    each = tuple(Disturbance("input", s.name) for s in model.inputs)
+    return None if model.disturbance_model == each else model.disturbance_model
+
+
+def _with_inputs(model: HybridModel, places: tuple[int, ...], own: list[Disturbance]) -> HybridModel:
+    chosen = (*(Disturbance("input", model.inputs[j].name) for j in places), *own)
+    return replace(model, disturbance_model=chosen)
+
+
+def _with_rates(model: HybridModel, control: OCP, held: list[int], sizes: Sizes) -> HybridModel | None:
+    """Rates of the states that held outputs show, of their speeds where they are positions, and outputs that are not
+    held; None where an output shows no state alone.
+    """
+    rows = output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full()
+    speeds, reach = kinematics(model), REACH * control.horizon * model.dt
+    chosen: list[Disturbance] = []
+    for i, signal in enumerate(model.outputs):
+        if i not in held:
+            chosen.append(Disturbance("output", signal.name, float(sizes.outputs[i])))
+            continue
+        shown = np.flatnonzero(rows[i])
+        if shown.size != 1:
+            return None
+        place = speeds.get(int(shown[0]), int(shown[0]))
+        chosen.append(Disturbance("rate", model.states[place].name, float(sizes.states[place] / reach)))
+    if len({(d.at, d.signal) for d in chosen}) < len(chosen):
+        return None
+    return replace(model, disturbance_model=tuple(chosen))
+
+
+def needed(model: HybridModel, control: OCP) -> float:
+    """Largest disturbance at an input, over its size, that keeps the outputs where they are when each parameter is off
+    by a share of :data:`OFF`; the largest over the operating point and what the model rests at under other inputs.
+
+    Zero of a model without free parameters or without disturbances at inputs.
+    """
+    at_inputs = np.any(model.disturbed[0] != 0, axis=0)
+    sizes, found = disturbance_sizes(model, control), [0.0]
+    for matrix, off in _errors(model, control) if at_inputs.any() else ():
+        d = np.linalg.lstsq(matrix, off, rcond=None)[0][model.n_x + model.n_h :]
+        found.append(float(np.max((np.sqrt(np.sum(d**2, axis=1)) / sizes)[at_inputs])))
+    return max(found)
+
+
+def unexplained(model: HybridModel, control: OCP) -> float:
+    """Largest deviation of an output, over its size, that remains when each parameter is off by a share of :data:`OFF`
+    and the disturbances explain what they can; over the same points.
+    """
+    sizes, n_z, found = Sizes(model, control).outputs, model.n_x + model.n_h, [0.0]
+    for matrix, off in _errors(model, control):
+        # what outputs do where state and disturbance are at rest: the rest of the equations holds exactly
+        _, values, rows = np.linalg.svd(matrix[:n_z])
+        rank = int(np.sum(values > RANK * values[0]))
+        rest = np.linalg.lstsq(matrix[:n_z], off[:n_z], rcond=RANK)[0]
+        free = matrix[n_z:] @ rows[rank:].T / sizes[:, None]
+        left = (off[n_z:] - matrix[n_z:] @ rest) / sizes[:, None]
+        left = left - free @ np.linalg.lstsq(free, left, rcond=RANK)[0]
+        found.append(float(np.max(np.sqrt(np.sum(left**2, axis=1)))))
+    return max(found)
+
+
+def _errors(model: HybridModel, control: OCP) -> list[tuple[Array, Array]]:
+    """At each point of :func:`_rests`: ``[[A - I, B_d], [C, C_d]]``, and what errors of the parameters add to states
+    and outputs ``(n_z + n_y, n_free)``; none of a model without free parameters.
+    """
+    free = [i for i, one in enumerate(model.parameters) if not one.fixed]
+    if not free:
+        return []
+    theta = ca.SX.sym("p", model.n_p)
+    x, h, u = (ca.SX.sym(k, n) for k, n in zip("xhu", (model.n_x, model.n_h, model.n_u), strict=True))
+    values = ca.vertcat(*model.step(x, h, u, model.w, theta)), model.output(x, u, model.w, theta)
+    slopes = ca.Function("slopes", [x, h, u, theta], [ca.densify(ca.jacobian(v, theta)) for v in values])
+    found = []
+    for point in _rests(model, control):
+        off = np.vstack([m.full()[:, free] for m in slopes(*point, model.p)]) * (OFF * np.abs(model.p[free]))
+        matrix = _at_rest(model, *point)
+        if np.all(np.isfinite(matrix)) and np.all(np.isfinite(off)):
+            found.append((matrix, off))
+    return found
+
+
+def _at_rest(model: HybridModel, x: Array, h: Array, u: Array) -> Array:
+    """``[[A - I, B_d], [C, C_d]]`` at a point."""
+    assert model.with_jacobian is not None
+    a, b = (m.full() for m in model.with_jacobian(x, h, u, model.w, model.p)[2:])
+    _, by_x, by_u = (m.full() for m in output_with_jacobian(model)(x, u, model.w))
+    on_u, on_x, on_y = model.disturbed
+    b_d = b @ on_u
+    b_d[: model.n_x] += on_x
+    c = np.hstack([by_x, np.zeros((model.n_y, model.n_h))])
+    return np.block([[a - np.eye(len(a)), b_d], [c, by_u @ on_u + on_y]])
+
+
+def _rests(model: HybridModel, control: OCP) -> list[tuple[Array, Array, Array]]:
+    """The operating point, and where the model comes to rest from there with one input a quarter of its range away;
+    none where it does not within the range of its states.
+    """
+    u0 = np.clip(model.u0, control.u_min, control.u_max)
+    found = [(model.x0, hidden_fixed_point(model, model.x0, u0), u0)]
+    sizes = Sizes(model, control).states
+    low, high = np.array([(s.lower, s.upper) for s in model.states]).T
+    for step in (QUARTER * row for one in np.diag(control.input_range) for row in (one, -one)):
+        u = np.clip(u0 + step, control.u_min, control.u_max)
+        x, h = model.x0, found[0][1]
+        for _ in range(RUN):
+            after, h = (m.full().ravel() for m in model.step(x, h, u, model.w, model.p))
+            moved, x = np.abs(after - x) / sizes, after
+            if not np.all((x >= low) & (x <= high)) or np.all(moved < STILL):
+                break
+        if np.all((x >= low) & (x <= high)) and np.all(moved < STILL):
+            found.append((x, h, u))
+    return found

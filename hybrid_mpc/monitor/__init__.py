@@ -1,1 +1,0 @@
-"""Online plausibility: residuals, their calibrated alarm, what broke, and replay on recordings."""

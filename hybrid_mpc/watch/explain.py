@@ -1,0 +1,107 @@
+"""Alarms of a recording or loop, each with what explains it; and the trace as a table."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.watch.diagnose import BLIND, Diagnoser
+from hybrid_mpc.watch.monitor import Monitor
+from hybrid_mpc.watch.readings import Validity
+from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, replay
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An alarm from its first to its last sample [s] in the recording's own time, the channels that alarmed in it, in
+    the order in which they did, and what explains it, if anything can.
+    """
+
+    start_s: float
+    end_s: float
+    diagnosis: str
+    channels: tuple[str, ...] = ()
+
+
+def explained(
+    monitor: Monitor,
+    estimator: EstimatorLike,
+    recording: TrajectoryLike,
+    diagnoser: Callable[[], Diagnoser] | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Trace, tuple[Alarm, ...]]:
+    """Replay a monitor with the closed loops' estimator, and diagnose each alarm.
+
+    Args:
+        monitor: The monitor.
+        estimator: The one that the loop uses.
+        recording: See :func:`~hybrid_mpc.watch.replay.replay`.
+        diagnoser: Makes what explains alarms; it is called once where there is one. Default: nothing is explained but
+            missing readings.
+        on_progress: Called with ``(done, total)`` samples every so often. Default: none.
+    """
+    estimates: list[Any] = []
+    trace = replay(
+        monitor, estimator, recording, on_sample=lambda k, estimate: estimates.append(estimate),
+        on_progress=on_progress,
+    )  # fmt: skip
+    alarms, made = [], None
+    for start, end in trace.intervals():
+        k, channels = int(np.searchsorted(trace.t, start - 1e-9)), trace.named(start, end)
+        text = BLIND.get(Validity(int(trace.validity[k])), "")
+        if channels and diagnoser is not None:
+            made = made or diagnoser()
+            text = made.of_alarm(k, trace, recording, estimates)
+        alarms.append(Alarm(start, end, text if channels or trace.blind[k] else "", channels))
+    return trace, tuple(alarms)
+
+
+def begun(alarms: Sequence[Alarm], start: float) -> tuple[list[Alarm], list[Alarm]]:
+    """Alarms that begin before ``start`` [s], and those from then on.
+
+    One that is on already when something breaks says nothing of it.
+
+    Example:
+        >>> before, seen = begun((Alarm(1.0, 9.0, ""), Alarm(5.0, 6.0, "pump")), 4.0)
+        >>> len(before), seen[0].diagnosis
+        (1, 'pump')
+    """
+    before = [alarm for alarm in alarms if alarm.start_s < start - 1e-9]
+    return before, [alarm for alarm in alarms if alarm not in before]
+
+
+def table(trace: Trace, y: Array, outputs: Sequence[Signal], monitor: Monitor) -> str:
+    """The trace as CSV, one row a sample: measurements ``y`` ``(n, n_y)``, values of the channels with units, levels of
+    their limits, alarms.
+    """
+    columns: dict[str, Any] = {"t_s": trace.t}
+    columns |= {f"{s.name}_{s.unit}": y[:, i] for i, s in enumerate(outputs)}
+    limits = () if monitor.limits is None else monitor.limits.channels
+    for i, channel in enumerate(trace.channels):
+        label = channel.name.replace(" ", "_")
+        columns[f"{label}_value_{channel.unit}"] = trace.values[:, i]
+        for j, limit in enumerate(limits):
+            if limit.channel == channel.name:
+                how = {0: "sum", 1: "value"}.get(limit.length, f"mean_{limit.length}")
+                columns[f"{label}_{how}_{'deviations' if limit.scale else limit.unit}"] = trace.levels[:, j]
+        columns[f"{label}_alarm"] = trace.on[:, i]
+    columns |= {f"{name}_frozen": trace.frozen[:, i] for i, name in enumerate(trace.outputs)}
+    columns |= {"share": trace.share, "valid": trace.validity == Validity.VALID, "alarm": trace.alarm}
+    text = io.StringIO()
+    np.savetxt(
+        text,
+        np.column_stack([*columns.values()]),
+        fmt="%.9g",
+        delimiter=",",
+        header=",".join(columns),
+        comments="",
+    )
+    return text.getvalue()
