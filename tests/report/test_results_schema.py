@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 
 PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
 RESULTS = {
-    "schema_version": 10,
+    "schema_version": 11,
     "scenario": "golf_robot",
     "seed": 0,
     "budget": "quick",
