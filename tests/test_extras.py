@@ -167,7 +167,10 @@ def test_every_package_that_an_extra_brings_is_known():
     """By what the package itself says that it needs."""
     from importlib.metadata import requires
 
-    modules = {"pillow": "PIL", "pyyaml": "yaml"}
+    modules = {
+        "pillow": "PIL", "pyyaml": "yaml", "mcap-ros1-support": "mcap_ros1", "mcap-ros2-support": "mcap_ros2",
+        "python-can": "can",
+    }  # fmt: skip
     for line in requires("hybrid-mpc") or []:
         name, _, marker = line.partition(";")
         extra = next((e for e in set(EXTRAS.values()) if f'extra == "{e}"' in marker.replace("'", '"')), "")

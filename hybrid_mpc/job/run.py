@@ -127,7 +127,7 @@ def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
         ahead: Names of those that are still to run.
 
     Example:
-        >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["guard", "analysis", "report"])
+        >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["watch", "analysis", "report"])
         ' (about 60 s left)'
         >>> remaining({"data": 4.0}, ["prior"])
         ''

@@ -384,7 +384,8 @@ class Kit:
             return self.rest_speed
         n_q = prior.n_x // 2
         natural = tuple(SHARE * size for size in held.sizes.x[n_q : 2 * n_q])
-        return natural if kinematics(prior) == {i: n_q + i for i in range(n_q)} and min(natural) > 0 else None
+        of_pairs = n_q > 0 and kinematics(prior) == {i: n_q + i for i in range(n_q)}
+        return natural if of_pairs and min(natural) > 0 else None
 
     def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
         """The kit with other process noise, by estimator (see :meth:`noise`)."""

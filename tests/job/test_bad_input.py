@@ -36,7 +36,7 @@ def constant(t):
 DAMAGE = {
     "nan": (replaced("4.99,nan,0.1"), ["bad.csv", "row 501", "tau_nm"]),
     "text": (replaced("4.99,0.1,broken"), ["bad.csv", "row 501", "phi_rad", "broken"]),
-    "repeated": (lambda lines: [*lines[:500], lines[499], *lines[501:]], ["bad.csv", "row 501", "time_s"]),
+    "repeated": (replaced("4.98,0.7,0.9"), ["bad.csv", "row 501", "time_s"]),
     "decreasing": (lambda lines: [*lines[:500], lines[600], *lines[501:]], ["bad.csv", "time_s"]),
     "no_column": (lambda lines: ["time_s,torque,phi_rad", *lines[1:]], ["bad.csv", "tau_nm", "torque"]),
     "short": (lambda lines: lines[:40], ["bad.csv", "s"]),

@@ -30,7 +30,7 @@ def without(finished, tmp_path, name):
     return out
 
 
-FAIL = ("control", "monitor", "analysis")
+FAIL = ("control", "watch", "analysis")
 
 
 @pytest.mark.parametrize("names", [FAIL, *(pytest.param((name,), marks=pytest.mark.full) for name in FAIL)])
@@ -42,7 +42,7 @@ def test_a_stage_that_cannot_run_leaves_its_reason_and_a_report(
     for name in names:
         stages = broken(stages, name, InputError(f"no {name} on Sundays"))
     monkeypatch.setattr(job, "STAGES", stages)
-    others = [word for stage in ("on_model", "residuals", "guard") for word in ("--skip", stage)]
+    others = [word for stage in ("on_model",) for word in ("--skip", stage)]
     code, told, _ = call(*arguments, "--out", out, "--resume", *others)
     assert code == 1
     for name in names:
@@ -73,11 +73,11 @@ def test_a_page_is_there_long_before_the_end(call, arguments, finished, tmp_path
 
 
 def test_a_full_disk_is_no_reason_to_go_on(call, arguments, finished, tmp_path, monkeypatch):
-    out = without(finished, tmp_path, "monitor")
-    error = StorageError("cannot write monitor.json: No space left on device")
-    monkeypatch.setattr(job, "STAGES", broken(job.STAGES, "monitor", error))
+    out = without(finished, tmp_path, "watch")
+    error = StorageError("cannot write watch.json: No space left on device")
+    monkeypatch.setattr(job, "STAGES", broken(job.STAGES, "watch", error))
     code, _, message = call(*arguments, "--out", out, "--resume")
     assert code == 2
     assert "No space left" in message
     assert "finished stages are saved: the same command with --resume goes on" in message
-    assert not (out / "checkpoints" / "monitor.json").exists()
+    assert not (out / "checkpoints" / "watch.json").exists()

@@ -62,7 +62,7 @@ def test_what_is_not_there_is_named(bench):
         bench.run(replace(SPEC, task="nothing"))
     with pytest.raises(InputError, match="without process noise for prior"):
         bench.run(replace(SPEC, controller="prior"))
-    with pytest.raises(InputError, match="holds no detector"):
+    with pytest.raises(InputError, match="holds no limits of energy"):
         bench.run(replace(SPEC, monitor="guard", guard="rest"))
 
 

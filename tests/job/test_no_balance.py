@@ -45,7 +45,7 @@ scenario = Scenario(
 """
 
 
-SKIPPED = [word for stage in ("control", "estimation", "monitor", "guard") for word in ("--skip", stage)]
+SKIPPED = [word for stage in ("control", "estimation", "watch") for word in ("--skip", stage)]
 
 
 def recording(path):

@@ -158,7 +158,7 @@ def test_resume_of_a_damaged_checkpoint(call, arguments, finished, tmp_path):
     ("file", "damage", "words"),
     [
         (KIT, lambda b: b[: len(b) // 2], "damaged"),
-        (KIT, lambda b: b.replace(b'"schema_version": 5', b'"schema_version": 99'), "schema_version"),
+        (KIT, lambda b: b.replace(b'"schema_version": 6', b'"schema_version": 99'), "schema_version"),
         (PROGRAMS, lambda b: b[: len(b) // 2], "programs.json"),
         (WEIGHTS, lambda b: b[:-8], "weights.safetensors"),
         (WEIGHTS, lambda b: b[:-8] + bytes(8), "weights.safetensors"),

@@ -16,7 +16,7 @@ def test_a_table_has_every_column_with_a_model_its_names_and_units(model, safe):
     numbered = {"t", "x_0", "x_1", "u_0", "h_1", "d_0", "reference_1", "source", "alarm", "solve_ms"}
     assert numbered <= set(plain)
     names = {
-        "t [s]", "x phi [rad]", "y phi [rad]", "u torque [N m]", "x_hat phi_dot [rad/s]", "level [W]", "solve [ms]",
+        "t [s]", "x phi [rad]", "y phi [rad]", "u torque [N m]", "x_hat phi_dot [rad/s]", "share [-]", "solve [ms]",
     }  # fmt: skip
     assert names <= set(named)
     np.testing.assert_array_equal(named["x phi_dot [rad/s]"], result.x[:, 1])

@@ -176,6 +176,6 @@ def test_what_does_not_fit_is_refused_before_the_first_run(run_folder, golf_arti
     refused("made for scenario torque_pendulum, not for golf_robot", folder)
     write_description(folder, note)
     set_process_noise(folder, SIGMA)
-    refused("holds no thresholds", folder, controllers=["hybrid"], monitors=["energy"])
+    refused("holds no limits of energy", folder, controllers=["hybrid"], monitors=["energy"])
     with pytest.raises(InputError, match="has no plant"):
         load_inputs(Study("torque_pendulum", run_folder, seeds=1))
