@@ -128,7 +128,7 @@ def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
 
     Example:
         >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["watch", "analysis", "report"])
-        ' (about 60 s left)'
+        ' (about 2 min left)'
         >>> remaining({"data": 4.0}, ["prior"])
         ''
     """
