@@ -148,6 +148,8 @@ explained four fifths of that."""
 TELLING = 0.9
 """Share of the error, of training and of validation, to which such a delay must bring it to be told; it must be twice
 its standard error, too."""
+HOPELESS = 0.98
+"""Share of the error that a linear step with a delay must get below, over one without, for a delay to be fitted."""
 PREDICTION_STEPS = 12
 """Gauss-Newton steps of a fit of predictions at most; it starts near its end."""
 FORGETS = 2.0
@@ -1695,7 +1697,15 @@ def _late(
             problems.append(Shooting(late, windows, sizes))
         elif not problems:
             return ()
-    at_once = Shooting(fit, problems[0].windows, sizes).solve(theta, START_ITERATIONS)
+    at_once, no_delay = Shooting(fit, problems[0].windows, sizes), np.append(theta, 0.0)
+    slopes, error = problems[0].linear(no_delay, at_once.first_states(theta))
+    b, r = slopes.reshape(-1, len(no_delay)), error.ravel()
+    without, with_one = (
+        float(np.linalg.norm(r - some @ np.linalg.lstsq(some, r, rcond=None)[0])) for some in (b[:, :-1], b)
+    )
+    if with_one > HOPELESS * without:
+        return ()
+    at_once = at_once.solve(theta, START_ITERATIONS)
     found = problems[0].solve(np.append(theta, 0.5), START_ITERATIONS)
     both = np.array([problem.explained([np.append(at_once.theta, 0.0), found.theta]) for problem in problems])
     delay, error = found.theta[-1] * fit.dt, math.sqrt(max(found.covariance[-1, -1], 0.0)) * fit.dt
