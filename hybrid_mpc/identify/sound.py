@@ -14,10 +14,10 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.fit import (
     AT_BOUND,
+    FEW,
     GROWN,
     LENGTHS,
     POOR,
-    WINDOWS,
     OutputFit,
     Shooting,
     cut_outputs,
@@ -201,7 +201,7 @@ def bound_costs(
 
 
 def shooting(
-    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = WINDOWS // 2
+    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = FEW
 ) -> Shooting:
     """At most so many windows of ``length`` [s], or as long as the recordings hold."""
     longest = max(len(t.t) for t in known) - 1

@@ -140,7 +140,7 @@ def test_measured_outputs_that_are_states_are_exact_where_a_run_starts(runs):
         Pendulum.outputs,
         FirstStates("measured"),
     )
-    assert windows.known.tolist() == [[True, False]] * 3
+    assert windows.known.tolist() == [[True, False]] * 4
     np.testing.assert_array_equal(windows.x[:, 0], runs[0].y[:60:20, 0])
     fit = fit_prior(Pendulum, runs, runs, dt=DT, first_states=FirstStates("measured"))
     # the noise of the first sample of every run is taken for motion: 5 mrad of some tenths
