@@ -56,8 +56,6 @@ SLOWEST = 3.0
 WINDOWS = 100
 """Windows of a length at most, evenly chosen. Where a prior lacks something, its parameters depend on which parts of
 the recordings are fitted: with half of them errors on held-out recordings scatter by a tenth."""
-REST = 0.5
-"""Length of a recording's last window at least, over that of the others: what it lacks counts as not measured."""
 FEW = 24
 """The same where starts are compared, where a delay is looked for, and of predictions."""
 ITERATIONS = 25
@@ -308,24 +306,22 @@ def cut_outputs(
     Raises:
         InputError: If no trajectory is long enough.
     """
-    warm, least = first.samples(trajectories[0].dt), 1
     if periods is None:
         periods = min(LONGEST, _longest(trajectories) - lead - 1)
-        most = sum(len(t.t) for t in trajectories)
-    elif _longest(trajectories) <= periods + lead:
-        longest = _longest(trajectories)
-        raise InputError(
-            f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
-            f"{lead} samples before it needs {periods + lead + 1}"
-        )
+        chosen = [(t, k) for t in trajectories for k in range(lead, len(t.t) - 2, periods)]
     else:
-        least = min(periods, max(math.ceil(REST * periods), 2 * warm))
-    starts = [(t, k) for t in trajectories for k in range(lead, len(t.t) - max(least, 2), periods)]
-    chosen = [starts[i] for i in evenly(len(starts), most)]
-    if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
-        begins = [one for one in starts if one[1] == 0][:most]
-        others = [one for one in starts if one[1] > 0]
-        chosen = begins + [others[i] for i in evenly(len(others), most - len(begins))]
+        starts = [(t, k) for t in trajectories for k in range(lead, len(t.t) - periods, periods)]
+        if not starts:
+            longest = _longest(trajectories)
+            raise InputError(
+                f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
+                f"{lead} samples before it needs {periods + lead + 1}"
+            )
+        chosen = [starts[i] for i in evenly(len(starts), most)]
+        if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
+            begins = [one for one in starts if one[1] == 0][:most]
+            others = [one for one in starts if one[1] > 0]
+            chosen = begins + [others[i] for i in evenly(len(others), most - len(begins))]
 
     def cut(key: str, before: int) -> Array:
         found = []
@@ -358,7 +354,7 @@ def cut_outputs(
     return OutputWindows(
         y, cut("u", lead), cut("w", 0), guesses,
         cut("censored", 0), lead, known, group,
-        min(warm, periods - 1),
+        min(first.samples(trajectories[0].dt), periods - 1),
     )  # fmt: skip
 
 

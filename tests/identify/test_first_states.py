@@ -140,8 +140,8 @@ def test_measured_outputs_that_are_states_are_exact_where_a_run_starts(runs):
         Pendulum.outputs,
         FirstStates("measured"),
     )
-    assert windows.known.tolist() == [[True, False]] * 4
-    np.testing.assert_array_equal(windows.x[:, 0], runs[0].y[:80:20, 0])
+    assert windows.known.tolist() == [[True, False]] * 3
+    np.testing.assert_array_equal(windows.x[:, 0], runs[0].y[:60:20, 0])
     fit = fit_prior(Pendulum, runs, runs, dt=DT, first_states=FirstStates("measured"))
     # the noise of the first sample of every run is taken for motion: 5 mrad of some tenths
     assert all(abs(fit.values[name] / value - 1) < 0.2 for name, value in TRUTH.items())
