@@ -98,7 +98,13 @@ def said(make: type[Prior], found: PriorFit, parts: Parts, dt: float, longest: f
 
 
 def compared(
-    name: str, make: type[Prior], parts: Parts, dt: float, length: float, truth: Mapping[str, float], windows: int
+    name: str,
+    make: type[Prior],
+    parts: Parts,
+    dt: float,
+    length: float,
+    truth: Mapping[str, float],
+    windows: int,
 ) -> dict[str, Any]:
     """A row: the fit of the library against the better of two independent ones to so many ``windows`` at most, from the
     nominal values and the plant's; where these are not known, from what the library found.
@@ -246,7 +252,12 @@ def invariance(
     of = np.array([factors[s.name] for s in make.outputs])
     moved = [[replace(t, y=t.y * of) for t in part] for part in (train, valid)]
     scaled = fit_prior(in_other_units(make, factors), *moved, dt=dt)
-    halves = [t.part(keep) for t in train for keep in (slice(0, len(t.t) // 2), slice(len(t.t) // 2, None))]
+    later = [replace(t, t=t.t + 2 * k * t.dt * len(t.t)) for k, t in enumerate(train)]
+    halves = [
+        t.part(keep, f"{k} {i}")
+        for k, t in enumerate(later)
+        for i, keep in enumerate((slice(0, len(t.t) // 2), slice(len(t.t) // 2, None)))
+    ]
     apart = [replace(t, t=t.t - t.t[0]) for t in halves]
     pieces, strangers = (fit_prior(make, some, valid, dt=dt) for some in (halves, apart))
 
@@ -333,7 +344,9 @@ def main() -> None:
     parser.add_argument(
         "--data", type=Path, default=Path("../shared/data"), help="folder of measured recordings"
     )
-    parser.add_argument("--windows", type=int, default=24, help="windows of the independent fit at most (machines)")
+    parser.add_argument(
+        "--windows", type=int, default=24, help="windows of the independent fit at most (machines)"
+    )
     parser.add_argument("--draws", type=int, default=20, help="recordings drawn of each machine (coverage)")
     parser.add_argument("--priors", type=int, default=None, help="random priors (random: 50, order: 5)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first random prior")

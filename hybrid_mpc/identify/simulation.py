@@ -179,7 +179,8 @@ def _chained(one: ca.Function) -> ca.Function:
     for now in ca.horzsplit(signals, one.size2_in(1)) if one.size2_in(1) else [signals] * CHAINED:
         found.append(one.call([after, now, constants]))
         after = found[-1][0]
-    return ca.Function(one.name(), [z, signals, constants], [ca.horzcat(*values) for values in zip(*found, strict=True)])
+    results = [ca.horzcat(*values) for values in zip(*found, strict=True)]
+    return ca.Function(one.name(), [z, signals, constants], results)
 
 
 def stepped(xdot: ca.Function, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int) -> ca.SX:

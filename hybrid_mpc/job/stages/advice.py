@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from hybrid_mpc.identify.fit import POOR
+from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.job.sequential import hardest
 from hybrid_mpc.job.stages.compare import REPORTED
 from hybrid_mpc.job.stages.promises import STRUCTURE
