@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 ITERATIONS = 25
 """Gauss-Newton steps of a length at most."""
 FIRST = 4
-"""Steps at most before outputs and outliers are weighed by what is left of them."""
+"""Steps at most before outputs and outliers are weighed by their residuals."""
 LOOSELY = 1e-2
 """Weight of a first state's distance from its guess, over its size, beside errors that are counted in spreads: a guess
 by the nominal prior is far off where that is, and errors are a small share of the spread once first states fit."""
@@ -39,11 +39,11 @@ COMMON = 0.7
 """Least robust standard deviation of an output's errors, over their root mean square without gross outliers: where a
 prior is far off for a part of the time, that part is no outlier."""
 GROSS = 10.0
-"""Residuals beyond this many are no measurements at the end of a fit; what they weigh before would bias it."""
+"""Residuals beyond this many robust standard deviations are left out at the end of a fit: any weight would bias it."""
 SCALINGS = 4
-"""Times at most that outputs are weighed by what is left of them: outliers hide how little that is."""
+"""Times at most that outputs are weighed by their residuals: outliers hide how small those are."""
 SETTLED = 0.8
-"""Share to which what is left must fall for another time."""
+"""Share to which the scales must fall for another time."""
 FAR = 3.0
 """Errors beyond this many spreads of the data are as bad as this one where candidates are compared."""
 LARGEST = 1e3
@@ -53,12 +53,12 @@ COMPARED = 10
 FOLLOWING = 4
 """Steps at most of the first states after ``theta``, where it would be rejected without."""
 ALIKE = 1e-3
-"""They end when none takes off more than this share of a candidate's cost."""
+"""These steps end when none lowers a candidate's cost by more than this share."""
 DAMPING, WORST = 1e-3, 1e9
 """First damping of a step, and the one with which steps are given up."""
 CONVERGED = 0.01
-"""A step that takes off less than this share of a window's mean cost is the last of a fit: what would come after it is
-far less than a standard error."""
+"""A step that lowers the cost by less than this share of a window's mean cost is the last of a fit: further steps are
+far smaller than a standard error."""
 CLOSELY = 1e-4
 """The same share at the end of a fit: steps along a narrow valley are short."""
 SETTLING, DIGITS, SAME = 12, 1e-9, 1e-9
@@ -70,7 +70,7 @@ SHARES = 1.0, 0.5, 0.2, 0.05
 
 @dataclass(frozen=True)
 class Trial:
-    """What a short fit found: the number of its start, ``theta``, and the error of the windows over the spread."""
+    """Result of a short fit: the number of its start, ``theta``, and the error of the windows over the spread."""
 
     start: int
     theta: Array
@@ -79,12 +79,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class _Point:
-    """Errors of the outputs at ``theta`` and first states ``x`` ``(n, n_x)``, and their slopes.
+    """Errors of the outputs at ``theta`` and first states ``x`` ``(n, n_x)``, and their Jacobians.
 
-    ``error`` ``(n, (T + 1) n_y)`` is zero where nothing counts, ``slopes`` ``(n, (T + 1) n_y, columns)`` are by
-    ``theta`` (or not) and by ``x`` in its sizes. ``scale`` ``(n_y,)`` is what an error of each output is counted in.
-    Errors beyond ``far`` scales are no measurements: they cost the same wherever they are. ``held`` is the weight of
-    what first states move from their guess, in their sizes, beside errors in scales.
+    ``error`` ``(n, (T + 1) n_y)`` is zero where nothing was measured. ``slopes`` ``(n, (T + 1) n_y, columns)`` are the
+    derivatives by ``theta`` (where asked for) and by ``x`` over its sizes. ``scale`` ``(n_y,)`` is the unit of each
+    output's errors. Errors beyond ``far`` scales cost a constant. ``held`` is the weight of a first state's distance
+    from its guess, in sizes, beside errors in scales.
     """
 
     theta: Array
@@ -133,10 +133,9 @@ class Shooting:
         self._known: dict[bytes, tuple[float, Array]] = {}
 
     def explained(self, thetas: Sequence[Array]) -> list[float]:
-        """How far each ``theta`` explains the windows from the first states that are best for it.
+        """Root mean square error of each ``theta`` over the windows, from the first states that are best for it.
 
-        That is the root mean square of the errors over the outputs' spreads, each at most ``FAR``; infinite where the
-        prior is too stiff for the period.
+        Errors are in spreads of the outputs, each at most ``FAR``. Infinite where the prior is too stiff.
         """
         unknown: dict[int, list[Array]] = {}
         for theta in {one.tobytes(): one for one in thetas if one.tobytes() not in self._known}.values():
@@ -164,8 +163,8 @@ class Shooting:
         return [self._known[theta.tobytes()][0] for theta in thetas]
 
     def _growing(self, thetas: Sequence[Array]) -> list[int]:
-        """Lengths [periods] over which first states are found one after the other before those of the windows, where
-        small errors grow more than a hundredfold: what is found over one tells where the next half as much begins.
+        """Lengths [periods] over which first states are estimated before the whole windows, where small errors grow
+        more than a hundredfold: each estimate is the start of the next.
         """
         periods, dt = self.windows.y.shape[1] - 1, self.own.dt
         reach = min(self.own.reach(theta) for theta in thetas) / dt
@@ -179,7 +178,7 @@ class Shooting:
         return self._known[theta.tobytes()][1]
 
     def solve(self, theta: Array, iterations: int = ITERATIONS) -> Fitted:
-        """Fit ``theta`` with the first states, from the best of these on: by the spreads, then by what is left."""
+        """Fit ``theta`` with the first states: errors are weighed by the spreads first, then by the residuals."""
         theta = np.clip(theta, self.own.lower, self.own.upper)
         point = self.start(theta, self.first_states(theta), "all")
         if len(theta):
@@ -200,7 +199,7 @@ class Shooting:
         keep: Sequence[int],
         free: int | None = None,
     ) -> list[Trial]:
-        """Short fits from several ``thetas`` ``(m, k)`` at once, one batch of free runs for all; the worst end early.
+        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs; the worst end early.
 
         Args:
             thetas: Starts.
@@ -258,7 +257,7 @@ class Shooting:
         ]
 
     def settled(self, theta: Array) -> Fitted:
-        """The same fit from near its end on, to the last digits: neither start nor rounding is left in it."""
+        """The fit continued to the last digits, so that it depends on neither the start nor rounding."""
         point = self.start(theta, self.first_states(theta), "all")
         for _ in range(2):
             rescaled = replace(point, scale=self._left(point.error), held=1.0)
@@ -281,7 +280,7 @@ class Shooting:
         return Fitted(point.theta, *self._covariance(point))
 
     def _along(self, point: _Point, step: Array, moved: Array) -> _Point:
-        """The point a step of ``theta`` and first states further, these corrected where the cost would rise without."""
+        """The point after a step; its first states are estimated anew where the cost would rise."""
         theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
         x = point.x + moved[self.windows.group] * self.sizes
         if self.windows.warm:
@@ -339,14 +338,14 @@ class Shooting:
         return replace(before, theta=theta, x=x, error=error, slopes=by)
 
     def _costs(self, point: _Point) -> Array:
-        """Robust sum of squares of each group of windows that counts for its first state, with what this moved."""
+        """Robust cost of each group of windows for its first state, the pull towards the guess included."""
         c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
         over = np.minimum(np.abs(point.error / point.scales), point.far)
         own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
         return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
 
     def _cost(self, point: _Point) -> float:
-        """What ``theta`` is fitted by: the same sum, or of a warm-up what comes behind it."""
+        """Cost of ``theta``: the sum over all windows; with a warm-up, of the samples after it."""
         if not self.windows.warm:
             return float(self._costs(point).sum()) + self._pulled(point)
         c2 = OUTLIERS**2
@@ -355,11 +354,11 @@ class Shooting:
         return float((own * self.count).sum()) + self._pulled(point)
 
     def _pulled(self, point: _Point) -> float:
-        """What parameters beside their nominal values cost."""
+        """Cost of the parameters' distance from their nominal values."""
         return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
 
     def _moved(self, point: _Point) -> Array:
-        """What first states moved from their guess, in their sizes, by the root of its weight."""
+        """Distance of the first states from their guess, in sizes, times the root of its weight."""
         return np.asarray(math.sqrt(point.held) * (point.x - self.windows.x) / self.sizes)
 
     def _grouped(self, values: Array) -> Array:
@@ -371,7 +370,7 @@ class Shooting:
         return total
 
     def _left(self, error: Array) -> Array:
-        """Size of what is left of each output: outputs of any unit count alike, outliers little."""
+        """Robust scale ``(n_y,)`` of each output's residuals."""
         own = error.reshape(self.windows.y.shape)
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
@@ -380,7 +379,7 @@ class Shooting:
         return np.maximum(robust, 1e-9 * self.spread)
 
     def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
-        """First states at a ``theta``, each window by itself: with a damping of its own, until all have settled."""
+        """First states for a given ``theta``: Levenberg and Marquardt in each group of windows, until all converge."""
         cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
         damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
         for _ in range(steps):
@@ -399,15 +398,15 @@ class Shooting:
         return point
 
     def _followed(self, point: _Point, trial: _Point) -> _Point:
-        """Another ``theta`` with first states that suit it: from the trial's, or from those before, in each window."""
+        """The trial with first states estimated anew, in each window from the trial's or the point's, the better ones."""
         moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
         still = self._at(point, trial.theta, point.x, "x")
         better = self._costs(still) < self._costs(moved)
         return self._states(moved.where(better[self.windows.group], still), FOLLOWING)
 
     def _descend(self, point: _Point, iterations: int, enough: float = CONVERGED) -> _Point:
-        """Steps of Levenberg and Marquardt, of ``theta`` with the first states, until one takes off less than a share
-        ``enough`` of a window's mean cost.
+        """Steps of Levenberg and Marquardt of ``theta`` and first states, until one lowers the cost by less than
+        ``enough`` times a window's mean cost.
         """
         damping, cost, n = DAMPING, self._cost(point), len(point.x)
         for _ in range(iterations):
@@ -442,7 +441,7 @@ class Shooting:
         return point
 
     def _weighted(self, point: _Point) -> Array:
-        """Slopes and, behind them, errors, over their scale and by the root of their robust weight."""
+        """Jacobian and, as the last column, errors: over their scale and times the root of their robust weight."""
         error = point.error / point.scales
         root = np.where(np.abs(error) < point.far, (1 + np.square(error / OUTLIERS)) ** -0.25, 0.0)
         slopes = point.slopes * (root / point.scales)[..., None]
@@ -463,15 +462,15 @@ class Shooting:
         )  # fmt: skip
 
     def _pull(self, point: _Point, n: int) -> tuple[Array, Array]:
-        """What holds ``theta`` at the nominal values: its part of the normal matrix, and of the gradient."""
+        """The pull towards the nominal values: its part of the normal matrix and of the gradient."""
         if not n:  # of the first states alone
             return np.zeros((0, 0)), np.zeros(0)
         weights = np.square(self.own.pull)
         return np.diag(weights), weights * (point.theta - self.own.nominal)
 
     def _eliminated(self, point: _Point) -> tuple[Array, Array, Array, float]:
-        """Slopes by ``theta`` and errors of what counts, with first states that follow; by how much these do, and how
-        many numbers of those that count they take for themselves.
+        """Jacobian by ``theta`` and errors that count, first states eliminated; how first states follow ``theta``, and
+        the degrees of freedom that they take.
         """
         rows, n_x = self._weighted(point), point.x.shape[1]
         b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
@@ -488,7 +487,7 @@ class Shooting:
         return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64), taken
 
     def _behind(self, point: _Point) -> tuple[Array, ...]:
-        """As :meth:`_normal`, of what comes behind the warm-up; first states follow from the warm-up alone."""
+        """As :meth:`_normal`, for the samples after the warm-up; the warm-up alone determines the first states."""
         b, error, follow, _ = self._eliminated(point)
         n_x = point.x.shape[1]
         pull, from_nominal = self._pull(point, b.shape[-1])
@@ -499,8 +498,8 @@ class Shooting:
         )  # fmt: skip
 
     def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
-        """Step of ``theta`` within its bounds, and of the first states by groups, which follow it; and how far it takes
-        the cost down to first order.
+        """Step of ``theta`` within its bounds, step of the first states by groups, and the decrease of the cost to
+        first order.
         """
         xx, xt, tt, gx, gt = normal
         reduced, slope = tt, gt
