@@ -398,7 +398,7 @@ class Shooting:
         return point
 
     def _followed(self, point: _Point, trial: _Point) -> _Point:
-        """The trial with first states estimated anew, in each window from the trial's or the point's, the better ones."""
+        """The trial with first states estimated anew, in each window from the trial's or the point's."""
         moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
         still = self._at(point, trial.theta, point.x, "x")
         better = self._costs(still) < self._costs(moved)
