@@ -176,11 +176,11 @@ class Scenario:
             nothing is finite, at the end of a run. It is never guessed: a guard that rests and a run on the real
             machine need it. Default: none is declared; a loop in simulation then holds its last input.
         tasks: Closed-loop tasks. Default: none; without a plant, too, a step and holding against a disturbance
-            (:func:`~hybrid_mpc.job.default_tasks.default_tasks`).
+            (:func:`~hybrid_mpc.check.default_tasks.default_tasks`).
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
         figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a
-            :class:`~hybrid_mpc.job.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
+            :class:`~hybrid_mpc.compare.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
             for :class:`~hybrid_mpc.watch.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` evaluates the machine's models on recordings; default: not at all.

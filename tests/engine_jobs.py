@@ -105,7 +105,7 @@ def jobs_in_this_process():
     """Networks are trained and loops of a comparison computed in this process."""
     import pytest
 
-    from hybrid_mpc.job.stages import compare, identify
+    from hybrid_mpc.workflow.stages import compare, identify
 
     with pytest.MonkeyPatch.context() as patch:
         for stage in (compare, identify):

@@ -12,9 +12,9 @@ from hybrid_mpc.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from hybrid_mpc.job.study import Study
-    from hybrid_mpc.job.study_results import StudyResults
-    from hybrid_mpc.job.study_run import Plan
+    from hybrid_mpc.compare.study import Study
+    from hybrid_mpc.compare.study_results import StudyResults
+    from hybrid_mpc.compare.study_run import Plan
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -62,7 +62,7 @@ def run(
 ) -> None:
     """Run a study; exit code 1 if runs have failed."""
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.job.study_run import dry_run, run_study
+    from hybrid_mpc.compare.study_run import dry_run, run_study
 
     wanted = _study(study, _models(model), scenario)
     if dry:
@@ -85,7 +85,7 @@ def run(
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
     """Write report.html, of a study that still runs too."""
-    from hybrid_mpc.job.study_results import StudyResults, write_study_report
+    from hybrid_mpc.compare.study_results import StudyResults, write_study_report
 
     print(f"report: {write_study_report(StudyResults.load(folder)).resolve()}")
 
@@ -97,7 +97,7 @@ def compare(
     value: Annotated[str, typer.Option(help="Figure to compare.")] = "cost",
 ) -> None:
     """Compare two studies run by run, on common draws and seeds."""
-    from hybrid_mpc.job.study_results import StudyResults
+    from hybrid_mpc.compare.study_results import StudyResults
 
     found = StudyResults.load(first).compare(StudyResults.load(second), value)
     for column, (one, two) in found.attrs["differs"].items():
@@ -109,7 +109,7 @@ def compare(
 @app.command("list")
 def list_studies() -> None:
     """List the built-in studies."""
-    from hybrid_mpc.job.study import built_in_studies, built_in_study
+    from hybrid_mpc.compare.study import built_in_studies, built_in_study
 
     for name, path in built_in_studies().items():
         title = path.read_text().partition("\n")[0].removeprefix("# ")
@@ -117,7 +117,7 @@ def list_studies() -> None:
 
 
 def _study(name: str, models: dict[str, str], scenario: str) -> Study:
-    from hybrid_mpc.job.study import built_in_studies, built_in_study, read_study
+    from hybrid_mpc.compare.study import built_in_studies, built_in_study, read_study
 
     there = built_in_studies()
     if name in there:
@@ -150,7 +150,7 @@ def _models(given: list[str] | None) -> dict[str, str]:
 
 
 def _plan(plan: Plan, workers: int) -> list[str]:
-    from hybrid_mpc.job.study_results import duration_text
+    from hybrid_mpc.compare.study_results import duration_text
 
     axes = " x ".join(f"{n} {name}" for name, n in plan.axes.items() if n > 1) or "a single one"
     lines = [f"{plan.runs} runs: {axes}"]

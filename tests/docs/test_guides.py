@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.job.check import check_scenario
+from hybrid_mpc.check.preflight import check_scenario
 
 ROOT = Path(__file__).parents[2]
 
