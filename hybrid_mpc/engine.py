@@ -287,14 +287,18 @@ def run_jobs(
     on_result: Callable[[str, Any], None] = lambda name, result: None,
     *,
     fresh: bool = True,
+    cluster: Any = None,
 ) -> dict[str, Any]:
-    """Run ``function(*args, report)`` for each job on this machine and return the results by name.
+    """Run ``function(*args, report)`` for each job and return the results by name.
 
     A job calls ``report(done, total, text)`` as it goes, which ``on_progress`` gets with its name. Jobs start in the
     order given, ``workers`` at a time, each in a fresh process with the environment's number of threads, so results do
     not depend on how many run side by side. ``on_result`` is called as each job ends, also beside one that fails.
     ``fresh=False``: a process computes one job after the other, for jobs that leave nothing behind that the next would
     notice and that load the same things for seconds.
+
+    On a ``cluster`` (address of a dask scheduler or a ``distributed.Client``) all jobs are handed to its workers, which
+    must see the files that the jobs name under the same paths; ``on_progress`` is then told of ends alone.
 
     Raises:
         InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
@@ -308,6 +312,8 @@ def run_jobs(
         {'a': 2, 'b': 4}
     """
     _check(workers)
+    if cluster is not None:
+        return _on_cluster(jobs, on_progress, cluster, on_result)
     queue, results = list(jobs), {}
     running: dict[str, _Worker] = {}
     idle: list[_Worker] = []
@@ -341,6 +347,43 @@ def run_jobs(
         for worker in (*running.values(), *idle):
             worker.close()
     return results
+
+
+def _on_cluster(
+    jobs: Mapping[str, tuple[Callable[..., Any], tuple[Any, ...]]],
+    on_progress: Callable[[str, int, int, str], None],
+    cluster: Any,
+    on_result: Callable[[str, Any], None],
+) -> dict[str, Any]:
+    """:func:`run_jobs` on the workers of a cluster; what a lost worker was at is handed out again."""
+    results: dict[str, Any] = {}
+    engine: Engine[tuple[str, Any, Any], Any] = DaskEngine(_run_named, cluster)
+    try:
+        for name, (function, args) in jobs.items():
+            engine.submit((name, function, args))
+        while len(results) < len(jobs):
+            found = engine.next(LOOK_S)
+            if found is None:
+                continue
+            batch, ended = found
+            if isinstance(ended, Lost):
+                if ended.final:
+                    raise RuntimeError(f"{batch[0]} failed:\n{ended}")
+                engine.submit(batch)
+                continue
+            value, error = ended
+            if error is not None:
+                raise error if isinstance(error, InputError) else RuntimeError(f"{batch[0]} failed:\n{error}")
+            results[batch[0]] = value
+            on_progress(batch[0], 1, 1, engine.name)
+            on_result(batch[0], value)
+    finally:
+        engine.close()
+    return results
+
+
+def _run_named(job: tuple[str, Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, Exception | None]:
+    return _computed(job[1], job[2], lambda done, total, text: None)
 
 
 class _Worker:
@@ -401,6 +444,12 @@ def _run(job: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, Exceptio
     def report(done: int, total: int, text: str) -> None:
         reports.send((done, total, text))
 
+    return _computed(function, args, report)
+
+
+def _computed(
+    function: Callable[..., Any], args: tuple[Any, ...], report: Callable[[int, int, str], None]
+) -> tuple[Any, Exception | None]:
     try:
         with no_exit():
             return function(*args, report), None

@@ -21,7 +21,7 @@ from hybrid_mpc.engine import Lost, Progress, make_engine, run_jobs
 from hybrid_mpc.errors import StorageError
 
 # the root first: tests/ has a folder nn_export
-ROOT, TESTS = (str(Path(__file__).parents[i]) for i in (2, 1))
+ROOT, TESTS = (str(Path(__file__).parents[i]) for i in (1, 0))
 
 
 @pytest.fixture(autouse=True)
@@ -301,6 +301,25 @@ def test_a_cluster_computes_a_study(here_cluster, tmp_path, monkeypatch):
     found = results.table.set_index("id")["cost"]
     assert {run.id: trivial_runs.trivial(run)["cost"] for run in study.runs()} == found.to_dict()
     assert results.note.engine == "dask, 2 workers"
+
+
+def test_a_cluster_computes_jobs_by_name(here_cluster):
+    ends, told = [], []
+    jobs = {name: (work.double, (i,)) for i, name in enumerate("abc")}
+    found = run_jobs(
+        jobs, lambda *p: told.append(p), 1, lambda *p: ends.append(p), cluster=here_cluster(2)[0]
+    )
+    assert found == {"a": 0, "b": 2, "c": 4}
+    assert sorted(ends) == sorted(found.items())
+    assert sorted(told) == [(name, 1, 1, "dask, 2 workers") for name in "abc"]
+
+
+@pytest.mark.parametrize(
+    ("job", "kind"), [((work.bad_input, ()), StorageError), ((work.defect, ()), RuntimeError)]
+)
+def test_a_job_that_fails_on_a_cluster_fails_here(here_cluster, job, kind):
+    with pytest.raises(kind):
+        run_jobs({"a": job}, quiet, 1, cluster=here_cluster(1)[0])
 
 
 @pytest.mark.parametrize("kind", [TypeError, OSError, CancelledError])

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.cli.options import (
+    Device,
+    InputColumns,
+    OutputColumns,
+    Recordings,
+    ScenarioName,
+    Scheduler,
+    TimeColumn,
+)
 from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
@@ -62,6 +70,7 @@ def run(
     skip: Annotated[
         list[str] | None, typer.Option(help="Stage after the export that is not to run, once for each.")
     ] = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Fit the prior, train, export, close the loop, learn what to alarm by, analyze, and write a report.
 
@@ -81,7 +90,7 @@ def run(
     )  # fmt: skip
     with make_progress() as progress:
         results = run_job(
-            settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress,
+            settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress, cluster=scheduler,
         )  # fmt: skip
     lines = ["the run ends here: later stages have not run, and --only names none of them"]
     print_summary(lines if results is None else summary(results), folder / "report.html", "report")

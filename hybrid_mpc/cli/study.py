@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybrid_mpc.cli.options import Scheduler
 from hybrid_mpc.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,9 +50,7 @@ def run(
         ),
     ] = "",
     workers: Annotated[int, typer.Option(help="Processes on this machine.", min=1)] = 2,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, in place of processes.")
-    ] = None,
+    scheduler: Scheduler = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the study that the folder holds.")] = False,
     retry_failed: Annotated[
         bool, typer.Option("--retry-failed", help="With --resume: failed runs again.")

@@ -34,13 +34,15 @@ R = TypeVar("R")
 class Context:
     """A run in its folder: what it computes, the machine, and where it reports to.
 
-    ``pictures`` are those that this process has drawn, by part of the report: section, file, caption.
+    ``pictures`` are those that this process has drawn, by part of the report: section, file, caption. On ``cluster``
+    (address of a dask scheduler or a ``distributed.Client``) networks are trained and loops run; None: on this machine.
     """
 
     settings: RunSettings
     scenario: Scenario
     out: Path
     progress: Progress = field(default_factory=Progress)
+    cluster: Any = field(default=None, repr=False, compare=False)
     pictures: dict[str, list[tuple[str, Path, str]]] = field(default_factory=dict, repr=False, compare=False)
     _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
     _kits: dict[str, Kit] = field(default_factory=dict, repr=False, compare=False)
@@ -76,6 +78,12 @@ class Context:
                 for stem, delays in spec.delays_of.items()
             },
         )
+
+    @property
+    def scenario_path(self) -> str:
+        """Name of the scenario, or the full path of its file, as processes elsewhere find it."""
+        name = self.settings.scenario
+        return str(Path(name).resolve()) if Path(name).is_file() else name
 
     @property
     def warm(self) -> int:

@@ -58,6 +58,7 @@ def run(
     only: Sequence[str] = (),
     skip: Sequence[str] = (),
     progress: Progress | None = None,
+    cluster: Any = None,
 ) -> Results | None:
     """Run the main job into the folder ``out``; the results stand in its ``results.json``, too.
 
@@ -76,6 +77,8 @@ def run(
             always run. Default: all.
         skip: Names of stages after the export that are not to run. Default: none.
         progress: Where to report; default: nowhere.
+        cluster: Address of a dask scheduler or a ``distributed.Client``, whose workers train the networks and run the
+            closed loops; they must see ``out`` under the same path. Default: processes of this machine.
 
     Raises:
         InputError: For any bad input; nothing half-written is left behind that a later run would trip over.
@@ -86,7 +89,7 @@ def run(
     """
     check_choice(only, skip)
     scenario = load_scenario(settings.scenario)
-    context = Context(settings, scenario, out, progress or Progress())
+    context = Context(settings, scenario, out, progress or Progress(), cluster)
     found = check_scenario(scenario, context.budget, (lambda: context.dataset) if settings.data else None)
     for warning in found.warnings:
         context.progress.warn(warning)

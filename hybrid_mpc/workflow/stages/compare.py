@@ -245,7 +245,7 @@ def run_or_read(
         write_rows(context.path(part), made, of[part])
         rows[part] = made
 
-    common = context.settings.scenario, context.out / "model"
+    common = context.scenario_path, (context.out / "model").resolve()
     missing = [part for part in parts if part not in rows]
     timed = [part for part in missing if part in alone]
     for i, part in enumerate(timed):
@@ -255,7 +255,7 @@ def run_or_read(
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         part: (run_specs, (*common, parts[part])) for part in missing if part not in alone
     }
-    run_jobs(jobs, context.progress.update, WORKERS, write, fresh=False)
+    run_jobs(jobs, context.progress.update, WORKERS, write, fresh=False, cluster=context.cluster)
     return rows
 
 

@@ -454,14 +454,15 @@ def training_stage(context: Context) -> TrainingResult:
     name = digest(TRAINING.keys(context))[:12]
     folder = context.out / "checkpoints" / "training" / name
     trained = train_kinds(
-        context.settings.scenario,
+        context.scenario_path,
         context.prior.fit.values,
         context.smoothed("train"),
         context.smoothed("valid"),
         {kind: _as_long_as_judged(context, kind) for kind in kinds_of(context.scenario.prior())},
-        folder,
+        folder.resolve(),
         device=context.settings.device,
         on_progress=context.progress.update,
+        cluster=context.cluster,
     )
     return TrainingResult(
         name,
@@ -483,6 +484,7 @@ def train_kinds(
     device: str = "cpu",
     workers: int = WORKERS,
     on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
+    cluster: Any = None,
 ) -> dict[str, Trained]:
     """Train the networks of every kind that ``folder`` does not hold yet; an interrupted training is resumed."""
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
@@ -490,7 +492,7 @@ def train_kinds(
         for kind in reversed(list(settings))
         if not is_trained(folder, settings[kind])
     }
-    run_jobs(jobs, on_progress, workers)
+    run_jobs(jobs, on_progress, workers, cluster=cluster)
     return {kind: load_trained(folder, kind) for kind in settings}
 
 
