@@ -10,7 +10,6 @@ a problem or runs a loop.
 """
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 # fmt: off
@@ -160,10 +159,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.watch.residuals import ResidualReadings as ResidualReadings
 # fmt: on
 
-try:
-    __version__ = version("hybrid-mpc")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
+__version__: str
 
 _ROOMS = {
     "analyze.equilibria": ("equilibria",),
@@ -267,7 +263,18 @@ _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 __all__ = sorted((*_HOME, "plots", "__version__"))
 
 
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("hybrid-mpc")
+    except PackageNotFoundError:  # a source tree that was never installed
+        return "0+unknown"
+
+
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
     if name != "plots" and name not in _HOME:
         raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
     from hybrid_mpc.errors import named_extra

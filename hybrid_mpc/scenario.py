@@ -8,7 +8,6 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -236,6 +235,8 @@ class Scenario:
 
 def registered_scenarios() -> dict[str, str]:
     """Registered scenario names with the place they come from."""
+    from importlib.metadata import entry_points
+
     return {e.name: e.value for e in sorted(entry_points(group="hybrid_mpc.scenarios"), key=lambda e: e.name)}
 
 
@@ -283,6 +284,8 @@ def load_scenario(name_or_path: str) -> Scenario:
         >>> load_scenario("golf_robot").name
         'golf_robot'
     """
+    from importlib.metadata import entry_points
+
     for entry in entry_points(group="hybrid_mpc.scenarios"):
         if entry.name == name_or_path:
             with no_exit(name_or_path):
