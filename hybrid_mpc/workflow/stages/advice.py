@@ -38,8 +38,8 @@ def advice(results: Results) -> list[Hint]:
         found.append(
             Hint(
                 "good",
-                "Nothing stands out.",
-                "Close the loop on the machine: hm.Runner, or the controller as C.",
+                "Nothing on this page speaks against a first try on the machine.",
+                "Close the loop with hm.Runner (docs/control.md), or export the controller as C (docs/embedded.md).",
             )
         )
     return sorted(found, key=lambda hint: hint.verdict != "bad")
@@ -104,8 +104,7 @@ def _choice(found: Identification) -> Iterator[Hint]:
     choice = found.details.choice
     own = choice.candidates[choice.hybrid]
     if choice.recommended != "phy":
-        yield Hint("good", choice.reason, "")
-        return
+        return  # the page's first answer says why
     why = choice.reason
     if own.error is None or own.ratio is None:
         yield Hint(
