@@ -32,7 +32,7 @@ from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import required_substeps
-from hybrid_mpc.job.benchmark_runs import read_training
+from hybrid_mpc.workflow.benchmark_runs import read_training
 
 RECORDINGS = {
     "golf_robot": (), "emps": ("*.mat",), "torque_pendulum": ("energy_shaping_*.csv",),
