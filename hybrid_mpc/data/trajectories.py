@@ -14,20 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
-from hybrid_mpc.data.findings import findings_of
-from hybrid_mpc.data.recording import (
-    MIN_SCORED,
-    Finding,
-    Flags,
-    Recording,
-    Signals,
-    complete,
-    empty,
-    gaps,
-    misspelt,
-    no_flags,
-    read_recordings,
-)
+from hybrid_mpc.data.findings import MIN_SCORED, Finding, findings_of, gaps
+from hybrid_mpc.data.recording import Flags, Recording, Signals, complete, misspelt, read_recordings
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
@@ -74,8 +62,8 @@ class Trajectory:
     y: Array
     x: Array
     xdot: Array
-    w: Array = field(default_factory=empty)
-    censored: Flags = field(default_factory=no_flags)
+    w: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    censored: Flags = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int8))
 
     def __post_init__(self) -> None:
         complete(self)
