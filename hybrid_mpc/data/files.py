@@ -38,7 +38,7 @@ LONGEST_ROW = 2**20
 
 BEGINS = (
     (re.compile(rb"PAR1|ARROW1"), ("sheets", "arrow_source")),
-    (re.compile(rb"\x89HDF\r\n\x1a\n"), ("sheets", "hdf5_source")),
+    (re.compile(rb"\x89HDF\r\n\x1a\n"), ("hdf5", "hdf5_source")),
     (re.compile(rb"MATLAB (5.0|7.3) MAT-file"), ("matlab", "mat_source")),
     (
         re.compile(

@@ -1,21 +1,17 @@
-"""Excel workbooks, Parquet, Feather and HDF5 files as sources."""
+"""Excel workbooks, Parquet and Feather files as sources."""
 
 from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hybrid_mpc.data.frames import HEAD, Frame, frame_source
 from hybrid_mpc.data.layout import MOST_SEEN, STEADY, Layout, Look, layout_of
-from hybrid_mpc.data.matlab import Leaf, columns_of_leaf
 from hybrid_mpc.data.source import LISTED, Source, line_of, megabytes
-from hybrid_mpc.data.vectors import LARGEST, budget_of, vector_source
+from hybrid_mpc.data.vectors import LARGEST
 from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.records import shown
 
@@ -185,56 +181,3 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
             lambda k, j: _written(whole_columns[j].iloc[k]),
         ),
     )
-
-
-# HDF5
-
-
-def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
-    """Datasets of an HDF5 file: vectors, columns of matrices, fields of tables; links to other files are left alone."""
-    with named_extra("reading HDF5 files"):
-        import h5py
-    try:
-        leaves = list(_walked(h5py.File(io.BytesIO(content), "r"), "", 0))
-    except Exception as error:  # a damaged file raises nearly anything
-        raise InputError(f"{path}: is no HDF5 file or damaged ({line_of(error)}). Write it again.") from error
-    vectors: dict[str, Callable[[], Any]] = {}
-    for leaf in leaves:
-        vectors |= dict(columns_of_leaf(leaf))
-    return vector_source(
-        path, sha256, budget_of(len(content)), tuple(vectors), lambda name: vectors[name](), "index", 0
-    )
-
-
-def _walked(group: Any, prefix: str, depth: int) -> Iterator[Leaf]:
-    import h5py
-
-    for name in group:
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            continue
-        item, full = group[name], f"{prefix}{name}"
-        if isinstance(item, h5py.Group):
-            if depth < 8:
-                yield from _walked(item, f"{full}.", depth + 1)
-            continue
-        if not isinstance(item, h5py.Dataset) or item.shape is None:
-            continue
-        unit = next(
-            (str(item.attrs[key]) for key in ("units", "unit") if isinstance(item.attrs.get(key), str)), ""
-        )
-        named = f"{full} [{unit}]" if unit else full
-        if item.dtype.names:
-            for field in item.dtype.names:
-                if item.dtype[field].kind in "biuf":
-                    yield Leaf(f"{full}.{field}", item.shape, partial(_numbers, item, field))
-        elif item.dtype.kind in "biufc":
-            yield Leaf(named, item.shape, partial(_numbers, item))
-
-
-def _numbers(item: Any, field: str = "") -> np.ndarray[Any, Any]:
-    """A dataset's numbers, or those of a field of its records; what it declares is looked at first."""
-    if max(8, item.dtype.itemsize) * item.size > budget_of(item.file.id.get_filesize()):
-        raise InputError(
-            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file"
-        )
-    return np.asarray(item[()][field] if field else item[()])

@@ -142,15 +142,10 @@ class Source:
             raise InputError(
                 f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
             )
-        inner = f".{name}"
-        fields = [
-            column
-            for column in self.header
-            if column.endswith(inner) or name_and_unit(column)[0].endswith(inner)
-        ] or [
-            column
-            for column in self.header
-            if name_and_unit(column)[0] == name or column == f"{name_and_unit(name)[0]} [s]"
+        own, inner = name_and_unit(name)[0], f".{name}"
+        fields = [c for c in self.header if name_and_unit(c)[0] == name or c == f"{own} [s]"]
+        fields = fields or [
+            c for c in self.header if name_and_unit(c)[0].endswith(inner) or c.endswith(inner)
         ]
         fields = [column for column in fields if column.count(".") == min(one.count(".") for one in fields)]
         if len(fields) == 1:

@@ -151,6 +151,21 @@ def test_matrices_structs_in_structs_and_vectors_of_other_lengths(tmp_path):
         read(path, "log.t", ["short"])
 
 
+def test_vectors_of_different_lengths_with_times_of_their_own(tmp_path):
+    """A time in each struct, or one of each length: inputs are held, outputs have their own samples."""
+    path, slow = tmp_path / "run.mat", T[::4] + 0.002
+    named = {"t_fast": T, "u": U, "t_slow": slow, "y": Y[::4]}
+    structs = {"a": {"t": T, "log": {"u": U}}, "b": {"t": slow, "y": Y[::4]}}
+    for content, time in ((named, "time"), (structs, "t")):
+        savemat(path, {**content, "k": 3.0})
+        rules(path, time, "u", "y")
+        assert opened(path).unread == ("k",)
+    same(read(path, "a.t", ["a.log.u"]), T, U)  # one clock by its own name
+    savemat(path, {"t": T, "u": U, "y": Y[::4]})  # which samples have which time?
+    with pytest.raises(InputError, match="differ in length"):
+        read(path, "t", ["u"], ["y"])
+
+
 def test_version_7_3(tmp_path):
     """As MATLAB writes it: HDF5 behind 512 bytes, transposed, structs as groups, objects marked."""
     h5py = pytest.importorskip("h5py", reason="h5py is not installed")
