@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import nn_export.files
-from hybrid_mpc.data.source import LISTED, Source, megabytes
+from hybrid_mpc.data.source import EMPTY, LARGEST, LISTED, Source, megabytes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
 from hybrid_mpc.records import shown
@@ -28,8 +28,6 @@ ENDINGS = (
     ".csv", ".txt", ".npz", ".mat", ".xlsx", ".parquet", ".feather", ".h5", ".mf4", ".tdms", ".mcap", ".bag", ".ulg"
 )  # fmt: skip
 """Endings that a message lists of a folder's files."""
-LARGEST = 2**31
-"""Largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day."""
 CHUNK = 2**20
 """Bytes of a file that are checked at a time [byte]."""
 LONGEST_ROW = 2**20
@@ -136,7 +134,7 @@ def _content(path: Path, rows: _Rows | None) -> bytes:
         )
         raise InputError(f"{path}: cannot be read ({error.strerror}). {remedy}") from error
     if not content or content.isspace():
-        raise InputError(f"{path}: the file is empty. It needs a header line and rows of numbers.")
+        raise InputError(f"{path}: {EMPTY}")
     return content
 
 

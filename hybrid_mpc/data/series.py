@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.source import Columns, Source
+from hybrid_mpc.data.source import LARGEST, Columns, Source
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-LARGEST = 2**31
-"""Most bytes of numbers in a table [byte]."""
 ROUNDING, SHARE = 5e-7, 1e-3
 """Stamps of two clocks are one where they differ by less: in their unit, and in steps of the fastest clock."""
 TIME = "time [s]"

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.data.frames import HEAD, Frame, frame_source
 from hybrid_mpc.data.layout import MOST_SEEN, STEADY, Layout, Look, layout_of
-from hybrid_mpc.data.source import LISTED, Source, line_of, megabytes
-from hybrid_mpc.data.vectors import LARGEST
+from hybrid_mpc.data.source import LARGEST, LISTED, Source, line_of, megabytes
 from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.records import shown
 

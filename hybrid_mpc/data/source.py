@@ -23,6 +23,9 @@ FEWEST = 10
 """Fewest samples before and behind the place where time begins anew."""
 COMPARED = 1000
 """Most names among which a message looks for one that is nearly right."""
+EMPTY = "the file is empty. It needs a header line and rows of numbers."
+LARGEST = 2**31
+"""Largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day."""
 
 
 def name_and_unit(column: str) -> tuple[str, str]:

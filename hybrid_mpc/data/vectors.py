@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.names import said_by
 from hybrid_mpc.data.series import TIME, Series, clocked
-from hybrid_mpc.data.source import LISTED, Columns, Source, line_of, megabytes
+from hybrid_mpc.data.source import LARGEST, LISTED, Columns, Source, line_of, megabytes
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_npz
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-LARGEST = 2**31
-"""Most bytes of numbers in a file [byte]."""
 SMALL = 2**26
 """Bytes of numbers that any file may hold [byte], however well they are compressed: 8 million numbers."""
 PACKED = 20
