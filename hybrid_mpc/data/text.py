@@ -35,7 +35,10 @@ CLOSING = 50  # most rows behind a table that are no rows of it: means, sums, a 
 TAIL = 200  # rows before the last one whose decimals are compared with its
 CUT = 3.0  # times the largest step of a column by which its last number must be off to be cut in two
 BLANKS = sorted({form(cell) for cell in BLANK for form in (str, str.upper, str.capitalize)} | {"NaN"})
-UNCLOSED = "a quotation mark is not closed, and the rows behind it are one cell. Delete the mark, or double it in a text."
+UNCLOSED = (
+    "a quotation mark is not closed, and the rows behind it are one cell. Delete the mark, or double it within "
+    "a text."
+)
 
 
 def text_source(path: Path, content: bytes, sha256: str) -> Source:
