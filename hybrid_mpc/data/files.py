@@ -28,10 +28,8 @@ ENDINGS = (
     ".csv", ".txt", ".npz", ".mat", ".xlsx", ".parquet", ".feather", ".h5", ".mf4", ".tdms", ".mcap", ".bag", ".ulg"
 )  # fmt: skip
 """Endings that a message lists of a folder's files."""
-CHUNK = 2**20
-"""Bytes of a file that are checked at a time [byte]."""
-LONGEST_ROW = 2**20
-"""Longest row of a text file [byte]: ten thousand columns of a hundred characters."""
+CHUNK = 2**20  # bytes of a file that are checked at a time [byte]
+LONGEST_ROW = 2**20  # longest row of a text file [byte]: ten thousand columns of a hundred characters
 
 
 BEGINS = (
@@ -147,8 +145,7 @@ def _beside(path: Path) -> str:
     return f"; that folder has: {', '.join(near[:LISTED])}" if near else ""
 
 
-MOST_DECIMALS = 17
-"""Most digits after the point that are written: a float has no more."""
+MOST_DECIMALS = 17  # most digits after the point that are written: a float has no more
 
 
 def real_numbers(values: object, name: str) -> Array:

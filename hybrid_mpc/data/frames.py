@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-HEAD = 200
-"""Rows of a column that show what it holds."""
+HEAD = 200  # rows of a column that show what it holds
 TAGS = words_of(
     "tag tagname name variable signal channel sensor sensorid sensorname parameter point pointname kanal messstelle "
     "metric item measurement quantity node device attribute series messgroesse"

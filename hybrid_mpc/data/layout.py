@@ -13,10 +13,8 @@ from hybrid_mpc.data.source import name_and_unit
 from hybrid_mpc.machine.units import Conversion, conversion
 from hybrid_mpc.records import shown
 
-MOST_SEEN = 1000
-"""Rows at the beginning of a file that show where its table begins."""
-STEADY = 3
-"""Fewest rows that show a table."""
+MOST_SEEN = 1000  # rows at the beginning of a file that show where its table begins
+STEADY = 3  # fewest rows that show a table
 COMMENTS = ("#", "%", "//", ";;")
 """How comments begin."""
 

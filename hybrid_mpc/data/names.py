@@ -41,16 +41,14 @@ STAMPS = words_of("timestamp timestamps datetime zeitstempel horodatage tijdstem
 """Words that say time whatever stands beside them."""
 WITHIN = tuple(_plain(text) for text in ("时间", "時間", "时刻", "時刻", "시간"))
 """The same where a language does not separate words."""
-DATES = words_of("datetime date dates datum fecha дата")
-"""Words for dates: their numbers may count days."""
+DATES = words_of("datetime date dates datum fecha дата")  # words for dates: their numbers may count days
 AROUND = words_of(
     "elapsed relative rel absolute abs sim simulation simulated ros unix posix utc gmt local system sys since "
     "start from begin recording recorded record log logger logging measurement measured meas test run real wall "
     "host pc plc device header stamp field total global master base axis vector in the of at and day"
 )
 """What may stand beside them."""
-PERHAPS = words_of("T ts s ms us ns min h d data")
-"""Single words that may say time: decided by their numbers."""
+PERHAPS = words_of("T ts s ms us ns min h d data")  # single words that may say time: decided by their numbers
 COUNT = words_of(
     "index indices idx sample samples row rows record records seq sequence unnamed datapoint datapoints messpunkt "
     "zeile"
@@ -63,8 +61,7 @@ STEP = (
     {"sampling", "time"}, {"sample", "time"}, {"sampling", "period"}, {"sample", "period"}, {"sampling", "interval"},
 )  # fmt: skip
 """Words for the sampling time."""
-BESIDE = words_of("number no nr num nummer id count counter of the s ms")
-"""What may stand beside them."""
+BESIDE = words_of("number no nr num nummer id count counter of the s ms")  # what may stand beside them
 COUNT_PERHAPS = words_of(
     "n i j k no nr num number nummer count counter id step steps point points frame scan cycle line x"
 )
@@ -73,8 +70,7 @@ ALONE = ("s", "ms", "us", "ns", "min", "mins", "h", "d", "day", "days")
 """Units of time that as a whole name, or behind a ``t``, may be something else (a minimum, a height)."""
 
 
-FIELD = re.compile(r"(?:[^\W\d]\w*\.)+([^\W\d]\w*)")
-"""A field of a struct, ``run.phi``, and its own name."""
+FIELD = re.compile(r"(?:[^\W\d]\w*\.)+([^\W\d]\w*)")  # a field of a struct, ``run.phi``, and its own name
 
 
 class Said(NamedTuple):

@@ -16,8 +16,7 @@ from hybrid_mpc.records import shown
 Array = NDArray[np.float64]
 ROUNDING, SHARE = 5e-7, 1e-3
 """Stamps of two clocks are one where they differ by less: in their unit, and in steps of the fastest clock."""
-TIME = "time [s]"
-"""Name of the time of files whose signals have clocks of their own."""
+TIME = "time [s]"  # name of the time of files whose signals have clocks of their own
 
 
 @dataclass(frozen=True)

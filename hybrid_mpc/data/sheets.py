@@ -17,12 +17,9 @@ from hybrid_mpc.records import shown
 if TYPE_CHECKING:
     import pandas as pd
 
-UNPACKED = 50
-"""Most bytes of a workbook's sheets for one byte of the file."""
-MOST_CELLS = 20_000_000
-"""Most cells of a sheet: each takes a hundred bytes of memory."""
-LONGER = 10
-"""Times as many rows as any other sheet that the one which is read has."""
+UNPACKED = 50  # most bytes of a workbook's sheets for one byte of the file
+MOST_CELLS = 20_000_000  # most cells of a sheet: each takes a hundred bytes of memory
+LONGER = 10  # times as many rows as any other sheet that the one which is read has
 
 
 def excel_source(path: Path, content: bytes, sha256: str) -> Source:

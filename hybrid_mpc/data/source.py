@@ -17,15 +17,11 @@ from hybrid_mpc.records import LONGEST, shown
 Array = NDArray[np.float64]
 ALIKE = 0.7
 """How alike a column's name must be to be proposed: ``inflow_degC`` is by 0.6 like ``tank_degC``, by its unit alone."""
-LISTED = 30
-"""Most names that a message lists."""
-FEWEST = 10
-"""Fewest samples before and behind the place where time begins anew."""
-COMPARED = 1000
-"""Most names among which a message looks for one that is nearly right."""
+LISTED = 30  # most names that a message lists
+FEWEST = 10  # fewest samples before and behind the place where time begins anew
+COMPARED = 1000  # most names among which a message looks for one that is nearly right
 EMPTY = "the file is empty. It needs a header line and rows of numbers."
-LARGEST = 2**31
-"""Largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day."""
+LARGEST = 2**31  # largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day
 
 
 def name_and_unit(column: str) -> tuple[str, str]:
