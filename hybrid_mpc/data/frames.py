@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.cells import BLANK, Cells, cause, cells_of, is_number, is_stamp
-from hybrid_mpc.data.names import said_by, words_of
-from hybrid_mpc.data.series import Series, clocked
-from hybrid_mpc.data.source import Columns, Source, name_and_unit
+from hybrid_mpc.data.names import name_and_unit, said_by, words_of
+from hybrid_mpc.data.source import Columns, Series, Source, clocked
 from hybrid_mpc.records import shown
 
 if TYPE_CHECKING:

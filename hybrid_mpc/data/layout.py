@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from hybrid_mpc.data.cells import BLANK, is_number, is_stamp, is_unit, is_value
-from hybrid_mpc.data.names import said_by
-from hybrid_mpc.data.source import name_and_unit
+from hybrid_mpc.data.names import name_and_unit, said_by
 from hybrid_mpc.machine.units import Conversion, conversion
 from hybrid_mpc.records import shown
 

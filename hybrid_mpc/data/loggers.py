@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.names import said_by
-from hybrid_mpc.data.series import Series, clocked
-from hybrid_mpc.data.source import LARGEST, LISTED, Source, line_of
+from hybrid_mpc.data.source import LARGEST, LISTED, Series, Source, clocked, line_of
 from hybrid_mpc.data.vectors import vector_source
 from hybrid_mpc.errors import InputError, MissingPackage, named_extra
 from hybrid_mpc.records import shown

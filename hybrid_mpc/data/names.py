@@ -11,7 +11,6 @@ import unicodedata
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-from hybrid_mpc.data.source import name_and_unit
 from hybrid_mpc.machine.units import time_factor
 
 Kind = Literal["time", "step", "count", ""]
@@ -71,6 +70,25 @@ ALONE = ("s", "ms", "us", "ns", "min", "mins", "h", "d", "day", "days")
 
 
 FIELD = re.compile(r"(?:[^\W\d]\w*\.)+([^\W\d]\w*)")  # a field of a struct, ``run.phi``, and its own name
+
+
+def name_and_unit(column: str) -> tuple[str, str]:
+    """A column's name and the unit that stands behind it in brackets; ``""`` if there is none.
+
+    A whole number in brackets is an index, as in ``state[0]`` and ``y(1)``; ``[1]`` behind a blank is the unit 1.
+
+    Example:
+        >>> name_and_unit("level [mm]"), name_and_unit("time (s)"), name_and_unit("phi")
+        (('level', 'mm'), ('time', 's'), ('phi', ''))
+        >>> name_and_unit("state[0]"), name_and_unit("slip [1]")
+        (('state[0]', ''), ('slip', '1'))
+    """
+    for opening, closing in ("[]", "()"):
+        name, bracket, unit = column.removesuffix(closing).rpartition(opening)
+        if column.endswith(closing) and bracket and name.strip():
+            index = re.fullmatch(r"[\d\s,;:]*", unit) and not (unit.strip() == "1" and name[-1].isspace())
+            return (column, "") if index else (name.strip(), unit.strip())
+    return column, ""
 
 
 class Said(NamedTuple):
@@ -263,6 +281,19 @@ def _parted(name: str) -> tuple[list[str], Ending]:
         if len(words) > 1 and words[-1] in LETTERS:
             return _written(" ".join(words[:-1]), camel=True), Ending(LETTERS[words[-1]], True)
     return words, Ending()
+
+
+def is_named(column: str, name: str) -> bool:
+    """Whether a column has this name but for the unit behind it.
+
+    Example:
+        >>> is_named("level_m", "level"), is_named("clock_ms", "clock"), is_named("temp_min", "temp")
+        (True, True, False)
+    """
+    words, ending = _parted(column)
+    if (said := said_by(column)).kind == "time" and said.unit == _plain(words[-1]):
+        words, ending = words[:-1], Ending(said.unit)
+    return bool(ending.unit) and words == _written(name, camel=True)
 
 
 def role_said_by(column: str, unit: str = "", switches: bool = False) -> Role:

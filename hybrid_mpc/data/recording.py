@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.findings import ABSURD, LARGER, MIN_SCORED, Channel, Finding, gaps, missing_code
-from hybrid_mpc.data.source import Columns, MissingColumn, Source, name_and_unit, restarts
+from hybrid_mpc.data.names import name_and_unit, said_by, unit_behind
+from hybrid_mpc.data.source import Columns, MissingColumn, Source, restarts
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
@@ -570,12 +571,16 @@ def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[
         size = float(given)
         wrong = "" if math.isfinite(size) and size else "the factor must be finite and not zero"
         return Conversion(size), wrong and f"data specification: units={{{name!r}: {given}}}: {wrong}."
-    unit = name_and_unit(column)[1] if given is None else given
-    if given is None and unit in ("", "1"):
-        return Conversion(1.0), ""
-    found = conversion(unit, signal.unit)
-    if isinstance(found, Conversion):
-        return found, ""
+    unit, index = name_and_unit(column)[1] if given is None else given, False
+    if (
+        given is None and not unit
+    ):  # behind the name; a single letter of a name that is given whole may be an index
+        ending = unit_behind(column)
+        unit = (said_by(column).unit if signal is TIME else "") or ending.unit
+        index = ending.perhaps and name == column
+    found = conversion(unit, signal.unit) if given is not None or unit not in ("", "1") else Conversion(1.0)
+    if isinstance(found, Conversion) or index:
+        return found if isinstance(found, Conversion) else Conversion(1.0), ""
     remedy = "Name the column of that signal, correct the unit of one of them, or give the factor"
     return Conversion(1.0), (
         f"column {column!r} is in {unit!r}, {found} for {signal.label}. {remedy}: units={{{name!r}: FACTOR}} in the "

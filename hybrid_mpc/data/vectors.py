@@ -15,8 +15,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.names import said_by
-from hybrid_mpc.data.series import TIME, Series, clocked
-from hybrid_mpc.data.source import LARGEST, LISTED, Columns, Source, line_of, megabytes
+from hybrid_mpc.data.source import LARGEST, LISTED, TIME, Columns, Series, Source, clocked, line_of, megabytes
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_npz
 from hybrid_mpc.records import shown
