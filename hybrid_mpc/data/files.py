@@ -73,7 +73,7 @@ def opened(path: Path) -> Source:
     ==================  ==================================================================================
     """
     reader = ENDS.get(path.suffix.lower())
-    content = _content(path, None if reader else _Rows(path))
+    content = _content(path, reader is None)
     if reader is None:
         reader = next((found for begin, found in BEGINS if begin.match(content)), ("text", "text_source"))
     if other := next((what for begin, what in OTHERS if begin.match(content)), ""):
@@ -83,40 +83,24 @@ def opened(path: Path) -> Source:
     return source
 
 
-class _Rows:
-    """Checks piece by piece that rows of text have a bearable length, before any is kept."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._length, self._first, self._text = path, 0, True, True
-
-    def check(self, piece: bytes) -> None:
-        """See the next piece; what is no text has no rows."""
-        if self._first and any(begin.match(piece) for begin, _ in BEGINS):
-            self._text = False
-        self._first = False
-        if not self._text:
-            return
-        parts = piece.replace(b"\r", b"\n").split(b"\n")
-        longest = max(self._length + len(parts[0]), *map(len, parts))
-        self._length = len(parts[-1]) if len(parts) > 1 else longest
-        if longest > LONGEST_ROW:
-            raise InputError(
-                f"{self._path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with the "
-                "columns that are needed."
-            )
-
-
-def _content(path: Path, rows: _Rows | None) -> bytes:
-    """The bytes of a regular file; ``rows`` sees them piece by piece before any is kept.
+def _content(path: Path, is_text: bool) -> bytes:
+    """The bytes of a regular file; rows of text have a bearable length, which is seen before any is kept.
 
     Pipes and devices are refused: nothing says how long they are, and they may never end.
     """
     try:
         with nn_export.files.opened(path, LARGEST) as (file, size):
-            left = size
+            left, longest = size if is_text else 0, 0
             while left > 0 and (piece := file.read(min(CHUNK, left))):
-                if rows is not None:
-                    rows.check(piece)
+                if left == size and any(begin.match(piece) for begin, _ in BEGINS):
+                    break  # what is no text has no rows
+                first, *others = map(len, piece.replace(b"\r", b"\n").split(b"\n"))
+                if max(longest + first, *others, 0) > LONGEST_ROW:
+                    raise InputError(
+                        f"{path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with the "
+                        "columns that are needed."
+                    )
+                longest = others[-1] if others else longest + first
                 left -= len(piece)
             file.seek(0)
             content = file.read(size)
@@ -125,9 +109,10 @@ def _content(path: Path, rows: _Rows | None) -> bytes:
             f"{path}: there is no such file{_beside(path)}. Check the path given with --data."
         ) from None
     except OSError as error:
+        large = error.errno == errno.EFBIG
         remedy = (
             "Split the recording, or leave out columns that are not needed."
-            if error.errno == errno.EFBIG
+            if large
             else "Give a readable file."
         )
         raise InputError(f"{path}: cannot be read ({error.strerror}). {remedy}") from error
@@ -190,10 +175,7 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
             f"write_csv: decimals from 0 to {MOST_DECIMALS} are needed, got {type(decimals).__name__}"
         )
     path = Path(path)
-    arrays = {
-        name: real_numbers(column, f"write_csv: column {shown(str(name))}")
-        for name, column in columns.items()
-    }
+    arrays = {n: real_numbers(column, f"write_csv: column {shown(str(n))}") for n, column in columns.items()}
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
         raise InputError(f"{path}: columns must be one-dimensional and of one length, got {shapes}")

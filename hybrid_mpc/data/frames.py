@@ -59,33 +59,23 @@ class _Reader:
     places: dict[str, tuple[int, ...]] = field(default_factory=dict)
     done: dict[str, Cells] = field(default_factory=dict)
 
-    def cells(self, names: Sequence[str]) -> list[Cells]:
-        """The columns of these names."""
+    def read(self, time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
+        """As :class:`Source` says."""
+        names, faults = [*([] if time is None else [time]), *wanted], {}
         missing = [name for name in dict.fromkeys(names) if name not in self.done]
         places = list(dict.fromkeys(place for name in missing for place in self.places[name]))
         read = dict(zip(places, self.frame.columns(places), strict=True)) if places else {}
         for name in missing:
-            columns = [read[place] for place in self.places[name]]
-            cells = cells_of(_joined(columns), self.frame.decimal)
+            cells = cells_of(_joined([read[place] for place in self.places[name]]), self.frame.decimal)
             if self.frame.clock is not None and self.places[name] == (0,):
                 start, step = self.frame.clock
                 cells = cells._replace(values=start + step * cells.values)
             self.done[name] = cells
-        return [self.done[name] for name in names]
-
-    def read(self, time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
-        """As :class:`Source` says."""
-        names = [*([] if time is None else [time]), *wanted]
-        cells = self.cells(names)
-        faults = {}
-        for name, one in zip(names, cells, strict=True):
-            if fault := self._fault(name, one, name in blanks):
+        for name in names:
+            if fault := self._fault(name, self.done[name], name in blanks):
                 faults[name] = fault
-        values = (
-            np.column_stack([one.values for one in cells])
-            if cells
-            else np.zeros((len(self.frame.numbers), 0))
-        )
+        rows = np.zeros((len(self.frame.numbers), 0))
+        values = np.column_stack([rows, *(self.done[name].values for name in names)])
         return Columns(np.where(np.isfinite(values), values, np.nan), "row", self.frame.numbers, faults)
 
     def _fault(self, name: str, one: Cells, may_be_blank: bool) -> str:

@@ -49,8 +49,33 @@ ROUNDING = 1e-9  # share of the end of a sensor's range within which a sample is
 TIME = Signal("time", "s")
 
 
+class Samples:
+    """Frozen samples ``(n,)`` that get their ``w`` ``(n, 0)`` and their ``censored`` of zeros where they have none.
+
+    Raises:
+        ValueError: If they have some, of another length or shape.
+    """
+
+    t: Array
+    y: Array
+    w: Array
+    censored: Flags
+
+    def __post_init__(self) -> None:
+        n = len(self.t)
+        if self.w.shape[-1] == 0:
+            object.__setattr__(self, "w", np.zeros((n, 0)))
+        if self.censored.shape != self.y.shape and not self.censored.any():
+            object.__setattr__(self, "censored", np.zeros(self.y.shape, dtype=np.int8))
+        if len(self.w) != n or self.censored.shape != self.y.shape:
+            raise ValueError(
+                f"{n} samples with w {self.w.shape}, y {self.y.shape} and censored {self.censored.shape}: w needs "
+                "a row, censored a number for each"
+            )
+
+
 @dataclass(frozen=True)
-class Recording:
+class Recording(Samples):
     """One recording as it was written, checked: ``m`` samples; its ``name`` is the file's stem.
 
     ``t`` ``(m,)`` [s] increases strictly; inputs ``u`` ``(m, n_u)`` are held from each time stamp to the next;
@@ -70,9 +95,6 @@ class Recording:
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
     censored: Flags = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int8))
     cuts: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        complete(self)
 
     @property
     def dt(self) -> float:
@@ -98,35 +120,6 @@ class Signals(Protocol):
     @property
     def disturbances(self) -> Sequence[Signal]:
         """Signals of what is measured and not commanded."""
-
-
-class _Samples(Protocol):
-    @property
-    def t(self) -> Array: ...
-    @property
-    def y(self) -> Array: ...
-    @property
-    def w(self) -> Array: ...
-    @property
-    def censored(self) -> Flags: ...
-
-
-def complete(samples: _Samples) -> None:
-    """Give a frozen record of ``n`` samples its ``w`` ``(n, 0)`` and its ``censored`` of zeros where it has none.
-
-    Raises:
-        ValueError: If it has some, and they have another length or shape.
-    """
-    n = len(samples.t)
-    if samples.w.shape[-1] == 0:
-        object.__setattr__(samples, "w", np.zeros((n, 0)))
-    if samples.censored.shape != samples.y.shape and not samples.censored.any():
-        object.__setattr__(samples, "censored", np.zeros(samples.y.shape, dtype=np.int8))
-    if len(samples.w) != n or samples.censored.shape != samples.y.shape:
-        raise ValueError(
-            f"{n} samples with w {samples.w.shape}, y {samples.y.shape} and censored {samples.censored.shape}: w needs "
-            "a row, censored a number for each"
-        )
 
 
 def read_recording(path: Path | str, prior: Signals, spec: DataSpec) -> Recording:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
 from hybrid_mpc.data.findings import MIN_SCORED, Finding, findings_of, gaps
-from hybrid_mpc.data.recording import Flags, Recording, Signals, complete, misspelt, read_recordings
+from hybrid_mpc.data.recording import Flags, Recording, Samples, Signals, misspelt, read_recordings
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
 
@@ -29,7 +29,7 @@ WORK = 2e10  # most products of smoothing, samples times those in a window: half
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(Samples):
     """One contiguous piece of a recording on the uniform grid ``dt``.
 
     Args:
@@ -58,9 +58,6 @@ class Trajectory:
     xdot: Array
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
     censored: Flags = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int8))
-
-    def __post_init__(self) -> None:
-        complete(self)
 
     @property
     def file(self) -> str:
