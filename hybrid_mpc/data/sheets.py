@@ -83,12 +83,9 @@ def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[s
     import pandas as pd
 
     numbers = [k for k in range(layout.first, len(rows)) if any(_written(cell) for cell in rows[k])]
+    words = [isinstance(next((c for c in rows[k] if c is not None), None), str) for k in numbers]
     closing: list[int] = []
-    while (
-        len(numbers) > 2
-        and isinstance(_first(rows[numbers[-1]]), str)
-        and not isinstance(_first(rows[numbers[0]]), str)
-    ):
+    while len(numbers) > 2 and words[len(numbers) - 1] and not words[0]:
         closing.append(numbers.pop() + 1)
     notes = [*notes, *layout.notes]
     if closing:
@@ -102,18 +99,9 @@ def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[s
     def columns(places: Sequence[int], most: int | None = None) -> list[pd.Series]:
         return [pd.Series([cell(k, j) for k in range(len(numbers[:most]))]) for j in places]
 
-    return Frame(
-        tuple(layout.names[j] for j in seen),
-        columns,
-        columns(range(len(seen)), HEAD),
-        [k + 1 for k in numbers],
-        lambda k, j: _written(cell(k, j)),
-        notes=tuple(notes),
-    )
-
-
-def _first(row: Sequence[Any]) -> Any:
-    return next((cell for cell in row if cell is not None), None)
+    names, heads = tuple(layout.names[j] for j in seen), columns(range(len(seen)), HEAD)
+    count = [k + 1 for k in numbers]
+    return Frame(names, columns, heads, count, lambda k, j: _written(cell(k, j)), notes=tuple(notes))
 
 
 # Columns of Arrow
@@ -124,56 +112,41 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
     with named_extra("reading Parquet and Feather files"):
         import pandas as pd
         import pyarrow
+    kinds, ipc = pyarrow.types, pyarrow.ipc
     try:
         if content.startswith(b"PAR1"):
             from pyarrow.parquet import ParquetFile
 
             file = ParquetFile(io.BytesIO(content))
             schema, rows = file.schema_arrow, file.metadata.num_rows
-
-            def read(name: str) -> Any:
-                return file.read([name]).column(0)
         else:
-            whole = pyarrow.ipc.open_file(io.BytesIO(content))
-            schema = whole.schema
-            none = pyarrow.ipc.IpcReadOptions(included_fields=[])
-            rows = pyarrow.ipc.open_file(io.BytesIO(content), options=none).read_all().num_rows
-
-            def read(name: str) -> Any:
-                one = pyarrow.ipc.IpcReadOptions(included_fields=[schema.get_field_index(name)])
-                return pyarrow.ipc.open_file(io.BytesIO(content), options=one).read_all().column(0)
+            none = ipc.open_file(io.BytesIO(content), options=ipc.IpcReadOptions(included_fields=[]))
+            file, schema, rows = None, ipc.open_file(io.BytesIO(content)).schema, none.read_all().num_rows
+        names = tuple(
+            field.name
+            for field in schema
+            if not (kinds.is_nested(field.type) or kinds.is_binary(field.type))
+            and schema.names.count(field.name) == 1
+        )
+        if 8 * rows * max(1, len(names)) > LARGEST:
+            raise InputError(f"{path}: has {rows} rows, more than are read. Split the recording.")
+        if file is None:
+            own = ipc.IpcReadOptions(included_fields=[schema.get_field_index(name) for name in names])
+            table = ipc.open_file(io.BytesIO(content), options=own).read_all()
+        else:
+            table = file.read(list(names))
+        whole = [pd.Series(table.column(name).to_pandas()) for name in names]
+    except InputError:
+        raise
     except Exception as error:  # a damaged file raises nearly anything
         raise InputError(
             f"{path}: is no Parquet or Feather file, or damaged ({line_of(error)}). Write it again, e.g. with pandas."
         ) from error
-    if 8 * rows > LARGEST:
-        raise InputError(f"{path}: has {rows} rows, more than are read. Split the recording.")
-    kinds = pyarrow.types
-    names = tuple(
-        field.name
-        for field in schema
-        if not kinds.is_nested(field.type)
-        and schema.names.count(field.name) == 1
-        and not kinds.is_binary(field.type)
+    frame = Frame(
+        names,
+        lambda places: [whole[j] for j in places],
+        [column.iloc[:HEAD] for column in whole],
+        range(1, rows + 1),
+        lambda k, j: _written(whole[j].iloc[k]),
     )
-
-    def columns(places: Sequence[int]) -> list[pd.Series]:
-        try:
-            return [pd.Series(read(names[j]).to_pandas()) for j in places]
-        except Exception as error:
-            raise InputError(
-                f"{path}: cannot be read ({line_of(error)}). Write it again, e.g. with pandas."
-            ) from error
-
-    whole_columns = columns(range(len(names)))
-    return frame_source(
-        path,
-        sha256,
-        Frame(
-            names,
-            lambda places: [whole_columns[j] for j in places],
-            [column.iloc[:HEAD] for column in whole_columns],
-            range(1, rows + 1),
-            lambda k, j: _written(whole_columns[j].iloc[k]),
-        ),
-    )
+    return frame_source(path, sha256, frame)
