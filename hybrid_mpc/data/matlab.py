@@ -16,7 +16,6 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,10 +74,9 @@ def leaves_of(content: bytes, budget: int) -> list[Leaf]:
     """
     file = _File(content, budget)
     found = list(file.level_4() if version(content) == "4" else file.level_5())
-    variables = Counter(name for name, _ in found)
-    if twice := next((name for name, count in variables.items() if count > 1), None):
+    if twice := next((name for name, count in Counter(file.names).items() if count > 1), None):
         raise ValueError(f"two variables have the name {twice!r}")
-    return [leaf for name, leaves in found if name for leaf in leaves]  # one without a name is MATLAB's own
+    return found
 
 
 class _Element(NamedTuple):
@@ -94,11 +92,11 @@ class _Element(NamedTuple):
 
 
 class _File:
-    """A file, and what it may still hold: ``size`` bytes of numbers, ``count`` elements."""
+    """A file, what it may still hold, ``size`` bytes of numbers and ``count`` elements, and its variables' names."""
 
     def __init__(self, content: bytes, budget: int) -> None:
         self.content, self.budget = content, budget
-        self.size, self.count, self.order = budget, ELEMENTS, "<"
+        self.size, self.count, self.order, self.names = budget, ELEMENTS, "<", list[str]()
 
     def take(self, size: int = 0, count: int = 0) -> None:
         """Use some of it up."""
@@ -108,8 +106,8 @@ class _File:
         if self.size < 0:
             raise ValueError(f"it declares more than {self.budget / 1e6:.4g} MB of numbers")
 
-    def level_4(self) -> Iterator[tuple[str, list[Leaf]]]:
-        """Variables by name."""
+    def level_4(self) -> Iterator[Leaf]:
+        """All variables."""
         content, begin = self.content, 0
         order = "<" if len(content) < 4 or 0 <= struct.unpack_from("<i", content)[0] <= 5000 else ">"
         while begin < len(content):
@@ -122,29 +120,29 @@ class _File:
             if min(rows, columns) < 0 or length < 1:
                 raise ValueError("a variable without its dimensions or its name")
             self.take(8 * rows * columns, 4)
+            pair = 1 + (imaginary == 1 and matrix != 2)
             dtype, start = np.dtype(order + LEVEL_4[number]), begin + 20 + length
-            ends = [start + k * rows * columns * dtype.itemsize for k in range(3)]
             name = content[begin + 20 : start].split(b"\0")[0].decode("latin-1")
-            begin = ends[2 if imaginary == 1 and matrix != 2 else 1]
+            begin = start + rows * columns * dtype.itemsize * pair
             if begin > len(content):
                 raise ValueError("a variable is longer than what is there")
-            read = partial(_numbers, content, dtype, (rows, columns), [*pairwise(ends)])
-            leaf = Leaf(name, (rows, columns), partial(read, begin == ends[2] and bool(rows * columns)))
+            self.names.append(name)
             if matrix:
-                leaf = Leaf(name, (), _text) if matrix == 1 else Leaf(name, what="sparse matrices")
-            yield name, [leaf]
+                yield Leaf(name, (), _text) if matrix == 1 else Leaf(name, what="sparse matrices")
+            else:
+                yield _leaf(name, content, dtype, (rows, columns), start, pair)
 
-    def level_5(self) -> Iterator[tuple[str, list[Leaf]]]:
-        """Variables by name; a compressed one is decompressed as far as the budget allows."""
+    def level_5(self) -> Iterator[Leaf]:
+        """All variables; a compressed one is decompressed as far as the budget allows."""
         content = self.content
         self.order = "<" if content[126:128] == b"IM" else ">"
         for element in self.elements(content, 128, len(content)):
             if element.kind != COMPRESSED:
-                yield self.variable(content, element)
+                yield from self.leaves(content, element)
                 continue
-            before = self.size
-            inner = self.unpacked(memoryview(content)[element.begin : element.end])
-            yield from [self.variable(inner, matrix) for matrix in self.elements(inner, 0, len(inner))]
+            before, inner = self.size, self.unpacked(memoryview(content)[element.begin : element.end])
+            for matrix in self.elements(inner, 0, len(inner)):
+                yield from self.leaves(inner, matrix)
             self.take(max(0, len(inner) - (before - self.size)))
 
     def unpacked(self, data: memoryview) -> bytes:
@@ -177,43 +175,36 @@ class _File:
             yield _Element(kind, start, start + size)
             begin = after
 
-    def variable(self, data: bytes, matrix: _Element) -> tuple[str, list[Leaf]]:
-        """Name and content of a variable."""
-        if matrix.kind != MATRIX:
-            raise ValueError(f"an element of type {matrix.kind} where a variable is due")
-        parts = list(self.elements(data, matrix.begin, matrix.end))
-        at = 1 if self.kind(data, parts) & 0xFF == OPAQUE else 2
-        if len(parts) <= at or parts[at].kind not in (1, *TEXT):
-            raise ValueError("a variable without its name")
-        name = data[parts[at].begin : parts[at].end].decode("latin-1")
-        return name, list(self.leaves(data, matrix, name, 0, parts))
-
-    def kind(self, data: bytes, parts: list[_Element]) -> int:
-        """Class and flags of an array."""
-        if not parts or parts[0].kind != 6 or parts[0].size != 8:
-            raise ValueError("a variable without its flags")
-        return int(struct.unpack_from(f"{self.order}I", data, parts[0].begin)[0])
-
     def leaves(
-        self, data: bytes, matrix: _Element, name: str, depth: int, parts: list[_Element] | None = None
+        self, data: bytes, matrix: _Element, named: str | None = None, depth: int = 0
     ) -> Iterator[Leaf]:
-        """What an array holds, at any depth."""
+        """What an array holds, at any depth; a variable has its own name."""
         if matrix.kind != MATRIX:
             raise ValueError(f"an element of type {matrix.kind} where a variable is due")
         if depth > DEEPEST:
             raise ValueError("structs lie too deep in each other")
-        if matrix.begin == matrix.end:
-            yield Leaf(name, (0, 0))
+        parts = list(self.elements(data, matrix.begin, matrix.end))
+        if not parts and named is not None:
+            yield Leaf(named, (0, 0))
             return
-        parts = parts or list(self.elements(data, matrix.begin, matrix.end))
-        flags = self.kind(data, parts)
+        if not parts or parts[0].kind != 6 or parts[0].size != 8:
+            raise ValueError("a variable without its flags")
+        flags = struct.unpack_from(f"{self.order}I", data, parts[0].begin)[0]
         kind, pair = flags & 0xFF, 1 + bool(flags >> 8 & COMPLEX)
+        own = parts[1 if kind == OPAQUE else 2 :][:1]
+        if not own or own[0].kind not in (1, *TEXT):
+            raise ValueError("a variable without its name")
+        name = data[own[0].begin : own[0].end].decode("latin-1") if named is None else named
+        if named is None:
+            self.names.append(name)
+        if not name:  # MATLAB's own
+            return
         if kind in (OPAQUE, FUNCTION):
             made_of = data[parts[3].begin : parts[3].end] if len(parts) > 3 else b""
             told = made_of.decode("ascii", errors="replace") if kind == OPAQUE else "function_handle"
             yield Leaf(name, what=f"{OBJECTS} of class {told or 'unknown'}", kind=told)
             return
-        if len(parts) < 3 or parts[1].kind not in (5, 6) or parts[1].size < 8 or parts[1].size % 4:
+        if parts[1].kind not in (5, 6) or parts[1].size < 8 or parts[1].size % 4:
             raise ValueError("a variable without its dimensions")
         shape = struct.unpack_from(f"{self.order}{parts[1].size // 4}i", data, parts[1].begin)
         if min(shape) < 0:
@@ -221,24 +212,22 @@ class _File:
         count, rest = math.prod(shape), parts[3:]
         if kind != SPARSE:  # whose dimensions are not what is stored
             self.take(8 * count * pair)
-        numeric = [part for part in rest if part.kind in NUMBERS]
-        fits = len(rest) == len(numeric)
-        if kind in NUMERIC and fits and len(rest) == pair and len({part.kind for part in rest}) == 1:
-            dtype = np.dtype(self.order + NUMBERS[rest[0].kind])
-            if all(part.size == count * dtype.itemsize for part in rest):
-                places = [(part.begin, part.end) for part in rest]
-                yield Leaf(name, shape, partial(_numbers, data, dtype, shape, places, pair == 2))
-                return
-        elif kind == CHAR and len(rest) == 1 and rest[0].kind in (*NUMBERS, *TEXT):
-            yield Leaf(name, (), _text)
-            return
-        elif kind == SPARSE and fits and len(rest) == 2 + pair:
-            yield Leaf(name, what="sparse matrices")
-            return
+        fits = all(part.kind in NUMBERS for part in rest)
+        if kind in NUMERIC and fits and len(rest) == pair:
+            dtypes = [np.dtype(self.order + NUMBERS[part.kind]) for part in rest]
+            fits = all(one.size == count * dtype.itemsize for one, dtype in zip(rest, dtypes, strict=True))
+            leaf = _leaf(name, data, dtypes[0], shape, rest[0].begin, pair) if fits else None
+        elif kind == CHAR:
+            leaf = Leaf(name, (), _text) if [p.kind in (*NUMBERS, *TEXT) for p in rest] == [True] else None
         elif kind in (CELL, STRUCT, OBJECT):
             yield from self.inner(data, rest[kind == OBJECT :], name, depth, count, kind == CELL)
             return
-        raise ValueError("a variable without its contents")
+        else:
+            sparse = kind == SPARSE and fits and len(rest) == 2 + pair
+            leaf = Leaf(name, what="sparse matrices") if sparse else None
+        if leaf is None:
+            raise ValueError("a variable without its contents")
+        yield leaf
 
     def inner(
         self, data: bytes, rest: list[_Element], name: str, depth: int, count: int, cell: bool
@@ -269,9 +258,12 @@ def _text() -> NDArray[Any]:
     return np.array("text")
 
 
-def _numbers(
-    data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], places: list[tuple[int, int]], pair: bool
-) -> NDArray[Any]:
-    """Numbers in columns; complex ones of a ``pair`` of real and imaginary parts."""
-    parts = [np.frombuffer(data, dtype, math.prod(shape), begin) for begin, _ in places[: 1 + pair]]
-    return (parts[0] + 1j * parts[1] if pair else parts[0]).reshape(shape, order="F")
+def _leaf(
+    name: str, data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], begin: int, pair: int
+) -> Leaf:
+    """Numbers in columns; of a ``pair`` of real and imaginary parts nothing is read but that it is one."""
+    if pair == 2:
+        return Leaf(name, shape, partial(np.zeros, shape, complex))
+    return Leaf(
+        name, shape, lambda: np.frombuffer(data, dtype, math.prod(shape), begin).reshape(shape, order="F")
+    )

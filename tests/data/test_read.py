@@ -227,6 +227,40 @@ def test_versions_of_mat(tmp_path):
     assert version(bytes(20)) == "4"
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_numbers_of_every_kind_of_mat(tmp_path, packed):
+    path = tmp_path / "run.mat"
+    kinds = [np.dtype(kind) for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")]
+    given = {f"v{k}": (100 * np.sin(np.arange(70) + k)).astype(kind) for k, kind in enumerate(kinds)}
+    given["v1"][:] = np.arange(70)
+    savemat(
+        path,
+        {**given, "grid": np.arange(140.0).reshape(70, 2), "z": 1j + np.arange(70)},
+        do_compression=packed,
+    )
+    source = opened(path)
+    for name, values in given.items():
+        np.testing.assert_array_equal(source.read(None, [name], ()).values[:, 0], values.astype(float))
+    np.testing.assert_array_equal(source.read(None, ["grid(:,2)"], ()).values[:, 0], 2 * np.arange(70) + 1)
+    with pytest.raises(InputError, match="'z' holds complex numbers"):
+        source.read(None, ["z"], ())
+
+
+def test_mat_in_the_other_order_of_bytes(tmp_path):
+    def element(kind, data):
+        return struct.pack(">II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    def vector(name, values):
+        head = element(6, struct.pack(">II", 6, 0)) + element(5, struct.pack(">ii", len(values), 1))
+        return element(14, head + element(1, name.encode()) + element(9, values.astype(">f8").tobytes()))
+
+    path = tmp_path / "run.mat"
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI"
+    path.write_bytes(header + b"".join(vector(name, values) for name, values in GOOD.items()))
+    found = read_recording(path, SIGNALS, SPEC)
+    np.testing.assert_array_equal(np.c_[found.t, found.u, found.y], np.column_stack(list(GOOD.values())))
+
+
 def test_bytes_that_crash_loadmat_are_refused_before_it(tmp_path):
     """Each of these ends the process in scipy 1.17: flags, type of the numbers, dimensions of a text."""
     text = io.BytesIO()
