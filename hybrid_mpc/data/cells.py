@@ -288,7 +288,7 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
         fault = "the names of their time zones differ. Write the offset, e.g. +02:00"
     else:
         zone, ways = offsets, _days(parts)
-        fault = "there is no such day. Correct that row" if not ways else ""
+        fault = "one of these days does not exist. Correct that row" if not ways else ""
     ways = [days * 86400 * 10**9 + within - zone for days in ways]
     if any((np.diff(way) != np.diff(ways[0])).any() for way in ways[1:]):
         ways = [way for way in ways if _goes_on(way)]

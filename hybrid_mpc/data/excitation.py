@@ -301,7 +301,7 @@ def check_excitation(
         if is_constant(np.concatenate([piece.u[:, j] for piece in trajectories])):
             level = trajectories[0].u[0, j]
             problems.append(
-                f"{names}: the input {one.name} is {level:.10g} throughout; what it does cannot be learned. Add a "
+                f"{names}: the input {one.name} is {level:.10g} throughout; its effect cannot be identified. Add a "
                 "recording in which it moves, or check that the DataSpec names the right column."
             )
     for j in range(trajectories[0].y.shape[1]):

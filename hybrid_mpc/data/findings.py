@@ -127,9 +127,9 @@ class Channel:
         if (far := outliers(y)) is not None:
             rest = np.delete(y, far)
             message = (
-                f" is {y[far[0]]:.6g} {self.signal.unit} at {t[far[0]]:.6g} s, far from all but {len(far)} of {len(t)} "
-                f"samples, which are within {np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}. A code for a missing "
-                "value, or a lost digit? Leave these cells blank, or delete the rows."
+                f" is {y[far[0]]:.6g} {self.signal.unit} at {t[far[0]]:.6g} s: {len(far)} of {len(t)} samples are far "
+                f"from all others, {np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}. A code for a missing value, or a "
+                "lost digit? Leave these cells blank, or delete the rows."
             )
             found.append(self.finding("outlier", far[0], len(far), message))
         if there.any() and not there.all():
@@ -137,8 +137,8 @@ class Channel:
             longest = float(np.diff(np.r_[t[0], t[there], t[-1]]).max())
             message = (
                 f" has no number in {count} of {len(t)} rows ({100 * count / len(t):.3g} %), first at "
-                f"{t[first]:.6g} s, and none for {longest:.4g} s at most. These samples count as missing; if they "
-                "should not, check the cells."
+                f"{t[first]:.6g} s; the longest time without one is {longest:.4g} s. These samples count as missing. "
+                "If that is wrong, check the cells."
             )
             found.append(self.finding("missing", first, count, message))
         return found
@@ -163,13 +163,13 @@ class Channel:
                     )
                 if signal.periodic and len(angle.unclear):
                     told += (
-                        f" Before {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} s) so many are "
-                        "missing that nobody knows how many turns it made: the recording is cut there."
+                        f" Before {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} s) too many "
+                        "are missing to count its turns: the recording is cut there."
                     )
                 found.append(_jumping(self, angle.jumps, "a full turn", 4, told, not signal.periodic))
             elif parted := folded(t, self.y, turn, max_gap):
                 part = f"1/{parted[0]} of a turn"
-                told = f"an angle that begins anew after each {part}, or a wrong unit. {again}{turn / parted[0]:.6g})."
+                told = f"an angle that restarts after each {part}, or a wrong unit. {again}{turn / parted[0]:.6g})."
                 found.append(_jumping(self, parted[1], f"{part} against its motion", 4, told, True))
         # whole numbers of b bits span less than 2^b
         if (raw == np.round(raw)).all() and (

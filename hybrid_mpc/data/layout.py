@@ -235,9 +235,6 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | str:
     for name, cell in zip(names, [*units, *[""] * (len(names) - len(units))], strict=True):
         unit, said = cell.strip("[]()").strip(), name_and_unit(name)[1]
         if said and unit and conversion(said, unit) != Conversion(1.0):
-            return (
-                f"column {shown(name)} is {shown(unit)}, and the header has {shown(said)}. Delete one of the two; "
-                "which is right, nobody here knows."
-            )
+            return f"column {shown(name)} is {shown(unit)}, and the header has {shown(said)}. Delete the wrong one."
         found.append(f"{name} [{unit}]" if unit not in ("", "-") and not said and name else name)
     return found

@@ -275,8 +275,8 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     if len(own) != 1:
         there = f"; that folder has {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
         raise InputError(
-            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Without it nobody "
-            "knows what its bytes mean."
+            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Its bytes "
+            "have no meaning without it."
         )
     base = cantools.database.load_string(own[0].read_text(encoding="cp1252"), "dbc", strict=False)
     known = {message.frame_id: message for message in base.messages}

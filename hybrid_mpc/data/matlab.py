@@ -116,7 +116,7 @@ class _File:
             kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", content, begin)
             number, matrix = kind // 10 % 10, kind % 10
             if not 0 <= kind <= 5000 or kind // 100 % 10 or number >= len(LEVEL_4) or matrix > 2:
-                raise ValueError("a variable of a type that there is not")
+                raise ValueError("a variable of an unknown type")
             if min(rows, columns) < 0 or length < 1:
                 raise ValueError("a variable without its dimensions or its name")
             self.take(8 * rows * columns, 4)
@@ -125,7 +125,7 @@ class _File:
             name = content[begin + 20 : start].split(b"\0")[0].decode("latin-1")
             begin = start + rows * columns * dtype.itemsize * pair
             if begin > len(content):
-                raise ValueError("a variable is longer than what is there")
+                raise ValueError("a variable is longer than the file")
             self.names.append(name)
             if matrix:
                 yield Leaf(name, (), _text) if matrix == 1 else Leaf(name, what="sparse matrices")
@@ -171,7 +171,7 @@ class _File:
             elif kind != COMPRESSED:
                 after += -size % 8
             if start + size > end or start + size > after:
-                raise ValueError("an element is longer than what is there")
+                raise ValueError("an element is longer than the file")
             yield _Element(kind, start, start + size)
             begin = after
 
@@ -180,7 +180,7 @@ class _File:
     ) -> Iterator[Leaf]:
         """What an array holds, at any depth; a variable has its own name."""
         if matrix.kind != MATRIX:
-            raise ValueError(f"an element of type {matrix.kind} where a variable is due")
+            raise ValueError(f"an element of type {matrix.kind} where a variable is expected")
         if depth > DEEPEST:
             raise ValueError("structs lie too deep in each other")
         parts = list(self.elements(data, matrix.begin, matrix.end))

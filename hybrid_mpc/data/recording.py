@@ -169,8 +169,8 @@ def read_recordings(
     for i, one in enumerate(recordings):
         if same := next((other for other in recordings[:i] if _alike(one, other)), None):
             problems.append(
-                f"{one.path} holds the same samples as {same.path.name}. Leave one out: what is recorded once is "
-                "evidence once."
+                f"{one.path} holds the same samples as {same.path.name}. Leave one out: one recording must not "
+                "count twice."
             )
     stems = [Path(path).stem for path in paths]
     if len(set(stems)) < len(stems):
@@ -272,8 +272,8 @@ def misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
             near = difflib.get_close_matches(name, free, n=1, cutoff=ALIKE)
             if near and re.sub(r"\d+", "", name) != re.sub(r"\d+", "", near[0]):
                 message = (
-                    f"{setting} of the DataSpec has {name!r}, which is not given, and nothing for {near[0]!r}: "
-                    "misspelt? Settings of recordings go by the stem of the file."
+                    f"{setting} of the DataSpec names {name!r}, which is not given. Did you mean {near[0]!r}? "
+                    "Settings of recordings go by the stem of the file."
                 )
                 found.append(Finding("settings", free[near[0]], "", 0.0, 1, message))
     return found
@@ -449,7 +449,7 @@ def _one_clock(
         twice = np.r_[False, (values[1:] == values[:-1]).all(axis=1)][: len(values)]
         if twice.any():
             count = int(twice.sum())
-            what = f"{count} rows are those before them once more, this one the first. They are left out."
+            what = f"{count} rows repeat the row before them, from this one on. They are left out."
             tell(int(np.argmax(twice)), count, what)
             numbers = [columns.numbers[j] for j in np.flatnonzero(~twice).tolist()]
             columns, values = replace(columns, values=columns.values[~twice], numbers=numbers), values[~twice]

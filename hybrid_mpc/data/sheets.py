@@ -89,7 +89,7 @@ def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[s
         closing.append(numbers.pop() + 1)
     notes = [*notes, *layout.notes]
     if closing:
-        notes.append(f"rows from {closing[-1]} on are no rows of the table: left out")
+        notes.append(f"rows from {closing[-1]} on do not belong to the table: left out")
     seen = [j for j, name in enumerate(layout.names) if name]
 
     def cell(k: int, j: int) -> Any:

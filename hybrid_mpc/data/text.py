@@ -169,7 +169,7 @@ class _Rows:
             again = [k for k in np.flatnonzero(like).tolist() if self.line(k) == line]
             keep[again] = False
             if again:
-                notes.append(f"the header stands again in row {self.numbers[again[0]]}: left out")
+                notes.append(f"row {self.numbers[again[0]]} repeats the header: left out")
         if remarks.any():
             notes.append(f"rows of remarks are left out, first row {self.numbers[np.argmax(remarks)]}")
         top = self.cells(layout.first) if keep.any() else []
@@ -182,7 +182,7 @@ class _Rows:
                 break
             keep[k], closing = False, k
         if closing:
-            notes.append(f"rows from {self.numbers[closing]} on are no rows of the table: left out")
+            notes.append(f"rows from {self.numbers[closing]} on do not belong to the table: left out")
         self.check(keep, layout)
         return keep
 
