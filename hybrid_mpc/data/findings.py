@@ -76,6 +76,7 @@ STIRRED = 0.5
 """Standard deviation of an input within a stretch, over that in all recordings, from which on the machine is driven."""
 PATIENCE = 10.0  # times the longest ordinary time without a change that a driven machine may rest
 LENGTHS = 5.0  # smoothing lengths that it may rest in any case: in each of them a motion shows
+Kind = Literal["read", "clock", "wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
 LEAVE_OUT = "Leave such stretches out (windows in the DataSpec, or delete the rows: longer gaps are cut out), or record"
 
 
@@ -87,7 +88,7 @@ class Finding:
     concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
     """
 
-    kind: Literal["read", "clock", "wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
+    kind: Kind
     file: str
     channel: str
     start: float
@@ -109,14 +110,7 @@ class Channel:
     t: Array
     y: Array
 
-    def finding(
-        self,
-        kind: Literal["wrapped", "frozen", "clipped", "speed", "missing", "outlier"],
-        first: int,
-        count: int,
-        message: str,
-        refused: bool = False,
-    ) -> Finding:
+    def finding(self, kind: Kind, first: int, count: int, message: str, refused: bool = False) -> Finding:
         """A finding of ``count`` samples from the index ``first`` on."""
         told = f"column {self.name!r}{message}"
         return Finding(kind, self.file, self.name, float(self.t[first]), count, told, refused)
@@ -314,11 +308,6 @@ def _anew(
 def folded(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, Indices] | None:
     """Into how many parts of a turn an angle is folded that begins anew after one, and the samples before which it
     jumps; None where it is not.
-
-    Example:
-        >>> t = 0.01 * np.arange(400)
-        >>> folded(t, (2 * t) % np.pi, 2 * np.pi, 0.05)
-        (2, array([158, 315]))
     """
     found = _anew(t, angle, [turn / parts for parts in PARTS], SPAN, max_gap)
     return found and (PARTS[found[0]], found[1])

@@ -1,7 +1,7 @@
 """What a column's name says of it: that it is the time, that it counts samples, its unit and its role.
 
-Names are compared in small letters, without accents, word by word; ``camelCase``, ``snake_case`` and blanks separate
-words. Names that may say it and may say something else (``T``, ``n``, ``valve_time``) are decided by their numbers.
+Names are compared word by word, in small letters, without accents. What may say something else as well (``T``, ``n``,
+``valve_time``) is decided by the numbers.
 """
 
 from __future__ import annotations

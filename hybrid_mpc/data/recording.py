@@ -125,11 +125,10 @@ class Signals(Protocol):
 def read_recording(path: Path | str, prior: Signals, spec: DataSpec) -> Recording:
     """Read one recording, whatever its format (:func:`hybrid_mpc.data.files.opened`), and check what would mislead.
 
-    Columns that ``spec`` does not name are ignored; ``spec.units``, or the unit in or behind a column's name, is turned
-    into the signal's own. A blank cell or NaN in the column of an output or a disturbance is a missing sample. A
-    wrapped angle is made to count on if its signal is ``periodic``. A single number as the time, in ``.npz`` or
-    ``.mat``, is the sampling time; time then begins at 0, as it does where ``spec.time`` is a number. Rows are counted
-    from 1, as an editor or MATLAB shows them (in CSV the header is row 1), the indices of ``.npz`` from 0.
+    ``spec.units``, or the unit in or behind a column's name, is turned into the signal's own. A blank cell of an output
+    or a disturbance is a missing sample. A wrapped angle counts on if its signal is ``periodic``. A single number as
+    the time is the sampling time; time then begins at 0. Rows are counted as an editor or MATLAB does, from 1, the
+    indices of ``.npz`` from 0.
     """
     recordings, problems = read_recordings([path], prior, spec)
     refuse(problems)
@@ -389,12 +388,7 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
 
 
 def censored_of(y: Array, outputs: Sequence[Signal]) -> Flags:
-    """Which samples ``(m, n_y)`` are at an end of their sensor's range or beyond: -1 lower, +1 upper, 0 measured.
-
-    Example:
-        >>> censored_of(np.array([[0.2], [9.9], [10.0], [np.nan]]), [Signal("h", "V", saturation=(0.5, 10.0))]).ravel()
-        array([-1,  0,  1,  0], dtype=int8)
-    """
+    """Which samples ``(m, n_y)`` are at an end of their sensor's range or beyond: -1 lower, +1 upper, 0 measured."""
     flags = np.zeros(y.shape, dtype=np.int8)
     for j, signal in enumerate(outputs):
         if signal.saturation is not None:
@@ -475,11 +469,6 @@ def even(t: Array) -> Array:
     Stamps are rounded to single precision, or to so many decimals. Where a grid of equal steps, with samples missing
     here and there, is nowhere further from them than that rounding, it is what was sampled. Stretches with a pause
     between them have grids of their own.
-
-    Example:
-        >>> single = (1e4 + 0.01 * np.arange(1000)).astype(np.float32).astype(float)
-        >>> bool(np.ptp(np.diff(single)) > 9e-4), bool(np.ptp(np.diff(even(single))) < 1e-9)
-        (True, True)
     """
     steps = np.diff(t)
     if len(t) < FEWEST or not (np.abs(t) < LARGER).all() or not (steps > 0).all():

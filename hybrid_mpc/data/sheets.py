@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybrid_mpc.data.frames import HEAD, Frame, frame_source
+from hybrid_mpc.data.frames import HEAD, Frame
 from hybrid_mpc.data.layout import MOST_SEEN, STEADY, Layout, Look, layout_of
 from hybrid_mpc.data.source import LARGEST, LISTED, Source, line_of, megabytes
 from hybrid_mpc.errors import InputError, named_extra
@@ -61,7 +61,7 @@ def excel_source(path: Path, content: bytes, sha256: str) -> Source:
     if isinstance(layout, str):
         raise InputError(f"{path}: sheet {shown(order[0])}: {layout}")
     note = [f"sheet {shown(order[0])}"] if len(sheets) > 1 else []
-    return frame_source(path, sha256, _frame_of(sheets[order[0]], layout, note))
+    return _frame_of(path, sheets[order[0]], layout, note).source(sha256)
 
 
 def _cells_of(sheet: Any) -> list[tuple[Any, ...]]:
@@ -78,7 +78,7 @@ def _written(cell: Any) -> str:
     return "" if cell is None else str(cell).strip()
 
 
-def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[str]) -> Frame:
+def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[str]) -> Frame:
     """The rows of a sheet below its header, without those that are blank and those behind the table."""
     import pandas as pd
 
@@ -101,7 +101,7 @@ def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[s
 
     names, heads = tuple(layout.names[j] for j in seen), columns(range(len(seen)), HEAD)
     count = [k + 1 for k in numbers]
-    return Frame(names, columns, heads, count, lambda k, j: _written(cell(k, j)), notes=tuple(notes))
+    return Frame(path, names, columns, heads, count, lambda k, j: _written(cell(k, j)), notes=tuple(notes))
 
 
 # Columns of Arrow
@@ -143,10 +143,11 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
             f"{path}: is no Parquet or Feather file, or damaged ({line_of(error)}). Write it again, e.g. with pandas."
         ) from error
     frame = Frame(
+        path,
         names,
         lambda places: [whole[j] for j in places],
         [column.iloc[:HEAD] for column in whole],
         range(1, rows + 1),
         lambda k, j: _written(whole[j].iloc[k]),
     )
-    return frame_source(path, sha256, frame)
+    return frame.source(sha256)

@@ -233,11 +233,9 @@ def _joined(stamps: Sequence[Array]) -> Array:
 
 def _disorder(one: Series) -> str:
     """Where the stamps of a signal do not increase; empty where all do."""
-    falls = np.diff(one.t) <= 0
-    if not falls.any():
+    k = int(np.argmax(np.r_[np.diff(one.t) <= 0, True]))
+    if k >= len(one.t) - 1:
         return ""
-    k = int(np.argmax(falls))
-    return (
-        f"column {shown(one.name)}: sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at {one.t[k]:.10g} s. "
-        "Time stamps must increase: delete the repeated samples, or split the file."
-    )
+    stamps = f"sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at {one.t[k]:.10g} s"
+    remedy = "Time stamps must increase: delete the repeated samples, or split the file."
+    return f"column {shown(one.name)}: {stamps}. {remedy}"

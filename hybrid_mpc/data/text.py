@@ -10,7 +10,6 @@ import csv
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.cells import BLANK, is_value
-from hybrid_mpc.data.frames import HEAD, Frame, frame_source, is_blank
+from hybrid_mpc.data.frames import HEAD, Frame, is_blank
 from hybrid_mpc.data.layout import MOST_SEEN, Layout, Look, layout_of
 from hybrid_mpc.data.source import EMPTY, LARGEST, Source
 from hybrid_mpc.errors import InputError, named_extra
@@ -67,8 +66,7 @@ def text_source(path: Path, content: bytes, sha256: str) -> Source:
     *_, separator, layout = best
     if isinstance(layout, str):
         raise InputError(f"{path}: {layout}")
-    frame = _frame(_Rows(path, text, separator), layout)
-    return frame_source(path, sha256, replace(frame, notes=(*notes, *frame.notes)))
+    return _frame(_Rows(path, text, separator), layout, notes).source(sha256)
 
 
 def _decoded(path: Path, content: bytes) -> tuple[bytes, list[str]]:
@@ -220,9 +218,9 @@ def split(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _frame(rows: _Rows, layout: Layout) -> Frame:
-    """The table of the whole text."""
-    path, names, notes = rows.path, layout.names, list(layout.notes)
+def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
+    """The table of the whole text; ``done`` was noted before."""
+    path, names, notes = rows.path, layout.names, [*done, *layout.notes]
     keep = rows.of_table(layout, notes)
     chosen, numbers = np.flatnonzero(keep), rows.numbers[keep].tolist()
     count = len(numbers)
@@ -258,7 +256,7 @@ def _frame(rows: _Rows, layout: Layout) -> Frame:
         return ""
 
     own, tops = tuple(names[j] for j in seen), [heads[j] for j in seen]
-    return Frame(own, columns, tops, numbers, text, fault, decimal, tuple(notes), layout.clock)
+    return Frame(path, own, columns, tops, numbers, text, fault, decimal, tuple(notes), layout.clock)
 
 
 def _parsed(

@@ -67,16 +67,10 @@ class Trajectory(Samples):
     def part(
         self, keep: NDArray[np.bool_] | slice, name: str | None = None, role: str | None = None
     ) -> Trajectory:
-        """The samples of ``keep``, a slice or a mask ``(n,)`` of one contiguous run.
-
-        Args:
-            keep: Which samples.
-            name: New name. Default: as before.
-            role: New role. Default: as before.
-        """
+        """The samples of ``keep``, a slice or a mask ``(n,)`` of one contiguous run; a name or a role may be new."""
         arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot", "w", "censored")}
-        own = (self.name if name is None else name), (self.role if role is None else role)
-        return replace(self, name=own[0], role=own[1], **arrays)
+        name, role = self.name if name is None else name, self.role if role is None else role
+        return replace(self, name=name, role=role, **arrays)
 
 
 class Cut(NamedTuple):
@@ -122,12 +116,11 @@ def load_trajectories(
 ) -> Dataset:
     """Read recordings, cut them at gaps, shift known delays out, smooth, resample to ``spec.dt``, give roles.
 
-    Where the outputs are the positions ``q`` of states ``[q, v]`` (as many, of the same names), velocities and
-    accelerations are their derivatives. Smoothing comes before resampling and the split, never across a gap, and never
-    across samples of that output that are missing or censored for longer than ``spec.max_gap``: there ``x`` and
-    ``xdot`` are NaN. A sample's ``x`` and ``xdot`` know half of ``spec.smoothing`` of the time before and after it.
-    Where the outputs are anything else, ``x`` and ``xdot`` are NaN throughout: states then come from the prior's own
-    equations. Parts by ``fractions`` keep ``spec.smoothing`` apart; ``windows`` should, too.
+    Where the outputs are the positions ``q`` of states ``[q, v]`` (as many, of the same names), ``x`` and ``xdot`` are
+    smoothed before resampling and the split. They depend on half of ``spec.smoothing`` before and after a sample, and
+    are NaN over gaps, and where samples of that output are missing or censored for longer than ``spec.max_gap``. For
+    other outputs they are NaN: states then come from the prior's equations. Parts by ``fractions`` keep
+    ``spec.smoothing`` apart; ``windows`` should, too.
 
     Args:
         paths: Files with different stems, of any formats and lengths.
@@ -137,9 +130,9 @@ def load_trajectories(
         needed: Roles that must not be empty. Default: all three.
 
     Raises:
-        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
-            between them, windows overlap, a role gets no trajectory, the sampling is too coarse or too uneven for
-            ``smoothing``, or the speeds are beyond all that is plausible. It names all that is wrong with all files.
+        InputError: With all that is wrong with all files: bad recordings
+            (:func:`~hybrid_mpc.data.recording.read_recording`), columns that differ between them, windows that overlap,
+            a role without a trajectory, sampling too coarse or uneven for ``smoothing``, implausible speeds.
 
     Example:
         >>> import tempfile
@@ -322,23 +315,18 @@ def to_grid(
 ) -> tuple[Array, Flags]:
     """One output's samples on a grid of period ``dt`` [s], without inventing any; what is censored.
 
-    - Between two samples of this output that are at most ``max_gap`` [s] apart the grid has the straight line.
-    - Elsewhere, as between the samples of a slow analyser or in a hole, a sample counts for the one grid point that is
-      nearest to it, with its value as it was measured, at most half a period away. All other points are NaN.
-
-    A straight line to a censored sample is a bound as well, of the same side; it is NaN between the two ends of a
-    sensor.
+    Between two samples that are at most ``max_gap`` [s] apart the grid has the straight line. Elsewhere, as between the
+    samples of a slow analyser, a sample counts for the grid point nearest to it, as it was measured, at most half a
+    period away; all other points are NaN. A straight line to a censored sample is a bound of the same side; it is NaN
+    between the two ends of a sensor.
 
     Args:
         t: Times ``(m,)`` [s] of the rows, increasing.
         y: Samples ``(m,)``; NaN is none.
         censored: -1, 0 or +1 ``(m,)`` for each.
-        grid: Times ``(n,)`` [s], ``dt`` apart.
+        grid: Times ``(n,)`` [s], ``dt`` apart; returned are values ``(n,)`` and -1, 0 or +1 for each.
         dt: Period [s].
         max_gap: Longest distance [s] that a straight line bridges.
-
-    Returns:
-        Values ``(n,)`` and -1, 0 or +1 for each.
 
     Example:
         >>> t = 0.1 * np.arange(9)
@@ -414,14 +402,13 @@ def _pieces(
             if not keep.any():
                 continue
             piece = segment.part(keep, _numbered(recording.name, len(pieces) + 1), window.role)
-            if len(piece.t) >= _fewest(spec) and np.isfinite(piece.y).any():
+            why = "" if np.isfinite(piece.y).any() else "no sample of any output"
+            why = _too_short(_fewest(spec) * spec.dt, spec) if len(piece.t) < _fewest(spec) else why
+            if not why:
                 pieces.append(piece)
                 continue
-            short = len(piece.t) < _fewest(spec)
-            why = _too_short(_fewest(spec) * spec.dt, spec) if short else "no sample of any output"
-            cuts.append(
-                Cut(recording.path.name, float(piece.t[0]), float(piece.t[-1]), f"{window.role}: {why}")
-            )
+            first, last = float(piece.t[0]), float(piece.t[-1])
+            cuts.append(Cut(recording.path.name, first, last, f"{window.role}: {why}"))
     return pieces
 
 
@@ -445,14 +432,7 @@ def _windows(recording: Recording, spec: DataSpec) -> tuple[Window, ...]:
 
 def _check_windows(spec: DataSpec) -> None:
     for stem, windows in spec.windows.items():
-        ordered = sorted(windows, key=lambda window: window.start)
-        for window in ordered:
-            if not window.start < window.end or window.role not in (*ROLES, "nominal"):
-                raise InputError(
-                    f"data specification: window {window} of {stem} needs start < end and one of "
-                    f"{(*ROLES, 'nominal')}"
-                )
-        for one, two in pairwise(ordered):
+        for one, two in pairwise(sorted(windows, key=lambda window: window.start)):
             if two.start < one.end:
                 raise InputError(
                     f"windows overlap in {stem}: {one.role} {one.start:g} to {one.end:g} s, "
