@@ -24,11 +24,10 @@ Mask = NDArray[np.bool_]
 Count = NDArray[np.int64]
 BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---")
 """Cells that say that there is no value, in small letters."""
-PAIRS = (
+PAIRS = (  # words for the two positions of a switch, 0 and 1, in small letters
     ("off", "on"), ("false", "true"), ("no", "yes"), ("closed", "open"), ("low", "high"), ("aus", "ein"), ("aus", "an"),
     ("zu", "auf"), ("nein", "ja"), ("falsch", "wahr"), ("arrêt", "marche"), ("non", "oui"),
 )  # fmt: skip
-"""Words for the two positions of a switch, 0 and 1, in small letters."""
 SWITCH = frozenset(word for pair in PAIRS for word in pair)
 DAY = 86400.0
 FAR = 20.0
@@ -36,21 +35,19 @@ FAR = 20.0
 SEEN = 100  # cells that are looked at before all are read as dates of ISO 8601
 ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}(:\d{2}([.,]\d{1,9})?)?(Z|[+-]\d{2}:?\d{2})?")
 TIMES = "times of day read as seconds"
-MONTHS = (
+MONTHS = (  # how the names of months begin, in small letters
     ("jan",), ("feb", "fév", "fev"), ("mar", "mär", "mrz"), ("apr", "avr"), ("may", "mai"), ("jun", "juin"),
     ("jul", "juil"), ("aug", "aoû", "aou"), ("sep",), ("oct", "okt"), ("nov",), ("dec", "dez", "déc"),
 )  # fmt: skip
-"""How the names of months begin, in small letters."""
 _CLOCK = r"(?P<H>\d{1,3}):(?P<M>\d{2})(?::(?P<S>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?\s*(?P<ap>[AaPp]\.?[Mm]\.?)?"
 _ZONE = r"\s*(?P<z>Z|[A-Z]{2,5}|[+-]\d{2}:?\d{2})?"
-_DAYS = (
+_DAYS = (  # a day: year first, year last, with the month's name, in eight digits (before a time of day)
     r"(?P<Y>\d{4})(?P<sep>[-/.])(?P<m>\d{1,2})(?P=sep)(?P<d>\d{1,2})",
     r"(?P<a>\d{1,2})(?P<sep>[-/.])(?P<b>\d{1,2})(?P=sep)(?P<Y>\d{4}|\d{2})",
     r"(?P<d>\d{1,2})[-/. ]\s?(?P<name>[^\W\d_]{3,9})\.?[-/. ,]\s?(?P<Y>\d{4})",
     r"(?P<name>[^\W\d_]{3,9})\.?\s(?P<d>\d{1,2}),?\s(?P<Y>\d{4})",
     r"(?P<Y>\d{4})(?P<m>\d{2})(?P<d>\d{2})",
 )
-"""A day: year first, year last, with the month's name, in eight digits (before a time of day)."""
 DATES = tuple(re.compile(rf"{day}(?:[T _,-]\s*{_CLOCK}{_ZONE})?") for day in _DAYS)
 TIME_OF_DAY = re.compile(_CLOCK)
 MINUTES = re.compile(r"(?P<M>\d{1,3}):(?P<S>\d{2})[.,](?P<f>\d{1,9})")

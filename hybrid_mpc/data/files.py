@@ -24,15 +24,14 @@ from hybrid_mpc.files import write_text
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-ENDINGS = (
+ENDINGS = (  # endings that a message lists of a folder's files
     ".csv", ".txt", ".npz", ".mat", ".xlsx", ".parquet", ".feather", ".h5", ".mf4", ".tdms", ".mcap", ".bag", ".ulg"
 )  # fmt: skip
-"""Endings that a message lists of a folder's files."""
 CHUNK = 2**20  # bytes of a file that are checked at a time [byte]
 LONGEST_ROW = 2**20  # longest row of a text file [byte]: ten thousand columns of a hundred characters
 
 
-BEGINS = (
+BEGINS = (  # how files of a format begin, and what reads them
     (re.compile(rb"PAR1|ARROW1"), ("sheets", "arrow_source")),
     (re.compile(rb"\x89HDF\r\n\x1a\n"), ("hdf5", "hdf5_source")),
     (re.compile(rb"MATLAB (5.0|7.3) MAT-file"), ("matlab", "mat_source")),
@@ -44,19 +43,16 @@ BEGINS = (
         ("loggers", "logger_source"),
     ),
 )
-"""How files of a format begin, and what reads them."""
-ENDS = {
+ENDS = {  # the same by their ending, for formats that do not say what they are
     ".npz": ("vectors", "npz_source"),
     ".mat": ("matlab", "mat_source"),
     ".xlsx": ("sheets", "excel_source"),
     ".xlsm": ("sheets", "excel_source"),
 }
-"""The same by their ending, for formats that do not say what they are."""
-OTHERS = (
+OTHERS = (  # formats that are not read
     (re.compile(rb"\xd0\xcf\x11\xe0"), "an old Excel workbook"),
     (re.compile(rb"PK\x03\x04.{26}mimetypeapplication/vnd\.oasis", re.DOTALL), "an OpenDocument file"),
 )
-"""Formats that are not read."""
 
 
 def opened(path: Path) -> Source:

@@ -302,8 +302,7 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     return _source(path, sha256, found, list(unread), f"messages decoded by {own[0].name}")
 
 
-_READERS = (
+_READERS = (  # how files begin, what reads them, and what they are; all others are CAN logs
     (b"MDF     ", _mdf, "MDF file"), (b"TDSm", _tdms, "TDMS file"), (b"\x89MCAP0", _mcap, "MCAP file"),
     (b"#ROSBAG", _bag, "ROS bag"), (b"SQLite", _db3, "ROS 2 bag"), (b"ULog", _ulog, "PX4 log"),
 )  # fmt: skip
-"""How files begin, what reads them, and what they are; all others are CAN logs."""

@@ -29,12 +29,11 @@ from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.int8]
-PROPOSED = (
+PROPOSED = (  # units that are proposed for a column that leaves its signal's range
     "ms", "us", "min", "h", "deg", "mrad", "rev", "deg/s", "rpm", "Hz", "rev/s", "mm", "cm", "um", "km", "mm/s", "cm/s",
     "km/h", "mN m", "N cm", "N mm", "kN m", "mN", "kN", "mV", "kV", "mA", "Pa", "kPa", "mbar", "bar", "g", "kg", "mW",
     "kW", "K", "degC", "degF", "%", "-", "l/min", "l/s", "m^3/h",
 )  # fmt: skip
-"""Units that are proposed for a column that leaves its signal's range."""
 FILLED = 0.01  # share of a signal's range that a column would have to fill in another unit
 SHARE = 0.05  # share of the samples beyond the range: a wrong unit is wrong in all rows
 BEYOND = 4.0  # times the range's limit that a column must reach: less may be a wrong range

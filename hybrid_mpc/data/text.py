@@ -110,10 +110,12 @@ class _Rows:
         newline = codes == 10
         lines = np.flatnonzero(newline)
         visible = (codes > 32) & (codes != 34)
-        marks = visible | (codes == 34)
-        begins_cell = marks & ~np.r_[False, marks[:-1]]  # where cells begin between blanks
-        is_sep = begins_cell if separator == " " else codes == ord(separator)
-        visible &= (separator == " ") | ~is_sep
+        is_sep = codes == ord(separator)
+        if separator == " ":  # where cells begin
+            marks = visible | (codes == 34)
+            is_sep = marks & ~np.r_[False, marks[:-1]]
+        else:
+            visible &= ~is_sep
         if b'"' in text:
             outside = (np.cumsum(codes == 34, dtype=np.uint8) & 1) == 0
             if whole and not outside[-1]:

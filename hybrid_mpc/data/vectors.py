@@ -151,7 +151,7 @@ def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
 MOST_WIDE = 64  # most columns of a matrix that are read as columns
 MOST_STRUCTS = 100  # most elements of an array of structs, or of cells, that are read
 OBJECTS = "objects"
-CONVERT = {
+CONVERT = {  # the line of MATLAB that makes vectors of an object, by its class
     "timeseries": "t = {0}.Time; y = {0}.Data; save('{1}', 't', 'y', '-v7')",
     "timetable": "t = seconds({0}.Properties.RowTimes - {0}.Properties.RowTimes(1)); "
     "s = table2struct(timetable2table({0}, 'ConvertRowTimes', false), 'ToScalar', true); save('{1}', 't', 's', '-v7')",
@@ -162,7 +162,6 @@ CONVERT = {
     "datetime": "t = seconds({0} - {0}(1)); save('{1}', 't', '-v7', '-append')",
     "duration": "t = seconds({0}); save('{1}', 't', '-v7', '-append')",
 }
-"""The line of MATLAB that makes vectors of an object, by its class."""
 
 
 class Leaf(NamedTuple):
