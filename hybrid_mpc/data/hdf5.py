@@ -19,6 +19,7 @@ from hybrid_mpc.data.vectors import CONVERT, MOST_STRUCTS, OBJECTS, Leaf, budget
 from hybrid_mpc.errors import InputError, named_extra
 
 DEEPEST = 8  # deepest groups in groups that are read
+MOST_ITEMS = 10_000  # most groups and datasets that are looked at: some seconds of work
 
 
 def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
@@ -28,7 +29,7 @@ def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
         import h5py
     try:
         file = h5py.File(io.BytesIO(content), "r")
-        leaves = list(_fields(file, "", file, 0, matlab))
+        leaves = list(_Walk(file, matlab).fields("", file, 0))
     except Exception as error:  # a damaged file raises nearly anything
         what, again = "HDF5 file", "Write it again."
         if matlab:
@@ -37,63 +38,72 @@ def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
     return leaf_source(path, content, sha256, leaves, matlab)
 
 
-def _fields(file: Any, prefix: str, group: Any, depth: int, matlab: bool) -> Iterator[Leaf]:
-    """What a group holds."""
-    import h5py
+class _Walk:
+    """A walk through a file; links may lead to one group again and again, so the steps are counted."""
 
-    for name in group:
-        item, full = group.get(name, getlink=True), f"{prefix}.{name}" if prefix else name
-        if not isinstance(item, h5py.HardLink) or (matlab and full.startswith("#")):
-            continue
-        item = group[name]
-        refers = matlab and isinstance(item, h5py.Dataset) and item.dtype == h5py.ref_dtype
-        if prefix and refers and not _class(item):  # a field of an array of structs
-            yield from _referred(file, item, full, f"{prefix}({{}}).{name}", "arrays of structs", depth)
+    def __init__(self, file: Any, matlab: bool) -> None:
+        self.file, self.matlab, self.left = file, matlab, MOST_ITEMS
+
+    def fields(self, prefix: str, group: Any, depth: int) -> Iterator[Leaf]:
+        """What a group holds."""
+        import h5py
+
+        for name in group:
+            full = f"{prefix}.{name}" if prefix else name
+            here = isinstance(group.get(name, getlink=True), h5py.HardLink)
+            if not here or (self.matlab and full.startswith("#")):
+                continue
+            item = group[name]
+            refers = self.matlab and isinstance(item, h5py.Dataset) and item.dtype == h5py.ref_dtype
+            if prefix and refers and not _class(item):  # a field of an array of structs
+                yield from self.referred(item, full, f"{prefix}(\0).{name}", "arrays of structs", depth)
+            else:
+                yield from self.item(full, item, depth)
+
+    def referred(self, item: Any, name: str, form: str, what: str, depth: int) -> Iterator[Leaf]:
+        """What references point at, named by ``form`` with the number of each for the null."""
+        if item.size > MOST_STRUCTS or depth > DEEPEST:
+            yield Leaf(name, what=what)
+            return
+        for k, one in enumerate(item[()].ravel(), 1):
+            yield from self.item(form.replace("\0", str(k)), self.file[one], depth + 1)
+
+    def item(self, name: str, item: Any, depth: int) -> Iterator[Leaf]:
+        """A group, or a dataset."""
+        import h5py
+
+        self.left -= 1
+        if self.left < 0:
+            raise ValueError(f"it has more than {MOST_ITEMS} groups and datasets")
+        kind = _class(item) if self.matlab else ""
+        if self.matlab and (item.attrs.get("MATLAB_object_decode", 0) or kind in CONVERT):
+            yield Leaf(name, what=f"{OBJECTS} of class {kind}", kind=kind)
+        elif isinstance(item, h5py.Group):
+            if "MATLAB_sparse" in item.attrs or depth > DEEPEST:
+                yield Leaf(name, what="sparse matrices" if depth <= DEEPEST else "structs in structs")
+            else:
+                yield from self.fields(name, item, depth + 1)
+        elif not isinstance(item, h5py.Dataset) or item.shape is None:
+            return
+        elif self.matlab and item.attrs.get("MATLAB_empty", 0):
+            yield Leaf(name, (0, 0))
+        elif kind == "cell" and item.dtype == h5py.ref_dtype:
+            form = f"{name}{{\0}}" if item.size > 1 else name
+            yield from self.referred(item, name, form, "cells", depth)
+        elif item.dtype.names:
+            for field in item.dtype.names:
+                if item.dtype[field].kind in "biuf":
+                    yield Leaf(f"{name}.{field}", item.shape, partial(_numbers, item, field))
+        elif kind == "char":
+            yield Leaf(name, (), lambda: np.array("text"))
+        elif kind in ("cell", "function_handle") or item.dtype.kind not in "biufc":
+            yield Leaf(name, what="cells")
+        elif self.matlab:
+            yield Leaf(name, item.shape[::-1], lambda: _numbers(item).T)
         else:
-            yield from _walked(file, full, item, depth, matlab)
-
-
-def _referred(file: Any, item: Any, name: str, form: str, what: str, depth: int) -> Iterator[Leaf]:
-    """What references point at, named by ``form`` with the number of each."""
-    if item.size > MOST_STRUCTS or depth > DEEPEST:
-        yield Leaf(name, what=what)
-        return
-    for k, one in enumerate(item[()].ravel(), 1):
-        yield from _walked(file, form.format(k), file[one], depth + 1, True)
-
-
-def _walked(file: Any, name: str, item: Any, depth: int, matlab: bool) -> Iterator[Leaf]:
-    import h5py
-
-    kind = _class(item) if matlab else ""
-    if matlab and (item.attrs.get("MATLAB_object_decode", 0) or kind in CONVERT):
-        yield Leaf(name, what=f"{OBJECTS} of class {kind}", kind=kind)
-    elif isinstance(item, h5py.Group):
-        if "MATLAB_sparse" in item.attrs or depth > DEEPEST:
-            yield Leaf(name, what="sparse matrices" if depth <= DEEPEST else "structs in structs")
-        else:
-            yield from _fields(file, name, item, depth + 1, matlab)
-    elif not isinstance(item, h5py.Dataset) or item.shape is None:
-        return
-    elif matlab and item.attrs.get("MATLAB_empty", 0):
-        yield Leaf(name, (0, 0))
-    elif kind == "cell" and item.dtype == h5py.ref_dtype:
-        form = f"{name}{{{{{{}}}}}}" if item.size > 1 else name
-        yield from _referred(file, item, name, form, "cells", depth)
-    elif item.dtype.names:
-        for field in item.dtype.names:
-            if item.dtype[field].kind in "biuf":
-                yield Leaf(f"{name}.{field}", item.shape, partial(_numbers, item, field))
-    elif kind == "char":
-        yield Leaf(name, (), lambda: np.array("text"))
-    elif kind in ("cell", "function_handle") or item.dtype.kind not in "biufc":
-        yield Leaf(name, what="cells")
-    elif matlab:
-        yield Leaf(name, item.shape[::-1], lambda: _numbers(item).T)
-    else:
-        units = (item.attrs.get(key) for key in ("units", "unit"))
-        unit = next((one for one in units if isinstance(one, str)), "")
-        yield Leaf(f"{name} [{unit}]" if unit else name, item.shape, partial(_numbers, item))
+            units = (item.attrs.get(key) for key in ("units", "unit"))
+            unit = next((one for one in units if isinstance(one, str)), "")
+            yield Leaf(f"{name} [{unit}]" if unit else name, item.shape, partial(_numbers, item))
 
 
 def _class(item: Any) -> str:
