@@ -20,8 +20,11 @@ from hybrid_mpc.data.scales import periods as periods_of
 from hybrid_mpc.data.scales import robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.fit import Fitted, OutputFit, OutputWindows, Shooting, cut_outputs
+from hybrid_mpc.identify.identifiable import Fitted
+from hybrid_mpc.identify.output_fit import OutputFit
+from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import Points, visited
+from hybrid_mpc.identify.windows import OutputWindows, cut_outputs
 from hybrid_mpc.machine import terms as laws
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior
