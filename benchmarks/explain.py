@@ -87,7 +87,7 @@ def row(name: str, fold: int, scenario: Scenario, files: list[Path], kind: str) 
         if which == "fitted":
             began = time.process_time()
             known = smoothed(make, fit, [*train, *valid], dt)
-            told = explain(make, fit.values, known, dt=dt, length=length)
+            told = explain(make, fit.values, known, dt=dt, length=length, warm_up=spec.warm_up)
             seconds = time.process_time() - began
             better = told.prior(make)(told.values)
             acting, substeps = shifted([*train, *valid], fit.delay), required_substeps(better, dt)

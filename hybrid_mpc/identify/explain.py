@@ -70,8 +70,13 @@ REACH = 3.0
 """Errors of a free run count up to so many spreads of their output: one that runs away is as bad as that."""
 RIDGE = 1e-6
 """Share that is added to the normal equations' diagonal: columns that are alike stay solvable."""
+SMALL = 0.1
+"""Share of the mean squared error that is added to that of every piece of evidence: pieces in which both models err
+little say little."""
 FEWEST, MANY = 3, 5
 """Pieces of evidence from which on their scatter is known; and recordings from which on each is one piece."""
+LEAST_T = 2.0
+"""Standard errors that one parameter of each term has to differ from none at least: else the data do not tell it."""
 SHORTEST = 4
 """Samples of a block at least."""
 DRAWN = 200
@@ -86,10 +91,23 @@ class _HeldOut:
     pieces: Places
     folds: Places
     told: Evidence
+    warm: int
 
-    def rows(self, keep: NDArray[np.bool_]) -> OutputWindows:
+    @property
+    def judged(self) -> OutputWindows:
+        """The windows, of which the warm-up alone determines the first states and the rest counts."""
+        return replace(self.windows, warm=self.warm)
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """Samples ``(n, T + 1)`` that count."""
+        seen = np.isfinite(self.windows.y).any(axis=-1)
+        seen[:, : self.warm] = False
+        return np.asarray(seen)
+
+    def rows(self, keep: NDArray[np.bool_], windows: OutputWindows | None = None) -> OutputWindows:
         """Some windows."""
-        w = self.windows
+        w = self.windows if windows is None else windows
         return replace(
             w, y=w.y[keep], u=w.u[keep], w=w.w[keep], x=w.x[keep], censored=w.censored[keep], known=w.known[keep],
             group=np.arange(int(keep.sum())),
@@ -97,10 +115,12 @@ class _HeldOut:
 
     def compared(self, own: Array, other: Array, candidates: int) -> HeldOutError:
         """Squared errors ``(n, T + 1)`` of one model over another's, which was the best of so many candidates."""
-        seen = np.isfinite(self.windows.y).any(axis=-1)
+        seen = self.counted
         sums = [np.bincount(self.pieces[seen], weights=v[seen]) for v in (own, other)]
-        there = np.bincount(self.pieces[seen]) > 0
-        each = 0.5 * np.log(np.maximum(sums[0][there], 1e-300) / np.maximum(sums[1][there], 1e-300))
+        counts = np.bincount(self.pieces[seen])
+        means = [total[counts > 0] / counts[counts > 0] for total in sums]
+        floor = SMALL * float(other[seen].mean()) + 1e-300
+        each = 0.5 * np.log((means[0] + floor) / (means[1] + floor))
         n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[seen].mean()))
         if n < FEWEST:
             return HeldOutError(error, math.exp(mean), 0.0, math.inf, 1.0)
@@ -113,7 +133,7 @@ class _HeldOut:
         )  # fmt: skip
 
 
-def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, most: int) -> _HeldOut:
+def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int, most: int) -> _HeldOut:
     """Windows of all recordings, shared evenly, with what is held out together: whole recordings that are alike in
     kind, or blocks of a single one.
     """
@@ -138,10 +158,11 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, most: int
         fold = dict(zip(order, np.arange(len(order)) * groups // len(order), strict=True))
         folds = np.array([fold[own] for own in of])
     samples = windows.y.shape[1]
+    warm = min(warm, samples // 3)
     if len(present) >= MANY:
         pieces = np.repeat(recording[:, None], samples, axis=1)
         text = f"{len(present)} recordings in {groups} groups"
-        return _HeldOut(windows, pieces, folds, Evidence(len(present), len(present), groups, length, text))
+        return _HeldOut(windows, pieces, folds, Evidence(len(present), len(present), groups, length, text), warm)
     pieces, count, blocks_of = (
         np.zeros((len(of), samples), dtype=np.int64),
         0,
@@ -164,7 +185,7 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, most: int
         )
     what = "one recording" if len(present) == 1 else f"{len(present)} recordings"
     text = f"{count} blocks of {what} in {groups} groups"
-    return _HeldOut(windows, pieces, folds, Evidence(len(present), count, groups, length, text))
+    return _HeldOut(windows, pieces, folds, Evidence(len(present), count, groups, length, text), warm)
 
 
 def _by_kind(windows: OutputWindows, pieces: Places, present: Sequence[int]) -> list[int]:
@@ -244,14 +265,30 @@ class _Search:
         for fold in sorted(set(self.evidence.folds.tolist())):
             held = self.evidence.folds == fold
             fitted = self.problem(terms, self.evidence.rows(~held)).solve(theta, ITERATIONS).theta
-            squares[held] = _squares(self.problem(terms, self.evidence.rows(held)), fitted)
+            judged = self.evidence.rows(held, self.evidence.judged)
+            squares[held] = _squares(self.problem(terms, judged), fitted)
         return squares
 
-    def begun(self, terms: Terms, theta: Array) -> tuple[Fitted, Shooting]:
+    def begun(self, terms: Terms, theta: Array) -> Fitted:
         """A fit to all windows from ``theta`` of the terms but the last ones."""
-        problem = self.problem(terms, self.evidence.windows)
         start = np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
-        return problem.solve(start, ITERATIONS), problem
+        return self.problem(terms, self.evidence.windows).solve(start, ITERATIONS)
+
+    def untold(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
+        """Those of the new terms whose parameters all may be zero; of those with a state the others."""
+        errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+        names, found = self.fit(terms).names, []
+        for term in new:
+            weights = [p.name for p in term.parameters if p.value == 0.0 and not p.fixed]
+            at = [names.index(name) for name in weights]
+            if at and (np.abs(fitted.theta[at]) < LEAST_T * errors[at]).all():
+                found.append(term)
+        return found
+
+    def error(self, terms: Terms, theta: Array) -> float:
+        """Mean squared error over all windows."""
+        squares = _squares(self.problem(terms, self.evidence.judged), theta)
+        return max(float(squares[self.evidence.counted].mean()), 1e-300)
 
     def without(self, terms: Terms, theta: Array, dropped: Term) -> tuple[Terms, Array]:
         """The terms but one, and what is left of ``theta``."""
@@ -267,13 +304,16 @@ class _Promises:
 
     def __init__(self, search: _Search, terms: Terms, theta: Array, forms: Sequence[Term]) -> None:
         joint = (*terms, *forms)
-        problem = search.problem(joint, search.evidence.windows)
-        begun = search.problem(terms, search.evidence.windows).first_states(theta)
-        own = search.fit(joint)
+        own, evidence = search.fit(joint), search.evidence
         start = np.concatenate([theta, np.zeros(len(own.nominal) - len(theta))])
-        slopes, errors = problem.linear(start, begun)
-        every = np.concatenate([slopes, errors[..., None]], axis=-1)
-        normal = every.swapaxes(1, 2) @ every  # (n, k + 1, k + 1)
+        normals = []
+        for windows in (evidence.windows, evidence.judged):
+            x = search.problem(terms, windows).first_states(theta)
+            slopes, errors = search.problem(joint, windows).linear(start, x)
+            every = np.concatenate([slopes, errors[..., None]], axis=-1)
+            normal = every.swapaxes(1, 2) @ every  # (n, k + 1, k + 1)
+            each = sorted(set(evidence.folds.tolist()))
+            normals.append([normal[evidence.folds == f].sum(axis=0) for f in each])
         self.low, self.high = own.lower - start, own.upper - start
         self.present, count = list(range(len(theta))), len(theta)
         self.places: list[list[int]] = []
@@ -281,15 +321,15 @@ class _Promises:
             free = [p for p in form.parameters if not p.fixed]
             self.places.append(list(range(count, count + len(free))))
             count += len(free)
-        folds = search.evidence.folds
-        self.held = [normal[folds == f].sum(axis=0) for f in sorted(set(folds.tolist()))]
-        self.total = np.sum(self.held, axis=0)
+        total = np.sum(normals[0], axis=0)
+        self.fitted = [total - own_normal for own_normal in normals[0]]
+        self.held = normals[1]
         self.plain = self._left(self.present)
 
     def _left(self, columns: list[int]) -> float:
         cost = 0.0
-        for own in self.held:
-            step = _step(self.total - own, columns, self.low, self.high)
+        for fitted, own in zip(self.fitted, self.held, strict=True):
+            step = _step(fitted, columns, self.low, self.high)
             moved = own[np.ix_(columns, columns)] @ step
             cost += own[-1, -1] + 2.0 * float(own[columns, -1] @ step) + float(step @ moved)
         return max(cost, 1e-300)
@@ -370,6 +410,7 @@ def explain(
     *,
     dt: float,
     length: float,
+    warm_up: float = 0.0,
     candidates: Sequence[Candidate] | None = None,
     own: Sequence[Term] = (),
     begun: Explanation | None = None,
@@ -384,6 +425,8 @@ def explain(
         known: Recordings with inputs that act and smoothed states (:func:`~hybrid_mpc.identify.fit.smoothed`).
         dt: Model period [s].
         length: Length [s] of the free runs that models are judged by.
+        warm_up: Length [s] of the part of a held-out free run that alone determines its first state, and does not
+            count; as where models are evaluated. Default: the whole run does both.
         candidates: Terms to choose from. Default: :func:`~hybrid_mpc.identify.term_library.library`.
         own: A user's own terms beside these.
         begun: What ``on_step`` had of a search with the same arguments that was stopped: it goes on from there.
@@ -394,7 +437,7 @@ def explain(
         InputError: If there are too few recordings to judge terms by, two terms have one name, or an own term does not
             fit to the prior, its units or its balances.
     """
-    found = _Explain(base, values, known, dt, length, candidates, own, on_progress)
+    found = _Explain(base, values, known, dt, length, warm_up, candidates, own, on_progress)
     return found.run(begun, on_step)
 
 
@@ -402,7 +445,7 @@ class _Explain:
     """One search."""
 
     def __init__(
-        self, base: type[Prior], values: dict[str, float], known: Sequence[Trajectory], dt: float, length: float,
+        self, base: type[Prior], values: dict[str, float], known: Sequence[Trajectory], dt: float, length: float, warm_up: float,
         candidates: Sequence[Candidate] | None, own: Sequence[Term], on_progress: Progress,
     ) -> None:  # fmt: skip
         prior = base(values)
@@ -410,7 +453,8 @@ class _Explain:
         longest = max(len(t.t) for t in known) - 1
         if len({t.file for t in known}) == 1:  # parts of a single recording are its evidence
             longest = max(sum(len(t.t) for t in known) // BLOCKS - 1, 2)
-        self.evidence = _gathered(known, prior, min(periods_of(length, dt, 2), longest), WINDOWS)
+        periods = min(periods_of(length, dt, 2), longest)
+        self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
         points = visited(known)
         sizes = np.array([robust_spread(c) or 1.0 for c in np.concatenate([t.x for t in known]).T])
         y = self.evidence.windows.y
@@ -487,15 +531,15 @@ class _Explain:
             own = promises.of(i), i
             best[k] = min(best.get(k, own), own)
         singles = [(score, (plain[i][1],)) for score, i in best.values()]
-        ends = self._mean(search.problem(now.terms, self.evidence.windows), now.theta)
+        ends = search.error(now.terms, now.theta)
         diverged = []
         slow = [one for one in self.pool if one.forms[0].state is not None]
         for i, one in enumerate(slow, 1):  # at once a lag does what no slope tells
             scores = []
             for form in one.forms:
                 try:
-                    fitted, problem = search.begun((*now.terms, form), now.theta)
-                    score = 0.5 * math.log(self._mean(problem, fitted.theta) / ends)
+                    terms = (*now.terms, form)
+                    score = 0.5 * math.log(search.error(terms, search.begun(terms, now.theta).theta) / ends)
                 except (InputError, np.linalg.LinAlgError) as error:
                     diverged.append(Trial((_found(form),), "diverged", None, str(error)))
                     continue
@@ -516,10 +560,6 @@ class _Explain:
             diverged,
         )
 
-    def _mean(self, problem: Shooting, theta: Array) -> float:
-        squares = _squares(problem, theta)
-        return max(float(squares.mean()), 1e-300)
-
     def _fitted(self, some: Sequence[Terms], running: int, text: str) -> Iterator[_Fitted]:
         """Candidates, fitted in every fold and judged."""
         search, now = self.search, self.now
@@ -529,22 +569,27 @@ class _Explain:
             )
             terms = (*now.terms, *forms)
             try:
-                own, _ = search.begun(terms, now.theta)
+                own = search.begun(terms, now.theta)
+                untold = search.untold(terms, own, forms)
                 squares = search.held_out(terms, own.theta)
             except (InputError, np.linalg.LinAlgError) as error:
                 yield _Fitted(forms, None, np.zeros(0), np.zeros(0), str(error))
                 continue
-            yield self._judged(forms, own.theta, squares, max(running, len(some)))
+            yield self._judged(forms, own.theta, squares, max(running, len(some)), untold)
 
-    def _judged(self, forms: Terms, theta: Array, squares: Array, candidates: int) -> _Fitted:
+    def _judged(
+        self, forms: Terms, theta: Array, squares: Array, candidates: int, untold: Sequence[Term]
+    ) -> _Fitted:
         found = self.evidence.compared(squares, self.now.squares, candidates)
         reason = ""
         if not np.isfinite(squares).all():
             return _Fitted(forms, None, theta, squares, "its free runs diverge")
-        if found.ratio >= WORTH or squares.mean() >= self.now.squares.mean():
+        if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
             reason = f"the error is {found.ratio:.2f} of that without it"
         elif found.harm >= DOUBT:
             reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
+        elif untold:
+            reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
         return _Fitted(forms, found, theta, squares, reason, not reason)
 
     def _both_needed(self, pair: _Fitted) -> bool:
@@ -595,7 +640,7 @@ class _Explain:
                 if term.name in newest:
                     continue
                 kept, theta = self.search.without(self.now.terms, self.now.theta, term)
-                fitted, _ = self.search.begun(kept, theta)
+                fitted = self.search.begun(kept, theta)
                 squares = self.search.held_out(kept, fitted.theta)
                 found = self.evidence.compared(squares, self.now.squares, 1)
                 if least is None or found.ratio < least[0].ratio:
@@ -642,9 +687,8 @@ class _Explain:
                     pictures=tuple(one for one in drawn if one is not None),
                 )  # fmt: skip
             steps.append(step)
-        seen = np.isfinite(self.evidence.windows.y).any(axis=-1)
         return Explanation(
-            self.base.__name__, float(np.sqrt(self.first[seen].mean())),
+            self.base.__name__, float(np.sqrt(self.first[self.evidence.counted].mean())),
             self.evidence.compared(self.now.squares, self.first, 1), tuple(steps), last, parameters,
             self.evidence.told, self.candidates, reason,
         )  # fmt: skip

@@ -291,7 +291,7 @@ class _Library:
                 "exchange with a second capacity",
             )
             tau = Parameter(
-                f"tau_s{number}_{state.name}", max(share * self.length, 2 * self.dt), "s", self.dt, 4 * self.length,
+                f"tau_s{number}_{state.name}", max(share * self.length, 2 * self.dt), "s", self.dt, self.length,
                 "time constant of the second capacity",
             )  # fmt: skip
             inner = Signal(f"{state.name}_{number}", state.unit, state.lower, state.upper)
