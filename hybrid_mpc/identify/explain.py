@@ -51,7 +51,9 @@ FOLDS = 5
 BLOCKS = 8
 """Pieces of evidence at least: a few recordings are cut into as many blocks."""
 WINDOWS = 48
-"""Windows of the search at most, shared evenly by the recordings."""
+"""Windows of the search at most, shared evenly by the recordings; of short ones twice as many."""
+SHORTER = 5
+"""How much shorter the short windows are, by which candidates are scored and begun, too."""
 TRIED = 3
 """Candidates of a step that are fitted in every fold."""
 PAIRS = 3
@@ -60,14 +62,19 @@ STEPS = 8
 """Steps at most."""
 ITERATIONS = 12
 """Gauss-Newton steps of a fit that starts near its end."""
-WORTH = 0.98
+WORTH = 0.95
 """Ratio of errors that a term has to reach at least: a parameter that takes off less is not worth its name."""
 HARM = 1.05
 """Ratio of errors from which on a term does harm."""
+GAIN = 0.7
+"""Ratio of errors below which a gain counts no more in the upper bound: a bound that is larger for it, and that no
+single recording of a large gain widens."""
 DOUBT = 0.1
-"""Probability of harm below which a term is added, all candidates in the running together."""
+"""Probability of harm below which a term is added, all candidates of a step together that were fitted."""
 REACH = 3.0
 """Errors of a free run count up to so many spreads of their output: one that runs away is as bad as that."""
+FAR = 2.0
+"""A start whose error is larger by this than the other's is not tried."""
 RIDGE = 1e-6
 """Share that is added to the normal equations' diagonal: columns that are alike stay solvable."""
 SMALL = 0.1
@@ -124,11 +131,13 @@ class _HeldOut:
         n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[seen].mean()))
         if n < FEWEST:
             return HeldOutError(error, math.exp(mean), 0.0, math.inf, 1.0)
-        scatter = max(float(each.std(ddof=1)) / math.sqrt(n), 1e-9)
-        wide = float(student.ppf(1.0 - 0.5 * DOUBT / candidates, n - 1)) * scatter
-        harm = float(student.cdf((mean - math.log(HARM)) / scatter, n - 1))
+        capped = np.maximum(each, math.log(GAIN))  # its mean is no less, its scatter not that of large gains
+        scatter, safe = (max(float(v.std(ddof=1)) / math.sqrt(n), 1e-9) for v in (each, capped))
+        wide = float(student.ppf(1.0 - 0.5 * DOUBT / candidates, n - 1))
+        upper = float(capped.mean()) + wide * safe
+        harm = float(student.cdf((float(capped.mean()) - math.log(HARM)) / safe, n - 1))
         return HeldOutError(
-            error, math.exp(mean), math.exp(max(mean - wide, -700.0)), math.exp(min(mean + wide, 700.0)),
+            error, math.exp(mean), math.exp(max(mean - wide * scatter, -700.0)), math.exp(min(upper, 700.0)),
             min(1.0, candidates * harm),
         )  # fmt: skip
 
@@ -215,6 +224,7 @@ class _Search:
     base: type[Prior]
     dt: float
     evidence: _HeldOut
+    short: _HeldOut
     sizes: Array
     points: Points
     spread: Array
@@ -270,9 +280,15 @@ class _Search:
         return squares
 
     def begun(self, terms: Terms, theta: Array) -> Fitted:
-        """A fit to all windows from ``theta`` of the terms but the last ones."""
+        """A fit to all windows from ``theta`` of the terms but the last ones: at once, and by way of short windows,
+        which lead further where long free runs go astray; the better one.
+        """
         start = np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
-        return self.problem(terms, self.evidence.windows).solve(start, ITERATIONS)
+        problem = self.problem(terms, self.evidence.windows)
+        near = self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
+        starts = [start, near] if problem.explained([near])[0] < FAR * problem.explained([start])[0] else [start]
+        fits = [problem.solve(one, ITERATIONS) for one in starts]
+        return min(fits, key=lambda fit: problem.explained([fit.theta])[0])
 
     def untold(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
         """Those of the new terms whose parameters all may be zero; of those with a state the others."""
@@ -302,9 +318,11 @@ class _Promises:
     first states in every fold.
     """
 
-    def __init__(self, search: _Search, terms: Terms, theta: Array, forms: Sequence[Term]) -> None:
+    def __init__(
+        self, search: _Search, evidence: _HeldOut, terms: Terms, theta: Array, forms: Sequence[Term]
+    ) -> None:
         joint = (*terms, *forms)
-        own, evidence = search.fit(joint), search.evidence
+        own = search.fit(joint)
         start = np.concatenate([theta, np.zeros(len(own.nominal) - len(theta))])
         normals = []
         for windows in (evidence.windows, evidence.judged):
@@ -394,6 +412,23 @@ class _Fitted:
     sure: bool = False
 
 
+@dataclass(frozen=True)
+class _Ranked:
+    """Candidates with the logarithm of the ratio of errors that they promise, over long windows and short ones."""
+
+    long: list[tuple[float, Terms]]
+    short: list[tuple[float, Terms]]
+
+    def best(self, count: int, beyond: _Ranked | None = None) -> list[Terms]:
+        """So many of both that promise most; only those that promise more than all of others do."""
+        found: list[Terms] = []
+        others = ([], []) if beyond is None else (beyond.long, beyond.short)
+        for own, other in zip((self.long, self.short), others, strict=True):
+            enough = math.log(WORTH) + min([score for score, _ in other], default=0.0)
+            found += [forms for score, forms in sorted(own, key=lambda s: s[0])[:count] if score < enough]
+        return list(dict.fromkeys(found))
+
+
 @dataclass
 class _State:
     """Where the search is: the terms, their fit, and the squared errors over held-out data."""
@@ -445,8 +480,8 @@ class _Explain:
     """One search."""
 
     def __init__(
-        self, base: type[Prior], values: dict[str, float], known: Sequence[Trajectory], dt: float, length: float, warm_up: float,
-        candidates: Sequence[Candidate] | None, own: Sequence[Term], on_progress: Progress,
+        self, base: type[Prior], values: dict[str, float], known: Sequence[Trajectory], dt: float, length: float,
+        warm_up: float, candidates: Sequence[Candidate] | None, own: Sequence[Term], on_progress: Progress,
     ) -> None:  # fmt: skip
         prior = base(values)
         self.base, self.known, self.own, self.on_progress = base, known, tuple(own), on_progress
@@ -455,11 +490,13 @@ class _Explain:
             longest = max(sum(len(t.t) for t in known) // BLOCKS - 1, 2)
         periods = min(periods_of(length, dt, 2), longest)
         self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
+        less = max(periods // SHORTER, min(periods, 2 * SHORTEST))
+        short = _gathered(known, prior, less, round(warm_up / dt), 2 * WINDOWS)
         points = visited(known)
         sizes = np.array([robust_spread(c) or 1.0 for c in np.concatenate([t.x for t in known]).T])
         y = self.evidence.windows.y
         spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
-        self.search = _Search(base, dt, self.evidence, sizes, points, spread)
+        self.search = _Search(base, dt, self.evidence, short, sizes, points, spread)
         given = library(prior, points, dt, length) if candidates is None else candidates
         self.pool = [*given, *(Candidate(term.name, (term,)) for term in own)]
         _check(prior, self.pool, own, points)
@@ -501,13 +538,11 @@ class _Explain:
         """Candidates that were fitted, the number of those that were scored, and what is added."""
         number = 1 + sum(step.action == "added" for step in self.steps)
         singles, pairs, diverged = self._scored(number)
-        running = sum(score < math.log(WORTH) for score, _ in singles)
-        fitted = list(self._fitted([forms for _, forms in singles[:TRIED]], running, f"step {number}"))
+        fitted = list(self._fitted(singles.best(TRIED), f"step {number}"))
         chosen = _chosen(fitted)
         if chosen is None:
-            best = min([score for score, _ in singles], default=0.0)
-            pairs = [one for one in pairs if one[0] < best + math.log(WORTH)]
-            both = list(self._fitted([forms for _, forms in pairs[:PAIRS]], running, f"step {number}, pairs"))
+            some = pairs.best(PAIRS, singles)
+            both = list(self._fitted(some, f"step {number}, pairs"))
             fitted += both
             chosen = _chosen([one for one in both if self._both_needed(one)])
         return (
@@ -518,19 +553,24 @@ class _Explain:
 
     def _scored(
         self, number: int
-    ) -> tuple[list[tuple[float, Terms]], list[tuple[float, Terms]], list[Trial]]:
-        """Single terms and pairs with the logarithm of the ratio of errors that they promise, the best first; those
-        that promise too little are left out. And candidates whose fit failed.
+    ) -> tuple[_Ranked, _Ranked, list[Trial]]:
+        """Single terms and pairs with the logarithm of the ratio of errors that they promise; and candidates whose fit
+        failed.
         """
         search, now = self.search, self.now
         self.on_progress(0, len(self.pool), f"step {number}: {len(self.pool)} candidates are scored")
         plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if form.state is None]
-        promises = _Promises(search, now.terms, now.theta, [form for _, form in plain])
-        best: dict[int, tuple[float, int]] = {}
-        for i, (k, _) in enumerate(plain):
-            own = promises.of(i), i
-            best[k] = min(best.get(k, own), own)
-        singles = [(score, (plain[i][1],)) for score, i in best.values()]
+        some = [form for _, form in plain]
+        promises = [_Promises(search, by, now.terms, now.theta, some) for by in (search.evidence, search.short)]
+        lists: list[list[tuple[float, Terms]]] = [[], []]
+        among: list[list[tuple[float, int]]] = [[], []]
+        for by, singles, ranked in zip(promises, lists, among, strict=True):
+            best: dict[int, tuple[float, int]] = {}
+            for i, (k, _) in enumerate(plain):
+                own = by.of(i), i
+                best[k] = min(best.get(k, own), own)
+            ranked += sorted(best.values())
+            singles += [(score, (plain[i][1],)) for score, i in ranked]
         ends = search.error(now.terms, now.theta)
         diverged = []
         slow = [one for one in self.pool if one.forms[0].state is not None]
@@ -544,23 +584,18 @@ class _Explain:
                     diverged.append(Trial((_found(form),), "diverged", None, str(error)))
                     continue
                 scores.append((score, (form,)))
-            singles += [min(scores, key=lambda s: s[0])] if scores else []
+            lists[0] += [min(scores, key=lambda s: s[0])] if scores else []
             self.on_progress(
                 len(self.pool) - len(slow) + i, len(self.pool), f"step {number}: {one.name} is scored"
             )
-        pairs = []
-        among = sorted(best.values())
-        for (_, i), (_, j) in combinations(among, 2):
-            if not set(plain[i][1].names) & set(plain[j][1].names):
-                pairs.append((promises.of(i, j), (plain[i][1], plain[j][1])))
-        enough = math.log(WORTH)
-        return (
-            sorted((s for s in singles if s[0] < enough), key=lambda s: s[0]),
-            sorted((s for s in pairs if s[0] < enough), key=lambda s: s[0]),
-            diverged,
-        )
+        pairs: list[list[tuple[float, Terms]]] = [[], []]
+        for by, ranked, found in zip(promises, among, pairs, strict=True):
+            for (_, i), (_, j) in combinations(ranked, 2):
+                if not set(plain[i][1].names) & set(plain[j][1].names):
+                    found.append((by.of(i, j), (plain[i][1], plain[j][1])))
+        return _Ranked(*lists), _Ranked(*pairs), diverged
 
-    def _fitted(self, some: Sequence[Terms], running: int, text: str) -> Iterator[_Fitted]:
+    def _fitted(self, some: Sequence[Terms], text: str) -> Iterator[_Fitted]:
         """Candidates, fitted in every fold and judged."""
         search, now = self.search, self.now
         for done, forms in enumerate(some):
@@ -575,7 +610,7 @@ class _Explain:
             except (InputError, np.linalg.LinAlgError) as error:
                 yield _Fitted(forms, None, np.zeros(0), np.zeros(0), str(error))
                 continue
-            yield self._judged(forms, own.theta, squares, max(running, len(some)), untold)
+            yield self._judged(forms, own.theta, squares, len(some), untold)
 
     def _judged(
         self, forms: Terms, theta: Array, squares: Array, candidates: int, untold: Sequence[Term]
