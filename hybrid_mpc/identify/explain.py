@@ -78,7 +78,7 @@ FAR = 2.0
 RIDGE = 1e-6
 """Share that is added to the normal equations' diagonal: columns that are alike stay solvable."""
 SMALL = 0.1
-"""Share of the mean squared error that is added to that of every piece of evidence: pieces in which both models err
+"""Share of the smaller mean squared error that is added to that of every piece: pieces in which both models err
 little say little."""
 FEWEST, MANY = 3, 5
 """Pieces of evidence from which on their scatter is known; and recordings from which on each is one piece."""
@@ -126,7 +126,7 @@ class _HeldOut:
         sums = [np.bincount(self.pieces[seen], weights=v[seen]) for v in (own, other)]
         counts = np.bincount(self.pieces[seen])
         means = [total[counts > 0] / counts[counts > 0] for total in sums]
-        floor = SMALL * float(other[seen].mean()) + 1e-300
+        floor = SMALL * min(float(own[seen].mean()), float(other[seen].mean())) + 1e-300
         each = 0.5 * np.log((means[0] + floor) / (means[1] + floor))
         n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[seen].mean()))
         if n < FEWEST:
@@ -171,7 +171,9 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
     if len(present) >= MANY:
         pieces = np.repeat(recording[:, None], samples, axis=1)
         text = f"{len(present)} recordings in {groups} groups"
-        return _HeldOut(windows, pieces, folds, Evidence(len(present), len(present), groups, length, text), warm)
+        return _HeldOut(
+            windows, pieces, folds, Evidence(len(present), len(present), groups, length, text), warm
+        )
     pieces, count, blocks_of = (
         np.zeros((len(of), samples), dtype=np.int64),
         0,
@@ -286,7 +288,9 @@ class _Search:
         start = np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
         problem = self.problem(terms, self.evidence.windows)
         near = self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
-        starts = [start, near] if problem.explained([near])[0] < FAR * problem.explained([start])[0] else [start]
+        starts = (
+            [start, near] if problem.explained([near])[0] < FAR * problem.explained([start])[0] else [start]
+        )
         fits = [problem.solve(one, ITERATIONS) for one in starts]
         return min(fits, key=lambda fit: problem.explained([fit.theta])[0])
 
@@ -551,9 +555,7 @@ class _Explain:
             chosen,
         )
 
-    def _scored(
-        self, number: int
-    ) -> tuple[_Ranked, _Ranked, list[Trial]]:
+    def _scored(self, number: int) -> tuple[_Ranked, _Ranked, list[Trial]]:
         """Single terms and pairs with the logarithm of the ratio of errors that they promise; and candidates whose fit
         failed.
         """
@@ -561,7 +563,9 @@ class _Explain:
         self.on_progress(0, len(self.pool), f"step {number}: {len(self.pool)} candidates are scored")
         plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if form.state is None]
         some = [form for _, form in plain]
-        promises = [_Promises(search, by, now.terms, now.theta, some) for by in (search.evidence, search.short)]
+        promises = [
+            _Promises(search, by, now.terms, now.theta, some) for by in (search.evidence, search.short)
+        ]
         lists: list[list[tuple[float, Terms]]] = [[], []]
         among: list[list[tuple[float, int]]] = [[], []]
         for by, singles, ranked in zip(promises, lists, among, strict=True):
@@ -879,8 +883,9 @@ class _Pictures:
             )  # fmt: skip
             x, u, w = (named(tuple(s.name for s in group), [ca.DM(c) for c in of.T]) for group, of in signals)
             own = ca.DM(self._signal(term.of)[1])
+            base = named(tuple(p.name for p in self.parameters[: self.n_p]), list(self.values[: self.n_p]))
             given = [float(v) for v, p in zip(values, self.parameters, strict=True) if p.name in term.names]
-            acting = term.law(At(x, u, w, own, None, 0.0, 0.0, None), named(term.names, given))
+            acting = term.law(At(x, u, w, own, None, 0.0, 0.0, None, base), named(term.names, given))
             return np.asarray((acting - own).full().ravel())
         return self._as_force(self._rates(values) - self._rates(zero), term)
 

@@ -5,7 +5,7 @@ Which terms can apply follows from a prior's structure and units, never from nam
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -110,27 +110,23 @@ class _Library:
         width = 0.05 * speed
 
         def weight(
-            key: str, size: float, per: str = "", positive: bool = False, words: str = ""
+            key: str, size: float, per: Sequence[str] = (), positive: bool = False, words: str = ""
         ) -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, f"{unit}{per}", positive=positive, words=words)
+            return self._weight(f"{key}_{own}", i, size, over(unit, *per), positive=positive, words=words)
 
-        per_speed = f" s/{_base(state.unit)}"
+        v_unit, q_unit = state.unit, _base(state.unit)
         at: dict[str, Any] = {"width": width, "place": place}
         yield _one(laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at))
         yield _one(
             laws.asymmetric(own, weight("F_a", 1.0, words="dry friction forwards more than backwards"), **at)
         )
-        yield _one(laws.viscous(own, weight("d", speed, per_speed, True, "viscous friction"), place=place))
+        yield _one(laws.viscous(own, weight("d", speed, (v_unit,), True, "viscous friction"), place=place))
         yield _one(
             laws.viscous_by_direction(
-                own, weight("d_a", speed, per_speed, words="viscous friction by direction"), place=place
+                own, weight("d_a", speed, (v_unit,), words="viscous friction by direction"), place=place
             )
         )
-        yield _one(
-            laws.quadratic(
-                own, weight("c", speed**2, f" s^2/{_base(state.unit)}^2", True, "drag"), place=place
-            )
-        )
+        yield _one(laws.quadratic(own, weight("c", speed**2, (v_unit, v_unit), True, "drag"), place=place))
         yield Candidate(
             f"Stribeck friction of {own}",
             tuple(
@@ -148,9 +144,9 @@ class _Library:
             yield _one(laws.loaded(own, mu, load=load, **at))
         centre, span = float(np.mean(position)), float(np.std(position)) or 1.0
         if turning:
-            sizes, per = (0.7, 0.7), ("", "")
+            sizes, per = (0.7, 0.7), ((), ())
         else:
-            sizes, per = (span, span**2), (f"/{_base(state.unit)}", f"/{_base(state.unit)}^2")
+            sizes, per = (span, span**2), ((q_unit,), (q_unit, q_unit))
         names = [
             weight(f"F_{k}", size, p, words="dry friction along the way")
             for k, size, p in zip((1, 2), sizes, per, strict=True)
@@ -179,7 +175,7 @@ class _Library:
             )  # fmt: skip
         if self.prior.states[q].periodic:
             return
-        stiff = f"/{_base(state.unit)}"
+        stiff = (q_unit,)
         yield _one(laws.spring(own, weight("k", span, stiff, words="stiffness"), centre=centre))
         low, high = np.quantile(position, (0.02, 0.98))
         reach = 0.1 * (high - low)
@@ -198,10 +194,8 @@ class _Library:
         own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
         temperature = (parsed(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
 
-        def weight(
-            key: str, size: float, per: str = "", positive: bool = False, words: str = ""
-        ) -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, f"{unit}{per}", positive=positive, words=words)
+        def weight(key: str, size: float, per: Sequence[str] = (), words: str = "") -> Parameter:
+            return self._weight(f"{key}_{own}", i, size, over(unit, *per), words=words)
 
         yield _one(laws.offset(own, weight("r_0", 1.0, words="offset of the rate"), place="rate"))
         if not state.periodic:
@@ -211,7 +205,7 @@ class _Library:
         for s, c in signals:
             scale, centre = float(np.std(c)), float(np.mean(c))
             if scale > 0:
-                k = weight(f"k_{_short(s.name)}", scale, f"/{_per(s.unit)}", words=f"of {s.name}")
+                k = weight(f"k_{_short(s.name)}", scale, (s.unit,), words=f"of {s.name}")
                 yield _one(laws.coupling(own, k, source=s.name, centre=centre))
         everything = signals if state.periodic else [(state, values), *signals]
         for a, (one, c) in enumerate(everything):
@@ -222,7 +216,7 @@ class _Library:
                     k = weight(
                         key,
                         size,
-                        f"/{_per(one.unit)}/{_per(two.unit)}",
+                        (one.unit, two.unit),
                         words=f"of {one.name} and {two.name}",
                     )
                     centres = float(np.mean(c)), float(np.mean(d))
@@ -233,8 +227,8 @@ class _Library:
         own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
         low, high = float(values.min()), float(values.max())
 
-        def weight(key: str, size: float, per: str = "", words: str = "") -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, f"{unit}{per}", positive=True, words=words)
+        def weight(key: str, size: float, by: str, words: str) -> Parameter:
+            return self._weight(f"{key}_{own}", i, size, by, positive=True, words=words)
 
         forms = []
         references: list[tuple[str | float, Array]] = (
@@ -248,7 +242,9 @@ class _Library:
             for exponent, key in ((1.0, "a"), (1.25, "b"), (0.5, "c"), (2.0, "d")):
                 if (temperature and exponent == 0.5) or (exponent == 1.25 and not temperature):
                     continue
-                k = weight(f"k_{number}{key}", far**exponent, f"/{state.unit}^{exponent:g}", "loss")
+                whole = over(unit, *[state.unit] * int(exponent))
+                by = whole if exponent in (1.0, 2.0) else f"{unit}/{state.unit}^{exponent:g}"
+                k = weight(f"k_{number}{key}", far**exponent, by, "loss")
                 forms.append(laws.loss(own, k, exponent=exponent, reference=reference))
         yield Candidate(f"loss of {own}", tuple(forms))
         if temperature:
@@ -257,7 +253,7 @@ class _Library:
             yield _one(
                 laws.radiation(
                     own,
-                    weight("e", float(size), " 1e8/K^4", "radiation"),
+                    weight("e", float(size), f"{unit} 1e8/K^4", "radiation"),
                     kelvin=kelvin,
                     surroundings=low,
                 )
@@ -271,7 +267,7 @@ class _Library:
             tuple(
                 laws.overflow(
                     own,
-                    weight(f"s_{n}", high - edge, f"/{state.unit}", "overflow"),
+                    weight(f"s_{n}", high - edge, over(unit, state.unit), "overflow"),
                     edge=edge,
                     width=width,
                 )
@@ -353,7 +349,12 @@ class _Library:
             )
         size = float(np.abs(values).max())
         k = Parameter(
-            f"sat_{own}", 0.0, f"1/{_per(signal.unit)}^2", 0.0, 9.0 / size**2, "saturation of the input"
+            f"sat_{own}",
+            0.0,
+            over("1", signal.unit, signal.unit),
+            0.0,
+            9.0 / size**2,
+            "saturation of the input",
         )
         yield _one(laws.saturation(own, k))
         yield _one(
@@ -381,7 +382,7 @@ class _Library:
         yield _one(laws.output_gain(own, of("s_g", 0.5, words="relative error of the sensor's gain")))
         yield _one(laws.output_offset(own, of("s_o", 2 * spread, unit, "offset of the sensor")))
         low, high = (float(v) for v in np.quantile(y, (0.0, 1.0)))
-        bend = of("s_b", 0.9 / (high - low), f"1/{_per(unit)}", "bend of the sensor")
+        bend = of("s_b", 0.9 / (high - low), over("1", unit), "bend of the sensor")
         yield _one(laws.output_curve(own, bend, lower=low, upper=high))
 
 
@@ -393,8 +394,24 @@ def _short(name: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in name)
 
 
-def _per(unit: str) -> str:
-    return unit if unit not in ("-", "") else "1"
+def over(unit: str, *by: str) -> str:
+    """A unit over others.
+
+    Example:
+        >>> over("N m", "rad/s"), over("m/s", "m/s"), over("1", "V", "V")
+        ('N m s/rad', '1', '1/V/V')
+    """
+    up, *down = unit.split("/")
+    ups = [up]
+    for one in by:
+        first, *rest = one.split("/")
+        ups += rest
+        down.append(first)
+    for same in [word for word in down if word in ups]:
+        ups.remove(same)
+        down.remove(same)
+    words = [word for word in ups if word not in ("-", "1", "")]
+    return " ".join(words or ["1"]) + "".join(f"/{word}" for word in down if word not in ("-", "1", ""))
 
 
 def _base(unit: str) -> str:

@@ -8,14 +8,15 @@ a prior may lack, with bounds from its recordings, says :func:`hybrid_mpc.identi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 import casadi as ca
 
 from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.machine import term_units
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Balance, OperatingPoint, Prior, named
 from hybrid_mpc.machine.signals import Parameter, Signal
@@ -86,6 +87,7 @@ class At(NamedTuple):
         driven: Force or rate by what the inputs do [unit of the force or rate], less what they do at rest.
         resting: Force or rate of the machine at rest where it is, as that of gravity or a spring.
         state: The term's own state; None where it has none.
+        p: Parameters of the prior, by name.
     """
 
     x: Any
@@ -96,6 +98,7 @@ class At(NamedTuple):
     driven: Any
     resting: Any
     state: Any
+    p: Any
 
 
 @dataclass(frozen=True)
@@ -165,8 +168,8 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
         terms: Terms, in any order. Default: none, ``base`` itself.
 
     Raises:
-        InputError: If a term's signal is not there, a parameter or state is there twice, or a force is added to a prior
-            that is not mechanical; all of it together.
+        InputError: If a term's signal is not there, a parameter or state is there twice, a force is added to a
+            prior that is not mechanical, the units do not fit, or a potential is none; all of it together.
 
     Example:
         >>> class Disk(MechanicalPrior):
@@ -223,7 +226,8 @@ def _expressions(
 
     def at(own: Any, term: Term, position: Any = None, driven: Any = 0.0, resting: Any = 0.0) -> At:
         x_named, u_named, w_named = (named(prior.names_of(k), ca.vertsplit(v)) for k, v in parts.items())
-        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term))
+        p_named = named(prior.names_of("p"), ca.vertsplit(of_base))
+        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term), p_named)
 
     def applied(term: Term, point: At) -> Any:
         value = term.law(point, given[term])
@@ -362,6 +366,8 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
             problems.append(f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}.")
         if term.state is not None and term.place in ("force", "potential"):
             problems.append(f"{where}: a {term.place} cannot have a state of its own.")
+    if not problems:
+        problems = [problem for term in terms for problem in _misfits(base, prior, term)]
     for what, every in (
         ("parameter", [p.name for p in base.parameters] + [name for t in terms for name in t.names]),
         ("state", [s.name for s in base.states] + [t.state.name for t in terms if t.state is not None]),
@@ -372,6 +378,58 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
                 f"{base.__name__} with terms: {what} {', '.join(twice)} is there twice; rename one."
             )
     refuse(problems)
+
+
+def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
+    """Why a term's law cannot stand where it is: its units, or a potential of more than its position."""
+    where = f"term {term.name!r} for {base.__name__}"
+    groups = {"x": base.states, "u": base.inputs, "w": base.disturbances, "p": base.parameters}
+    symbols = {key: [ca.SX.sym(s.name) for s in signals] for key, signals in groups.items()}
+    inputs = [(v, s.unit) for key in groups for v, s in zip(symbols[key], groups[key], strict=True)]
+    x, u, w, p = (named(prior.names_of(key), symbols[key]) for key in ("x", "u", "w", "p"))
+    kind: str = {"input": "u", "disturbance": "w"}.get(term.place, "x")
+    signals = base.outputs if term.place == "output" else groups[kind]
+    k = [s.name for s in signals].index(term.of)
+    unit, position = signals[k].unit, None
+    wanted, power = term_units.of(unit), None
+    if term.place == "output":
+        inputs.append((own := ca.SX.sym("y"), unit))
+    else:
+        own = symbols[kind][k]
+    for q, v in prior.kinematics:
+        if kind == "x" and v == k:
+            position = symbols["x"][q]
+            power = "N m" if term_units.of(base.states[q].unit) == term_units.NONE else "N"
+    if term.place == "rate":
+        wanted = term_units.per_second(wanted)
+    elif term.place in ("force", "potential"):
+        wanted = term_units.of("J" if term.place == "potential" else power or "N")
+    moved = [ca.SX.sym(name) for name in ("driven", "resting")]
+    given = [ca.SX.sym(q.name) for q in term.parameters]
+    inputs += [(v, q.unit) for v, q in zip(given, term.parameters, strict=True)]
+    state = None if term.state is None else ca.SX.sym(term.state.name)
+    if term.state is not None:
+        inputs.append((state, term.state.unit))
+    point = At(x, u, w, own, position, *moved, state, p)
+    value = _uneven(term).law(point, named(term.names, given))
+    parts = [(value, wanted)]
+    if term.state is not None:
+        parts = [(value[0], wanted), (value[1], term_units.per_second(term_units.of(term.state.unit)))]
+    for one, needed in parts:
+        if said := term_units.clash(one, inputs, needed):
+            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law."
+    if term.place == "potential":
+        free = [v for v in (*symbols["x"], *symbols["u"], *symbols["w"], *moved) if v is not position]
+        if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
+            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force."
+
+
+def _uneven(term: Term) -> Term:
+    """The same law with other numbers: a factor of 1 or 2, whatever its unit, leaves no trace in an expression."""
+    if term.made is None:
+        return term
+    options = {k: 1.2345 * v if type(v) is float else v for k, v in term.made.options.items()}
+    return again(replace(term.made, options=options))
 
 
 def _sign(v: Any, width: Any) -> Any:
