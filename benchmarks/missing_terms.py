@@ -199,10 +199,9 @@ def recorded(
         y = prior.equations.output(states.T, held.T, room.T, prior.p).full().T
         y = y + rng.standard_normal(y.shape) * np.asarray(noise)
         nothing = np.full((n, len(machine.start)), np.nan)
+        x = states if with_states else nothing
         made.append(
-            Trajectory(
-                f"run{k}", "train", machine.dt, machine.dt * np.arange(n), held, y, nothing, nothing, room
-            )
+            Trajectory(f"run{k}", "train", machine.dt, machine.dt * np.arange(n), held, y, x, nothing, room)
         )
     return made
 
@@ -231,12 +230,12 @@ def draw(name: str, number: int) -> dict[str, object]:
     base = machine.prior
     values = {p.name: p.value * float(np.exp(rng.uniform(-0.4, 0.4))) for p in base.parameters}
     plain = base(values)
-    quiet = recorded(plain, machine, [0.0] * len(base.outputs), rng)
-    # states by the plain machine, whose outputs tell them: for the library's scales
-    told = smoothed(base, fit_prior(base, quiet, [], dt=machine.dt), quiet, machine.dt)
+    quiet = recorded(
+        plain, machine, [0.0] * len(base.outputs), rng, with_states=True
+    )  # for the library's scales
     spread = np.std(np.concatenate([t.y for t in quiet]), axis=0)
     length = machine.samples * machine.dt / 3
-    pool = {c.name: c for c in library(plain, visited(told), machine.dt, length)}
+    pool = {c.name: c for c in library(plain, visited(quiet), machine.dt, length)}
     chosen = rng.choice(machine.missing, size=number % 3, replace=False).tolist()
     missing = [planted(pool[key], rng) for key in chosen]
     plant = extended(base, *missing)(values)

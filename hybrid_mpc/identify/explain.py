@@ -21,7 +21,7 @@ from scipy.stats import t as student
 from hybrid_mpc.data.scales import evenly, robust_spread
 from hybrid_mpc.data.scales import periods as periods_of
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.explanation import (
     Evidence,
     ExplainStep,
@@ -84,6 +84,8 @@ FEWEST, MANY = 3, 5
 """Pieces of evidence from which on their scatter is known; and recordings from which on each is one piece."""
 LEAST_T = 2.0
 """Standard errors that one parameter of each term has to differ from none at least: else the data do not tell it."""
+LEAST = 20
+"""Periods of the parts of a single recording at least."""
 SHORTEST = 4
 """Samples of a block at least."""
 DRAWN = 200
@@ -491,7 +493,14 @@ class _Explain:
         self.base, self.known, self.own, self.on_progress = base, known, tuple(own), on_progress
         longest = max(len(t.t) for t in known) - 1
         if len({t.file for t in known}) == 1:  # parts of a single recording are its evidence
-            longest = max(sum(len(t.t) for t in known) // BLOCKS - 1, 2)
+            samples = sum(len(t.t) for t in known)
+            longest = samples // BLOCKS - 1
+            if longest < min(LEAST, periods_of(length, dt, 2)):
+                raise InputError(
+                    f"one recording of {samples} samples is too little evidence for terms, which are judged by "
+                    f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples more, "
+                    "or a second recording"
+                )
         periods = min(periods_of(length, dt, 2), longest)
         self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
         less = max(periods // SHORTER, min(periods, 2 * SHORTEST))
@@ -758,17 +767,38 @@ def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points:
     """Refuse two terms of one name, and own terms that do not fit to the prior.
 
     Raises:
-        InputError: If there are any.
+        InputError: With all that does not.
     """
-    names = [form.name for one in pool for form in one.forms]
+    names = [name for one in pool for name in {form.name for form in one.forms}]
     parameters = [name for one in pool for form in one.forms for name in form.names]
+    problems = []
     for term in own:
         if names.count(term.name) > 1:
-            raise InputError(f"term {term.name!r} is there twice; rename one")
-        twice = [name for name in term.names if parameters.count(name) > 1]
-        if twice:
-            raise InputError(f"term {term.name!r}: parameter {', '.join(twice)} is there twice; rename one")
-        extended(type(prior), term)
+            problems.append(f"term {term.name!r} is there twice; rename one.")
+        problems += [
+            f"term {term.name!r}: parameter {name} is there twice; rename one."
+            for name in term.names
+            if parameters.count(name) > 1
+        ]
+        made = extended(type(prior), term)
+        if term.loss and term.state is None:
+            problems += _supplied(prior, made, term, points)
+    refuse(problems)
+
+
+def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> list[str]:
+    """Why a term that is declared a loss is none: it supplies where the recordings go."""
+    given = tuple(v.T for v in points)
+    values = {p.name: p.upper if math.isfinite(p.upper) else p.value or 1.0 for p in term.parameters}
+    full = made({**prior.values, **values})
+    for before, after in zip(prior.equations.balances, full.equations.balances, strict=True):
+        lost = after.loss(*given, full.p).full() - before.loss(*given, prior.p).full()
+        if lost.min() < -1e-6 * max(np.abs(lost).max(), 1e-300):
+            return [
+                f"term {term.name!r} is declared a loss, but supplies to the balance {before.name!r} at some of the "
+                "recordings' points; correct its sign, or leave loss=False."
+            ]
+    return []
 
 
 class _Pictures:
