@@ -165,7 +165,11 @@ MACHINES = {
 
 
 def recorded(
-    prior: Prior, machine: Machine, noise: Sequence[float], rng: np.random.Generator
+    prior: Prior,
+    machine: Machine,
+    noise: Sequence[float],
+    rng: np.random.Generator,
+    with_states: bool = False,
 ) -> list[Trajectory]:
     """Recordings of a simulated machine from its start under inputs that are held, each of its own size."""
     x, u, w = (

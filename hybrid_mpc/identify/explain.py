@@ -498,8 +498,8 @@ class _Explain:
             if longest < min(LEAST, periods_of(length, dt, 2)):
                 raise InputError(
                     f"one recording of {samples} samples is too little evidence for terms, which are judged by "
-                    f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples more, "
-                    "or a second recording"
+                    f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples "
+                    "more, or a second recording"
                 )
         periods = min(periods_of(length, dt, 2), longest)
         self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
