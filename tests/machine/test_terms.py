@@ -47,29 +47,34 @@ def p(name, value=0.0, unit="N m", low=-10.0, high=10.0):
 def arm_terms(value):
     """A term of each law of an axis, with this weight."""
     one, two = p("a", value), p("b", value)
+
+    def of(unit):
+        return p("a", value, unit)
+
     return {
         "coulomb": terms.coulomb("v1", one, width=0.2),
         "asymmetric": terms.asymmetric("v1", one, width=0.2),
-        "viscous": terms.viscous("v1", one),
-        "viscous by direction": terms.viscous_by_direction("v1", one),
-        "quadratic": terms.quadratic("v1", one),
+        "viscous": terms.viscous("v1", of("N m s/rad")),
+        "viscous by direction": terms.viscous_by_direction("v1", of("N m s/rad")),
+        "quadratic": terms.quadratic("v1", of("N m s^2/rad^2")),
         "stribeck": terms.stribeck("v2", one, speed=0.5, width=0.2),
-        "loaded by motor": terms.loaded("v1", one, load="driven", width=0.2),
-        "loaded by both": terms.loaded("v2", one, load="both", width=0.2),
+        "loaded by motor": terms.loaded("v1", of("-"), load="driven", width=0.2),
+        "loaded by both": terms.loaded("v2", of("-"), load="both", width=0.2),
         "by position": terms.coulomb_by_position("v1", one, two, width=0.2, turning=True),
         "offset": terms.offset("v1", one),
         "gravity": terms.gravity_error("v1", one, two),
         "cogging": terms.cogging("v2", one, two, periods=4.0),
-        "spring": terms.spring("v1", one, centre=0.1),
-        "end": terms.elastic_end("v1", one, edge=-0.2, upper=True),
-        "gain": terms.input_gain("t1", one),
+        "spring": terms.spring("v1", of("N m/rad"), centre=0.1),
+        "end": terms.elastic_end("v1", of("N m/rad"), edge=-0.2, upper=True),
+        "gain": terms.input_gain("t1", of("-")),
         "input offset": terms.input_offset("t1", one),
-        "by direction": terms.gain_by_direction("t2", one),
-        "input curve": terms.input_curve("t1", one, centre=0.0, span=2.0),
+        "by direction": terms.gain_by_direction("t2", of("-")),
+        "input curve": terms.input_curve("t1", of("-"), centre=0.0, span=1.0),
+        "saturation": terms.saturation("t1", of("1/N^2 m^2")),
         "dead zone": terms.dead_zone("t1", one, width=0.1),
-        "sensor gain": terms.output_gain("q1", one),
-        "sensor offset": terms.output_offset("q1", one),
-        "sensor curve": terms.output_curve("q2", one, lower=-1.0, upper=1.0),
+        "sensor gain": terms.output_gain("q1", of("-")),
+        "sensor offset": terms.output_offset("q1", of("rad")),
+        "sensor curve": terms.output_curve("q2", of("1/rad"), lower=-1.0, upper=1.0),
     }
 
 
