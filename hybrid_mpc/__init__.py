@@ -124,10 +124,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.loop.loop import Loop as Loop
     from hybrid_mpc.loop.realtime import Runner as Runner, SafeEnd as SafeEnd
     from hybrid_mpc.loop.simulate import ClosedLoopResult as ClosedLoopResult, simulate as simulate
-    from hybrid_mpc.machine.friction import (
-        Coulomb as Coulomb, LoadDependent as LoadDependent, Stribeck as Stribeck, Viscous as Viscous,
-        with_friction as with_friction,
-    )
+    from hybrid_mpc.machine import terms as terms
     from hybrid_mpc.machine.mechanical import MechanicalPrior as MechanicalPrior
     from hybrid_mpc.machine.prior import Balance as Balance, OperatingPoint as OperatingPoint, Prior as Prior
     from hybrid_mpc.machine.signals import Parameter as Parameter, Signal as Signal
@@ -135,6 +132,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         BenchmarkBudget as BenchmarkBudget, BenchmarkSpec as BenchmarkSpec, DataSpec as DataSpec,
         Role as Role, Window as Window,
     )
+    from hybrid_mpc.machine.terms import Term as Term, extended as extended
     from hybrid_mpc.machine.torch_prior import TorchPrior as TorchPrior
     from hybrid_mpc.model.buffered import BufferedFunction as BufferedFunction
     from hybrid_mpc.model.delay import with_input_delay as with_input_delay
@@ -237,11 +235,11 @@ _ROOMS = {
     "loop.loop": ("Loop",),
     "loop.realtime": ("Runner", "SafeEnd"),
     "loop.simulate": ("ClosedLoopResult", "simulate"),
-    "machine.friction": ("Coulomb", "LoadDependent", "Stribeck", "Viscous", "with_friction"),
     "machine.mechanical": ("MechanicalPrior",),
     "machine.prior": ("Balance", "OperatingPoint", "Prior"),
     "machine.signals": ("Parameter", "Signal"),
     "machine.specification": ("BenchmarkBudget", "BenchmarkSpec", "DataSpec", "Role", "Window"),
+    "machine.terms": ("Term", "extended"),
     "machine.torch_prior": ("TorchPrior",),
     "model.buffered": ("BufferedFunction",),
     "model.delay": ("with_input_delay",),
@@ -264,17 +262,19 @@ _ROOMS = {
 }  # fmt: skip
 """Public names by the module that defines them."""
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
-__all__ = sorted((*_HOME, "plots", "__version__"))
+_MODULES = {"plots": "plots", "terms": "machine.terms"}
+"""Public modules by their names."""
+__all__ = sorted((*_HOME, *_MODULES, "__version__"))
 
 
 def __getattr__(name: str) -> Any:
-    if name != "plots" and name not in _HOME:
+    if name not in _MODULES and name not in _HOME:
         raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
     from hybrid_mpc.errors import named_extra
 
     with named_extra(f"hybrid_mpc.{name}"):
-        if name == "plots":
-            return importlib.import_module("hybrid_mpc.plots")
+        if name in _MODULES:
+            return importlib.import_module(f"hybrid_mpc.{_MODULES[name]}")
         return getattr(importlib.import_module(f"hybrid_mpc.{_HOME[name]}"), name)
 
 

@@ -398,8 +398,8 @@ def over(unit: str, *by: str) -> str:
     """A unit over others.
 
     Example:
-        >>> over("N m", "rad/s"), over("m/s", "m/s"), over("1", "V", "V")
-        ('N m s/rad', '1', '1/V/V')
+        >>> over("N m", "rad/s"), over("m/s", "m/s"), over("1", "V", "V"), over("m/s", "m", "m")
+        ('N m s/rad', '1', '1/V/V', '1/s/m')
     """
     up, *down = unit.split("/")
     ups = [up]
@@ -407,9 +407,10 @@ def over(unit: str, *by: str) -> str:
         first, *rest = one.split("/")
         ups += rest
         down.append(first)
-    for same in [word for word in down if word in ups]:
-        ups.remove(same)
-        down.remove(same)
+    for word in list(down):
+        if word in ups:
+            ups.remove(word)
+            down.remove(word)
     words = [word for word in ups if word not in ("-", "1", "")]
     return " ".join(words or ["1"]) + "".join(f"/{word}" for word in down if word not in ("-", "1", ""))
 

@@ -184,7 +184,10 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
         >>> [b.loss([0.0, 2.0], 0.0, [], dragged.p) for b in dragged.equations.balances]
         [DM(0.8)]
     """
-    made: type[Prior] = _extended(cast(Any, base), terms) if terms else base
+    own: Any = base
+    if not terms:
+        return base
+    made: type[Prior] = _extended(getattr(own, "base", own), (*getattr(own, "terms", ()), *terms))
     return made
 
 
