@@ -94,6 +94,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.identify.tune import SearchSpace as SearchSpace, tune as tune
     from hybrid_mpc.check.preflight import check_scenario as check_scenario
     from hybrid_mpc.workflow.check_fit import check_fit as check_fit
+    from hybrid_mpc.workflow.explain import explain as explain
     from hybrid_mpc.compare.controllers import find_noise as find_noise
     from hybrid_mpc.compare.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
     from hybrid_mpc.workflow.run import run as run
@@ -132,7 +133,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         BenchmarkBudget as BenchmarkBudget, BenchmarkSpec as BenchmarkSpec, DataSpec as DataSpec,
         Role as Role, Window as Window,
     )
-    from hybrid_mpc.machine.terms import Term as Term, extended as extended
+    from hybrid_mpc.machine.terms import Term as Term, extended as extended, with_nominal as with_nominal
     from hybrid_mpc.machine.torch_prior import TorchPrior as TorchPrior
     from hybrid_mpc.model.buffered import BufferedFunction as BufferedFunction
     from hybrid_mpc.model.delay import with_input_delay as with_input_delay
@@ -239,7 +240,7 @@ _ROOMS = {
     "machine.prior": ("Balance", "OperatingPoint", "Prior"),
     "machine.signals": ("Parameter", "Signal"),
     "machine.specification": ("BenchmarkBudget", "BenchmarkSpec", "DataSpec", "Role", "Window"),
-    "machine.terms": ("Term", "extended"),
+    "machine.terms": ("Term", "extended", "with_nominal"),
     "machine.torch_prior": ("TorchPrior",),
     "model.buffered": ("BufferedFunction",),
     "model.delay": ("with_input_delay",),
@@ -257,6 +258,7 @@ _ROOMS = {
     "watch.replay": ("Trace", "count_alarms", "replay"),
     "watch.residuals": ("ResidualReadings",),
     "workflow.check_fit": ("check_fit",),
+    "workflow.explain": ("explain",),
     "workflow.run": ("run",),
     "workflow.settings": ("RunSettings",),
 }  # fmt: skip

@@ -455,6 +455,7 @@ def explain(
     candidates: Sequence[Candidate] | None = None,
     own: Sequence[Term] = (),
     begun: Explanation | None = None,
+    most: int = STEPS,
     on_progress: Progress = lambda done, total, text: None,
     on_step: Callable[[Explanation], None] = lambda told: None,
 ) -> Explanation:
@@ -471,6 +472,7 @@ def explain(
         candidates: Terms to choose from. Default: :func:`~hybrid_mpc.identify.term_library.library`.
         own: A user's own terms beside these.
         begun: What ``on_step`` had of a search with the same arguments that was stopped: it goes on from there.
+        most: Steps that add terms, at most.
         on_progress: ``(done, total, text)`` after every fit of a step.
         on_step: What is known after each step, for a file from which a stopped search goes on.
 
@@ -479,7 +481,7 @@ def explain(
             fit to the prior, its units or its balances.
     """
     found = _Explain(base, values, known, dt, length, warm_up, candidates, own, on_progress)
-    return found.run(begun, on_step)
+    return found.run(begun, most, on_step)
 
 
 class _Explain:
@@ -520,15 +522,18 @@ class _Explain:
             search.problem((), self.evidence.windows).solve(search.fit(()).scaled(values), ITERATIONS).theta
         )
         self.first = search.held_out((), theta)
+        self.nominal = _squares(search.problem((), self.evidence.judged), search.fit(()).nominal)
         self.now = _State((), theta, self.first)
 
-    def run(self, begun: Explanation | None, on_step: Callable[[Explanation], None]) -> Explanation:
+    def run(
+        self, begun: Explanation | None, most: int, on_step: Callable[[Explanation], None]
+    ) -> Explanation:
         """The whole search."""
         if begun is not None:
             self._resume(begun)
         last: tuple[Trial, ...] = ()
-        reason = f"the search ends after {STEPS} steps"
-        while sum(step.action == "added" for step in self.steps) < STEPS:
+        reason = f"the search ends after {most} steps"
+        while sum(step.action == "added" for step in self.steps) < most:
             trials, scored, chosen = self._step()
             if chosen is None:
                 last, reason = trials, _reason(trials, self.evidence.told.pieces)
@@ -719,6 +724,9 @@ class _Explain:
             for p in fit.prior.parameters
         )
 
+    def _error(self, squares: Array) -> float:
+        return float(np.sqrt(squares[self.evidence.counted].mean()))
+
     def _told(self, reason: str, last: tuple[Trial, ...]) -> Explanation:
         terms = self.now.terms
         parameters = self._parameters(terms, self.now.theta)
@@ -736,7 +744,7 @@ class _Explain:
                 )  # fmt: skip
             steps.append(step)
         return Explanation(
-            self.base.__name__, float(np.sqrt(self.first[self.evidence.counted].mean())),
+            self.base.__name__, self._error(self.nominal), self._error(self.first),
             self.evidence.compared(self.now.squares, self.first, 1), tuple(steps), last, parameters,
             self.evidence.told, self.candidates, reason,
         )  # fmt: skip

@@ -202,6 +202,7 @@ class Explanation:
 
     Args:
         base: Name of the prior's class.
+        nominal: Error of the nominal parameters over the same data [-].
         before: Held-out error of the fitted prior without terms [-].
         after: Held-out error with all terms, over that without any.
         steps: Steps of the search in order.
@@ -213,6 +214,7 @@ class Explanation:
     """
 
     base: str
+    nominal: float
     before: float
     after: HeldOutError
     steps: tuple[ExplainStep, ...]

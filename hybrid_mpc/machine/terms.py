@@ -191,6 +191,47 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
     return made
 
 
+def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]:
+    """A prior class with other nominal parameters, e.g. fitted ones; of an extended prior those of its terms, too.
+
+    Args:
+        prior: A prior; an extended one too.
+        values: Nominal values [their units] by name. Parameters that are not named keep theirs.
+
+    Raises:
+        InputError: If a name is no parameter.
+
+    Example:
+        >>> class Decay(Prior):
+        ...     states, inputs, outputs = (Signal("x", "m"),), (Signal("u", "m/s"),), (Signal("x", "m"),)
+        ...     parameters = (Parameter("k", 1.0, "1/s", 0.0, 9.0),)
+        ...     def xdot(self, x, u, w, p):
+        ...         return (u.u - p.k * x.x,)
+        >>> with_nominal(Decay, {"k": 2.0})().values
+        {'k': 2.0}
+    """
+    names = [p.name for p in prior.parameters]
+    if unknown := sorted(set(values) - set(names)):
+        raise InputError(
+            f"{prior.__name__} has no parameter {', '.join(unknown)}; there are {', '.join(names) or 'none'}"
+        )
+    own: Any = prior
+    terms: tuple[Term, ...] = getattr(own, "terms", ())
+    base: Any = getattr(own, "base", own)
+    chosen = tuple(replace(p, value=values.get(p.name, p.value)) for p in base.parameters)
+    made = type(
+        base.__name__, (base,), {"parameters": chosen, "__module__": base.__module__, "__doc__": base.__doc__}
+    )
+    return extended(made, *(_with_values(term, values) for term in terms))
+
+
+def _with_values(term: Term, values: Mapping[str, float]) -> Term:
+    """A term with other nominal parameters."""
+    chosen = tuple(replace(p, value=values.get(p.name, p.value)) for p in term.parameters)
+    made = None if term.made is None else replace(term.made, parameters=chosen)
+    return replace(term, parameters=chosen, made=made)
+
+
 @cache
 def _extended(base: Any, terms: tuple[Term, ...]) -> Any:
     _check(base, terms)
