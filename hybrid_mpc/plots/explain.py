@@ -48,13 +48,16 @@ class Picture(Protocol):
         """What the recordings ask for there; empty where nothing shows it."""
 
 
-def error_steps(labels: Sequence[str], errors: Sequence[float], ylabel: str) -> Figure:
+def error_steps(
+    labels: Sequence[str], errors: Sequence[float], what: str, floor: float | None = None
+) -> Figure:
     """A bar a model, from the nominal prior on: how much of the error each step removed.
 
     Args:
         labels: Of the bars: ``"nominal"``, ``"fitted"``, then what was added or removed.
         errors: Errors, not negative; what is not finite has no bar.
-        ylabel: What the errors are, with unit.
+        what: What the errors are, with unit.
+        floor: Error that the sensors' noise alone makes. Default: it is not drawn.
 
     Raises:
         InputError: If no error is finite.
@@ -67,7 +70,7 @@ def error_steps(labels: Sequence[str], errors: Sequence[float], ylabel: str) -> 
     finite = [v for v in errors if math.isfinite(v)]
     if not finite:
         raise InputError("plot of the steps: there is no finite error")
-    figure, axes = new_figure(1, 1, size=(10.0, 0.9 + 0.42 * len(labels)))
+    figure, axes = new_figure(1, 1, size=(10.0, 1.3 + 0.42 * len(labels)))
     ax, top = axes[0, 0], max(finite)
     for k, (value, before) in enumerate(zip(errors, [math.inf, *errors], strict=False)):
         if not math.isfinite(value):
@@ -85,8 +88,11 @@ def error_steps(labels: Sequence[str], errors: Sequence[float], ylabel: str) -> 
     ax.set_yticks(range(len(labels)), [_broken(plain(label)) for label in labels])
     ax.invert_yaxis()
     ax.set_xlim(0.0, 1.32 * top)
-    ax.set_xlabel(plain(ylabel))
+    ax.set_xlabel(plain(what))
     ax.grid(visible=False, axis="y")
+    if floor is not None:
+        ax.axvline(floor, color=INK, linestyle="--", linewidth=1.0, label="sensor noise")
+        shared_legend(figure)
     return figure
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -237,7 +238,13 @@ class _Search:
             tests = self.tests(fit, told)
             progress.finish("")
         name = self.context.scenario.name
-        return ExplainResult(name, told, fit.delay, tests, f"{explained_name(name)}.py" if told.found else "")
+        own = fit.smoother(self.make(fit.values), self.dt)
+        floor = math.sqrt(
+            sum((s / size) ** 2 for s, size in zip(own.sigma, own.sizes.y, strict=True)) / len(own.sigma)
+        )
+        return ExplainResult(
+            name, told, fit.delay, floor, tests, f"{explained_name(name)}.py" if told.found else ""
+        )
 
     def fit(self) -> PriorFit:
         """The fitted prior."""

@@ -22,7 +22,7 @@ MODELS = {"nominal": "prior, nominal", "fitted": "prior, fitted", "explained": "
 def write_page(out: Path, scenario: Scenario, found: ExplainResult, command: Sequence[str]) -> Path:
     """Write figures and the page; its path."""
     told = found.explanation
-    bars = plots.error_steps(*bars_of(told), f"held-out error, {SPREADS} [-]")
+    bars = plots.error_steps(*bars_of(told), f"held-out error, {SPREADS} [-]", found.floor)
     steps = save(bars, out / "figures" / "error_by_step.png")
     drawn = []
     for number, step in enumerate(told.steps, 1):
@@ -35,7 +35,7 @@ def write_page(out: Path, scenario: Scenario, found: ExplainResult, command: Seq
             "Error by step",
             (
                 "Each bar is the error of free runs over recordings that the model was not fitted to. The pale part is "
-                "what the step removed.",
+                "what the step removed. The dashed line is the sensors' noise.",
             ),
             ((steps, "Held-out error of the nominal and the fitted prior, and after each step."),),
             (steps_table(told), *([tests_table(found)] if found.tests else [])),

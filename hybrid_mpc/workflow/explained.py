@@ -36,6 +36,7 @@ class ExplainResult:
         scenario: Name of the scenario.
         explanation: Steps, terms, values and what they were judged by.
         delay: Delay of the inputs [s] that was fitted with the prior.
+        floor: Error that the sensors' noise alone makes [-], of the fitted prior's smoother.
         tests: Errors over the test recordings by model: ``"nominal"``, ``"fitted"``, ``"explained"``. Empty where there
             are no test recordings.
         file: Name of the scenario file with the found terms; empty where none was found.
@@ -44,6 +45,7 @@ class ExplainResult:
     scenario: str
     explanation: Explanation
     delay: float
+    floor: float
     tests: Mapping[str, FreeRuns] = field(default_factory=dict)
     file: str = ""
 
@@ -130,17 +132,22 @@ def _call(made: Made, values: Mapping[str, FittedParameter]) -> Iterator[str]:
     for p in made.parameters:
         fitted = values[p.name]
         words = f", {p.description!r}" if p.description else ""
-        text = f"Parameter({p.name!r}, {_number(fitted)}, {p.unit!r}, {p.lower!r}, {p.upper!r}{words})"
+        ends = ", ".join(repr(_rounded(end)) for end in (p.lower, p.upper))
+        text = f"Parameter({p.name!r}, {_number(fitted)}, {p.unit!r}, {ends}{words})"
         yield f"        {text},  # {_error(fitted)}"
     for key, value in made.options.items():
-        yield f"        {key}={value!r},"
+        yield f"        {key}={_rounded(value) if isinstance(value, float) else value!r},"
     yield "    ),"
 
 
 def _number(p: FittedParameter) -> str:
-    """A value, rounded where its bounds allow."""
-    rounded = float(f"{p.value:.{DIGITS}g}")
-    return repr(rounded if p.lower <= rounded <= p.upper else p.value)
+    """A value, which its rounded bounds hold."""
+    return repr(_rounded(p.value))
+
+
+def _rounded(value: float) -> float:
+    """A number as a user writes it; rounding keeps the order of numbers, so values stay within bounds."""
+    return float(f"{value:.{DIGITS}g}")
 
 
 def _error(p: FittedParameter) -> str:
