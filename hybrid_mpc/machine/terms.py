@@ -8,8 +8,9 @@ a prior may lack, with bounds from its recordings, says :func:`hybrid_mpc.identi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
@@ -53,10 +54,8 @@ class Made:
     @property
     def code(self) -> str:
         """The call as code."""
-        more = [f"{key}={value!r}" for key, value in self.options.items()]
-        return (
-            f"terms.{self.maker}({', '.join([repr(self.of), *map(_parameter_code, self.parameters), *more])})"
-        )
+        more = [f"{key}={code_of(value)}" for key, value in self.options.items()]
+        return f"terms.{self.maker}({', '.join([repr(self.of), *map(code_of, self.parameters), *more])})"
 
 
 def again(made: Made) -> Term:
@@ -481,9 +480,28 @@ def _sign(v: Any, width: Any) -> Any:
     return ca.tanh(v / width)
 
 
-def _parameter_code(p: Parameter) -> str:
-    words = f", {p.description!r}" if p.description else ""
-    return f"Parameter({p.name!r}, {p.value!r}, {p.unit!r}, {p.lower!r}, {p.upper!r}{words})"
+def code_of(value: Option | Parameter) -> str:
+    """A parameter, signal or option as code.
+
+    Example:
+        >>> code_of(Parameter("d", 0.0, "N s/m", 0.0, math.inf)), code_of(Signal("s", "N"))
+        ("Parameter('d', 0.0, 'N s/m', 0.0, float('inf'))", "Signal('s', 'N')")
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"float('{value}')"
+    if isinstance(value, tuple):
+        return f"({''.join(f'{code_of(one)}, ' for one in value).rstrip()})"
+    if isinstance(value, Parameter):
+        given = [value.name, value.value, value.unit, value.lower, value.upper]
+        return f"Parameter({', '.join(map(code_of, [*given, value.description][: 5 + bool(value.description)]))})"
+    if isinstance(value, Signal):
+        more = [
+            f", {f.name}={code_of(own)}"
+            for f in fields(value)[2:]
+            if (own := getattr(value, f.name)) != f.default
+        ]
+        return f"Signal({value.name!r}, {value.unit!r}{''.join(more)})"
+    return repr(value)
 
 
 def _added(

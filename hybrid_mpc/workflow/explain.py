@@ -97,7 +97,7 @@ def explain(
         if data is None:
             data = _simulated(context, make)
         found = _Search(context, make, data, chosen, most).result()
-        write(context, make, found)
+        write(context, found)
         return found
 
 
@@ -348,12 +348,12 @@ def _added(told: Explanation | None) -> int:
     return 0 if told is None else sum(step.action == "added" for step in told.steps)
 
 
-def write(context: Context, make: type[Prior], found: ExplainResult) -> None:
+def write(context: Context, found: ExplainResult) -> None:
     """Write page, scenario file and, last, ``explain.json``."""
     out, settings = context.out, context.settings
     if found.file:
         write_text(
-            out / found.file, scenario_code(context.scenario, context.scenario_path, make, found.explanation)
+            out / found.file, scenario_code(context.scenario, context.scenario_path, found.explanation)
         )
     write_page(out, context.scenario, found, ["explain", settings.scenario, *settings.options(str)])
     write_json(

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from hybrid_mpc.identify.explanation import Explanation, FittedParameter, FoundTerm
-from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.machine.terms import Made
+from hybrid_mpc.machine.terms import Made, code_of
 from hybrid_mpc.scenario import Scenario
 
 DIGITS = 6
@@ -60,13 +59,12 @@ def explained_name(scenario: str) -> str:
     return scenario.removesuffix(ENDING) + ENDING
 
 
-def scenario_code(scenario: Scenario, where: str, prior: type[Prior], found: Explanation) -> str:
+def scenario_code(scenario: Scenario, where: str, found: Explanation) -> str:
     """A scenario file: the machine of another one, whose prior has the found terms, with fitted values as nominal ones.
 
     Args:
         scenario: The scenario that was explained.
         where: Its registered name or the path of its file.
-        prior: The class of its prior.
         found: What was found.
     """
     values = {p.name: p for p in found.parameters}
@@ -103,7 +101,9 @@ def scenario_code(scenario: Scenario, where: str, prior: type[Prior], found: Exp
         lines += [f"    own[{term.name!r}],"] if term.made is None else _call(term.made, values)
     lines += [")", '"""The terms that were found, with their fitted values."""', "", "FITTED = {"]
     lines += [
-        f"    {p.name!r}: {_number(p)},  # {_error(p)}" for p in found.parameters if p.name not in of_made
+        f"    {p.name!r}: {_rounded(p.value)!r},  # {_error(p)}"
+        for p in found.parameters
+        if p.name not in of_made
     ]
     lines += [
         "}", '"""Fitted values of the other parameters."""', "",
@@ -131,18 +131,11 @@ def _call(made: Made, values: Mapping[str, FittedParameter]) -> Iterator[str]:
     yield f"        {made.of!r},"
     for p in made.parameters:
         fitted = values[p.name]
-        words = f", {p.description!r}" if p.description else ""
-        ends = ", ".join(repr(_rounded(end)) for end in (p.lower, p.upper))
-        text = f"Parameter({p.name!r}, {_number(fitted)}, {p.unit!r}, {ends}{words})"
-        yield f"        {text},  # {_error(fitted)}"
+        own = replace(p, value=_rounded(fitted.value), lower=_rounded(p.lower), upper=_rounded(p.upper))
+        yield f"        {code_of(own)},  # {_error(fitted)}"
     for key, value in made.options.items():
-        yield f"        {key}={_rounded(value) if isinstance(value, float) else value!r},"
+        yield f"        {key}={code_of(_rounded(value) if isinstance(value, float) else value)},"
     yield "    ),"
-
-
-def _number(p: FittedParameter) -> str:
-    """A value, which its rounded bounds hold."""
-    return repr(_rounded(p.value))
 
 
 def _rounded(value: float) -> float:
