@@ -1,7 +1,7 @@
 """Which physical terms a prior lacks: a search over a library of terms, judged by held-out recordings.
 
 Each step scores all candidates by one Gauss-Newton step from the present fit, with the parameters and first states, in
-every fold; fits the best few in every fold; and adds the best of those that surely do no harm. Where no single term
+every fold; fits the best few in every fold; and adds the best of those that surely lower the error. Where no single term
 does, pairs are tried. After each step, terms that later ones made needless are removed. No torch in here.
 """
 
@@ -70,7 +70,8 @@ GAIN = 0.7
 """Ratio of errors below which a gain counts no more in the upper bound: a bound that is larger for it, and that no
 single recording of a large gain widens."""
 DOUBT = 0.1
-"""Probability of harm below which a term is added, all candidates of a step together that were fitted."""
+"""Probability of an error beyond an end of an interval, for all candidates of a step together that were fitted: a term
+is added where the upper end is below 1, so that it surely lowers the error."""
 REACH = 3.0
 """Errors of a free run count up to so many spreads of their output: one that runs away is as bad as that."""
 FAR = 2.0
@@ -135,7 +136,7 @@ class _HeldOut:
             return HeldOutError(error, math.exp(mean), 0.0, math.inf, 1.0)
         capped = np.maximum(each, math.log(GAIN))  # its mean is no less, its scatter not that of large gains
         scatter, safe = (max(float(v.std(ddof=1)) / math.sqrt(n), 1e-9) for v in (each, capped))
-        wide = float(student.ppf(1.0 - 0.5 * DOUBT / candidates, n - 1))
+        wide = float(student.ppf(1.0 - DOUBT / candidates, n - 1))
         upper = float(capped.mean()) + wide * safe
         harm = float(student.cdf((float(capped.mean()) - math.log(HARM)) / safe, n - 1))
         return HeldOutError(
@@ -432,7 +433,7 @@ class _Ranked:
         for own, other in zip((self.long, self.short), others, strict=True):
             enough = math.log(WORTH) + min([score for score, _ in other], default=0.0)
             found += [forms for score, forms in sorted(own, key=lambda s: s[0])[:count] if score < enough]
-        return list(dict.fromkeys(found))
+        return list({frozenset(form.name for form in forms): forms for forms in found}.values())
 
 
 @dataclass
@@ -634,7 +635,7 @@ class _Explain:
             return _Fitted(forms, None, theta, squares, "its free runs diverge")
         if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
             reason = f"the error is {found.ratio:.2f} of that without it"
-        elif found.harm >= DOUBT:
+        elif found.upper >= 1.0:
             reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
         elif untold:
             reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
@@ -743,7 +744,7 @@ class _Explain:
 
 
 def _chosen(fitted: Sequence[_Fitted]) -> _Fitted | None:
-    """The candidate of the lowest expected logarithm of the error, of those that surely do no harm."""
+    """The candidate of the lowest expected logarithm of the error, of those that surely lower it."""
     sure = [one for one in fitted if one.sure]
     return min(sure, key=lambda one: one.held_out.ratio if one.held_out else math.inf, default=None)
 
