@@ -1,8 +1,8 @@
 """Which physical terms a prior lacks: a search over a library of terms, judged by held-out recordings.
 
 Each step scores all candidates by one Gauss-Newton step from the present fit, with the parameters and first states, in
-every fold; fits the best few in every fold; and adds the best of those that surely lower the error. Where no single term
-does, pairs are tried. After each step, terms that later ones made needless are removed. No torch in here.
+every fold; fits the best few in every fold; and adds the best of those that surely lower the error. Where no single
+term does, pairs are tried. After each step, terms that later ones made needless are removed. No torch in here.
 """
 
 from __future__ import annotations
@@ -111,9 +111,8 @@ class _HeldOut:
     @property
     def counted(self) -> NDArray[np.bool_]:
         """Samples ``(n, T + 1)`` that count."""
-        seen = np.isfinite(self.windows.y).any(axis=-1)
-        seen[:, : self.warm] = False
-        return np.asarray(seen)
+        late = np.arange(self.windows.y.shape[1]) >= self.warm
+        return np.asarray(np.isfinite(self.windows.y).any(axis=-1) & late)
 
     def rows(self, keep: NDArray[np.bool_], windows: OutputWindows | None = None) -> OutputWindows:
         """Some windows."""
