@@ -124,13 +124,8 @@ class _HeldOut:
 
     def compared(self, own: Array, other: Array, candidates: int) -> HeldOutError:
         """Squared errors ``(n, T + 1)`` of one model over another's, which was the best of so many candidates."""
-        seen = self.counted
-        sums = [np.bincount(self.pieces[seen], weights=v[seen]) for v in (own, other)]
-        counts = np.bincount(self.pieces[seen])
-        means = [total[counts > 0] / counts[counts > 0] for total in sums]
-        floor = SMALL * min(float(own[seen].mean()), float(other[seen].mean())) + 1e-300
-        each = 0.5 * np.log((means[0] + floor) / (means[1] + floor))
-        n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[seen].mean()))
+        each = self._each(own, other)
+        n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[self.counted].mean()))
         if n < FEWEST:
             return HeldOutError(error, math.exp(mean), 0.0, math.inf, 1.0)
         capped = np.maximum(each, math.log(GAIN))  # its mean is no less, its scatter not that of large gains
@@ -142,6 +137,25 @@ class _HeldOut:
             error, math.exp(mean), math.exp(max(mean - wide * scatter, -700.0)), math.exp(min(upper, 700.0)),
             min(1.0, candidates * harm),
         )  # fmt: skip
+
+    def needed(self, own: Array, other: Array, candidates: int) -> int:
+        """Recordings like these that it takes besides for a bound below 1; 0 where they would be more than tenfold."""
+        capped = np.maximum(self._each(own, other), math.log(GAIN))
+        mean, scatter, n = float(capped.mean()), float(capped.std(ddof=1)), len(capped)
+        for pieces in range(n + 1, 10 * n + 1):
+            wide = float(student.ppf(1.0 - DOUBT / candidates, pieces - 1)) * scatter / math.sqrt(pieces)
+            if mean + wide < 0:
+                return math.ceil((pieces - n) * self.told.recordings / n)
+        return 0
+
+    def _each(self, own: Array, other: Array) -> Array:
+        """Logarithm of the ratio of errors of each piece of evidence."""
+        seen = self.counted
+        sums = [np.bincount(self.pieces[seen], weights=v[seen]) for v in (own, other)]
+        counts = np.bincount(self.pieces[seen])
+        means = [total[counts > 0] / counts[counts > 0] for total in sums]
+        floor = SMALL * min(float(own[seen].mean()), float(other[seen].mean())) + 1e-300
+        return np.asarray(0.5 * np.log((means[0] + floor) / (means[1] + floor)))
 
 
 def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int, most: int) -> _HeldOut:
@@ -491,7 +505,11 @@ class _Explain:
     ) -> None:  # fmt: skip
         prior = base(values)
         self.base, self.known, self.own, self.on_progress = base, known, tuple(own), on_progress
-        longest = max(len(t.t) for t in known) - 1
+        ends = {name: max(len(t.t) for t in known if t.file == name) - 1 for name in {t.file for t in known}}
+        longest = min(periods_of(length, dt, 2), max(ends.values()))
+        longest = min(
+            end for end in ends.values() if 2 * end >= longest
+        )  # no recording is left out for being shorter
         if len({t.file for t in known}) == 1:  # parts of a single recording are its evidence
             samples = sum(len(t.t) for t in known)
             longest = samples // BLOCKS - 1
@@ -635,7 +653,10 @@ class _Explain:
         if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
             reason = f"the error is {found.ratio:.2f} of that without it"
         elif found.upper >= 1.0:
+            more = self.evidence.needed(squares, self.now.squares, candidates)
             reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
+            if more:
+                reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
         elif untold:
             reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
         return _Fitted(forms, found, theta, squares, reason, not reason)
