@@ -1,8 +1,8 @@
 """Which physical terms a prior lacks: a search over a library of terms, judged by held-out recordings.
 
 Each step scores all candidates by one Gauss-Newton step from the present fit, with the parameters and first states, in
-every fold; fits the best few in every fold; and adds the best of those that surely do no harm. Where no single term
-does, pairs are tried. After each step, terms that later ones made needless are removed. No torch in here.
+every fold; fits the best few in every fold; and adds the best of those that surely lower the error. Where no single
+term does, pairs are tried. After each step, terms that later ones made needless are removed. No torch in here.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ GAIN = 0.7
 """Ratio of errors below which a gain counts no more in the upper bound: a bound that is larger for it, and that no
 single recording of a large gain widens."""
 DOUBT = 0.1
-"""Probability of harm below which a term is added, all candidates of a step together that were fitted."""
+"""Probability of an error beyond an end of an interval, for all candidates of a step together that were fitted: a term
+is added where the upper end is below 1, so that it surely lowers the error."""
 REACH = 3.0
 """Errors of a free run count up to so many spreads of their output: one that runs away is as bad as that."""
 FAR = 2.0
@@ -110,9 +111,8 @@ class _HeldOut:
     @property
     def counted(self) -> NDArray[np.bool_]:
         """Samples ``(n, T + 1)`` that count."""
-        seen = np.isfinite(self.windows.y).any(axis=-1)
-        seen[:, : self.warm] = False
-        return np.asarray(seen)
+        late = np.arange(self.windows.y.shape[1]) >= self.warm
+        return np.asarray(np.isfinite(self.windows.y).any(axis=-1) & late)
 
     def rows(self, keep: NDArray[np.bool_], windows: OutputWindows | None = None) -> OutputWindows:
         """Some windows."""
@@ -124,24 +124,38 @@ class _HeldOut:
 
     def compared(self, own: Array, other: Array, candidates: int) -> HeldOutError:
         """Squared errors ``(n, T + 1)`` of one model over another's, which was the best of so many candidates."""
-        seen = self.counted
-        sums = [np.bincount(self.pieces[seen], weights=v[seen]) for v in (own, other)]
-        counts = np.bincount(self.pieces[seen])
-        means = [total[counts > 0] / counts[counts > 0] for total in sums]
-        floor = SMALL * min(float(own[seen].mean()), float(other[seen].mean())) + 1e-300
-        each = 0.5 * np.log((means[0] + floor) / (means[1] + floor))
-        n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[seen].mean()))
+        each = self._each(own, other)
+        n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[self.counted].mean()))
         if n < FEWEST:
             return HeldOutError(error, math.exp(mean), 0.0, math.inf, 1.0)
         capped = np.maximum(each, math.log(GAIN))  # its mean is no less, its scatter not that of large gains
         scatter, safe = (max(float(v.std(ddof=1)) / math.sqrt(n), 1e-9) for v in (each, capped))
-        wide = float(student.ppf(1.0 - 0.5 * DOUBT / candidates, n - 1))
+        wide = float(student.ppf(1.0 - DOUBT / candidates, n - 1))
         upper = float(capped.mean()) + wide * safe
         harm = float(student.cdf((float(capped.mean()) - math.log(HARM)) / safe, n - 1))
         return HeldOutError(
             error, math.exp(mean), math.exp(max(mean - wide * scatter, -700.0)), math.exp(min(upper, 700.0)),
             min(1.0, candidates * harm),
         )  # fmt: skip
+
+    def needed(self, own: Array, other: Array, candidates: int) -> int:
+        """Recordings like these that it takes besides for a bound below 1; 0 where they would be more than tenfold."""
+        capped = np.maximum(self._each(own, other), math.log(GAIN))
+        mean, scatter, n = float(capped.mean()), float(capped.std(ddof=1)), len(capped)
+        for pieces in range(n + 1, 10 * n + 1):
+            wide = float(student.ppf(1.0 - DOUBT / candidates, pieces - 1)) * scatter / math.sqrt(pieces)
+            if mean + wide < 0:
+                return math.ceil((pieces - n) * self.told.recordings / n)
+        return 0
+
+    def _each(self, own: Array, other: Array) -> Array:
+        """Logarithm of the ratio of errors of each piece of evidence."""
+        seen = self.counted
+        sums = [np.bincount(self.pieces[seen], weights=v[seen]) for v in (own, other)]
+        counts = np.bincount(self.pieces[seen])
+        means = [total[counts > 0] / counts[counts > 0] for total in sums]
+        floor = SMALL * min(float(own[seen].mean()), float(other[seen].mean())) + 1e-300
+        return np.asarray(0.5 * np.log((means[0] + floor) / (means[1] + floor)))
 
 
 def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int, most: int) -> _HeldOut:
@@ -432,7 +446,7 @@ class _Ranked:
         for own, other in zip((self.long, self.short), others, strict=True):
             enough = math.log(WORTH) + min([score for score, _ in other], default=0.0)
             found += [forms for score, forms in sorted(own, key=lambda s: s[0])[:count] if score < enough]
-        return list(dict.fromkeys(found))
+        return list({frozenset(form.name for form in forms): forms for forms in found}.values())
 
 
 @dataclass
@@ -493,7 +507,11 @@ class _Explain:
     ) -> None:  # fmt: skip
         prior = base(values)
         self.base, self.known, self.own, self.on_progress = base, known, tuple(own), on_progress
-        longest = max(len(t.t) for t in known) - 1
+        ends = {name: max(len(t.t) for t in known if t.file == name) - 1 for name in {t.file for t in known}}
+        longest = min(periods_of(length, dt, 2), max(ends.values()))
+        longest = min(
+            end for end in ends.values() if 2 * end >= longest
+        )  # no recording is left out for being shorter
         if len({t.file for t in known}) == 1:  # parts of a single recording are its evidence
             samples = sum(len(t.t) for t in known)
             longest = samples // BLOCKS - 1
@@ -639,8 +657,11 @@ class _Explain:
             return _Fitted(forms, None, theta, squares, "its free runs diverge")
         if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
             reason = f"the error is {found.ratio:.2f} of that without it"
-        elif found.harm >= DOUBT:
+        elif found.upper >= 1.0:
+            more = self.evidence.needed(squares, self.now.squares, candidates)
             reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
+            if more:
+                reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
         elif untold:
             reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
         return _Fitted(forms, found, theta, squares, reason, not reason)
@@ -751,7 +772,7 @@ class _Explain:
 
 
 def _chosen(fitted: Sequence[_Fitted]) -> _Fitted | None:
-    """The candidate of the lowest expected logarithm of the error, of those that surely do no harm."""
+    """The candidate of the lowest expected logarithm of the error, of those that surely lower it."""
     sure = [one for one in fitted if one.sure]
     return min(sure, key=lambda one: one.held_out.ratio if one.held_out else math.inf, default=None)
 

@@ -59,10 +59,11 @@ class HeldOutError:
     Args:
         error: With the change [-].
         ratio: That over the error without the change [-]: the geometric mean over the pieces of evidence.
-        lower: Lower end of its interval [-].
-        upper: Upper end of its interval [-]; infinite where there are too few pieces of evidence.
-        harm: Probability that the change makes the error more than 5 % larger on the next piece of evidence's kind,
-            times the number of candidates that were compared, at most 1.
+        lower: Lower end of its interval [-]: the probability of an error beyond it is 10 %, shared by the candidates
+            that were fitted in the step.
+        upper: Upper end of its interval [-], likewise; infinite where there are too few pieces of evidence.
+        harm: Probability that the expected error is more than 5 % larger with the change, times the number of
+            candidates that were fitted in the step, at most 1.
     """
 
     error: float

@@ -143,10 +143,8 @@ class _Library:
             mu = Parameter(f"mu_{k}_{own}", 0.0, "-", 0.0, 2.0, f"friction by {load} load")
             yield _one(laws.loaded(own, mu, load=load, **at))
         centre, span = float(np.mean(position)), float(np.std(position)) or 1.0
-        if turning:
-            sizes, per = (0.7, 0.7), ((), ())
-        else:
-            sizes, per = (span, span**2), ((q_unit,), (q_unit, q_unit))
+        sizes: tuple[float, float] = (0.7, 0.7) if turning else (span, span**2)
+        per: tuple[tuple[str, ...], ...] = ((), ()) if turning else ((q_unit,), (q_unit, q_unit))
         names = [
             weight(f"F_{k}", size, p, words="dry friction along the way")
             for k, size, p in zip((1, 2), sizes, per, strict=True)

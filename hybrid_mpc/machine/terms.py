@@ -426,9 +426,15 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
 def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
     """Why a term's law cannot stand where it is: its units, or a potential of more than its position."""
     where = f"term {term.name!r} for {base.__name__}"
-    groups = {"x": base.states, "u": base.inputs, "w": base.disturbances, "p": base.parameters}
-    symbols = {key: [ca.SX.sym(s.name) for s in signals] for key, signals in groups.items()}
-    inputs = [(v, s.unit) for key in groups for v, s in zip(symbols[key], groups[key], strict=True)]
+    groups: dict[str, tuple[Signal | Parameter, ...]] = {
+        "x": base.states, "u": base.inputs, "w": base.disturbances, "p": base.parameters,
+    }  # fmt: skip
+    symbols: dict[str, list[Any]] = {
+        key: [ca.SX.sym(s.name) for s in signals] for key, signals in groups.items()
+    }
+    inputs: list[tuple[Any, str]] = [
+        (v, s.unit) for key in groups for v, s in zip(symbols[key], groups[key], strict=True)
+    ]
     x, u, w, p = (named(prior.names_of(key), symbols[key]) for key in ("x", "u", "w", "p"))
     kind: str = {"input": "u", "disturbance": "w"}.get(term.place, "x")
     signals = base.outputs if term.place == "output" else groups[kind]
@@ -447,13 +453,13 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
         wanted = term_units.per_second(wanted)
     elif term.place in ("force", "potential"):
         wanted = term_units.of("J" if term.place == "potential" else power or "N")
-    moved = [ca.SX.sym(name) for name in ("driven", "resting")]
+    driven, resting = ca.SX.sym("driven"), ca.SX.sym("resting")
     given = [ca.SX.sym(q.name) for q in term.parameters]
     inputs += [(v, q.unit) for v, q in zip(given, term.parameters, strict=True)]
     state = None if term.state is None else ca.SX.sym(term.state.name)
     if term.state is not None:
         inputs.append((state, term.state.unit))
-    point = At(x, u, w, own, position, *moved, state, p)
+    point = At(x, u, w, own, position, driven, resting, state, p)
     value = _uneven(term).law(point, named(term.names, given))
     parts = [(value, wanted)]
     if term.state is not None:
@@ -462,7 +468,9 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
         if said := term_units.clash(one, inputs, needed):
             yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law."
     if term.place == "potential":
-        free = [v for v in (*symbols["x"], *symbols["u"], *symbols["w"], *moved) if v is not position]
+        free = [
+            v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not position
+        ]
         if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
             yield f"{where}: a potential is of its position alone, or the balance breaks; take a force."
 
