@@ -500,8 +500,9 @@ def code_of(value: Option | Parameter) -> str:
     if isinstance(value, tuple):
         return f"({''.join(f'{code_of(one)}, ' for one in value).rstrip()})"
     if isinstance(value, Parameter):
-        given = [value.name, value.value, value.unit, value.lower, value.upper]
-        return f"Parameter({', '.join(map(code_of, [*given, value.description][: 5 + bool(value.description)]))})"
+        given: list[Option] = [value.name, value.value, value.unit, value.lower, value.upper]
+        given += [value.description] if value.description else []
+        return f"Parameter({', '.join(map(code_of, given))})"
     if isinstance(value, Signal):
         more = [
             f", {f.name}={code_of(own)}"

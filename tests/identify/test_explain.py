@@ -1,12 +1,14 @@
 """The search for missing terms: a term that was taken out is found, and none is added where none is missing."""
 
 import json
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, MechanicalPrior, OperatingPoint, Parameter, Signal, Trajectory, fit_prior
+from hybrid_mpc.identify import term_table
 from hybrid_mpc.identify.explain import explain
 from hybrid_mpc.identify.explanation import Explanation
 from hybrid_mpc.identify.fit import smoothed
@@ -189,3 +191,8 @@ def test_a_stopped_search_goes_on_where_it_was():
     again = begun(runs=runs, candidates=(dry,), begun=steps[0])
     assert [step.name for step in again.steps] == [step.name for step in whole.steps]
     assert again.values["F_c"] == pytest.approx(whole.values["F_c"], rel=1e-3)
+
+
+def test_the_page_of_terms_is_that_of_the_library():
+    assert {law for laws in term_table.GROUPS.values() for law in laws} == set(terms.EXPLANATIONS)
+    assert (Path(__file__).parents[2] / "docs/terms.md").read_text() == term_table.document()
