@@ -96,8 +96,8 @@ def explain(
     with open_folder(out, note, resume=None):
         if data is None:
             data = _simulated(context, make)
-        found = _Search(context, make, data, chosen, most).result()
-        write(context, found)
+        found = Search(context, make, data, chosen, out, most).result()
+        write(context, found, out, ["explain", settings.scenario, *settings.options(str), "--out", str(out)])
         return found
 
 
@@ -204,13 +204,20 @@ def _simulated(context: Context, make: type[Prior]) -> Dataset:
     return _recordings(context, make)
 
 
-class _Search:
+class Search:
     """Fit and search of one machine, each kept in the folder."""
 
     def __init__(
-        self, context: Context, make: type[Prior], data: Dataset, chosen: ChosenTerms, most: int
+        self,
+        context: Context,
+        make: type[Prior],
+        data: Dataset,
+        chosen: ChosenTerms,
+        out: Path,
+        most: int = STEPS,
     ) -> None:
-        self.context, self.make, self.data, self.chosen, self.most = context, make, data, chosen, most
+        self.context, self.make, self.data, self.chosen = context, make, data, chosen
+        self.out, self.most = out, most
         self.dt = context.spec.dt
         self.train, self.valid, self.test = (list(data.by_role(role)) for role in ("train", "valid", "test"))
         self.length = context.spec.free_run or max(
@@ -220,7 +227,7 @@ class _Search:
         self.key = digest({
             "prior": {name: to_json(program) for name, program in programs.items()},
             "parameters": extended(make, *chosen.own).parameters, "recordings": data.hash, "data": context.spec,
-            "chosen": chosen.laws, "versions": versions(), "program": sources("hybrid_mpc.workflow.explain"),
+            "chosen": chosen.laws, "versions": versions(), "program": sources("hybrid_mpc.identify.explain"),
         })  # fmt: skip
 
     def result(self) -> ExplainResult:
@@ -330,7 +337,7 @@ class _Search:
         return passed
 
     def _path(self, name: str) -> Path:
-        return self.context.out / "checkpoints" / f"{name}.json"
+        return self.out / "checkpoints" / f"{name}.json"
 
     def _held(self, name: str) -> Any:
         """What the folder holds of a part; None where it holds nothing, or of something else."""
@@ -348,14 +355,13 @@ def _added(told: Explanation | None) -> int:
     return 0 if told is None else sum(step.action == "added" for step in told.steps)
 
 
-def write(context: Context, found: ExplainResult) -> None:
-    """Write page, scenario file and, last, ``explain.json``."""
-    out, settings = context.out, context.settings
+def write(context: Context, found: ExplainResult, out: Path, command: Sequence[str]) -> None:
+    """Write page, scenario file and, last, ``explain.json``; ``command`` is what made them."""
     if found.file:
         write_text(
             out / found.file, scenario_code(context.scenario, context.scenario_path, found.explanation)
         )
-    write_page(out, context.scenario, found, ["explain", settings.scenario, *settings.options(str)])
+    write_page(out, context.scenario, found, command)
     write_json(
         out / RESULT,
         {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "versions": versions(), "result": found},

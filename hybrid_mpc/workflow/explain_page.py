@@ -52,7 +52,7 @@ def write_page(out: Path, scenario: Scenario, found: ExplainResult, command: Seq
     ]
     report = Report(
         f"Missing terms: {scenario.name}", scenario.title, scenario.description,
-        shlex.join(["hybrid-mpc", *command, "--out", str(out)]), _figures(told), sections, hints=_hints(found),
+        shlex.join(["hybrid-mpc", *command]), _figures(told), sections, hints=_hints(found),
     )  # fmt: skip
     return write_report(out / PAGE, report)
 
