@@ -14,6 +14,8 @@ from hybrid_mpc.plots.style import FAINT, GOOD, INK, colour, new_figure, number,
 
 WORDS = 38
 """Characters of a label at most before it is broken."""
+WAVES = 6.0
+"""Ways up and down of a term along its abscissa up to which it is drawn as a line; beyond, another signal acts too."""
 
 
 class Picture(Protocol):
@@ -81,7 +83,9 @@ def error_steps(
         if math.isfinite(before) and before > value:  # what the step removed
             ax.barh(k, before - value, left=value, color=ink, alpha=0.18, height=0.62)
         share = (
-            f" ({value / before:.0%} of the bar above)" if k and math.isfinite(before) and before > 0 else ""
+            f" ({100 * value / before:.0f} % of the bar above)"
+            if k and math.isfinite(before) and before > 0
+            else ""
         )
         ax.text(max(value, before if math.isfinite(before) else 0.0) + 0.01 * top, k, f"{number(value)}{share}",
                 va="center", fontsize=9, color=INK)  # fmt: skip
@@ -115,7 +119,10 @@ def term_over_data(picture: Picture) -> Figure:
         margin = 0.15 * (reach.max() - reach.min()) or 1.0
         ax.set_ylim(reach.min() - margin, reach.max() + margin)
     ax.fill_between(at, low, high, color=colour("phy"), alpha=0.25, linewidth=0, label="two standard errors")
-    ax.plot(at, term, color=colour("phy"), linewidth=1.8, label="the term")
+    line = np.abs(np.diff(term)).sum() <= WAVES * (term.max() - term.min())
+    ax.plot(
+        at, term, "-" if line else ".", color=colour("phy"), linewidth=1.8, markersize=5, label="the term"
+    )
     ax.set_xlabel(plain(picture.abscissa))
     ax.set_ylabel(_broken(plain(picture.ordinate)))
     shared_legend(figure)

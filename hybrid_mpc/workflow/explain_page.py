@@ -89,7 +89,7 @@ def interval(step: ExplainStep) -> str:
 
 def values_of(step: ExplainStep) -> str:
     """Fitted values of a step's parameters with their standard errors."""
-    return ", ".join(str(p).replace("+-", "±") for p in step.parameters)
+    return ", ".join(str(p).replace("+-", "±").removesuffix(" -") for p in step.parameters)
 
 
 def alternatives_of(step: ExplainStep) -> str:
@@ -105,7 +105,7 @@ def steps_table(told: Explanation) -> Table:
     ]  # fmt: skip
     return Table(
         ("step", "held-out error [-]", "ratio to the step before", "fitted values", "alternatives"),
-        [("prior, fitted", told.before, None, "", ""), *rows],
+        [("prior, nominal", told.nominal, None, "", ""), ("prior, fitted", told.before, None, "", ""), *rows],
         "Steps of the search. The intervals hold for all candidates of a step that were fitted, together.",
     )
 

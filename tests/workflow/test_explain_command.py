@@ -13,8 +13,12 @@ from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.plots.explain import error_steps
 from hybrid_mpc.workflow import explain as command
+from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain import chosen_terms, read_result
 from hybrid_mpc.workflow.explained import scenario_code
+from hybrid_mpc.workflow.stage import bring_up_to_date
+from hybrid_mpc.workflow.stages.explain import EXPLAIN
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR
 
 LAWS = ("coulomb", "quadratic")
 DRY = 0.08
@@ -192,3 +196,43 @@ def test_explain_json_is_plain(explained):
     held = json.loads((out / "explain.json").read_text())
     assert (held["schema"], held["schema_version"]) == ("hybrid-mpc explain", 1)
     assert held["result"]["explanation"]["steps"][0]["terms"][0]["made"]["maker"] == "coulomb"
+
+
+@pytest.fixture(scope="module")
+def asking(machine, files, tmp_path_factory):
+    """Settings of runs whose scenario names one law, with and without --explain."""
+    path = tmp_path_factory.mktemp("asking") / "my_machine.py"
+    text = (machine / "my_machine.py").read_text()
+    path.write_text(f'{text}\nscenario = dataclasses.replace(scenario, terms=("coulomb",))\n')
+    settings = RunSettings(str(path), files, explain=True)
+    return settings, replace(settings, explain=False)
+
+
+def test_stages_go_on_with_the_found_terms(asking, tmp_path):
+    """Fit, and what trains and closes loops elsewhere, have the extended prior; without --explain the user's."""
+    settings, bare = asking
+    for own in (settings, settings, bare):
+        context = Context(own, load_scenario(own.scenario), tmp_path)
+        said = [bring_up_to_date(context, stage) for stage in (DATA, EXPLAIN, PRIOR)]
+        values = context.prior.fit.values
+        if not own.explain:
+            assert said[1:] == ["", ""]  # the prior of the search is no longer the run's
+            assert "F_c_phi_dot" not in values
+            assert context.scenario is context.given
+            break
+        assert values["F_c_phi_dot"] == pytest.approx(DRY, rel=0.1)
+        assert context.scenario.name == "my_machine_explained"
+        assert load_scenario(context.scenario_path).prior().values["F_c_phi_dot"] == pytest.approx(
+            DRY, rel=0.1
+        )
+        assert context.as_given.scenario.name == "my_machine"
+        assert said in ([""] * 3, ["up to date"] * 3)
+
+
+@pytest.mark.full  # two fits and their pictures
+def test_a_run_shows_the_found_terms(asking, tmp_path):
+    settings, bare = asking
+    for own, shown in ((settings, True), (bare, False)):
+        assert hm.run(own, tmp_path / "run", resume=not shown, only=("data", "explain", "prior")) is None
+        page = (tmp_path / "run" / "report.html").read_text()
+        assert ("Missing terms" in page) == ("--explain" in page) == shown

@@ -187,7 +187,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         list(_summary(context, results)),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
-        advice(results),
+        advice(results, explained=not isinstance(context.find(EXPLAIN), Absent)),
         doubt_of(found.details.prior_parameters.in_doubt),
     )
 
