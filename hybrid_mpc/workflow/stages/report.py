@@ -96,7 +96,7 @@ def report_so_far(context: Context) -> None:
     figures = draw_first(context)
     tables: dict[str, Sequence[Table]] = {
         "data": [_data_table(recordings(context))],
-        **({"explain": shown} if (shown := _explain_tables(context)) else {}),
+        **({"explain": _explain_tables(context)} if _explained(context) else {}),
         "models": [_prior_table(context)],
     }
     if "free_run" in figures:
@@ -175,8 +175,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
             after.get(key, ()),
         )
         for key in TITLES
-        if (key != "on_model" or not results.on_model.reason)
-        and (key != "explain" or not isinstance(context.find(EXPLAIN), Absent))
+        if (key != "on_model" or not results.on_model.reason) and (key != "explain" or _explained(context))
     )
     versions = ", ".join(f"{name} {v}" for name, v in results.versions.items())
     return Report(
@@ -187,7 +186,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         list(_summary(context, results)),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
-        advice(results, explained=not isinstance(context.find(EXPLAIN), Absent)),
+        advice(results, explained=_explained(context)),
         doubt_of(found.details.prior_parameters.in_doubt),
     )
 
@@ -353,6 +352,12 @@ def _data_table(data: Data) -> Table:
     ]
     caption = f"{len(data.files)} files; content hash {data.hash[:16]}."
     return Table(("part", "length [s]"), rows, caption)
+
+
+def _explained(context: Context) -> bool:
+    """Whether missing terms were searched."""
+    found = context.find(EXPLAIN)
+    return not isinstance(found, Absent)
 
 
 def _explain_tables(context: Context) -> list[Table]:
