@@ -10,7 +10,6 @@ a problem or runs a loop.
 """
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 # fmt: off
@@ -159,10 +158,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.watch.residuals import ResidualReadings as ResidualReadings
 # fmt: on
 
-try:
-    __version__ = version("hybrid-mpc")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
+__version__: str
 
 _ROOMS = {
     "analyze.equilibria": ("equilibria",),
@@ -269,7 +265,18 @@ _MODULES = {"plots": "plots", "terms": "machine.terms"}
 __all__ = sorted((*_HOME, *_MODULES, "__version__"))
 
 
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("hybrid-mpc")
+    except PackageNotFoundError:  # a source tree that was never installed
+        return "0+unknown"
+
+
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
     if name not in _MODULES and name not in _HOME:
         raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
     from hybrid_mpc.errors import named_extra

@@ -1,7 +1,6 @@
 """What jobs work on: a small machine of a user's own with its recordings, and the folder of a golf robot's run."""
 
 import math
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 from engine_jobs import jobs_in_this_process
 from PIL import Image
 
-README = Path(__file__).parents[1] / "README.md"
+PENDULUM = Path(__file__).parents[1] / "docs/examples/my_machine.py"
 TINY = """
 import dataclasses
 from hybrid_mpc import Budget
@@ -22,7 +21,7 @@ scenario = dataclasses.replace(scenario, budgets=tiny)
 
 
 def recording(seed: int, seconds: float = 12.0, dt: float = 0.01) -> dict[str, np.ndarray]:
-    """A pendulum with dry friction (the README's prior has none), by semi-implicit Euler at 2.5 ms."""
+    """A pendulum with dry friction (the prior of docs/examples has none), by semi-implicit Euler at 2.5 ms."""
     rng = np.random.default_rng(seed)
     n, fine = round(seconds / dt), 4
     t = dt * np.arange(n)
@@ -46,14 +45,12 @@ def write(path: Path, columns: dict[str, np.ndarray]) -> Path:
 
 @pytest.fixture(scope="session")
 def machine(shared) -> Path:
-    """Folder with ``my_machine.py`` (the README's lines) and two recordings, one with ten samples that repeat."""
+    """Folder with ``my_machine.py`` (that of docs/examples) and two recordings, one with ten samples that repeat."""
     return shared("machine", write_machine)
 
 
 def write_machine(folder: Path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    pendulum = next(block for block in blocks if "class Pendulum" in block)
-    (folder / "my_machine.py").write_text(pendulum + TINY)
+    (folder / "my_machine.py").write_text(PENDULUM.read_text() + TINY)
     for i, name in enumerate(("monday", "tuesday")):
         columns = recording(i)
         columns["phi_rad"][600 : 600 + 10 * i] = columns["phi_rad"][600]

@@ -222,6 +222,11 @@ def test_every_result_is_read_back_as_it_was(finished, tmp_path):
         assert read_stage(tmp_path / f"{stage.name}.json", stage, "").content == stored.content
 
 
+def never(context):
+    """What must not be computed."""
+    raise AssertionError
+
+
 def one(compute, reads=lambda context: {"seed": context.settings.seed}, **named):
     return Stage("sum", "adding up", Sum, compute, reads, **named)
 
@@ -305,29 +310,29 @@ class OldSum:
 
 
 def test_a_result_of_another_version_is_computed_again_and_that_is_said(context):
-    old = Stage("sum", "adding up", OldSum, lambda context: OldSum(1.0, 1.0, {}), one(None).reads)
+    old = Stage("sum", "adding up", OldSum, lambda context: OldSum(1.0, 1.0, {}), one(never).reads)
     bring_up_to_date(context, old)
     told = []
     progress = Progress()
     progress.warn = told.append
     fresh = Context(context.settings, context.scenario, context.out, progress)
     with pytest.raises(InputError, match=r"another version wrote its result \(sum.json: .*names is missing"):
-        fresh.read(one(None))
+        fresh.read(one(never))
     assert bring_up_to_date(fresh, one(lambda context: Sum(2.0, ("a",), {}))) == ""
-    assert fresh.read(one(None)).total == 2.0
+    assert fresh.read(one(never)).total == 2.0
     (line,) = told
     assert line.startswith(
         "stage sum runs again: another version wrote its result (sum.json: no field 'mean'"
     )
     again = Context(context.settings, context.scenario, context.out)
-    assert bring_up_to_date(again, one(None)) == "up to date"
+    assert bring_up_to_date(again, one(never)) == "up to date"
 
 
 def test_only_does_not_take_a_result_of_another_version(context, monkeypatch):
-    old = Stage("sum", "adding up", OldSum, lambda context: OldSum(1.0, 1.0, {}), one(None).reads)
+    old = Stage("sum", "adding up", OldSum, lambda context: OldSum(1.0, 1.0, {}), one(never).reads)
     bring_up_to_date(context, old)
     fresh = Context(context.settings, context.scenario, context.out)
-    monkeypatch.setattr(job, "STAGES", (one(None), replace(one(None), name="later")))
+    monkeypatch.setattr(job, "STAGES", (one(never), replace(one(never), name="later")))
     with pytest.raises(
         InputError, match=r"stage sum must run again: another version wrote .*, and later needs it"
     ):

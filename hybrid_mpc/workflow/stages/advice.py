@@ -43,8 +43,8 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
         found.append(
             Hint(
                 "good",
-                "Nothing stands out.",
-                "Close the loop on the machine: hm.Runner, or the controller as C.",
+                "Nothing on this page speaks against a first try on the machine.",
+                "Close the loop with hm.Runner (docs/control.md), or export the controller as C (docs/embedded.md).",
             )
         )
     return sorted(found, key=lambda hint: hint.verdict != "bad")
@@ -110,10 +110,9 @@ def _choice(found: Identification, explained: bool) -> Iterator[Hint]:
     choice = found.details.choice
     own = choice.candidates[choice.hybrid]
     if choice.recommended != "phy":
-        yield Hint(
-            "good", choice.reason, "" if explained else f"The prior may lack a physical term. {SEARCH}"
-        )
-        return
+        if not explained:
+            yield Hint("plain", "A network was needed: the prior may lack a physical term.", SEARCH)
+        return  # the page's first answer says why
     why = choice.reason
     if own.error is None or own.ratio is None:
         yield Hint(

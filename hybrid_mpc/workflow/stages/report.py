@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,13 @@ from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
-from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, Verdict, words, write_report
+from hybrid_mpc.report.page import Report, Section, Table, words, write_report
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, tests_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.advice import advice, doubt_of
 from hybrid_mpc.workflow.stages.analyze import ANALYSIS
+from hybrid_mpc.workflow.stages.answers import answer_all
 from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.compare import CONTROL
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
@@ -32,7 +33,7 @@ from hybrid_mpc.workflow.stages.evaluate import EVALUATION
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT
 from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
-from hybrid_mpc.workflow.stages.identify import DATA, MODELS, PRIOR, TRAINING, models_of, training_settings
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, models_of, training_settings
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.workflow.stages.promises import PROMISES
 from hybrid_mpc.workflow.stages.results import (
@@ -49,7 +50,6 @@ from hybrid_mpc.workflow.stages.results import (
     collect,
     finite,
     identification,
-    ratio,
     recordings,
 )
 from hybrid_mpc.workflow.stages.watch import RATES, WATCH, WatchResult
@@ -183,61 +183,13 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         context.scenario.title,
         context.scenario.description,
         command(context),
-        list(_summary(context, results)),
+        (),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
         advice(results, explained=_explained(context)),
         doubt_of(found.details.prior_parameters.in_doubt),
+        answer_all(results),
     )
-
-
-def _summary(context: Context, results: Results) -> Iterator[KeyFigure]:
-    found, timing, control = results.identification, results.timing, results.control
-    over, hybrid = found.details.hybrid_over_phy, found.details.choice.hybrid
-    for output in context.scenario.prior().outputs:
-        rmse, base = (_by(found.rmse[m], output.label) for m in (hybrid, "phy"))
-        fit = _by(found.fit_percent[hybrid], output.label)
-        words = "" if fit is None else f"FIT {fit:.0f} %; "
-        yield KeyFigure(
-            f"Free-run error (RMSE) of {output.name}, hybrid on unseen data", rmse, output.unit,
-            f"{words}fitted prior: {_text(base)} {output.unit}", _verdict(ratio(rmse, base)),
-        )  # fmt: skip
-    e_sim = {m: _number(found.e_sim[m]) for m in MODELS}
-    yield KeyFigure(
-        "Simulation error E_sim of the hybrid, over the rates' spread", e_sim[hybrid], "",
-        f"fitted prior: {_text(e_sim['phy'])}, RNN: {_text(e_sim['rnn'])}", _verdict(over["e_sim"]),
-    )  # fmt: skip
-    choice = found.details.choice
-    own = choice.candidates[choice.hybrid]
-    yield KeyFigure(
-        f"Recommended: {name_of(choice.recommended)}; left-out error of the hybrid over the prior's", own.ratio, "",
-        choice.reason, "plain" if choice.recommended == "phy" else "good",
-    )  # fmt: skip
-    gap = control.gap_closed
-    if gap is not None:
-        named = {"prior": control.prior, "hybrid": control.hybrid, "oracle": control.oracle}
-        costs = ", ".join(f"{name} {_text(of.cost)}" for name, of in named.items())
-        yield KeyFigure(
-            "Gap from prior to oracle closed by the hybrid", gap, "",
-            f"mean over the tasks that tell controllers apart; summed costs: {costs}", "good" if gap > 0 else "bad",
-        )  # fmt: skip
-    p99, period = timing.controller_step_ms.p99, timing.period_ms
-    if p99 is not None:
-        comment = f"period: {period:g} ms"
-        yield KeyFigure("Controller step, 99th percentile", p99, "ms", comment, _verdict(p99 / period))
-    watch = results.watch
-    clean, rate = watch.details.clean, watch.wanted_per_hour
-    if watch.alarms is not None and clean is not None and rate is not None:
-        verdict: Verdict = "bad" if clean.too_many(rate) else "good"
-        yield KeyFigure("Alarms of the monitor", len(watch.alarms), "", clean.words(rate), verdict)
-
-
-def _verdict(over: float | None) -> Verdict:
-    return "plain" if over is None else "good" if over < 1.0 else "bad"
-
-
-def _text(value: float | None) -> str:
-    return "diverged" if value is None else f"{value:.3g}"
 
 
 Notes = dict[str, tuple[str, ...]]
