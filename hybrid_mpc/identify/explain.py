@@ -311,13 +311,15 @@ class _Search:
         return min(fits, key=lambda fit: problem.explained([fit.theta])[0])
 
     def untold(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
-        """Those of the new terms whose parameters all may be zero; of those with a state the others."""
+        """Those of the new terms whose parameters all may be zero. Of a term with a state a weight and a time constant
+        are told together; there the held-out error alone decides.
+        """
         errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
         names, found = self.fit(terms).names, []
         for term in new:
             weights = [p.name for p in term.parameters if p.value == 0.0 and not p.fixed]
             at = [names.index(name) for name in weights]
-            if at and (np.abs(fitted.theta[at]) < LEAST_T * errors[at]).all():
+            if term.state is None and at and (np.abs(fitted.theta[at]) < LEAST_T * errors[at]).all():
                 found.append(term)
         return found
 
