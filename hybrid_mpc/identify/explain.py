@@ -345,7 +345,7 @@ class _Promises:
     ) -> None:
         joint = (*terms, *forms)
         own = search.fit(joint)
-        start = np.concatenate([theta, np.zeros(len(own.nominal) - len(theta))])
+        start = np.concatenate([theta, own.nominal[len(theta) :]])
         normals = []
         for windows in (evidence.windows, evidence.judged):
             x = search.problem(terms, windows).first_states(theta)
@@ -383,6 +383,11 @@ class _Promises:
 def _with_state(terms: Sequence[Term]) -> list[Term]:
     """Those with a state of their own, in order."""
     return [term for term in terms if term.state is not None]
+
+
+def _vanishes(term: Term) -> bool:
+    """Whether a term does nothing at its nominal values, so that slopes tell what it would do."""
+    return term.state is None and term.parameters[0].value == 0.0
 
 
 def _index(base: type[Prior], term: Term) -> int:
@@ -564,7 +569,7 @@ class _Explain:
         theta = search.fit(terms).scaled({**search.fit(terms).prior.values, **begun.values})
         self.steps = list(begun.steps)
         self.now = _State(terms, theta, search.held_out(terms, theta))
-        there = {term.name for term in terms}
+        there = {term.name for step in begun.steps for term in step.terms}
         self.pool = [one for one in self.pool if not there & {form.name for form in one.forms}]
 
     def _step(self) -> tuple[tuple[Trial, ...], int, _Fitted | None]:
@@ -590,7 +595,7 @@ class _Explain:
         """
         search, now = self.search, self.now
         self.on_progress(0, len(self.pool), f"step {number}: {len(self.pool)} candidates are scored")
-        plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if form.state is None]
+        plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if _vanishes(form)]
         some = [form for _, form in plain]
         promises = [
             _Promises(search, by, now.terms, now.theta, some) for by in (search.evidence, search.short)
@@ -606,7 +611,7 @@ class _Explain:
             singles += [(score, (plain[i][1],)) for score, i in ranked]
         ends = search.error(now.terms, now.theta)
         diverged = []
-        slow = [one for one in self.pool if one.forms[0].state is not None]
+        slow = [one for one in self.pool if not _vanishes(one.forms[0])]
         for i, one in enumerate(slow, 1):  # at once a lag does what no slope tells
             scores = []
             for form in one.forms:
