@@ -87,6 +87,8 @@ LEAST_T = 2.0
 """Standard errors that one parameter of each term has to differ from none at least: else the data do not tell it."""
 LEAST = 20
 """Periods of the parts of a single recording at least."""
+ALONG = 4
+"""Steps of a period in which a term's state is followed along a recording."""
 SHORTEST = 4
 """Samples of a block at least."""
 DRAWN = 200
@@ -95,18 +97,17 @@ DRAWN = 200
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Windows with the piece of evidence of each sample and the fold of each window."""
+    """Windows with the piece of evidence of each sample and the fold of each window.
+
+    ``starts`` are the trajectory and the sample that each window begins with.
+    """
 
     windows: OutputWindows
+    starts: tuple[tuple[Trajectory, int], ...]
     pieces: Places
     folds: Places
     told: Evidence
     warm: int
-
-    @property
-    def judged(self) -> OutputWindows:
-        """The windows, of which the warm-up alone determines the first states and the rest counts."""
-        return replace(self.windows, warm=self.warm)
 
     @property
     def counted(self) -> NDArray[np.bool_]:
@@ -114,9 +115,9 @@ class _HeldOut:
         late = np.arange(self.windows.y.shape[1]) >= self.warm
         return np.asarray(np.isfinite(self.windows.y).any(axis=-1) & late)
 
-    def rows(self, keep: NDArray[np.bool_], windows: OutputWindows | None = None) -> OutputWindows:
+    def rows(self, keep: NDArray[np.bool_]) -> OutputWindows:
         """Some windows."""
-        w = self.windows if windows is None else windows
+        w = self.windows
         return replace(
             w, y=w.y[keep], u=w.u[keep], w=w.w[keep], x=w.x[keep], censored=w.censored[keep], known=w.known[keep],
             group=np.arange(int(keep.sum())),
@@ -165,11 +166,14 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
     files = sorted({t.file for t in known})
     share = max(2 if len(files) > 1 else most, most // len(files))
     parts, of = [], []
+    starts: list[tuple[Trajectory, int]] = []
     for number, name in enumerate(files):
         own = [t for t in known if t.file == name and len(t.t) > periods]
         if own:
             parts.append(cut_outputs(own, periods, 0, share, prior.states))
             of += [number] * len(parts[-1].x)
+            begins = [(t, k) for t in own for k in range(0, len(t.t) - periods, periods)]
+            starts += [begins[i] for i in evenly(len(begins), share)]
     joined: dict[str, Any] = {
         key: np.concatenate([getattr(p, key) for p in parts])
         for key in ("y", "u", "w", "x", "censored", "known")
@@ -188,7 +192,12 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
         pieces = np.repeat(recording[:, None], samples, axis=1)
         text = f"{len(present)} recordings in {groups} groups"
         return _HeldOut(
-            windows, pieces, folds, Evidence(len(present), len(present), groups, length, text), warm
+            windows,
+            tuple(starts),
+            pieces,
+            folds,
+            Evidence(len(present), len(present), groups, length, text),
+            warm,
         )
     pieces, count, blocks_of = (
         np.zeros((len(of), samples), dtype=np.int64),
@@ -212,7 +221,9 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
         )
     what = "one recording" if len(present) == 1 else f"{len(present)} recordings"
     text = f"{count} blocks of {what} in {groups} groups"
-    return _HeldOut(windows, pieces, folds, Evidence(len(present), count, groups, length, text), warm)
+    return _HeldOut(
+        windows, tuple(starts), pieces, folds, Evidence(len(present), count, groups, length, text), warm
+    )
 
 
 def _by_kind(windows: OutputWindows, pieces: Places, present: Sequence[int]) -> list[int]:
@@ -287,14 +298,63 @@ class _Search:
             return windows.w[:, 0, k], float(np.std(self.points[2][:, k]))
         return windows.y[:, 0, k], float(self.spread[k])
 
+    def judged(
+        self, by: _HeldOut, terms: Terms, theta: Array, keep: NDArray[np.bool_] | None = None
+    ) -> Shooting:
+        """Windows that the prior with terms is judged by: the warm-up alone determines the first states, and the rest
+        counts. States of terms begin where they are along the recording: a free one would explain what the term
+        does not.
+        """
+        some = np.ones(len(by.starts), dtype=bool) if keep is None else keep
+        problem = self.problem(terms, replace(by.rows(some), warm=by.warm))
+        added = _with_state(terms)
+        if not added:
+            return problem
+        values = self.fit(terms).values(theta)
+        n_x, windows = len(self.base.states), problem.windows
+        first, known = windows.x.copy(), windows.known.copy()
+        for k, term in enumerate(added, n_x):
+            along = {id(t): self._along(term, t, values) for t, _ in by.starts}
+            first[:, k] = [along[id(t)][at] for (t, at), kept in zip(by.starts, some, strict=True) if kept]
+            known[:, k] = True
+        return Shooting(problem.own, replace(windows, x=first, known=known), problem.sizes, self.spread)
+
+    def _along(self, term: Term, trajectory: Trajectory, values: dict[str, float]) -> Array:
+        """A term's state along a recording ``(n,)``, from its signal at the first sample on."""
+        prior = self.base()
+        x, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in ("x", "u", "w", "p"))
+        state, given = ca.SX.sym("s"), ca.SX.sym("q", len(term.parameters))
+        k = _index(self.base, term)
+        own = {"rate": x, "input": u, "disturbance": w}.get(term.place)
+        own = prior.equations.output(x, u, w, p)[k] if own is None else own[k]
+        names = (
+            named(prior.names_of(key), ca.vertsplit(v)) for key, v in zip("xuwp", (x, u, w, p), strict=True)
+        )
+        x_named, u_named, w_named, p_named = names
+        at = At(x_named, u_named, w_named, own, None, 0.0, 0.0, state, p_named)
+        rate = term.law(at, named(term.names, ca.vertsplit(given)))[1]
+        f = ca.Function("rate", [state, x, u, w, given, p], [rate])
+        h, one = self.dt / ALONG, state
+        for _ in range(ALONG):
+            half = one + 0.5 * h * f(one, x, u, w, given, p)
+            one = one + h * f(half, x, u, w, given, p)
+        step = ca.Function("step", [state, x, u, w, given, p], [one]).mapaccum(len(trajectory.t))
+        start = ca.Function("own", [x, u, w, p], [own])
+        base = ca.DM([values[q.name] for q in self.base.parameters])
+        mine = ca.DM([values[name] for name in term.names])
+        columns = [np.nan_to_num(getattr(trajectory, key)).T for key in ("x", "u", "w")]
+        first = start(*(ca.DM(c[:, :1]) for c in columns), base)
+        n = len(trajectory.t)
+        found = step(first, *columns, ca.repmat(mine, 1, n), ca.repmat(base, 1, n)).full().ravel()
+        return np.concatenate([first.full().ravel(), found[:-1]])
+
     def held_out(self, terms: Terms, theta: Array) -> Array:
         """Squared errors ``(n, T + 1)`` of every window by a fit to the other folds, each from ``theta`` on."""
         squares = np.zeros(self.evidence.pieces.shape)
         for fold in sorted(set(self.evidence.folds.tolist())):
             held = self.evidence.folds == fold
             fitted = self.problem(terms, self.evidence.rows(~held)).solve(theta, ITERATIONS).theta
-            judged = self.evidence.rows(held, self.evidence.judged)
-            squares[held] = _squares(self.problem(terms, judged), fitted)
+            squares[held] = _squares(self.judged(self.evidence, terms, fitted, held), fitted)
         return squares
 
     def begun(self, terms: Terms, theta: Array) -> Fitted:
@@ -311,19 +371,21 @@ class _Search:
         return min(fits, key=lambda fit: problem.explained([fit.theta])[0])
 
     def untold(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
-        """Those of the new terms whose parameters all may be zero; of those with a state the others."""
+        """Those of the new terms whose parameters all may be zero. Of a term with a state a weight and a time constant
+        are told together; there the held-out error alone decides.
+        """
         errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
         names, found = self.fit(terms).names, []
         for term in new:
             weights = [p.name for p in term.parameters if p.value == 0.0 and not p.fixed]
             at = [names.index(name) for name in weights]
-            if at and (np.abs(fitted.theta[at]) < LEAST_T * errors[at]).all():
+            if term.state is None and at and (np.abs(fitted.theta[at]) < LEAST_T * errors[at]).all():
                 found.append(term)
         return found
 
     def error(self, terms: Terms, theta: Array) -> float:
         """Mean squared error over all windows."""
-        squares = _squares(self.problem(terms, self.evidence.judged), theta)
+        squares = _squares(self.judged(self.evidence, terms, theta), theta)
         return max(float(squares[self.evidence.counted].mean()), 1e-300)
 
     def without(self, terms: Terms, theta: Array, dropped: Term) -> tuple[Terms, Array]:
@@ -343,11 +405,14 @@ class _Promises:
     ) -> None:
         joint = (*terms, *forms)
         own = search.fit(joint)
-        start = np.concatenate([theta, np.zeros(len(own.nominal) - len(theta))])
+        start = np.concatenate([theta, own.nominal[len(theta) :]])
         normals = []
-        for windows in (evidence.windows, evidence.judged):
-            x = search.problem(terms, windows).first_states(theta)
-            slopes, errors = search.problem(joint, windows).linear(start, x)
+        for problem, before in (
+            (search.problem(joint, evidence.windows), search.problem(terms, evidence.windows)),
+            (search.judged(evidence, joint, start), search.judged(evidence, terms, theta)),
+        ):
+            x = before.first_states(theta)
+            slopes, errors = problem.linear(start, x)
             every = np.concatenate([slopes, errors[..., None]], axis=-1)
             normal = every.swapaxes(1, 2) @ every  # (n, k + 1, k + 1)
             each = sorted(set(evidence.folds.tolist()))
@@ -381,6 +446,11 @@ class _Promises:
 def _with_state(terms: Sequence[Term]) -> list[Term]:
     """Those with a state of their own, in order."""
     return [term for term in terms if term.state is not None]
+
+
+def _vanishes(term: Term) -> bool:
+    """Whether a term does nothing at its nominal values, so that slopes tell what it would do."""
+    return term.state is None and term.parameters[0].value == 0.0
 
 
 def _index(base: type[Prior], term: Term) -> int:
@@ -567,7 +637,7 @@ class _Explain:
         theta = search.fit(terms).scaled({**search.fit(terms).prior.values, **begun.values})
         self.steps = list(begun.steps)
         self.now = _State(terms, theta, search.held_out(terms, theta))
-        there = {term.name for term in terms}
+        there = {term.name for step in begun.steps for term in step.terms}
         self.pool = [one for one in self.pool if not there & {form.name for form in one.forms}]
 
     def _step(self) -> tuple[tuple[Trial, ...], int, _Fitted | None]:
@@ -593,7 +663,7 @@ class _Explain:
         """
         search, now = self.search, self.now
         self.on_progress(0, len(self.pool), f"step {number}: {len(self.pool)} candidates are scored")
-        plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if form.state is None]
+        plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if _vanishes(form)]
         some = [form for _, form in plain]
         promises = [
             _Promises(search, by, now.terms, now.theta, some) for by in (search.evidence, search.short)
@@ -609,7 +679,7 @@ class _Explain:
             singles += [(score, (plain[i][1],)) for score, i in ranked]
         ends = search.error(now.terms, now.theta)
         diverged = []
-        slow = [one for one in self.pool if one.forms[0].state is not None]
+        slow = [one for one in self.pool if not _vanishes(one.forms[0])]
         for i, one in enumerate(slow, 1):  # at once a lag does what no slope tells
             scores = []
             for form in one.forms:

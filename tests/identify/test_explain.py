@@ -7,7 +7,16 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_mpc import InputError, MechanicalPrior, OperatingPoint, Parameter, Signal, Trajectory, fit_prior
+from hybrid_mpc import (
+    InputError,
+    MechanicalPrior,
+    OperatingPoint,
+    Parameter,
+    Prior,
+    Signal,
+    Trajectory,
+    fit_prior,
+)
 from hybrid_mpc.identify import term_table
 from hybrid_mpc.identify.explain import explain
 from hybrid_mpc.identify.explanation import Explanation
@@ -178,6 +187,27 @@ def test_a_candidate_whose_fit_diverges_is_reported_and_the_search_goes_on():
     assert [trial.name for trial in found.diverged] == ["wild"]
 
 
+def test_an_own_term_may_have_parameters_that_are_not_zero():
+    level = Parameter("F", 0.15, "N m", 0.0, 1.0)
+    runs = recorded(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))(), 4, 4.0)
+    steep = Parameter("gamma", 10.0, "s/rad", 5.0, 40.0)
+    for first in (0.0, 0.1):
+        own_level = Parameter("F_own", first, "N m", 0.0, 1.0)
+        dry = Term(
+            "dry",
+            "force",
+            "phi_dot",
+            (own_level, steep),
+            lambda at, p: -p.F_own * ca.tanh(p.gamma * at.own),
+            loss=True,
+        )
+        found = begun(dry, runs=runs)
+        assert found.values["F_own"] == pytest.approx(0.15, rel=0.1)
+        assert found.prior(Pendulum, [dry]) is extended(Pendulum, dry)
+        with pytest.raises(InputError):  # its own code alone can make it
+            found.prior(Pendulum)
+
+
 def test_a_stopped_search_goes_on_where_it_was():
     level = Parameter("F", 0.15, "N m", 0.0, 1.0)
     runs = recorded(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))(), 4, 4.0)
@@ -191,6 +221,57 @@ def test_a_stopped_search_goes_on_where_it_was():
     again = begun(runs=runs, candidates=(dry,), begun=steps[0])
     assert [step.name for step in again.steps] == [step.name for step in whole.steps]
     assert again.values["F_c"] == pytest.approx(whole.values["F_c"], rel=1e-3)
+
+
+class Vessel(Prior):
+    states = (Signal("temperature", "degC", -100.0, 200.0),)
+    inputs = (Signal("power", "W", -10.0, 10.0),)
+    outputs = states
+    parameters = (Parameter("tau", 4.0, "s", 1.0, 10.0), Parameter("gain", 2.0, "K/W", 0.5, 5.0))
+    operating_point = OperatingPoint((0.0,), (0.0,))
+
+    def xdot(self, x, u, w, p):
+        return ((p.gain * u.power - x.temperature) / p.tau,)
+
+
+def warmed(prior, drift, count=6, n=300, dt=0.2, seed=0):
+    """Recordings of a vessel, each with a slow disturbance [K/s] of its own that nobody measures."""
+    rng, f, runs = np.random.default_rng(seed), prior.equations.xdot, []
+    for k in range(count):
+        power = np.repeat(rng.uniform(-5, 5, n // 20), 20)[:, None]
+        disturbance = drift * np.sin(2 * np.pi * np.arange(n) / n + rng.uniform(0, 6))
+        x = [np.zeros(len(prior.states))]
+        for u, d in zip(power[:-1], disturbance, strict=False):
+            for _ in range(4):
+                rate = f(x[-1], u, [], prior.p).full().ravel()
+                rate[0] += d
+                x.append(x[-1] + 0.25 * dt * rate)
+        y = np.array(x[::4])[:, :1] + 0.02 * rng.standard_normal((n, 1))
+        nothing = np.full((n, 1), np.nan)
+        runs.append(Trajectory(f"run{k}", "train", dt, dt * np.arange(n), power, y, nothing, nothing))
+    return runs
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.5])
+def test_a_slow_disturbance_is_not_taken_for_a_second_capacity(drift):
+    """Free first states of a slow state would explain it in every run."""
+    wall = terms.storage(
+        "temperature", Parameter("k_s", 0.0, "1/s", 0.0, 1.0), Parameter("tau_s", 12.0, "s", 0.2, 30.0),
+        state=Signal("wall", "degC", -100.0, 200.0),
+    )  # fmt: skip
+    plant = Vessel() if drift else extended(Vessel, wall)({"k_s": 0.3})
+    runs = warmed(plant, drift)
+    known = smoothed(Vessel, fit_prior(Vessel, runs, [], dt=0.2, length=15.0), runs, 0.2)
+    found = explain(
+        Vessel,
+        Vessel().values,
+        known,
+        dt=0.2,
+        length=15.0,
+        warm_up=2.0,
+        candidates=(Candidate("wall", (wall,)),),
+    )
+    assert [term.name for term in found.found] == ([] if drift else ["second capacity of temperature"])
 
 
 def test_the_page_of_terms_is_that_of_the_library():
