@@ -610,7 +610,7 @@ class _Explain:
             search.problem((), self.evidence.windows).solve(search.fit(()).scaled(values), ITERATIONS).theta
         )
         self.first = search.held_out((), theta)
-        self.nominal = _squares(search.problem((), self.evidence.judged), search.fit(()).nominal)
+        self.nominal = math.sqrt(search.error((), search.fit(()).nominal))
         self.now = _State((), theta, self.first)
 
     def run(
@@ -835,7 +835,7 @@ class _Explain:
                 )  # fmt: skip
             steps.append(step)
         return Explanation(
-            self.base.__name__, self._error(self.nominal), self._error(self.first),
+            self.base.__name__, self.nominal, self._error(self.first),
             self.evidence.compared(self.now.squares, self.first, 1), tuple(steps), last, parameters,
             self.evidence.told, self.candidates, reason,
         )  # fmt: skip

@@ -12,9 +12,10 @@ from hybrid_mpc import InputError, RunSettings, extended, load_scenario, terms, 
 from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.plots.explain import error_steps
-from hybrid_mpc.workflow import explain as command
+from hybrid_mpc.workflow import explain_search
 from hybrid_mpc.workflow.context import Context
-from hybrid_mpc.workflow.explain import chosen_terms, read_result
+from hybrid_mpc.workflow.explain import read_result
+from hybrid_mpc.workflow.explain_search import chosen_terms
 from hybrid_mpc.workflow.explained import scenario_code
 from hybrid_mpc.workflow.stage import bring_up_to_date
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
@@ -100,8 +101,8 @@ def test_its_scenario_has_the_error_of_the_explanation(explained, files):
 
 def test_the_command_goes_on_and_prints_the_table(explained, machine, files, call, monkeypatch):
     out, found = explained
-    monkeypatch.setattr(command, "search", None)  # nothing is searched again
-    monkeypatch.setattr(command, "fit_prior", None)
+    monkeypatch.setattr(explain_search, "search", None)  # nothing is searched again
+    monkeypatch.setattr(explain_search, "fit_prior", None)
     words = [word for path in files for word in ("--data", path)]
     laws = [word for law in LAWS for word in ("--terms", law)]
     code, told, _ = call("explain", machine / "my_machine.py", *words, *laws, "--most", 1, "--out", out)

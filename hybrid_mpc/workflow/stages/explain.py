@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hybrid_mpc.files import write_text
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.machine.terms import extended
 from hybrid_mpc.workflow.context import Context
-from hybrid_mpc.workflow.explain import Search, chosen_terms, prior_class, write
-from hybrid_mpc.workflow.explained import ExplainResult
+from hybrid_mpc.workflow.explain_search import Search, chosen_terms, prior_class
+from hybrid_mpc.workflow.explained import ExplainResult, scenario_code
 from hybrid_mpc.workflow.stage import Absent, Stage
 from hybrid_mpc.workflow.stages.identify import DATA, what_prior_reads
 from nn_export.program import to_json
@@ -42,7 +43,8 @@ def explain_stage(context: Context) -> ExplainResult | Absent:
         return Absent("--explain was not given")
     own, out = context.as_given, context.out / FOLDER
     found = Search(own, prior_class(own.scenario), own.dataset, chosen_terms(own.scenario), out).result()
-    write(own, found, out, ["run", own.settings.scenario, *own.settings.options(str), "--explain"])
+    if found.file:
+        write_text(out / found.file, scenario_code(own.scenario, own.scenario_path, found.explanation))
     return found
 
 

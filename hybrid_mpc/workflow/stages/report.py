@@ -21,7 +21,7 @@ from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
 from hybrid_mpc.workflow.context import Context
-from hybrid_mpc.workflow.explain_page import steps_table, tests_table
+from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.advice import advice, doubt_of
 from hybrid_mpc.workflow.stages.analyze import ANALYSIS
@@ -317,7 +317,11 @@ def _explain_tables(context: Context) -> list[Table]:
     found = context.find(EXPLAIN)
     if isinstance(found, Absent):
         return []
-    return [steps_table(found.explanation), *([tests_table(found)] if found.tests else [])]
+    told = found.explanation
+    tests = [tests_table(found)] if found.tests else []
+    return [
+        table for table in (steps_table(told), *tests, terms_table(told), trials_table(told)) if table.rows
+    ]
 
 
 def _prior_table(context: Context) -> Table:
