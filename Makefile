@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+DEMO := .venv/.demo
 # Arrays here are small: threads inside numpy and torch only cost time.
 export OMP_NUM_THREADS ?= 1
 
@@ -9,13 +10,20 @@ export OMP_NUM_THREADS ?= 1
 
 install: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml constraints.txt
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
+
+# What a run needs; tests, docs and notebooks need more.
+$(DEMO): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP) '.[train,cli,report,analysis]'
+	touch $@
+
+$(INSTALLED): $(DEMO)
+	$(PIP) '.[dev]'
 	touch $@
 
 # An interrupted demo goes on where it stopped.
-demo: $(INSTALLED)
+demo: $(DEMO)
 	$(BIN)/hybrid-mpc run golf_robot --budget quick --out runs/demo $(if $(wildcard runs/demo/run.json),--resume)
 
 lint: $(INSTALLED)

@@ -18,7 +18,7 @@ from typing import Any
 
 from hybrid_mpc import Scenario, Trajectory, fit_prior, load_scenario, load_trajectories
 from hybrid_mpc.identify.fit import smoothed
-from hybrid_mpc.job.benchmark_runs import read_training
+from hybrid_mpc.workflow.benchmark_runs import read_training
 
 Parts = tuple[Sequence[Trajectory], Sequence[Trajectory], Sequence[Trajectory], dict[str, Any]]
 

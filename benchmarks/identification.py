@@ -38,7 +38,7 @@ from parts import arguments, report
 
 from hybrid_mpc import Scenario, Trajectory, load_scenario, load_trajectories
 from hybrid_mpc.identify.evaluate import STARTS
-from hybrid_mpc.job.benchmark_runs import read_training
+from hybrid_mpc.workflow.benchmark_runs import read_training
 
 FILES = {
     "golf_robot": (),

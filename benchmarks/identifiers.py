@@ -29,7 +29,7 @@ from hybrid_mpc import Prior, Scenario, TrainingSettings, Trajectory, fit_prior
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, required_substeps
 from hybrid_mpc.identify.train import TrainingRun
-from hybrid_mpc.job.benchmark_runs import run_freely, warm_samples
+from hybrid_mpc.workflow.benchmark_runs import run_freely, warm_samples
 from nn_export.expressions import scalar_steps
 
 Array = np.ndarray

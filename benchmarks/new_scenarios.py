@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import DataSpec, InputError, load_scenario
+from hybrid_mpc.check.new import Draft, drafted
 from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.names import said_by
-from hybrid_mpc.job.new import Draft, drafted
 
 Array = NDArray[np.float64]
 

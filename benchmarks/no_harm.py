@@ -26,13 +26,13 @@ from parts import arguments, report
 
 from hybrid_mpc import InputError, Window, load_scenario, load_trajectories
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.settings import RunSettings
-from hybrid_mpc.job.stage import bring_up_to_date
-from hybrid_mpc.job.stages.choose import CHOICE
-from hybrid_mpc.job.stages.evaluate import EVALUATION
-from hybrid_mpc.job.stages.identify import DATA, PRIOR, TRAINING
 from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stage import bring_up_to_date
+from hybrid_mpc.workflow.stages.choose import CHOICE
+from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING
 
 RECORDINGS = {
     "unbalanced_disk_2022": ("unbalanced_disk/multisine_2022.npz",),

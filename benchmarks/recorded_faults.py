@@ -45,11 +45,11 @@ from hybrid_mpc.estimate.tuning import most_likely
 from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import with_states
 from hybrid_mpc.identify.prior_model import prior_programs
-from hybrid_mpc.job.benchmark_runs import benchmark_of, read_test, read_training
-from hybrid_mpc.job.stages.watch import rates
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import first_deviations
 from hybrid_mpc.watch.replay import stretches
+from hybrid_mpc.workflow.benchmark_runs import benchmark_of, read_test, read_training
+from hybrid_mpc.workflow.stages.watch import rates
 
 SCALES = (0.3, 1.0, 3.0, 10.0)
 """Candidate factors on the model's errors of a period; the likeliest on the training recording gives the noise."""

@@ -17,8 +17,8 @@ from parts import arguments, report
 
 from hybrid_mpc import RunSettings, load_scenario
 from hybrid_mpc.identify.train import TrainingRun
-from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.stages.identify import training_settings
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stages.identify import training_settings
 
 EVERY = 25
 

@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 from hybrid_mpc import InputError, Scenario, Trajectory, fit_prior, load_scenario
 from hybrid_mpc.identify.linear import fit_arx, fit_subspace
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.job.benchmark_runs import benchmark_of, in_runs, read_test, read_training, run_freely
+from hybrid_mpc.workflow.benchmark_runs import benchmark_of, in_runs, read_test, read_training, run_freely
 
 STEPS = 20
 """Steps at most to the least error."""

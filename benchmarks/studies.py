@@ -19,11 +19,10 @@ import pandas
 from parts import arguments, report
 
 from hybrid_mpc import LoopSpec, Study, run_study
-from hybrid_mpc.job import study_run
-from hybrid_mpc.job.context import Progress
-from hybrid_mpc.job.engine import DaskEngine, LocalEngine
-from hybrid_mpc.job.study_log import RunLog, RunRow, compact, rows, segments
-from hybrid_mpc.job.study_run import THREADS, TIMING, execute, load_inputs, run_batch
+from hybrid_mpc.compare import study_run
+from hybrid_mpc.compare.study_log import RunLog, RunRow, compact, rows, segments
+from hybrid_mpc.compare.study_run import THREADS, TIMING, execute, load_inputs, run_batch
+from hybrid_mpc.engine import DaskEngine, LocalEngine, Progress
 
 
 def nothing(config: LoopSpec) -> dict:

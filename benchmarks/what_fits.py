@@ -23,9 +23,9 @@ from hybrid_mpc import (
     Scenario,
     Signal,
 )
+from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
-from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import make_estimator
 from hybrid_mpc.kit.parts import loop_settings

@@ -10,7 +10,6 @@ a problem or runs a loop.
 """
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 # fmt: off
@@ -92,18 +91,18 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     )
     from hybrid_mpc.identify.train import train as train
     from hybrid_mpc.identify.tune import SearchSpace as SearchSpace, tune as tune
-    from hybrid_mpc.job.check import check_scenario as check_scenario
-    from hybrid_mpc.job.check_fit import check_fit as check_fit
-    from hybrid_mpc.job.controllers import find_noise as find_noise
-    from hybrid_mpc.job.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
-    from hybrid_mpc.job.run import run as run
-    from hybrid_mpc.job.sequential import Comparison as Comparison, compare_costs as compare_costs
-    from hybrid_mpc.job.settings import RunSettings as RunSettings
-    from hybrid_mpc.job.study import FaultKind as FaultKind, RandomFaults as RandomFaults, Study as Study
-    from hybrid_mpc.job.study_results import (
+    from hybrid_mpc.check.preflight import check_scenario as check_scenario
+    from hybrid_mpc.workflow.check_fit import check_fit as check_fit
+    from hybrid_mpc.compare.controllers import find_noise as find_noise
+    from hybrid_mpc.compare.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
+    from hybrid_mpc.workflow.run import run as run
+    from hybrid_mpc.compare.sequential import Comparison as Comparison, compare_costs as compare_costs
+    from hybrid_mpc.workflow.settings import RunSettings as RunSettings
+    from hybrid_mpc.compare.study import FaultKind as FaultKind, RandomFaults as RandomFaults, Study as Study
+    from hybrid_mpc.compare.study_results import (
         StudyResults as StudyResults, write_study_report as write_study_report,
     )
-    from hybrid_mpc.job.study_run import dry_run as dry_run, run_study as run_study
+    from hybrid_mpc.compare.study_run import dry_run as dry_run, run_study as run_study
     from hybrid_mpc.kit.artifact import Kit as Kit, load as load, save_artifact as save_artifact
     from hybrid_mpc.kit.assembly import (
         make_adaptive_guard as make_adaptive_guard, make_controller as make_controller,
@@ -158,10 +157,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.watch.residuals import ResidualReadings as ResidualReadings
 # fmt: on
 
-try:
-    __version__ = version("hybrid-mpc")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
+__version__: str
 
 _ROOMS = {
     "analyze.equilibria": ("equilibria",),
@@ -175,6 +171,13 @@ _ROOMS = {
         "balanced_truncation", "frequency_response", "physical_states", "steady_gain", "system_structure",
     ),
     "analyze.sensitivity": ("parameter_sensitivities",),
+    "check.preflight": ("check_scenario",),
+    "compare.controllers": ("find_noise",),
+    "compare.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
+    "compare.sequential": ("Comparison", "compare_costs"),
+    "compare.study": ("FaultKind", "RandomFaults", "Study"),
+    "compare.study_results": ("StudyResults", "write_study_report"),
+    "compare.study_run": ("dry_run", "run_study"),
     "control.best_of": ("BestOf",),
     "control.move": ("Move", "shortest_move"),
     "control.nlp": ("IpoptController",),
@@ -215,16 +218,6 @@ _ROOMS = {
     "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
     "identify.train": ("train",),
     "identify.tune": ("SearchSpace", "tune"),
-    "job.check": ("check_scenario",),
-    "job.check_fit": ("check_fit",),
-    "job.controllers": ("find_noise",),
-    "job.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
-    "job.run": ("run",),
-    "job.sequential": ("Comparison", "compare_costs"),
-    "job.settings": ("RunSettings",),
-    "job.study": ("FaultKind", "RandomFaults", "Study"),
-    "job.study_results": ("StudyResults", "write_study_report"),
-    "job.study_run": ("dry_run", "run_study"),
     "kit.artifact": ("Kit", "load", "save_artifact"),
     "kit.assembly": (
         "make_adaptive_guard", "make_controller", "make_estimator", "make_ocp",
@@ -259,6 +252,9 @@ _ROOMS = {
     "watch.monitor": ("Monitor", "make_monitor", "make_readings"),
     "watch.replay": ("Trace", "count_alarms", "replay"),
     "watch.residuals": ("ResidualReadings",),
+    "workflow.check_fit": ("check_fit",),
+    "workflow.run": ("run",),
+    "workflow.settings": ("RunSettings",),
 }  # fmt: skip
 """Public names by the module that defines them."""
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
@@ -267,7 +263,18 @@ _MODULES = {"plots": "plots", "terms": "machine.terms"}
 __all__ = sorted((*_HOME, *_MODULES, "__version__"))
 
 
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("hybrid-mpc")
+    except PackageNotFoundError:  # a source tree that was never installed
+        return "0+unknown"
+
+
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
     if name not in _MODULES and name not in _HOME:
         raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
     from hybrid_mpc.errors import named_extra

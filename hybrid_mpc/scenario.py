@@ -8,7 +8,6 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -176,11 +175,11 @@ class Scenario:
             nothing is finite, at the end of a run. It is never guessed: a guard that rests and a run on the real
             machine need it. Default: none is declared; a loop in simulation then holds its last input.
         tasks: Closed-loop tasks. Default: none; without a plant, too, a step and holding against a disturbance
-            (:func:`~hybrid_mpc.job.default_tasks.default_tasks`).
+            (:func:`~hybrid_mpc.check.default_tasks.default_tasks`).
         budgets: Effort by name.
         draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
         figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a
-            :class:`~hybrid_mpc.job.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
+            :class:`~hybrid_mpc.compare.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
         causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
             for :class:`~hybrid_mpc.watch.diagnose.Diagnoser`. Default: each by itself.
         benchmark: How ``hybrid-mpc benchmark`` evaluates the machine's models on recordings; default: not at all.
@@ -236,6 +235,8 @@ class Scenario:
 
 def registered_scenarios() -> dict[str, str]:
     """Registered scenario names with the place they come from."""
+    from importlib.metadata import entry_points
+
     return {e.name: e.value for e in sorted(entry_points(group="hybrid_mpc.scenarios"), key=lambda e: e.name)}
 
 
@@ -283,6 +284,8 @@ def load_scenario(name_or_path: str) -> Scenario:
         >>> load_scenario("golf_robot").name
         'golf_robot'
     """
+    from importlib.metadata import entry_points
+
     for entry in entry_points(group="hybrid_mpc.scenarios"):
         if entry.name == name_or_path:
             with no_exit(name_or_path):
@@ -312,9 +315,7 @@ def load_scenario(name_or_path: str) -> Scenario:
             spec.loader.exec_module(module)
         except Exception as error:
             line = _line_in(error, path)
-            raise InputError(
-                f"{path}{line}: {type(error).__name__}: {said_by(error)}{_hint(error)}"
-            ) from error
+            raise InputError(f"{path}{line}: {_missing(error) or _told(error)}") from error
     if not hasattr(module, "scenario"):
         raise InputError(f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)")
     return _checked(module.scenario, str(path))
@@ -325,6 +326,25 @@ def _checked(scenario: object, where: str) -> Scenario:
         kind = type(scenario).__name__
         raise InputError(f"{where}: 'scenario' is a {kind}, it must be a hybrid_mpc Scenario")
     return scenario
+
+
+def _told(error: BaseException) -> str:
+    return f"{type(error).__name__}: {said_by(error)}{_hint(error)}"
+
+
+def _missing(error: BaseException) -> str:
+    """What to write where a class was not given all that it needs; empty for any other error.
+
+    Example:
+        >>> _missing(TypeError("DataSpec.__init__() missing 2 required positional arguments: 'dt' and 'max_gap'"))
+        'DataSpec lacks dt and max_gap; write DataSpec(..., dt=..., max_gap=...)'
+    """
+    found = re.search(r"(\w+)\.__init__\(\) missing \d+ required [\w-]+ arguments?: (.*)", said_by(error))
+    if found is None:
+        return ""
+    names = re.findall(r"'(\w+)'", found[2])
+    said = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    return f"{found[1]} lacks {said}; write {found[1]}(..., {', '.join(f'{name}=...' for name in names)})"
 
 
 def _hint(error: BaseException) -> str:

@@ -10,35 +10,37 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 from hypothesis import settings
+from machine_runs import arguments, bare_tanks, finished, jobs_here, machine, run_folder
+
+__all__ = ["arguments", "bare_tanks", "finished", "jobs_here", "machine", "run_folder"]  # fixtures
 
 # the same cases in every run: what fails on one machine fails on all
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
 
 LONG = (
-    "job/test_machines.py",
-    "job/test_run.py",
-    "job/test_on_model.py",
+    "workflow/test_machines.py",
+    "workflow/test_run.py",
+    "workflow/test_on_model.py",
     "notebooks/test_notebooks.py",
     "nn_export/test_random_modules.py",
-    "job/study/test_study_runner.py",
-    "job/study/test_loops.py",
+    "compare/study/test_study_runner.py",
+    "compare/study/test_loops.py",
     "embedded/test_whole_loops.py",
     "embedded/test_export.py",
     "scenarios/test_simulated.py",
     "identify/test_linear.py",
-    "job/test_control_command.py",
+    "workflow/test_control_command.py",
     "identify/test_prior_fit.py",
     "identify/test_training.py",
     "identify/test_simulation.py",
     "identify/test_prediction.py",
     "docs/test_examples.py",
-    "job/test_engine.py",
-    "job/test_guard.py",
-    "job/test_check_planted.py",
+    "test_engine.py",
+    "check/test_check_planted.py",
     "scenarios/paper/test_reproduce.py",
-    "job/test_stages.py",
-    "job/test_preflight.py",
+    "workflow/test_stages.py",
+    "check/test_preflight.py",
     "nn_export/test_budget.py",
     "loop/test_faulted_loops.py",
 )

@@ -86,7 +86,7 @@ def waits(batch):
     time.sleep(1.0)
 
 
-def one_by_one(jobs, on_progress, workers, on_result=lambda name, result: None, *, fresh=True):
+def one_by_one(jobs, on_progress, workers, on_result=lambda name, result: None, *, fresh=True, cluster=None):
     """``run_jobs`` in this process: others of their own take longer to start than small jobs to end.
 
     Jobs and results are what would reach another process, and come back from it.
@@ -105,7 +105,7 @@ def jobs_in_this_process():
     """Networks are trained and loops of a comparison computed in this process."""
     import pytest
 
-    from hybrid_mpc.job.stages import compare, identify
+    from hybrid_mpc.workflow.stages import compare, identify
 
     with pytest.MonkeyPatch.context() as patch:
         for stage in (compare, identify):

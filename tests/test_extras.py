@@ -11,8 +11,8 @@ import pytest
 from patience import HANGS
 
 import hybrid_mpc as hm
+from hybrid_mpc.compare.step_response import step_response
 from hybrid_mpc.errors import EXTRAS, MissingPackage, named_extra
-from hybrid_mpc.job.step_response import step_response
 
 TRAIN = ("torch", "optuna")
 REPORT = ("matplotlib", "PIL", "bokeh", "jinja2", "markupsafe")
@@ -46,7 +46,7 @@ for package in (hybrid_mpc, nn_export):
             getattr(package, name)
         except ImportError as error:
             found[f"{package.__name__}.{name}"] = [type(error).__name__, str(error)]
-from hybrid_mpc.job.context import versions
+from hybrid_mpc.folder import versions
 found["versions"] = sorted(versions())
 print(json.dumps(found))
 """

@@ -17,8 +17,10 @@ ROOMS = {
     "nn_export": "",
     "errors": "",
     "rules": "",
+    "engine": "errors",
     "records": "nn_export errors rules",
     "files": "nn_export errors records",
+    "folder": "errors records files",
     "machine": "nn_export errors rules records",
     "data": "nn_export errors records files machine",
     "model": "nn_export errors rules records machine",
@@ -28,16 +30,21 @@ ROOMS = {
     "scenario": "errors rules records machine model control loop",
     "watch": "errors rules machine data model",
     "embedded": "nn_export errors rules files model estimate control loop watch",
-    "analyze": "nn_export errors data model estimate control loop",
     "kit": "nn_export errors rules records files machine data model estimate control embedded loop scenario watch",
     "identify": "nn_export errors rules records files machine data model kit",
     "plots": "errors files machine watch",
     "report": "errors rules files plots",
-    "job": "nn_export errors rules records files machine data model estimate control loop scenario watch analyze kit "
-    "identify plots report",
-    "cli": "errors rules records files machine data scenario kit identify job",
-    "scenarios.paper": "errors rules records files machine data scenario identify plots job cli",
-    "scenarios.golf_robot.monitor_study": "errors records files loop scenario watch kit plots report job cli",
+    "analyze": "nn_export errors records files machine data model estimate control loop watch plots report",
+    "check": "nn_export errors rules engine records files machine data model control loop scenario kit identify plots "
+    "analyze",
+    "compare": "nn_export errors rules engine records files folder machine data model estimate control loop scenario "
+    "watch kit identify plots report analyze check",
+    "workflow": "nn_export errors engine records files folder machine data model estimate control loop scenario watch "
+    "kit identify plots report analyze check compare",
+    "cli": "errors rules engine files machine data scenario kit identify analyze check compare workflow",
+    "scenarios.paper": "errors rules engine records files folder machine data scenario identify plots workflow cli",
+    "scenarios.golf_robot.monitor_study": "errors engine records files folder loop scenario watch kit plots report "
+    "compare cli",
     "scenarios": "nn_export",
 }
 """What each room may import, besides itself. A room imports only rooms above its own line, so there are no circles.
@@ -226,7 +233,7 @@ def test_only_the_command_line_knows_typer():
 
 
 def test_the_engine_computes_any_work_and_knows_none():
-    own = {name for name in imports(ROOT / "hybrid_mpc/job/engine.py", at_load=False) if name.startswith(OWN)}
+    own = {name for name in imports(ROOT / "hybrid_mpc/engine.py", at_load=False) if name.startswith(OWN)}
     assert own == {"hybrid_mpc.errors"}
 
 

@@ -29,10 +29,10 @@ from hybrid_mpc import (
     make_resting_guard,
     simulate,
 )
-from hybrid_mpc.job.analyze import driving_input, input_range, responses_of, state_range
-from hybrid_mpc.job.check import check_scenario
-from hybrid_mpc.job.loops import excess, limits_used
-from hybrid_mpc.job.nominal import unknown_load
+from hybrid_mpc.analyze.analysis import driving_input, input_range, responses_of, state_range
+from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.compare.loops import excess, limits_used
+from hybrid_mpc.compare.nominal import unknown_load
 from hybrid_mpc.kit.assembly import sensor_steps, working_point
 from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.model.limits import share_used

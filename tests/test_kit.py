@@ -166,7 +166,7 @@ def test_a_scenario_s_problem_is_taken_as_it_now_is(run):
 def test_the_lines_of_the_readme(run, monkeypatch):
     """They are run as they stand, around the simulated machine."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.S)
-    lines = next(b for b in blocks if "hm.load(" in b) + next(b for b in blocks if "loop.step(" in b)
+    lines = next(b for b in blocks if "hm.load(" in b and "loop.step(" in b)
     plant, rng = GOLF.plant(), np.random.default_rng(0)
     machine = {"state": plant.reset(np.zeros(2), 0), "left": 150, "u": np.zeros(1)}
 

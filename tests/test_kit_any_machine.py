@@ -6,11 +6,11 @@ import pytest
 from machines import MachinePlant
 
 import hybrid_mpc as hm
+from hybrid_mpc.compare.loops import LoopSpec, excess, limits_used, row_of
+from hybrid_mpc.compare.tasks import repeated
 from hybrid_mpc.identify.prior_model import prior_programs
-from hybrid_mpc.job import monitor as monitor_job
-from hybrid_mpc.job.loops import LoopSpec, excess, limits_used, row_of
-from hybrid_mpc.job.tasks import repeated
 from hybrid_mpc.kit.parts import WatchFile, loop_settings, set_limits
+from hybrid_mpc.workflow import monitor as monitor_job
 
 DT = 10.0
 

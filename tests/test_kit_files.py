@@ -13,11 +13,6 @@ import pytest
 import hybrid_mpc as hm
 from hybrid_mpc import InputError, RunSettings, load_scenario
 from hybrid_mpc.files import read_document, sha256, write_document
-from hybrid_mpc.job import run as job
-from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.stages.export import EXPORT, NOISE, TASKS, ExportResult, NoiseResult, put_noise
-from hybrid_mpc.job.stages.promises import PROMISES, PromisesResult, put_promises
-from hybrid_mpc.job.stages.watch import WATCH, WatchResult, put_limits
 from hybrid_mpc.kit import parts as files
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.migrate import (
@@ -46,6 +41,11 @@ from hybrid_mpc.kit.parts import (
 )
 from hybrid_mpc.kit.promises import Promise, read_promises
 from hybrid_mpc.records import plain
+from hybrid_mpc.workflow import run as job
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, TASKS, ExportResult, NoiseResult, put_noise
+from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult, put_promises
+from hybrid_mpc.workflow.stages.watch import WATCH, WatchResult, put_limits
 
 ROOT = Path(__file__).parents[1]
 GOLF = load_scenario("golf_robot")
@@ -60,7 +60,7 @@ WRITERS = {
 }  # fmt: skip
 """Functions that write a kit's files, by the stage that may call them."""
 MODULES = {"noise": "export", "tasks": "export"}
-"""Module in ``job/stages`` of a stage where its name is another one's."""
+"""Module in ``workflow/stages`` of a stage where its name is another one's."""
 
 
 # a run whose stages take no time: what each writes says what it was made of

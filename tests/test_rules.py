@@ -12,8 +12,8 @@ import pytest
 
 import hybrid_mpc as hm
 from hybrid_mpc import OCP, DataSpec, HardBound, InputError, Parameter, Scenario, Signal, SoftBound, Task
+from hybrid_mpc.compare.study import FaultKind, Study
 from hybrid_mpc.identify.settings import TrainingSettings
-from hybrid_mpc.job.study import FaultKind, Study
 from hybrid_mpc.kit.parts import BalanceInfo, LoopSettings, ModelInfo
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.prior import Balance, OperatingPoint
@@ -232,7 +232,7 @@ def test_no_scenario_of_a_bad_name_passes_the_check(call, tmp_path):
     machine = tmp_path / "machine.py"
     for change in ("name='../../x'", "sensor_sigma=(1e300,)", "data=replace(GOOD.data, dt=True)"):
         machine.write_text(
-            "from dataclasses import replace\nfrom tests.job.test_preflight import GOOD\n"
+            "from dataclasses import replace\nfrom tests.check.test_preflight import GOOD\n"
             f"scenario = replace(GOOD, {change})\n"
         )
         assert call("check", machine)[0] == 2

@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 
 from hybrid_mpc import Study, run_study
-from hybrid_mpc.job import study_run as runner
-from hybrid_mpc.job.study import generator
-from hybrid_mpc.job.study_log import ModelNote, NoiseNote
+from hybrid_mpc.compare import study_run as runner
+from hybrid_mpc.compare.study import generator
+from hybrid_mpc.compare.study_log import ModelNote, NoiseNote
 
 SCENARIO = "golf_robot"
 

@@ -14,6 +14,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hybrid_mpc import OCP, DataSpec, HybridModel, Prior, Scenario, Trajectory, fit_prior
+from hybrid_mpc.check.first_model import CLOSED, Runs, feedback_of, first_lag, growth_of, slowest
+from hybrid_mpc.check.new import HORIZONS, first_limits
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.data.scales import robust_spread, time_unit
 from hybrid_mpc.estimate.switching import Filter
@@ -21,8 +23,6 @@ from hybrid_mpc.estimate.tuning import process_noise
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.job.first_model import CLOSED, Runs, feedback_of, first_lag, growth_of, slowest
-from hybrid_mpc.job.new import HORIZONS, first_limits
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.kit.assembly import make_controller, make_estimator, tuned_noise
 from hybrid_mpc.kit.disturbances import default_disturbances

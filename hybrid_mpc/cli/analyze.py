@@ -12,7 +12,7 @@ from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.analyze import AnalysisSettings
+    from hybrid_mpc.workflow.analyze import AnalysisSettings
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -40,10 +40,11 @@ def analyze(
     seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
 ) -> None:
     """Poles, Bode plots, margins of the control loop and more, as tables, pictures and a page."""
+    from hybrid_mpc.analyze.analysis import analyze_models
+    from hybrid_mpc.analyze.page import write_analysis
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.files import check_folder
-    from hybrid_mpc.job.analyze import AnalysisSettings, analysis_input, analyze_models
-    from hybrid_mpc.job.analyze_page import write_analysis
+    from hybrid_mpc.workflow.analyze import AnalysisSettings, analysis_input
 
     check_folder(out)
     settings = AnalysisSettings(model, scenario, tuple(data or ()), speed, seed)

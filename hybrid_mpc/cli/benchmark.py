@@ -44,9 +44,9 @@ def benchmark(
 ) -> None:
     """Fit the prior, train networks on it, and evaluate free runs over unseen recordings."""
     from hybrid_mpc.cli.progress import make_progress, print_summary
-    from hybrid_mpc.job.benchmark import BenchmarkSettings, draw, table
-    from hybrid_mpc.job.benchmark import benchmark as run_job
     from hybrid_mpc.scenario import load_scenario
+    from hybrid_mpc.workflow.benchmark import BenchmarkSettings, draw, table
+    from hybrid_mpc.workflow.benchmark import benchmark as run_job
 
     folder = out or Path("runs") / f"{Path(machine).stem}-benchmark"
     settings = BenchmarkSettings(

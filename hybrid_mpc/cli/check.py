@@ -16,12 +16,12 @@ from hybrid_mpc.rules import printable
 if TYPE_CHECKING:
     import numpy as np
 
-    from hybrid_mpc.job.check import Preflight, Rest
-    from hybrid_mpc.job.context import Context
-    from hybrid_mpc.job.stages.identify import PriorResult
+    from hybrid_mpc.check.preflight import Preflight, Rest
     from hybrid_mpc.machine.prior import Prior
     from hybrid_mpc.machine.signals import Signal
     from hybrid_mpc.machine.specification import DataSpec
+    from hybrid_mpc.workflow.context import Context
+    from hybrid_mpc.workflow.stages.identify import PriorResult
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -54,11 +54,11 @@ def check(
     puts its structure in doubt is named. Nothing is trained, no file is written. Exit code 2 if something must be
     mended.
     """
-    from hybrid_mpc.job.check import preflight
-    from hybrid_mpc.job.context import Context
-    from hybrid_mpc.job.new import left_to_decide
-    from hybrid_mpc.job.settings import RunSettings
+    from hybrid_mpc.check.new import left_to_decide
+    from hybrid_mpc.check.preflight import preflight
     from hybrid_mpc.scenario import load_scenario
+    from hybrid_mpc.workflow.context import Context
+    from hybrid_mpc.workflow.settings import RunSettings
 
     machine = load_scenario(scenario)
     settings = RunSettings(
@@ -99,8 +99,8 @@ def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str
 
     from hybrid_mpc.cli.progress import Unwarned, make_progress
     from hybrid_mpc.errors import InputError
-    from hybrid_mpc.job.check_fit import fit_of
-    from hybrid_mpc.job.stages.identify import stops
+    from hybrid_mpc.workflow.check_fit import fit_of
+    from hybrid_mpc.workflow.stages.identify import stops
 
     with make_progress() as progress:
         try:

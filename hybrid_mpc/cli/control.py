@@ -12,8 +12,8 @@ from hybrid_mpc.cli.options import ScenarioName
 from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.control import ControlResults
-    from hybrid_mpc.job.loops import LoopRow
+    from hybrid_mpc.compare.loops import LoopRow
+    from hybrid_mpc.workflow.control import ControlResults
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -66,9 +66,9 @@ def control(
     A machine without plant is stood in for by a model: then nothing that is found is of the machine.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
-    from hybrid_mpc.job.control import run_control
-    from hybrid_mpc.job.study import DEFAULT_CONTROLLERS, Study
+    from hybrid_mpc.compare.study import DEFAULT_CONTROLLERS, Study
     from hybrid_mpc.kit.promises import promise_lines
+    from hybrid_mpc.workflow.control import run_control
 
     guarded = guard or adapt
     controllers = controller or (("hybrid_observer",) if guarded else DEFAULT_CONTROLLERS)

@@ -63,7 +63,7 @@ def tell(path: Path, plot: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from hybrid_mpc.job.look import look, picture
+    from hybrid_mpc.check.look import look, picture
 
     found, console = look(path), Console(highlight=False)
     console.print(printable(f"{path.name}: {found.rows} rows, {len(found.columns)} columns"), markup=False)

@@ -13,7 +13,7 @@ def doctor() -> None:
 
     Exit code 1 if a job could not run.
     """
-    from hybrid_mpc.job.doctor import examined
+    from hybrid_mpc.check.doctor import examined
 
     findings = examined()
     width = max(len(one.name) for one in findings)

@@ -11,7 +11,7 @@ from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 from hybrid_mpc.errors import InputError
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.monitor import MonitorJob, MonitorResult, RecordingResult
+    from hybrid_mpc.workflow.monitor import MonitorJob, MonitorResult, RecordingResult
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -62,10 +62,10 @@ def monitor(
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.files import check_folder
-    from hybrid_mpc.job.monitor import learn as learn_job
-    from hybrid_mpc.job.monitor import prepared, watch
     from hybrid_mpc.kit.parts import KIT, artifact_folder, read_description
     from hybrid_mpc.scenario import scenario_of
+    from hybrid_mpc.workflow.monitor import learn as learn_job
+    from hybrid_mpc.workflow.monitor import prepared, watch
 
     check_folder(out)
     folder = artifact_folder(model)

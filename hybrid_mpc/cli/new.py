@@ -31,7 +31,7 @@ def new(
 
     What only you can know is marked TODO; 'hybrid-mpc check' lists what is left.
     """
-    from hybrid_mpc.job.new import KINDS, horizon_of, left_to_decide, loop_lines, printable, write_scenario
+    from hybrid_mpc.check.new import KINDS, horizon_of, left_to_decide, loop_lines, printable, write_scenario
 
     named = (tuple(columns or ()) for columns in (input_column, output_column, disturbance_column))
     inputs, outputs, disturbances = named

@@ -26,3 +26,7 @@ DisturbanceColumns: TypeAlias = Annotated[
 Device: TypeAlias = Annotated[str, typer.Option(help="Where networks are trained: cpu, cuda, cuda:1, ...")]
 ArtifactFolder: TypeAlias = Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")]
 EmptyFolder: TypeAlias = Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")]
+Scheduler: TypeAlias = Annotated[
+    str | None,
+    typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, in place of processes of this machine."),
+]

@@ -33,8 +33,8 @@ def predict(
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.files import check_folder
-    from hybrid_mpc.job.predict import predict_recordings, read_recordings_of
     from hybrid_mpc.kit.artifact import load
+    from hybrid_mpc.workflow.predict import predict_recordings, read_recordings_of
 
     check_folder(out)
     loaded = load(kit)

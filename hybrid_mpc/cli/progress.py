@@ -11,7 +11,7 @@ from rich import progress as rich_progress
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from hybrid_mpc.job.context import Progress
+from hybrid_mpc.engine import Progress
 from hybrid_mpc.rules import printable
 
 LINE_EVERY_S = 5.0

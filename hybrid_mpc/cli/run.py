@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import Device, InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+from hybrid_mpc.cli.options import (
+    Device,
+    InputColumns,
+    OutputColumns,
+    Recordings,
+    ScenarioName,
+    Scheduler,
+    TimeColumn,
+)
 from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.job.stages.results import Control, Identification, OnModel, Results, Watch
+    from hybrid_mpc.workflow.stages.results import Control, Identification, OnModel, Results, Watch
 
 INCOMPLETE = 1
 """Exit code of a run whose report lacks a part."""
@@ -62,6 +70,7 @@ def run(
     skip: Annotated[
         list[str] | None, typer.Option(help="Stage after the export that is not to run, once for each.")
     ] = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Fit the prior, train, export, close the loop, learn what to alarm by, analyze, and write a report.
 
@@ -70,9 +79,9 @@ def run(
     has changed. Exit code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
-    from hybrid_mpc.job.run import failed_stages
-    from hybrid_mpc.job.run import run as run_job
-    from hybrid_mpc.job.settings import RunSettings
+    from hybrid_mpc.workflow.run import failed_stages
+    from hybrid_mpc.workflow.run import run as run_job
+    from hybrid_mpc.workflow.settings import RunSettings
 
     folder = out or Path("runs") / Path(scenario).stem
     settings = RunSettings(
@@ -81,7 +90,7 @@ def run(
     )  # fmt: skip
     with make_progress() as progress:
         results = run_job(
-            settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress,
+            settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress, cluster=scheduler,
         )  # fmt: skip
     lines = ["the run ends here: later stages have not run, and --only names none of them"]
     print_summary(lines if results is None else summary(results), folder / "report.html", "report")
@@ -93,8 +102,8 @@ def run(
 
 def summary(results: Results) -> list[str]:
     """The figures of a run that are worth a line on the terminal."""
-    from hybrid_mpc.job.stages.advice import doubt_of
     from hybrid_mpc.kit.promises import promise_lines
+    from hybrid_mpc.workflow.stages.advice import doubt_of
 
     found = results.identification
     doubt = doubt_of(found.details.prior_parameters.in_doubt)
@@ -116,7 +125,7 @@ def summary(results: Results) -> list[str]:
 
 def comparison_lines(found: Control) -> list[str]:
     """The hybrid's cost by task over that of the baseline that it does least well against, on the same seeds."""
-    from hybrid_mpc.job.sequential import hardest
+    from hybrid_mpc.compare.sequential import hardest
 
     lines = []
     for task, own in (found.details.comparisons if found.details is not None else {}).items():
@@ -179,7 +188,7 @@ def watch_lines(found: Watch) -> list[str]:
     r"""What the run says of its monitor.
 
     Example:
-        >>> from hybrid_mpc.job.stages.results import FaultedLoop, Watch
+        >>> from hybrid_mpc.workflow.stages.results import FaultedLoop, Watch
         >>> row = FaultedLoop("weak_pump", "the pump weakens", "levels", 450.0, None, (), "", 1)
         >>> watch = Watch("residuals", 2.0, 0.1, 0.0, (), (row,))
         >>> print(*watch_lines(watch), sep="\n")

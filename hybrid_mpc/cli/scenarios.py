@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
+
+WIDTH = 80
+
 
 def scenarios() -> None:
-    """List the registered scenarios and what each needs."""
+    """List the registered scenarios, where their recordings come from, and what they are."""
     from hybrid_mpc.scenario import load_scenario, registered_scenarios
 
-    for name in registered_scenarios():
+    names = registered_scenarios()
+    first = max(map(len, (*names, "name")))
+    head = f"{'name':{first}}  recordings   "
+    print(f"{head}machine")
+    for name in names:
         scenario = load_scenario(name)
-        needs = "makes its own data" if scenario.make_data else "needs --data FILE.csv"
-        budgets = ", ".join(scenario.budgets)
-        print(f"{name:18} {scenario.title} ({needs}; budgets: {budgets})")
+        source = "simulated" if scenario.make_data else "--data FILE"
+        start = f"{name:{first}}  {source:11}  "
+        title = re.sub(r" \((simulated|real recordings?)\)$", "", scenario.title)
+        print(textwrap.fill(title, WIDTH, initial_indent=start, subsequent_indent=" " * len(start)))

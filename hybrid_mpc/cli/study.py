@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybrid_mpc.cli.options import Scheduler
 from hybrid_mpc.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from hybrid_mpc.job.study import Study
-    from hybrid_mpc.job.study_results import StudyResults
-    from hybrid_mpc.job.study_run import Plan
+    from hybrid_mpc.compare.study import Study
+    from hybrid_mpc.compare.study_results import StudyResults
+    from hybrid_mpc.compare.study_run import Plan
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -49,9 +50,7 @@ def run(
         ),
     ] = "",
     workers: Annotated[int, typer.Option(help="Processes on this machine.", min=1)] = 2,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, in place of processes.")
-    ] = None,
+    scheduler: Scheduler = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the study that the folder holds.")] = False,
     retry_failed: Annotated[
         bool, typer.Option("--retry-failed", help="With --resume: failed runs again.")
@@ -62,7 +61,7 @@ def run(
 ) -> None:
     """Run a study; exit code 1 if runs have failed."""
     from hybrid_mpc.cli.progress import make_progress
-    from hybrid_mpc.job.study_run import dry_run, run_study
+    from hybrid_mpc.compare.study_run import dry_run, run_study
 
     wanted = _study(study, _models(model), scenario)
     if dry:
@@ -85,7 +84,7 @@ def run(
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
     """Write report.html, of a study that still runs too."""
-    from hybrid_mpc.job.study_results import StudyResults, write_study_report
+    from hybrid_mpc.compare.study_results import StudyResults, write_study_report
 
     print(f"report: {write_study_report(StudyResults.load(folder)).resolve()}")
 
@@ -97,7 +96,7 @@ def compare(
     value: Annotated[str, typer.Option(help="Figure to compare.")] = "cost",
 ) -> None:
     """Compare two studies run by run, on common draws and seeds."""
-    from hybrid_mpc.job.study_results import StudyResults
+    from hybrid_mpc.compare.study_results import StudyResults
 
     found = StudyResults.load(first).compare(StudyResults.load(second), value)
     for column, (one, two) in found.attrs["differs"].items():
@@ -109,7 +108,7 @@ def compare(
 @app.command("list")
 def list_studies() -> None:
     """List the built-in studies."""
-    from hybrid_mpc.job.study import built_in_studies, built_in_study
+    from hybrid_mpc.compare.study import built_in_studies, built_in_study
 
     for name, path in built_in_studies().items():
         title = path.read_text().partition("\n")[0].removeprefix("# ")
@@ -117,7 +116,7 @@ def list_studies() -> None:
 
 
 def _study(name: str, models: dict[str, str], scenario: str) -> Study:
-    from hybrid_mpc.job.study import built_in_studies, built_in_study, read_study
+    from hybrid_mpc.compare.study import built_in_studies, built_in_study, read_study
 
     there = built_in_studies()
     if name in there:
@@ -150,7 +149,7 @@ def _models(given: list[str] | None) -> dict[str, str]:
 
 
 def _plan(plan: Plan, workers: int) -> list[str]:
-    from hybrid_mpc.job.study_results import duration_text
+    from hybrid_mpc.compare.study_results import duration_text
 
     axes = " x ".join(f"{n} {name}" for name, n in plan.axes.items() if n > 1) or "a single one"
     lines = [f"{plan.runs} runs: {axes}"]

@@ -50,7 +50,7 @@ def tune(
     """Search hidden units and other settings of the networks by the validation error of free runs."""
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.identify.tune import parsed_space
-    from hybrid_mpc.job.tune import TuneSettings, run_tuning, usage
+    from hybrid_mpc.workflow.tune import TuneSettings, run_tuning, usage
 
     folder = out or Path("runs") / f"tune-{Path(scenario).stem}"
     settings = TuneSettings(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh, solve_triangular
 
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.control.problem import SoftRows
+from hybrid_mpc.control.problem import BoundRows
 from hybrid_mpc.control.rti import condense_all, condense_hessians
 from hybrid_mpc.model.stages import Linearization, Slopes
 
@@ -35,7 +35,7 @@ class StageCurvature:
     """
 
     def __init__(
-        self, stages: Linearization, ocp: OCP, sizes: Array, hidden: Array, soft: SoftRows | None = None
+        self, stages: Linearization, ocp: OCP, sizes: Array, hidden: Array, soft: BoundRows | None = None
     ) -> None:
         self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, hidden.size
         n_h, self._hidden_shift = hidden.size, SHIFT * hidden
@@ -117,7 +117,7 @@ class StageCurvature:
             rows[chosen] = (slopes - here) / taken[:, :, None]
         return rows.transpose(1, 0, 2)
 
-    def _of_soft(self, soft: SoftRows, z: Array, u: Array, multipliers: Array, e: Array | None) -> Array:
+    def _of_soft(self, soft: BoundRows, z: Array, u: Array, multipliers: Array, e: Array | None) -> Array:
         """Second derivatives of the soft bounds' expressions, which know the states and inputs before the last."""
         n, n_x, m = len(u), self._n_x, self._shift.size
 

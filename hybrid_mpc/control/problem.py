@@ -115,7 +115,7 @@ class Solution:
         )
 
 
-class SoftRows:
+class BoundRows:
     """The M soft and hard bounds of a problem along a trajectory, one row a bound and period.
 
     Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), those on outputs and expressions for ``(x_0, u_0) ..
@@ -475,7 +475,7 @@ def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None
     return ca.Function("stage_cost", [x, u, p], [total])
 
 
-class EconomicCost:
+class StageCost:
     """:func:`stage_cost` along a trajectory, with first and second derivatives; zero where there is none."""
 
     def __init__(
@@ -545,7 +545,7 @@ class Target:
         d: Unmeasured disturbances ``(n_d,)``.
         y: Reference of the outputs ``(N + 1, n_y)``, or the nearest that can be reached; no columns where references
             are the states'.
-        e: What bounded values depend on beside state and input, see :class:`SoftRows`: ``(N, n_d + n_w + n_p)``.
+        e: What bounded values depend on beside state and input, see :class:`BoundRows`: ``(N, n_d + n_w + n_p)``.
         steady: Steady state of the first row of such a reference.
     """
 
@@ -599,8 +599,8 @@ class Problem:
         self.targets = Targets(model, ocp, self.sizes) if ocp.n_y else None
         """Steady states for set-points; None where references are the states'."""
         self.terminal = ocp.terminal_weight(model)
-        self.soft = SoftRows(ocp, model, self.sizes)
-        self.economic = EconomicCost(ocp, model.dt, model, self.sizes.states)
+        self.soft = BoundRows(ocp, model, self.sizes)
+        self.economic = StageCost(ocp, model.dt, model, self.sizes.states)
         self.run = free_run(model, ocp.horizon)
         self._rows = np.arange(ocp.horizon + 1)
         self._u0 = fixed(np.tile(model.u0, (ocp.horizon, 1)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.active_set import Active, ActiveSet, RowQP
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import SoftRows, Status
+from hybrid_mpc.control.problem import BoundRows, Status
 
 Array = NDArray[np.float64]
 Soft = tuple[Array, Array] | None
@@ -39,12 +39,12 @@ class InputQP:
     """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
 
     Where the problem has move blocks, the unknowns are the blocks' inputs; all that comes in and goes out is by
-    period. Inputs are scaled by :attr:`OCP.input_scale`, soft bounds by :attr:`SoftRows.scale`. Bounds that do not act
+    period. Inputs are scaled by :attr:`OCP.input_scale`, soft bounds by :attr:`BoundRows.scale`. Bounds that do not act
     cost no more than the look whether they do (:class:`~hybrid_mpc.control.active_set.ActiveSet`, which begins with the
     last plan's active rows). The answer is checked, however it was found.
     """
 
-    def __init__(self, ocp: OCP, soft: SoftRows | None = None, dt: float = 1.0) -> None:
+    def __init__(self, ocp: OCP, soft: BoundRows | None = None, dt: float = 1.0) -> None:
         self._starts, n_u = ocp.block_starts, ocp.n_u
         n = self._starts.size * n_u
         self._ocp, self._n = ocp, n

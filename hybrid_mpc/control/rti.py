@@ -32,7 +32,7 @@ class Prepared:
     With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
     defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
     ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is it times the state weights, ``direct``
-    the gradient of the costs of inputs and changes, targets left out. ``soft`` is what :meth:`SoftRows.condensed`
+    the gradient of the costs of inputs and changes, targets left out. ``soft`` is what :meth:`BoundRows.condensed`
     gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second
     ones; None where there are none. ``e`` is what bounded values depend on besides state and input.
     """

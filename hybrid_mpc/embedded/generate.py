@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.control.problem import KEPT, KNOTS, Problem, SoftRows
+from hybrid_mpc.control.problem import KEPT, KNOTS, BoundRows, Problem
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.control.targets import Targets
@@ -210,19 +210,19 @@ def _modes(estimator: Filter) -> tuple[ExtendedKalmanFilter, ...]:
     return estimator.filters if isinstance(estimator, SwitchingFilter) else (estimator,)
 
 
-def kinds_of(soft: SoftRows, horizon: int) -> list[int]:
+def kinds_of(soft: BoundRows, horizon: int) -> list[int]:
     """The rows of the last period, where all bounds hold: of the states' bounds, then of each expression's."""
     sizes = [soft.states.size, *(int(f.numel_out(0)) for f in soft.functions)]
     ends = horizon * np.cumsum(sizes)
     return [row for end, size in zip(ends, sizes, strict=True) for row in range(end - size, end)]
 
 
-def bound_names(soft: SoftRows, horizon: int) -> list[str]:
+def bound_names(soft: BoundRows, horizon: int) -> list[str]:
     """Names of the hard bounds by their place in ``given_way``, empty for soft ones."""
     return [soft.names[row] if soft.hard[row] else "" for row in kinds_of(soft, horizon)]
 
 
-def _first_periods(soft: SoftRows, horizon: int) -> list[int]:
+def _first_periods(soft: BoundRows, horizon: int) -> list[int]:
     """The first period in which each bound holds, by its place among those of a period."""
     bounded = np.isfinite(soft.lower) | np.isfinite(soft.upper)
     first, at = [], 0
@@ -262,7 +262,7 @@ def _config(sizes: Mapping[str, int], single: bool, names: list[str], watched: W
 def _expressions(
     model: HybridModel,
     parts: Cut,
-    soft: SoftRows,
+    soft: BoundRows,
     fallback: HybridModel | None,
     ocp: OCP,
     problem: Problem,
@@ -418,7 +418,7 @@ def target_starts(own: Targets | None) -> Array:
 
 
 def _tables(
-    model: HybridModel, ocp: OCP, problem: Problem, soft: SoftRows, fallback: HybridModel | None,
+    model: HybridModel, ocp: OCP, problem: Problem, soft: BoundRows, fallback: HybridModel | None,
     safe_input: Array | None, estimator: Filter | None, watched: str,
 ) -> str:  # fmt: skip
     """All numbers of the problem and the estimator, and those of monitor and guard as they are given."""

@@ -36,6 +36,16 @@ class KeyFigure:
 
 
 @dataclass(frozen=True)
+class Answer:
+    """A question at the head of the report, its answer in a few words, and the figures behind it, a line each."""
+
+    question: str
+    verdict: Verdict
+    short: str
+    lines: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
 class Hint:
     """What to do next: a verdict (``"bad"`` needs the reader), what was found, and a remedy, which may be empty."""
 
@@ -100,7 +110,7 @@ class Report:
     """A page: titles, a paragraph about the machine, the command that made it, key figures, hints, sections.
 
     ``remark`` is a line under the title: seed, budget, versions. ``doubt`` stands above it: what a reader must know
-    before anything else on the page; empty: nothing.
+    before anything else on the page; empty: nothing. ``answers`` come first, before the machine.
     """
 
     title: str
@@ -112,6 +122,7 @@ class Report:
     remark: str = ""
     hints: Sequence[Hint] = ()
     doubt: str = ""
+    answers: Sequence[Answer] = ()
 
 
 def write_report(path: str | Path, report: Report) -> Path:

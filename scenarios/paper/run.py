@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybrid_mpc.data.trajectories import Dataset, Trajectory
+from hybrid_mpc.engine import WORKERS, Progress, run_jobs
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_arrays, read_json, write_json, write_text
-from hybrid_mpc.job.context import Progress, versions
-from hybrid_mpc.job.engine import WORKERS, run_jobs
-from hybrid_mpc.job.folder import JobNote, open_folder
-from hybrid_mpc.job.settings import check_device
+from hybrid_mpc.folder import JobNote, open_folder, versions
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Scenario, load_scenario
+from hybrid_mpc.workflow.settings import check_device
 from scenarios.paper.experiment import Effort, Experiment
 from scenarios.paper.jobs import RULE, Case, EvaluationSet, ensemble_job, fit_job, physics_job, sindy_job
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of

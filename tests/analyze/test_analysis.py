@@ -9,8 +9,8 @@ from online_models import rk4
 from scipy.linalg import expm
 
 from hybrid_mpc import HybridModel, InputError, Signal, frequency_response, linearize, linearize_at_speed
-from hybrid_mpc.job.stages.analyze import linear_point
 from hybrid_mpc.model.equilibrium import fixed_point
+from hybrid_mpc.workflow.stages.analyze import linear_point
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 

@@ -24,23 +24,21 @@ from hybrid_mpc import (
     simulate,
     write_csv,
 )
-from hybrid_mpc.analyze.linearize import control_toolbox, jacobians
-from hybrid_mpc.cli.analyze import command
-from hybrid_mpc.cli.main import app
-from hybrid_mpc.job.analyze import (
+from hybrid_mpc.analyze.analysis import (
     AnalysisInput,
-    AnalysisSettings,
     Missing,
-    _speed,
-    analysis_input,
     analyze_models,
     input_range,
     loops_of,
     responses_of,
     state_range,
 )
-from hybrid_mpc.job.analyze_page import _draw_measured, tables_of, write_analysis
+from hybrid_mpc.analyze.linearize import control_toolbox, jacobians
+from hybrid_mpc.analyze.page import _draw_measured, tables_of, write_analysis
+from hybrid_mpc.cli.analyze import command
+from hybrid_mpc.cli.main import app
 from hybrid_mpc.kit.parts import loop_settings, read_description, save_loop, write_description
+from hybrid_mpc.workflow.analyze import AnalysisSettings, _speed, analysis_input
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
 

@@ -14,7 +14,7 @@ from hybrid_mpc import (
     SQPController,
     Status,
 )
-from hybrid_mpc.control.problem import EconomicCost
+from hybrid_mpc.control.problem import StageCost
 
 X, U = ca.MX.sym("x", 2), ca.MX.sym("u")
 COSTS = {
@@ -86,7 +86,7 @@ def test_parameters_are_columns_of_the_reference(solver):
 
 @pytest.mark.parametrize("name", COSTS)
 def test_derivatives_are_those_of_finite_differences(name):
-    cost, rng = EconomicCost(problem(name), 0.1), np.random.default_rng(0)
+    cost, rng = StageCost(problem(name), 0.1), np.random.default_rng(0)
     x, u, step = rng.normal(size=(21, 2)), rng.normal(size=(20, 1)), 1e-6
     slope, curvature = cost.derivatives(x, u)
     moved = x + np.array([step, 0.0]), x - np.array([step, 0.0])

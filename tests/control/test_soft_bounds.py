@@ -8,7 +8,7 @@ from lq_oracle import soft_plan, states
 from online_models import linear_model, pendulum_model, random_linear
 
 from hybrid_mpc import OCP, CondensedController, InputError, SoftBound, Status
-from hybrid_mpc.control.problem import SoftRows
+from hybrid_mpc.control.problem import BoundRows
 from hybrid_mpc.control.sizes import Sizes
 
 DT = 0.1
@@ -111,7 +111,7 @@ def test_derivatives_of_expressions_are_those_of_finite_differences():
     bound = SoftBound(e, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
     ocp = OCP(3, [1.0, 1.0], [1.0] * 2, [0.0] * 2, [-9.0] * 2, [9.0] * 2, x_max=[np.inf, 0.5], soft=[bound])
     model = linear_model(0.9 * np.eye(2), np.eye(2), np.eye(2))
-    rows, rng = SoftRows(ocp, model, Sizes(model, ocp)), np.random.default_rng(0)
+    rows, rng = BoundRows(ocp, model, Sizes(model, ocp)), np.random.default_rng(0)
     xs, us = rng.normal(size=(4, 2)), rng.normal(size=(3, 2))
     value, by_x, by_u = rows.linearize(xs, us)
     assert len(rows) == 3 + 9

@@ -9,9 +9,9 @@ import pytest
 from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_trajectories
+from hybrid_mpc.check.new import drafted
 from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.recording import read_recording
-from hybrid_mpc.job.new import drafted
 
 K = np.arange(40)
 T = np.array([float(f"{0.01 * k:.2f}") for k in K])

@@ -142,7 +142,7 @@ def test_unequal_columns_are_refused_by_file_and_column(tmp_path):
 
 def test_the_main_job_reads_mat_files(tmp_path):
     from hybrid_mpc import RunSettings, load_scenario
-    from hybrid_mpc.job.context import Context
+    from hybrid_mpc.workflow.context import Context
 
     t = np.arange(0, 30, 0.01)
     savemat(tmp_path / "mine.mat", {"time_s": t, "u_nm": 0.1 * np.cos(t), "angle": np.sin(t)})

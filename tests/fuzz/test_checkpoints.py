@@ -6,12 +6,9 @@ import shutil
 import pytest
 
 from hybrid_mpc import InputError, RunSettings, load_scenario
-from hybrid_mpc.job.context import Context
-from hybrid_mpc.job.run import NAMES, STAGES
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.run import NAMES, STAGES
 from tests.fuzz.forked import command
-from tests.job.conftest import arguments, finished, machine
-
-__all__ = ["arguments", "finished", "machine"]  # fixtures
 
 
 def damages(content, rng):

@@ -120,7 +120,7 @@ RUNNER = {
 def freeze(name, run):
     """The folder of a machine from a finished run: programs, weights, plain numbers, references."""
     from hybrid_mpc import ModelInfo, load, load_scenario, make_estimator, make_ocp
-    from hybrid_mpc.job.controllers import no_surer_than_prior
+    from hybrid_mpc.compare.controllers import no_surer_than_prior
     from hybrid_mpc.kit.assembly import first_controller
     from hybrid_mpc.kit.parts import read_description
 

@@ -8,7 +8,7 @@ from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, fit_prior, fit_smoother
 from hybrid_mpc.data.scales import time_unit
-from hybrid_mpc.job.benchmark import REFIT_LENGTHS, refitted
+from hybrid_mpc.workflow.benchmark import REFIT_LENGTHS, refitted
 
 POWERS = {"J": 2, "mgl": 0, "d": 1}
 """With time k times as long, an inertia of k^2 J and a damping of k d give the same swings."""

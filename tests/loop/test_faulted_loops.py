@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import load, make_controller, make_estimator, make_monitor, simulate
-from hybrid_mpc.job.study import built_in_study
+from hybrid_mpc.compare.study import built_in_study
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.faults import catalogue
 

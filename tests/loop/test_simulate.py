@@ -22,7 +22,7 @@ from hybrid_mpc import (
     TrueState,
     simulate,
 )
-from hybrid_mpc.job.loops import share_given_way
+from hybrid_mpc.compare.loops import share_given_way
 from hybrid_mpc.loop.plant import SimulatedMachine
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Signal
-from hybrid_mpc.job.stages.report import TITLES
 from hybrid_mpc.plots import analysis, data, estimation, fit, loops, monitor
 from hybrid_mpc.plots.style import name_of, save
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, words, write_report
 from hybrid_mpc.watch.detector import ChannelLimit, WatchLimits
 from hybrid_mpc.watch.readings import Channel
 from hybrid_mpc.watch.replay import Trace
+from hybrid_mpc.workflow.stages.report import TITLES
 
 STATES = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
 INPUTS = (Signal("tau", "N m"),)

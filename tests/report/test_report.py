@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.job.stages.report import TITLES
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, render, words, write_report
+from hybrid_mpc.workflow.stages.report import TITLES
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report_example as example

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.job.stages.results import Results, read_results
+from hybrid_mpc.workflow.stages.results import Results, read_results
 
 PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
 

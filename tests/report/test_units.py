@@ -7,9 +7,9 @@ import pytest
 from engine_jobs import jobs_in_this_process
 
 from hybrid_mpc import write_csv
-from hybrid_mpc.job.run import run
-from hybrid_mpc.job.settings import RunSettings
-from hybrid_mpc.job.stages import figures as stage
+from hybrid_mpc.workflow.run import run
+from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stages import figures as stage
 
 MACHINE = """
 import numpy as np

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import hybrid_mpc as hm
+from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.identify.prior_model import prior_programs
-from hybrid_mpc.job.check import check_scenario
 from hybrid_mpc.kit.artifact import build_model
 from scenarios.double_pendulum import scenario
 from scenarios.double_pendulum.plant import DoublePendulumPlant, simulation

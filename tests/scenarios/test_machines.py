@@ -22,8 +22,8 @@ from hybrid_mpc import (
     write_csv,
 )
 from hybrid_mpc.identify.simulation import required_substeps
-from hybrid_mpc.job.benchmark_runs import in_turn, read_test, read_training
 from hybrid_mpc.scenario import load_scenario, registered_scenarios
+from hybrid_mpc.workflow.benchmark_runs import in_turn, read_test, read_training
 from scenarios.emps import NEWTON_PER_VOLT
 from scenarios.emps import scenario as emps
 from scenarios.emps.prior import EmpsPrior

@@ -10,7 +10,7 @@ import pytest
 import trivial_runs
 
 from hybrid_mpc import ChannelLimit, InputError, WatchLimits
-from hybrid_mpc.job.study_run import run_batch
+from hybrid_mpc.compare.study_run import run_batch
 from hybrid_mpc.loop.faults import install
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.monitor_study import run as room

@@ -9,7 +9,7 @@ from energy_checks import rates
 from scipy.integrate import solve_ivp
 
 from hybrid_mpc import InputError, load_trajectories
-from hybrid_mpc.job.stages.results import read_results
+from hybrid_mpc.workflow.stages.results import read_results
 from scenarios.pendulum import scenario
 from scenarios.pendulum.data import (
     AMPLITUDE,

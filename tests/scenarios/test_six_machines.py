@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import Scenario, fit_prior, load_trajectories
+from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.identify.simulation import required_substeps
-from hybrid_mpc.job.benchmark_runs import run_freely
-from hybrid_mpc.job.check import check_scenario
+from hybrid_mpc.workflow.benchmark_runs import run_freely
 from scenarios.cascaded_tanks import scenario as tanks
 from scenarios.cascaded_tanks.prior import CascadedTanksPrior, above, root
 from scenarios.coupled_drives import scenario as drives

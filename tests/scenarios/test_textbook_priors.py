@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hybrid_mpc import load_scenario
-from hybrid_mpc.job.check import check_scenario
+from hybrid_mpc.check.preflight import check_scenario
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "textbook.py"
 found = importlib.util.spec_from_file_location("textbook", FILE)

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from hybrid_mpc import ChannelLimit, InputError, WatchLimits, load_scenario, set_limits, write_csv
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.files import write_json
-from hybrid_mpc.job.monitor import MonitorJob, prepared, read_limits, watch
 from hybrid_mpc.records import plain
+from hybrid_mpc.workflow.monitor import MonitorJob, prepared, read_limits, watch
 from scenarios.golf_robot.rig import Rig
 
 DT = 0.02

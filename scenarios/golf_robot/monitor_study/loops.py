@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybrid_mpc.compare.loops import MODEL, Bench, LoopRow, LoopSpec
+from hybrid_mpc.compare.study_run import ModelInput, local_folder
+from hybrid_mpc.compare.tasks import selected_tasks
 from hybrid_mpc.files import read_arrays, read_json, write_arrays
-from hybrid_mpc.job.loops import MODEL, Bench, LoopRow, LoopSpec
-from hybrid_mpc.job.study_run import ModelInput, local_folder
-from hybrid_mpc.job.tasks import selected_tasks
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Task, load_scenario

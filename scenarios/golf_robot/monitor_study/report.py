@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from hybrid_mpc.compare.study_log import StudyNote
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
-from hybrid_mpc.job.study_log import StudyNote
 from hybrid_mpc.plots.style import save
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
 from scenarios.golf_robot.monitor_study.detection import METHODS

@@ -8,14 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.job.context import Progress
-from hybrid_mpc.job.engine import Engine, make_engine
-from hybrid_mpc.job.folder import check_out, open_folder
-from hybrid_mpc.job.study import Study
-from hybrid_mpc.job.study_log import NOUN, RUNS, RunLog, RunRow, rows, study_note
-from hybrid_mpc.job.study_run import (
+from hybrid_mpc.compare.study import Study
+from hybrid_mpc.compare.study_log import NOUN, RUNS, RunLog, RunRow, rows, study_note
+from hybrid_mpc.compare.study_run import (
     THREADS,
     Config,
     execute,
@@ -26,6 +21,10 @@ from hybrid_mpc.job.study_run import (
     make_note,
     run_batch,
 )
+from hybrid_mpc.engine import Engine, Progress, make_engine
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.folder import check_out, open_folder
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import adaptable
 from hybrid_mpc.records import record

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_mpc.job.context import Progress
+from hybrid_mpc.engine import Progress
 from scenarios.paper import run as run_module
 from scenarios.paper.run import reproduce
 from scenarios.paper.settings import ReproductionSettings

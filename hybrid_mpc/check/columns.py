@@ -1,0 +1,425 @@
+"""Columns of recordings: which move, their units, and which one is the time."""
+
+from __future__ import annotations
+
+import keyword
+import math
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.check.first_model import FEWEST
+from hybrid_mpc.data.names import FIELD, Said, said_by, unit_behind
+from hybrid_mpc.data.source import Columns, Source, name_and_unit
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.records import shown
+from hybrid_mpc.rules import LARGEST, column_problem
+
+Array = NDArray[np.float64]
+MOST_RECORDED = 1e-3 * LARGEST
+"""Largest number of a signal: its range is wider than what was recorded."""
+EVEN = 0.2
+"""Share by which the distances of time stamps may spread."""
+COUNTED = (
+    "it counts samples and stands for the time, as no column says that it is: write the seconds of one count into "
+    "units, and all lengths below with it"
+)
+"""What is not sure of a time that is a count."""
+UNNAMED = "it rises evenly and no column says that it is the time; is it, in seconds?"
+NO_UNIT = "is it in seconds? Its name names no unit"
+LONGEST_NAME = 40
+"""Most characters of a signal's name."""
+EPOCHS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3), (1e9, 1.0))
+"""What a time since 1970 is at least since 2001, and its unit [s]; after 2130 it is none."""
+UNIT = re.compile(r"[\w/^*·.%°²³µμΩ() -]{1,20}")
+"""How a unit is written; anything else behind a name is none."""
+DIVERGED, AGAIN = 1e12, 3
+"""Times a column's usual deviation that a recording which diverges reaches, and fewest numbers that do."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the recordings: full name, name and unit as the header has them, all its numbers ``(m,)``.
+
+    ``lengths`` are those of the recordings, which follow each other. ``periodic`` is an angle that jumps by full turns
+    where it is recorded; its numbers count on. ``asked`` says that the unit is a letter at the end of the name, which
+    may be an index.
+    """
+
+    full: str
+    name: str
+    unit: str
+    values: Array
+    lengths: tuple[int, ...]
+    periodic: bool = False
+    asked: bool = False
+
+    @property
+    def pieces(self) -> tuple[Array, ...]:
+        """Its numbers in each recording."""
+        return tuple(np.split(self.values, np.cumsum(self.lengths)[:-1]))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Smallest and largest number."""
+        return float(np.nanmin(self.values)), float(np.nanmax(self.values))
+
+    @property
+    def identifier(self) -> str:
+        """The name as Python can write it after a dot."""
+        text = ascii_of(self.name)[:LONGEST_NAME].strip("_") or "signal"
+        return f"c_{text}" if text[0].isdigit() or keyword.iskeyword(text) else text
+
+    @property
+    def signal(self) -> Signal:
+        """The signal, with a range twice as wide again as what was recorded, on either side."""
+        if self.periodic:
+            return Signal(self.identifier, self.unit or "-", periodic=True)
+        low, high = self.span
+        span = high - low
+        return Signal(
+            self.identifier,
+            self.unit or "-",
+            float(near(low - span, span / 20)),
+            float(near(high + span, span / 20)),
+        )
+
+
+def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, str]]:
+    """Columns whose numbers move, and why the others are no signals, by full name."""
+    found: dict[str, Column] = {}
+    tables = [read_all(source) for source in sources]
+    usual = [_usual_length(read) for read, _ in tables]
+    left_out: dict[str, str] = {}
+    diverged: list[str] = []
+    small = any(_ends_with_unit(full) for source in sources for full in source.header)
+    for full in dict.fromkeys(name for source in sources for name in source.header):
+        pieces: list[Array] = []
+        problems: list[str] = []
+        for source, (read, reasons), rows in zip(sources, tables, usual, strict=True):
+            where = f" in {source.path.name}" if len(sources) > 1 else ""
+            if full not in read:
+                problems.append(reasons.get(full, f"it is not in {source.path.name}"))
+                continue
+            one = read[full]
+            pieces.append(one.values[:, 0])
+            if full in one.faults:
+                problems.append(f"{one.faults[full]}{where}")
+            elif rows and len(one.values) not in (1, rows):
+                problems.append(f"it has {len(one.values)} values{where}, the others have {rows}")
+            elif (k := _diverges(pieces[-1])) is not None:
+                diverged.append(
+                    f"{source.path}: {one.place(k)}, column {shown(full)}: it grows to "
+                    f"{np.nanmax(np.abs(pieces[-1])):.3g}; the recording or the simulation diverged. Cut the file "
+                    "before that row, or leave the recording out"
+                )
+        known = np.concatenate([piece[np.isfinite(piece)] for piece in pieces]) if pieces else np.zeros(0)
+        if problem := column_problem(full):
+            left_out[full] = problem
+        elif problems:
+            left_out[full] = problems[0]
+        elif not len(known):
+            left_out[full] = "it has no number"
+        elif len(known) < FEWEST or max(map(len, pieces)) == 1:
+            left_out[full] = f"it has {len(known)} number{'s' * (len(known) > 1)}, fewer than {FEWEST}"
+        elif known.min() == known.max():
+            left_out[full] = f"it is {known[0]:g} throughout"
+        elif np.abs(known).max() > MOST_RECORDED:
+            left_out[full] = f"it reaches {np.abs(known).max():g}; no machine does"
+        else:
+            inner = FIELD.fullmatch(full)
+            name, unit = name_and_unit(inner[1] if inner else full)
+            unit = unit if UNIT.fullmatch(unit) and unit.isprintable() and unit != "1" else ""
+            ending = unit_behind(name, small)
+            lengths = tuple(map(len, pieces))
+            found[full] = Column(
+                full,
+                name,
+                unit or ending.unit,
+                np.concatenate(pieces),
+                lengths,
+                asked=not unit and ending.perhaps,
+            )
+    refuse(diverged)
+    if not found:
+        why = "".join(f"\n  {shown(name)}: {reason}" for name, reason in left_out.items())
+        raise InputError(
+            f"{sources[0].path}: no column has {FEWEST} numbers that move; give a recording in which the machine moves."
+            f"{sources[0].note}{why}"
+        )
+    return found, left_out
+
+
+def _ends_with_unit(full: str) -> bool:
+    """Whether a column's name ends with a unit of more than a letter, or is a time that does: ``time_s``."""
+    ending = unit_behind(full)
+    return bool(ending.unit and not ending.perhaps) or (
+        said_by(full).kind == "time" and bool(said_by(full).unit)
+    )
+
+
+def _usual_length(read: Mapping[str, Columns]) -> int:
+    """How many rows most columns of a file have; the time's where columns differ."""
+    lengths = [
+        len(one.values)
+        for full, one in sorted(read.items(), key=lambda item: said_by(item[0]).kind != "time")
+        if len(one.values) >= FEWEST
+    ]
+    return Counter(lengths).most_common(1)[0][0] if lengths else 0
+
+
+def _diverges(values: Array) -> int | None:
+    """The row from which on numbers grow beyond all bounds; None where they do not.
+
+    Several numbers, each larger than the one before, at the end: a code for missing values is one number.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    size = np.abs(values[known])
+    if len(known) < FEWEST:
+        return None
+    middle = float(np.median(size))
+    large = (size > DIVERGED * middle) & (size > DIVERGED) if middle > 0 else size > MOST_RECORDED
+    large |= size > MOST_RECORDED
+    if large.sum() < AGAIN or not large[-AGAIN:].all() or len(np.unique(size[large])) < AGAIN:
+        return None
+    return int(known[int(np.argmax(large))])
+
+
+def read_all(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
+    """Each column, where blank cells are none; and why the others cannot be read, by full name."""
+    read: dict[str, Columns] = {}
+    counts = Counter(source.header)
+    reasons = {
+        name: f"the name stands {count} times in the header; rename all but one"
+        for name, count in counts.items()
+        if count > 1
+    }
+    names = [name for name, count in counts.items() if count == 1]
+    try:
+        whole = source.read(None, names, names) if names else None
+        if whole is not None:
+            return {
+                name: replace(whole, values=whole.values[:, j : j + 1]) for j, name in enumerate(names)
+            }, reasons
+    except InputError:  # below, column by column
+        pass
+    for name in names:  # vectors may be of any length and kind: each says what is wrong with it
+        try:
+            read[name] = source.read(None, [name], [name])
+        except InputError as error:
+            reasons[name] = str(error).removeprefix(f"{source.path}: ")
+    return read, reasons
+
+
+# Time
+
+
+class Clock(NamedTuple):
+    """The time: its column, None for a sampling time alone; period, the column's unit and the length [s]; a doubt."""
+
+    column: Column | None
+    period: float
+    seconds: float = 1.0
+    doubt: str = ""
+    length: float = 0.0
+
+
+def clock_of(
+    sources: Sequence[Source],
+    columns: Mapping[str, Column],
+    left_out: dict[str, str],
+    asked: str,
+    chosen: set[str],
+) -> Clock:
+    """The time of all recordings: the first one's column, the longest sampling time, the shortest length.
+
+    Raises:
+        InputError: If the column cannot be used in a recording.
+    """
+    first = _time(sources[0], columns, left_out, asked, chosen)
+    rows = next(iter(columns.values())).lengths
+    if first.column is None:
+        return first._replace(length=first.period * min(rows))
+    full, clocks, problems = first.column.full, list[Clock](), list[str]()
+    for source in sources:
+        clock = (
+            _clock(source, full, said_by(full))
+            if full in source.header
+            else f"it is not in {source.path.name}"
+        )
+        if isinstance(clock, Clock):
+            clocks.append(clock)
+        else:
+            problems.append(f"{source.path}: column {shown(full)}, the time, cannot be used: {clock}")
+    refuse(problems)
+    lengths = [
+        clock.period * m
+        if clock.column is None or clock.column.values.size == 1
+        else clock.seconds * float(np.ptp(clock.column.values))
+        for clock, m in zip(clocks, rows, strict=True)
+    ]
+    return first._replace(period=max(clock.period for clock in clocks), length=min(lengths))
+
+
+def _time(
+    source: Source, columns: Mapping[str, Column], left_out: dict[str, str], asked: str, chosen: set[str]
+) -> Clock:
+    """The column of the time.
+
+    A name that says time decides; then numbers that rise evenly; a count of samples only where there is nothing else.
+
+    Raises:
+        InputError: If a column says that it is the time and cannot be used; with the reason.
+    """
+    names = [asked] if asked else [full for full in dict.fromkeys(source.header) if full not in chosen]
+    said = {full: said_by(full) for full in names}
+    troubles: dict[str, str] = {}
+    for perhaps in (False, True):
+        for full in names:
+            column, one = columns.get(full), said[full]
+            kinds = ("time", "step") if perhaps else ("time",)
+            if not asked and (one.kind not in kinds or one.perhaps > perhaps):
+                continue
+            if perhaps and (column is None or not _mostly_even(column.values)):
+                continue
+            clock = _clock(source, full, one)
+            if isinstance(clock, Clock):
+                left_out.pop(full, None)
+                left_out |= {
+                    other: f"{reason}; {shown(full)} is the time" for other, reason in troubles.items()
+                }
+                known = one.seconds is not None or clock.seconds != 1.0 or not one.kind
+                return clock if known else clock._replace(doubt=NO_UNIT)
+            troubles[full] = clock
+        lost = [name for name in source.unread if said_by(name).kind == "time"]
+        if troubles or lost:
+            role = "was named as" if asked else "says that it is"
+            many = troubles | dict.fromkeys(lost, f"it is of a kind that is not read.{source.note}")
+            refuse([
+                f"{source.path}: column {shown(name)} {role} the time and cannot be used: {trouble}"
+                for name, trouble in many.items()
+            ])  # fmt: skip
+    for full in names:
+        if said[full].kind == "step" and (step := _sampling_time(source, full, said[full])):
+            if step.column is not None:
+                left_out.pop(full, None)
+            return step
+    for counts in (False, True):
+        for full in names:
+            column, one = columns.get(full), said[full]
+            if column is None or (column.unit and one.seconds is None) or not _rises(column.values):
+                continue
+            clock = _clock(source, full, one)
+            if isinstance(clock, Clock) and counts is (one.kind == "count" or _is_count(column.values)):
+                return clock._replace(doubt=COUNTED if counts else UNNAMED)
+    return Clock(None, 1.0, doubt="the sampling time [s]; no column of the recording looks like time")
+
+
+def _clock(source: Source, full: str, said: Said) -> Clock | str:
+    """A column as the time; or what is wrong with it."""
+    if source.header.count(full) > 1:
+        return "its name stands more than once in the header. Rename all but one"
+    if said.unit and said.seconds is None:
+        return f"its unit {said.unit!r} is none of time. Write seconds, or name the unit, e.g. 'time [ms]'"
+    try:
+        columns = source.read(None, [full], ())
+    except InputError as error:
+        return str(error).removeprefix(f"{source.path}: ")
+    if columns.faults:
+        return "; ".join(columns.problems)
+    t = columns.values[:, 0]
+    if not len(t):
+        return "it has no number"
+    seconds = said.seconds or 1.0
+    if not said.unit and said.kind:
+        epoch = next(((least, unit) for least, unit in EPOCHS if least <= t[0] < 5 * least), None)
+        seconds = epoch[1] if epoch else 1.0
+        if said.is_date and epoch is None:
+            return "what the numbers of its dates count is not known. Write seconds since the beginning"
+    column = Column(full, *name_and_unit(full), t, (len(t),))
+    if len(t) == 1:
+        fine = 0 < t[0] < math.inf
+        return (
+            Clock(column, seconds * float(t[0]), seconds)
+            if fine
+            else f"the sampling time {t[0]:g} is not positive"
+        )
+    if np.abs(t).max() * seconds > MOST_RECORDED:
+        return f"it reaches {np.abs(t).max():g}"
+    if disorder := columns.disorder(seconds * t, f"column {shown(full)}"):
+        return disorder
+    return Clock(column, seconds * float(np.median(np.diff(t))), seconds)
+
+
+def _sampling_time(source: Source, full: str, said: Said) -> Clock | None:
+    """The sampling time that a column names: one number, or the same one in every row."""
+    clock = _clock(source, full, said)
+    if isinstance(clock, Clock):
+        return clock._replace(doubt="" if said.unit else NO_UNIT)
+    try:
+        values = source.read(None, [full], ()).values[:, 0]
+    except InputError:
+        return None
+    values = values[np.isfinite(values)]
+    if not (len(values) and 0 < values[0] < math.inf and (values == values[0]).all()):
+        return None
+    if said.unit and said.seconds is None:
+        return None
+    seconds = said.seconds or 1.0
+    return Clock(None, seconds * float(values[0]), doubt=f"the sampling time [s], by {shown(full)}")
+
+
+def no_signal(column: Column) -> str:
+    """Why a column is no signal although its numbers move; empty if it may be one."""
+    said = said_by(column.full)
+    even = _mostly_even(column.values)
+    if said.kind == "time" and (even or not said.perhaps):
+        return "its name says time"
+    if said.kind == "step":
+        return "its name says sampling time"
+    if said.kind == "count" and (not said.perhaps or (even and _is_count(column.values))):
+        return "it counts samples" if column.name else "it has no name"
+    return "it rises evenly, as a time does" if _rises(column.values) else ""
+
+
+def _rises(values: Array) -> bool:
+    """Whether numbers rise evenly, as time does."""
+    return bool(np.isfinite(values).all() and (np.diff(values) > 0).all()) and _mostly_even(values)
+
+
+def _mostly_even(values: Array) -> bool:
+    """Whether most numbers rise evenly: time that may repeat, begin again or lack some."""
+    steps = np.diff(values[np.isfinite(values)])
+    middle = float(np.median(steps)) if len(steps) else 0.0
+    return middle > 0 and bool(np.quantile(np.abs(steps / middle - 1), 0.9) < EVEN)
+
+
+def _is_count(values: Array) -> bool:
+    """Whether numbers are whole and mostly follow each other at one distance."""
+    known = values[np.isfinite(values)]
+    steps = np.diff(known)
+    return bool((known == np.round(known)).all() and (steps == np.median(steps)).mean() >= 0.9)
+
+
+# Names and numbers
+
+
+def ascii_of(text: str) -> str:
+    """Letters, digits and underscores alone: letters without their accents, anything else as an underscore."""
+    bare = text.replace("ß", "ss")
+    bare = "".join(c for c in unicodedata.normalize("NFKD", bare) if not unicodedata.combining(c))
+    return re.sub(r"\W+", "_", bare, flags=re.ASCII).strip("_")
+
+
+def near(value: float, step: float) -> str:
+    """A number with the digits that tell it from one that is ``step`` away."""
+    if not (math.isfinite(value) and 0 < step < math.inf):
+        return repr(float(value) + 0.0)
+    return repr(round(float(value), -math.floor(math.log10(step))) + 0.0)

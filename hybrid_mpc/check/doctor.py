@@ -1,0 +1,154 @@
+"""``hybrid-mpc doctor``: what is installed, and what of this computer a job will use. Nothing heavy is imported."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Literal
+
+from hybrid_mpc import __version__
+from hybrid_mpc.engine import THREADS
+
+PACKAGE = "hybrid-mpc"
+WAIT_S = 1.0
+"""Longest time [s] that another program is asked."""
+State = Literal["ok", "absent", "wrong"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at: its name, what was found, whether a job can do with it, and what to do if not."""
+
+    name: str
+    found: str
+    state: State = "ok"
+    remedy: str = ""
+
+
+def examined() -> list[Finding]:
+    """All findings, in the order in which they are told."""
+    return [
+        Finding("hybrid-mpc", f"{__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}"),
+        *_packages(),
+        _compiler(),
+        _threads(),
+        _gpu(),
+        *_folders(),
+    ]  # fmt: skip
+
+
+def _packages() -> Iterator[Finding]:
+    """What the package needs, then its extras."""
+    try:
+        needed = requires(PACKAGE) or []
+    except PackageNotFoundError:
+        yield Finding(
+            "packages", "hybrid-mpc itself is not installed, so nobody knows what it needs", "wrong",
+            "pip install 'hybrid-mpc[all]', in the source tree pip install -e '.[all]'",
+        )  # fmt: skip
+        return
+    extras: dict[str, list[str]] = {"": []}
+    for line in needed:
+        marker = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", line)
+        named = re.match(r"[\w.-]+", line)
+        if named and named[0].lower().replace("_", "-") != PACKAGE:
+            extras.setdefault(marker[1] if marker else "", []).append(named[0])
+    for extra, names in extras.items():
+        there = {name: _version(name) for name in dict.fromkeys(names)}
+        told = ", ".join(f"{name} {found or 'absent'}" for name, found in there.items())
+        if not told:
+            continue
+        complete = all(there.values())
+        state: State = "ok" if complete else "absent" if extra else "wrong"
+        remedy = (
+            "" if complete else f"pip install 'hybrid-mpc[{extra}]'" if extra else "pip install hybrid-mpc"
+        )
+        yield Finding(f"extra {extra}" if extra else "needed", told, state, remedy)
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
+
+
+def _compiler() -> Finding:
+    """The one that :func:`nn_export.compile_function` would take: ``CC``, else cc, gcc or clang."""
+    named = os.environ.get("CC")
+    for command in [named] if named else ["cc", "gcc", "clang"]:
+        words = shlex.split(command)
+        if words and shutil.which(words[0]):
+            lines = _told([*words, "--version"]).splitlines()
+            told = f"{command}: {lines[0]}" if lines else f"{command}, which tells no version"
+            return Finding("C compiler", told)
+    what = f"CC = {named}, which is no command" if named else "none (cc, gcc, clang)"
+    remedy = "install one to compile models; without it they run in CasADi's machine, slower"
+    return Finding("C compiler", what, "absent", remedy)
+
+
+def _threads() -> Finding:
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        cores = os.cpu_count() or 1
+    settings = ", ".join(f"{name}={os.environ[name]}" for name in THREADS if name in os.environ)
+    return Finding("threads", f"{cores} cores; BLAS and OpenMP: {settings or 'as many as there are cores'}")
+
+
+def _gpu() -> Finding:
+    """What the driver says; whether the installed torch can use it."""
+    torch = _version("torch")
+    names = (
+        re.findall(r"GPU \d+: ([^(\n]+)", _told(["nvidia-smi", "-L"])) if shutil.which("nvidia-smi") else []
+    )
+    if not names:
+        return Finding("GPU", "none found (nvidia-smi); networks are trained on the CPU")
+    told = ", ".join(name.strip() for name in names)
+    if torch.endswith("+cpu"):
+        remedy = "install a torch with CUDA, then --device cuda"
+        return Finding("GPU", f"{told}, which torch {torch} cannot use", "absent", remedy)
+    return Finding("GPU", f"{told}; give --device cuda to train on it" if torch else told)
+
+
+def _told(command: list[str]) -> str:
+    """What a program says, or nothing."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout if done.returncode == 0 else ""
+
+
+def _folders() -> Iterator[Finding]:
+    """Where jobs write beside ``--out``: compiled models, matplotlib's fonts, temporary files."""
+    cache = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or ""
+    home = Path(cache) if cache and Path(cache).is_absolute() else Path.home() / ".cache"
+    for name, folder, variable in (
+        ("cache", home, "XDG_CACHE_HOME"), ("temporary files", Path(tempfile.gettempdir()), "TMPDIR"),
+    ):  # fmt: skip
+        if _can_be_written(folder):
+            yield Finding(name, f"{folder}, can be written")
+        else:
+            remedy = f"point {variable} at a folder that can be written"
+            yield Finding(name, f"{folder}, cannot be written", "wrong", remedy)
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether a file can be made in a folder, or in the nearest one above it that there is."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False

@@ -1,0 +1,681 @@
+"""A scenario to begin with, written from a recording; what only its user knows is marked TODO."""
+
+from __future__ import annotations
+
+import keyword
+import tokenize
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.check.columns import COUNTED, Column, ascii_of, clock_of, columns_of, near, no_signal
+from hybrid_mpc.check.first_model import CLOSED, Lag, Runs, feedback_of, first_lag, growth_of, slowest
+from hybrid_mpc.check.roles import Kind, Trait, Verdict, judged
+from hybrid_mpc.data.excitation import check_excitation
+from hybrid_mpc.data.files import opened
+from hybrid_mpc.data.names import ANGLES
+from hybrid_mpc.data.recording import MIN_SCORED, read_recordings
+from hybrid_mpc.data.source import Source, name_and_unit
+from hybrid_mpc.data.trajectories import load_trajectories
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.files import write_text
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.machine.specification import DataSpec
+from hybrid_mpc.machine.units import per_second
+from hybrid_mpc.records import shown
+from hybrid_mpc.rules import LARGEST
+
+Array = NDArray[np.float64]
+MARK = "TODO"
+"""What stands before everything that is left to decide."""
+ACTING = "what only acts: new ... --disturbance-column NAME"
+"""What to do about a column that is no output although it is measured."""
+SMOOTHED = 7
+"""Fewest sampling times that are smoothed over: a polynomial of order 4 needs six samples, and stamps are rounded."""
+HORIZONS = 20, 100
+"""Fewest and most periods of the horizon that is proposed."""
+KINDS: Mapping[Kind, str] = {
+    "input": "an input",
+    "output": "an output",
+    "disturbance": "a measured disturbance",
+    "set-point": "a set-point",
+}
+"""What roles are called."""
+USED = frozenset(("Prior", "Signal", "Parameter", "Scenario", "DataSpec", "OperatingPoint", "OCP"))
+"""Names that the written file uses."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What recordings show: their time, what is commanded and what measured, and what is neither.
+
+    ``period`` is the sampling time [s], ``seconds`` what one in the column of the time is [s]; ``time`` is None where
+    no column may be one. ``doubt`` says what is not sure of the time, ``left_out`` by column why it is no signal.
+    ``disturbances`` are measured and act on the machine, but nobody commands them. ``verdicts`` say by column why it
+    has its role. ``loop`` says how a closed loop is seen, empty if none is; ``growth`` [1/s] is the rate at which the
+    machine leaves its rest, zero if it does not; ``lags`` are first models of the outputs. ``length`` is that of the
+    shortest recording [s]. ``notes`` say by file what was done to read it.
+    """
+
+    time: Column | None
+    period: float
+    inputs: tuple[Column, ...]
+    outputs: tuple[Column, ...]
+    left_out: Mapping[str, str]
+    disturbances: tuple[Column, ...] = ()
+    seconds: float = 1.0
+    doubt: str = ""
+    set_points: tuple[Column, ...] = ()
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    loop: str = ""
+    growth: float = 0.0
+    length: float = 0.0
+    lags: tuple[Lag, ...] = ()
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def unsure(self) -> dict[str, str]:
+        """Why a column has its role, where that is not sure."""
+        return {name: verdict.reason for name, verdict in self.verdicts.items() if not verdict.sure}
+
+    @property
+    def runs(self) -> tuple[Runs, ...]:
+        """Outputs, and all that acts, of each recording."""
+        y, u = (list(zip(*(c.pieces for c in group), strict=True)) for group in (self.outputs, self.drives))
+        return tuple(Runs(np.column_stack(a), np.column_stack(b)) for a, b in zip(y, u, strict=True))
+
+    @property
+    def drives(self) -> tuple[Column, ...]:
+        """All that acts on the machine."""
+        return (*self.inputs, *self.disturbances)
+
+    @property
+    def signals(self) -> tuple[Column, ...]:
+        """All signals."""
+        return (*self.drives, *self.outputs)
+
+    @property
+    def units(self) -> dict[str, float]:
+        """Factors that the DataSpec names: of a time that is not in seconds, and of units that no signal has."""
+        named = self.time is not None and (self.seconds != 1.0 or self.doubt == COUNTED)
+        time = {self.time.full: self.seconds} if named and self.time else {}
+        return time | {
+            c.full: 1.0 for c in self.signals if not c.unit and name_and_unit(c.full)[1] not in ("", "1")
+        }
+
+    def data(self, smoothing: float, warm_up: float) -> DataSpec:
+        """How the recording is read; ``smoothing`` and ``warm_up`` [s]."""
+        return DataSpec(
+            self.time.full if self.time else float(_rounded(self.period)),
+            tuple(c.full for c in self.inputs), tuple(c.full for c in self.outputs),
+            dt=float(_rounded(self.period)), max_gap=float(_rounded(5 * self.period)),
+            smoothing=float(_rounded(smoothing)), warm_up=float(_rounded(warm_up)), units=self.units,
+            disturbances=tuple(c.full for c in self.disturbances),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Signals by their role, as reading asks for them: a state an output, and a second one where it has a speed."""
+
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    disturbances: tuple[Signal, ...]
+
+    @classmethod
+    def of(cls, draft: Draft, names: Sequence[str] = (), speeds: Sequence[Signal] = ()) -> Roles:
+        """Those of a draft; ``names`` of the outputs, by default their own, and ``speeds`` of some of them."""
+        inputs, outputs, disturbances = (
+            tuple(c.signal for c in group) for group in (draft.inputs, draft.outputs, draft.disturbances)
+        )
+        if names:
+            outputs = tuple(replace(s, name=name) for s, name in zip(outputs, names, strict=True))
+        return cls((*outputs, *speeds), inputs, outputs, disturbances)
+
+
+def write_scenario(
+    path: Path, data: Path | Sequence[Path], inputs: Sequence[str] = (), outputs: Sequence[str] = (), time: str = "",
+    disturbances: Sequence[str] = (),
+) -> Draft:  # fmt: skip
+    """Write a scenario for recordings; returned is what it was made from.
+
+    Args:
+        path: Python file to make; there must be none.
+        data: The recording, or several of one machine. Signals are the columns that all have.
+        inputs: Columns of the inputs. Default: those that look commanded (:mod:`hybrid_mpc.check.roles`).
+        outputs: Columns of the outputs. Default: those that look measured.
+        time: Column of the time. Default: one whose name says so, or else one that rises evenly.
+        disturbances: Columns of measured disturbances. Default: those whose names or numbers say so.
+
+    Raises:
+        InputError: If the file is there, a recording is bad, too short, or diverges, they show no input or no output,
+            or have a time that cannot be used: with the reader's reason.
+
+    Example:
+        ``write_scenario(Path("my_machine.py"), [Path("monday.csv"), Path("tuesday.csv")])``
+    """
+    if path.suffix != ".py":
+        raise InputError(f"{path}: a scenario is a Python file; give a name that ends with .py")
+    if path.exists():
+        raise InputError(f"{path} is there already; give another name, or remove it")
+    files = (data,) if isinstance(data, Path) else tuple(data)
+    if not files:
+        raise InputError("no recordings given; name at least one file with --data")
+    draft = drafted([opened(file) for file in files], inputs, outputs, time, disturbances)
+    write_text(path, scenario_text(path, files, draft))
+    return draft
+
+
+def left_to_decide(path: Path) -> list[str]:
+    r"""Lines of a scenario's file whose comment begins with the mark, with their numbers; texts do not count.
+
+    Raises:
+        InputError: If the file is no text of Python.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "a.py"
+        ...     _ = path.write_text("x = 1\ny = 2  # TODO: is it?\n")
+        ...     left_to_decide(path)
+        ['line 2: is it?']
+    """
+    found, mark = [], f"# {MARK}"
+    try:
+        with path.open("rb") as file:
+            for token in tokenize.tokenize(file.readline):
+                if token.type == tokenize.COMMENT and token.string.startswith(mark):
+                    found.append(f"line {token.start[0]}: {token.string.removeprefix(mark).lstrip(': ')}")
+    except (SyntaxError, UnicodeDecodeError, tokenize.TokenError) as error:
+        raise InputError(f"{path}: cannot be read as Python ({error}). Save it as UTF-8 text.") from error
+    return found
+
+
+def drafted(
+    sources: Sequence[Source],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    time: str,
+    disturbances: Sequence[str] = (),
+) -> Draft:
+    """Roles of the recordings' columns: as they are given, or as their names and numbers look."""
+    columns, left_out = columns_of(sources)
+    source = sources[0]
+
+    def named(names: Sequence[str]) -> tuple[Column, ...]:
+        found = list(map(source.find, names))
+        refuse(
+            [
+                f"{source.path}: column {shown(name)} is no signal: {left_out[name]}"
+                for name in found
+                if name in left_out
+            ]
+        )
+        return tuple(columns[name] for name in found)
+
+    given: dict[Kind, tuple[Column, ...]] = {
+        "input": named(inputs), "output": named(outputs), "disturbance": named(disturbances),
+    }  # fmt: skip
+    kinds: dict[str, Kind] = {c.full: kind for kind, group in given.items() for c in group}
+    clock = clock_of(sources, columns, left_out, source.find(time) if time else "", set(kinds))
+    free = []
+    for full, column in columns.items():
+        if clock.column is not None and full == clock.column.full:
+            continue
+        if full not in kinds and (reason := no_signal(column)):
+            left_out[full] = reason
+        else:
+            free.append(column)
+    while True:
+        verdicts = judged([Trait(c.full, c.unit, c.pieces) for c in free], kinds)
+        verdicts |= _left_to_user(verdicts, given)
+        roles: dict[Kind, tuple[Column, ...]] = {
+            kind: given.get(kind) or tuple(c for c in free if verdicts[c.full].kind == kind)
+            for kind in ("input", "output", "disturbance", "set-point")
+        }
+        if not roles["input"] or not roles["output"]:
+            reasons = "".join(f"\n  {shown(name)}: {reason}" for name, reason in left_out.items())
+            raise InputError(
+                f"{source.path}: no column is left for {'an output' if roles['input'] else 'an input'}; it has "
+                f"{', '.join(source.header)}. Say which is which: --input-column, --output-column, --disturbance-column"
+                f".{source.note}{f' No signals are:{reasons}' if reasons else ''}"
+            )
+        draft = Draft(
+            clock.column, clock.period, roles["input"], roles["output"], left_out, roles["disturbance"], clock.seconds,
+            clock.doubt, roles["set-point"], verdicts, length=clock.length,
+        )  # fmt: skip
+        draft = _counting_on([one.path for one in sources], draft)
+        still = [full for full in _at_rest([one.path for one in sources], draft) if full not in kinds]
+        if not still:
+            break
+        free = [c for c in free if c.full not in still]
+        left_out |= dict.fromkeys(still, "it does not move in the part of the recording that trains")
+    used = {c.full for c in (*draft.signals, *draft.set_points)}
+    left_out |= {c.full: verdicts[c.full].reason for c in free if c.full not in used}
+    runs = draft.runs
+    lags = [first_lag(runs, i, draft.period, len(draft.inputs)) for i in range(len(draft.outputs))]
+    notes = {one.path.name: one.notes for one in sources if one.notes}
+    return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags), notes=notes))
+
+
+def _left_to_user(
+    verdicts: Mapping[str, Verdict], given: Mapping[Kind, Sequence[Column]]
+) -> dict[str, Verdict]:
+    """Verdicts of columns that look like what the user has named others for: these lists are complete."""
+    named = {c.full for group in given.values() for c in group}
+    found: dict[str, Verdict] = {}
+    for full, verdict in verdicts.items():
+        if full in named or not given.get(verdict.kind):
+            continue
+        found[full] = Verdict("none", f"no role was given to it; as {verdict.kind}: {verdict.reason}")
+    kept = {full: found.get(full, verdict) for full, verdict in verdicts.items()}
+    if given["input"] and not given["output"] and not any(v.kind == "output" for v in kept.values()):
+        found |= {
+            full: Verdict("output", "all that is left", sure=False)
+            for full, verdict in verdicts.items()
+            if full not in named and verdict.kind in ("input", "set-point")
+        }
+    return found
+
+
+def _in_loop(draft: Draft) -> Draft:
+    """The draft with what its recordings say of a closed loop, and of an unstable machine in it."""
+    if any(not np.isfinite(c.values).all() for c in draft.inputs):
+        return draft
+    # measured disturbances answer to nothing
+    runs = [Runs(run.y, run.u[:, : len(draft.inputs)]) for run in draft.runs]
+    answered = feedback_of(runs)
+    loop = ""
+    if answered > CLOSED:
+        loop = f"inputs answer to outputs, {answered:.1f} times the most by chance"
+    elif draft.set_points:
+        loop = "set-points are recorded"
+    growth = growth_of(runs, draft.period) if loop else 0.0
+    return replace(draft, loop=loop, growth=growth)
+
+
+def _counting_on(paths: Sequence[Path], draft: Draft) -> Draft:
+    """The draft whose angles count on where they are recorded wrapped; the recordings can be read as it says."""
+    trial = replace(draft, outputs=tuple(replace(c, periodic=c.unit in ANGLES) for c in draft.outputs))
+    recordings, problems = read_recordings(
+        paths, Roles.of(trial), trial.data(SMOOTHED * draft.period, 2 * draft.period)
+    )
+    refuse(problems)
+    wrapped = {finding.channel for one in recordings for finding in one.findings if finding.kind == "wrapped"}
+    values = np.concatenate([one.y for one in recordings]).T
+    return replace(
+        draft,
+        outputs=tuple(
+            replace(c, periodic=True, values=own, lengths=tuple(len(one.y) for one in recordings))
+            if c.full in wrapped
+            else c
+            for c, own in zip(draft.outputs, values, strict=True)
+        ),
+    )
+
+
+def _at_rest(paths: Sequence[Path], draft: Draft) -> list[str]:
+    """Inputs and outputs that do not move in what trains, by their full names."""
+    roles = Roles.of(draft)
+    dataset = load_trajectories(
+        paths, roles, draft.data(SMOOTHED * draft.period, 2 * draft.period), needed=("train",)
+    )
+    found = []
+    for key, columns, signals in (("u", draft.inputs, roles.inputs), ("y", draft.outputs, roles.outputs)):
+        for j, (column, signal) in enumerate(zip(columns, signals, strict=True)):
+            # as input and as output: what else there is does not count
+            train = [
+                replace(piece, u=part, y=part, censored=np.zeros(part.shape, dtype=np.int8))
+                for piece in dataset.by_role("train")
+                for part in [getattr(piece, key)[:, [j]]]
+            ]
+            try:
+                check_excitation(train, inputs=(signal,), outputs=(signal,))
+            except InputError:
+                found.append(column.full)
+    return found
+
+
+# What is written
+
+
+def _text(text: str) -> str:
+    """A string as Python writes it: everything that a recording or a path says stands in these, or in comments."""
+    written = repr(text)
+    return f'"{written[1:-1]}"' if not {'"', "'"} & set(text) else written
+
+
+def printable(text: str) -> str:
+    r"""A text that cannot end its line, as a comment or a terminal takes it: unseen characters are escaped.
+
+    Example:
+        >>> print(printable("u\n1, größe"))
+        u\n1, größe
+    """
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _rounded(value: float, digits: int = 3) -> str:
+    return f"{float(f'{value:.{digits}g}') + 0.0!r}"
+
+
+def _signal(column: Column, name: str) -> tuple[str, str]:
+    """A Signal as it is written, and what stands behind it."""
+    low, high = column.span
+    recorded = f"recorded: {near(low, (high - low) / 2000)} to {near(high, (high - low) / 2000)}"
+    unit = f"unit by the header; {recorded}" if column.unit else f"{MARK}: its unit; {recorded}"
+    if column.asked:
+        unit = f"{MARK}: its unit? by the last letter of its name; {recorded}"
+    signal = column.signal
+    ends = "periodic=True" if column.periodic else f"{signal.lower!r}, {signal.upper!r}"
+    return f"Signal({_text(name)}, {_text(column.unit or '-')}, {ends})", unit
+
+
+def _names(columns: Sequence[Column], taken: set[str]) -> list[str]:
+    names = []
+    for column in columns:
+        name = _unused(column.identifier, taken)
+        taken.add(name)
+        names.append(name)
+    return names
+
+
+def _unused(name: str, taken: Iterable[str]) -> str:
+    """A name that is not taken: the given one, or with a number behind it."""
+    there, given, k = set(taken), name, 2
+    while name in there:
+        name, k = f"{given}_{k}", k + 1
+    return name
+
+
+def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
+    """The file: signals, a first prior of lags, and how the recording is read.
+
+    Raises:
+        InputError: If the recording cannot be read with them, with the reader's reason.
+    """
+    y_names = _names(draft.outputs, set())
+    u_names, w_names = _names(draft.inputs, set()), _names(draft.disturbances, set())
+    drives = [*(("u", n) for n in u_names), *(("w", n) for n in w_names)]
+    lags = draft.lags
+    kind = "".join(part.capitalize() for part in ascii_of(path.stem).split("_")) or "Machine"
+    kind = f"Machine{kind}" if kind[0].isdigit() or keyword.iskeyword(kind) or kind in USED else kind
+    rates, parameters, steady = [], list[tuple[str, float, str, float, float, str]](), list[str]()
+    gains, offsets = list[list[float]](), list[float]()
+    taken, lag_names = set[str](), list[tuple[str, str]]()
+
+    def parameter(name: str, value: float, unit: str, low: float, high: float, text: str) -> str:
+        name = _unused(name, taken)
+        taken.add(name)
+        parameters.append((name, min(max(value, low), high), unit, low, high, text))
+        return f"p.{name}"
+
+    speeds: dict[str, tuple[str, Signal]] = {}  # a second state of an output: its name and itself
+    for name, column, lag in zip(y_names, draft.outputs, lags, strict=True):
+        unit = column.unit or "-"
+        span = float(np.ptp(column.span))
+        low, high = column.span[0] - span, column.span[1] + span
+        # what the drives make of the output at their middle; what they leave of it may lie far from all that it was
+        made = sum(
+            gain * float(np.nanmedian(c.values)) for gain, c in zip(lag.gains, draft.drives, strict=True)
+        )
+        middle = min(max(lag.offset + made, low), high) - made
+        low, high = min(low, low - made, middle), max(high, high - made, middle)
+        rest = near(low, span / 20), near(middle, span / 500), near(high, span / 20)
+        seconds = float(_rounded(lag.seconds))
+        constant = parameter(
+            f"T_{name}",
+            seconds,
+            "s",
+            float(_rounded(seconds / 20)),
+            float(_rounded(seconds * 20)),
+            "time constant",
+        )
+        damping = ""
+        if lag.states == 2:
+            bounded = float(_rounded(min(max(lag.damping, 0.01), 5.0)))
+            damping = parameter(f"D_{name}", bounded, "-", 0.0, 10.0, "damping")
+        lag_names.append((constant, damping))
+        low, middle, high = map(float, rest)
+        towards = [parameter(f"rest_{name}", middle, unit, low, high, "value without inputs")]
+        offsets.append(parameters[-1][1])
+        gains.append([])
+        for (kind_of, drive), source, gain in zip(drives, draft.drives, lag.gains, strict=True):
+            reach = float(_rounded(min(10 * max(abs(gain), span / float(np.ptp(source.span))), LARGEST)))
+            per = f"{unit}/({source.unit})" if source.unit and source.unit != "-" else unit
+            # rounded by what it makes of the output at the largest input
+            value = float(near(gain, span / 500 / max(map(abs, source.span)))) or float(_rounded(gain))
+            towards.append(
+                f"{parameter(f'k_{name}_{drive}', value, per, -reach, reach, f'gain from {drive}')} * {kind_of}.{drive}"
+            )
+            gains[-1].append(parameters[-1][1])
+        steady.append(f"{name}_steady = {' + '.join(towards)}")
+        if lag.states == 1:
+            rates.append((f"({name}_steady - x.{name}) / {constant}", "a lag of first order"))
+            continue
+        steps = np.diff(column.values) / draft.period
+        rms = float(np.sqrt(np.nanmean(steps**2))) if np.isfinite(steps).any() else 0.0
+        # refused are speeds whose rms is beyond: a sensor's noise, differentiated, is within
+        fast = float(_rounded(max(10 * span / lag.seconds, 3 * rms), 2))
+        speed = _unused(f"{name}_rate", {*y_names, *(one for one, _ in speeds.values())})
+        speeds[name] = speed, Signal(speed, per_second(unit), -fast, fast)
+        rates.append((f"x.{speed}", f"exact: the rate of {name}"))
+    states = [_signal(column, name) for name, column in zip(y_names, draft.outputs, strict=True)]
+    for name, (constant, damping) in zip(y_names, lag_names, strict=True):
+        if damping:
+            speed, signal = speeds[name]
+            ends = f"{signal.lower!r}, {signal.upper!r}"
+            states.append((f"Signal({_text(speed)}, {_text(signal.unit)}, {ends})", "not measured"))
+            pull = f"({name}_steady - x.{name}) / {constant}**2"
+            rates.append((f"{pull} - 2 * {damping} / {constant} * x.{speed}", "second order"))
+    corrected = [n for n in y_names if n not in speeds] + [speed for speed, _ in speeds.values()]
+    pace, _ = slowest(lags, draft.length)
+    dt, length = draft.period, draft.length
+    # a fifth of the recording validates and a fifth tests: each must hold a warm-up and what is scored
+    smoothing = max(SMOOTHED * dt, min(10 * dt, length / 40))
+    warm = max(2 * dt, min(max(10 * dt, pace), length / 10, length / 5 - smoothing - (MIN_SCORED + 2) * dt))
+    spec = draft.data(smoothing, warm)
+    # what is refused of the recording as the file reads it is refused here, by its reason
+    roles = Roles.of(draft, y_names, [signal for _, signal in speeds.values()])
+    train = load_trajectories(data, roles, spec).by_role("train")
+    check_excitation(train, inputs=roles.inputs, outputs=roles.outputs)
+    x0, u0, w0 = _first_rest(draft, np.array(gains), np.array(offsets))
+    still = [*(near(v, float(np.ptp(c.span)) / 1e4) for v, c in zip(x0, draft.outputs, strict=True))]
+    point = f"x={_tuple([*still, *['0.0'] * (len(states) - len(still))])}, u={_tuple(map(repr, u0))}"
+    point += f", w={_tuple(map(repr, w0))}" if w_names else ""
+    title = printable(path.stem)
+    lines = [
+        _text(
+            f"{title}: written from {printable(_and(file.name for file in data))} by hybrid-mpc new. "
+            f"Lines marked {MARK} are yours to decide."
+        ),
+        "",
+        "from hybrid_mpc import OCP, DataSpec, OperatingPoint, Parameter, Prior, Scenario, Signal",
+        "",
+        "",
+        f"class {kind}(Prior):",
+        '    """A first prior: each output is a lag of all that acts."""',
+        "",
+        f"    # {MARK}: write the machine's own equations in xdot; its states need not be measured",
+        "    states = (",
+        *(f"        {text},  # {note}" for text, note in states),
+        "    )",
+        "    inputs = (",
+        *(
+            f"        {text},  # {note}"
+            for text, note in (_signal(c, n) for c, n in zip(draft.inputs, u_names, strict=True))
+        ),
+        "    )",
+        f"    outputs = states[:{len(y_names)}]",
+        *(["    disturbances = ("] if w_names else []),
+        *(
+            f"        {text},  # {note}"
+            for text, note in (_signal(c, n) for c, n in zip(draft.disturbances, w_names, strict=True))
+        ),
+        *(["    )"] if w_names else []),
+        "    parameters = (  # name, value, unit, bounds of the fit",
+        *(
+            f"        Parameter({_text(n)}, {v!r}, {_text(unit)}, {low!r}, {high!r}, {_text(text)}),"
+            for n, v, unit, low, high, text in parameters
+        ),
+        "    )",
+        f"    corrects = {_tuple(map(_text, corrected))}",
+        f"    # {MARK}: where the machine works; your own equations rest elsewhere: see check",
+        f"    # operating_point = OperatingPoint({point})",
+        f"    # {MARK}: balances(self, x, u, w, p), if something is stored: energy, mass, heat",
+        "",
+        "    def xdot(self, x, u, w, p):",
+        *(f"        {text}" for text in steady),
+        "        return (",
+        *(f"            {text},  # {note}" for text, note in rates),
+        "        )",
+        "",
+        "",
+        "scenario = Scenario(",
+        f"    {_text(ascii_of(path.stem) or 'machine')},",
+        f"    {_text(title)},  # {MARK}: a title",
+        f'    "",  # {MARK}: a few words for the report',
+        f"    prior={kind},",
+        "    data=DataSpec(",
+        f"        {_text(spec.time) if isinstance(spec.time, str) else repr(spec.time)},"
+        + (f"  # {MARK}: {printable(draft.doubt)}" if draft.doubt else ""),
+        f"        {_tuple(map(_text, spec.inputs))},  # {MARK}: are these commanded?",
+        f"        {_tuple(map(_text, spec.outputs))},  # {MARK}: does the machine move these? {ACTING}",
+        *(
+            f"        # {MARK}: is {printable(name)} {KINDS[draft.verdicts[name].kind]}? {printable(reason)}"
+            for name, reason in draft.unsure.items()
+            if draft.verdicts[name].kind in KINDS and draft.verdicts[name].kind != "set-point"
+        ),
+        *(
+            f"        # {MARK}: not used: {printable(c.full)}, a set-point ({printable(draft.verdicts[c.full].reason)})"
+            for c in draft.set_points
+        ),
+        *(
+            f"        # {MARK}: not used: {printable(name)} ({printable(reason)})"
+            for name, reason in draft.left_out.items()
+        ),
+        *(f"        # {MARK}: {line}" for line in loop_lines(draft)),
+        f"        dt={spec.dt!r},  # s, as it was sampled; a tenth of the fastest motion is enough",
+        f"        max_gap={spec.max_gap!r},",
+        f"        smoothing={spec.smoothing!r},",
+        f"        warm_up={spec.warm_up!r},  # s of the past that start a free run",
+        *([f"        disturbances={_tuple(map(_text, spec.disturbances))},"] if w_names else []),
+        *(
+            [f"        units={{{', '.join(f'{_text(n)}: {f!r}' for n, f in spec.units.items())}}},"]
+            if spec.units
+            else []
+        ),
+        "    ),",
+        *_first_control(draft, len(states)),
+        ")",
+        "",
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _first_rest(draft: Draft, gains: Array, offsets: Array) -> tuple[list[float], list[float], list[float]]:
+    """Outputs, inputs and disturbances at which the lags rest: as near to the recording's middle as they can."""
+    n_u = len(draft.inputs)
+    y, drives = (np.array([np.nanmedian(c.values) for c in cs]) for cs in (draft.outputs, draft.drives))
+    missing = y - offsets - gains @ drives
+    sizes = np.array([np.ptp(c.span) for c in (*draft.outputs, *draft.drives)])
+    per_y, per_u = sizes[: len(y)], sizes[len(y) : len(y) + n_u]
+    # in shares of what was recorded: units do not enter
+    drives[:n_u] += per_u * (np.linalg.pinv(gains[:, :n_u] * per_u / per_y[:, None]) @ (missing / per_y))
+    held = [
+        float(near(min(max(v, c.span[0]), c.span[1]), np.ptp(c.span) / 500))
+        for v, c in zip(drives, draft.drives, strict=True)
+    ]
+    return (offsets + gains @ np.array(held)).tolist(), held[:n_u], held[n_u:]
+
+
+def horizon_of(draft: Draft) -> tuple[int, str]:
+    """Periods of a first horizon, and why: twice the slowest time constant that matters, within ``HORIZONS``."""
+    pace, i = slowest(draft.lags, draft.length)
+    asked = max(round(2 * pace / draft.period), 1)
+    periods = min(max(asked, HORIZONS[0]), HORIZONS[1])
+    why = (
+        f"{periods} periods of {draft.period:.3g} s; the slowest time constant that matters is {pace:.3g} s, of "
+        f"{printable(draft.outputs[i].full)}"
+    )
+    if asked > periods:
+        why += f". Twice that are {asked} periods: take a longer dt"
+    return periods, why
+
+
+def first_limits(span: tuple[float, float], growth: float) -> tuple[float, float]:
+    """Limits of an input in a first control problem: what was recorded.
+
+    An unstable machine falls where its input stays at a limit. Where its input was moved to both sides of zero, it may
+    be moved as far to either side: a recording from one start may hold much of one side alone.
+
+    Args:
+        span: Smallest and largest recorded value.
+        growth: Rate [1/s] at which the machine leaves its rest; 0: it does not.
+
+    Example:
+        >>> first_limits((-4.8, 14.0), 5.0), first_limits((-4.8, 14.0), 0.0), first_limits((0.0, 14.0), 5.0)
+        ((-14.0, 14.0), (-4.8, 14.0), (0.0, 14.0))
+    """
+    low, high = span
+    if growth > 0 and low < 0 < high:
+        return -max(-low, high), max(-low, high)
+    return low, high
+
+
+def _first_control(draft: Draft, n_x: int) -> list[str]:
+    """A control problem for a first loop, commented out: what only the user knows is marked.
+
+    Outputs are weighed by one over the square of a twentieth of what was recorded, changes of inputs of a tenth
+    (Bryson's rule); for the limits of inputs see :func:`first_limits`.
+    """
+    horizon, why = horizon_of(draft)
+
+    def each(columns: Sequence[Column], share: float) -> str:
+        return _tuple(_rounded(share * float(np.ptp(c.span))) + "**-2" for c in columns)
+
+    limits = [(first_limits(c.span, draft.growth), np.ptp(c.span) / 500) for c in draft.inputs]
+    low, high = (_tuple(near(ends[i], step) for ends, step in limits) for i in (0, 1))
+    free = f"q={_tuple(['0.0'] * n_x)}, r={_tuple(['0.0'] * len(draft.inputs))}"
+    sigma = _tuple(_rounded(0.005 * float(np.ptp(c.span))) for c in draft.outputs)
+    return [
+        f"    # {MARK}: what a controller is to do. For a first loop take away the # before:",
+        f"    # control=OCP({horizon}, {free}, u_min={low}, u_max={high},",
+        f"    #             # {why}",
+        "    #             # weights: one over the square of a deviation that you tolerate",
+        f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",
+        f"    # sensor_sigma={sigma},  # how much each sensor errs",
+        "    # safe_input=(...),  # within these limits, and no harm when a sensor is lost: nobody can guess it",
+    ]
+
+
+def loop_lines(draft: Draft) -> list[str]:
+    """What is said of a closed loop and of an unstable machine; empty where neither is seen."""
+    lines = []
+    if draft.loop:
+        lines.append(
+            f"recorded in closed loop? {draft.loop}. Free runs are biased there; the fit of the prior fits "
+            "predictions, too"
+        )
+    if draft.growth:
+        lines.append(
+            f"unstable? deviations grow by e in {1 / draft.growth:.3g} s. The lags written here are stable: write the "
+            "machine's equation before a controller is built on it"
+        )
+    return lines
+
+
+def _and(names: Iterable[str]) -> str:
+    """Names one after another; of many the first and how many more."""
+    given = list(names)
+    return ", ".join(given) if len(given) <= 3 else f"{given[0]} and {len(given) - 1} more"
+
+
+def _tuple(written: Iterable[str]) -> str:
+    """What is written already, as a tuple."""
+    given = list(written)
+    return f"({', '.join(given)},)" if len(given) == 1 else f"({', '.join(given)})"

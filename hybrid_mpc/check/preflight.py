@@ -1,0 +1,581 @@
+"""Everything that a scenario defines, built and called once before any work; all that is wrong is reported at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
+from hybrid_mpc.check.default_tasks import default_tasks
+from hybrid_mpc.check.prior import DRIFT, Report, check_prior
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.sizes import Sizes
+from hybrid_mpc.data.excitation import check_excitation, short_runs
+from hybrid_mpc.data.recording import COARSE, check_unit
+from hybrid_mpc.errors import InputError, named_extra, no_exit, refuse
+from hybrid_mpc.identify.prior_model import model_info, prior_programs
+from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of
+from hybrid_mpc.kit.artifact import build_model
+from hybrid_mpc.kit.assembly import make_controller, make_estimator
+from hybrid_mpc.kit.disturbances import default_disturbances
+from hybrid_mpc.kit.parts import loop_settings
+from hybrid_mpc.loop.faults import check_channels, install
+from hybrid_mpc.loop.loop import Loop
+from hybrid_mpc.loop.plant import Plant
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.machine.specification import DataSpec
+from hybrid_mpc.model.equilibrium import Range, RateEquations, rate_search
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.scenario import Budget, Scenario, Task
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Dataset
+
+Array = NDArray[np.float64]
+QUIET = 1e-4
+"""Process noise a period of the observer that is tried, over the states' sizes: little, as that of a good prior."""
+STARTS = 32
+"""Starts of the search for equilibria."""
+FEW = 6
+"""Equilibria that are told one by one; more are a continuum as a rule."""
+REACHED = 0.01
+"""Share of its size by which a state may miss a set-point that counts as one that can be held."""
+ANSWER = 10
+"""Periods within which the plant is asked for its answer to a step of an input."""
+AGAINST = -0.3
+"""Cosine between the plant's and the prior's answer below which they go different ways."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A prior where it rests, as far as that is known.
+
+    Args:
+        x: States ``(n_x,)``: the operating point, or else the middle of the signals' ranges.
+        u: Inputs ``(n_u,)`` there.
+        w: Disturbances ``(n_w,)`` there.
+        modes: Eigenvalues ``(n_x,)`` [1/s] of the rates by the states.
+        substeps: Runge-Kutta steps a period.
+        equilibria: Points of rest under ``u`` within the signals' ranges.
+    """
+
+    x: Array
+    u: Array
+    w: Array
+    modes: NDArray[np.complex128]
+    substeps: int
+    equilibria: tuple[Equilibrium, ...]
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """What a scenario's pre-flight has understood, and what is wrong with it.
+
+    Args:
+        scenario: The scenario.
+        prior: Its prior; None if it cannot be made.
+        problems: What must be mended, a line each.
+        warnings: What is doubtful about the scenario.
+        doubts: What is doubtful about the recordings.
+        rest: Where the prior rests; None if its equations cannot be asked there.
+        dataset: The recordings; None if there are none, or they cannot be read.
+        default_tasks: Tasks that the scenario gets where it declares none and has no plant.
+    """
+
+    scenario: Scenario
+    prior: Prior | None
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    doubts: tuple[str, ...]
+    rest: Rest | None
+    dataset: Dataset | None
+    default_tasks: tuple[Task, ...] = ()
+
+
+@no_exit()
+@named_extra("the check")
+def check_scenario(
+    scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
+) -> Preflight:
+    """Build and call everything that a scenario defines, before any work is done; arguments as of :func:`preflight`.
+
+    Raises:
+        InputError: Naming everything that is wrong, a line each.
+    """
+    found = preflight(scenario, budget, recordings)
+    refuse(found.problems)
+    return found
+
+
+@no_exit()
+def preflight(
+    scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
+) -> Preflight:
+    """Build and call everything that a scenario defines, and say what was understood and what is wrong.
+
+    The prior is asked at the origin, at random points within its signals' ranges and at their ends, and exported; the
+    model, controllers, estimators, plant, tasks and their references are built of it and called. A part is looked at
+    whatever is wrong with the others, as far as it does not need them.
+
+    Args:
+        scenario: The scenario.
+        budget: The effort that is meant. Default: all of the scenario's.
+        recordings: Reads the recordings. Default: there are none yet.
+    """
+    report = Report()
+    prior, asked = check_prior(report, scenario.prior)
+    if prior is not None:
+        _check_columns(report, scenario, prior)
+    before = len(report.problems)
+    rest = model = None
+    if prior is not None and asked:
+        rest, model = _check_rest(report, scenario, prior)
+    _check_control(report, scenario, prior, model if len(report.problems) == before else None, rest)
+    _check_plant(report, scenario, prior, model, rest)
+    tasks: tuple[Task, ...] = ()
+    if len(report.problems) == before and model is not None:
+        tasks = _default_tasks(report, scenario)
+    dataset, n_warnings = None, len(report.warnings)
+    if recordings is not None and prior is not None:
+        dataset = _check_recordings(report, prior, recordings, rest, scenario.data)
+    problems, warnings = (
+        tuple(f"scenario {scenario.name}: {text}" for text in texts)
+        for texts in (report.problems, report.warnings)
+    )
+    told, doubts = warnings[:n_warnings], warnings[n_warnings:]
+    return Preflight(scenario, prior, problems, told, doubts, rest, dataset, tasks)
+
+
+def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
+    """Those of a scenario without plant and tasks; that there can be none is told, and stops nothing."""
+    if scenario.plant is not None or scenario.control is None or scenario.tasks:
+        return ()
+    with report.part("default tasks"):
+        try:
+            return default_tasks(scenario)
+        except InputError as none:
+            report.warn(f"tasks: none are declared, and no loop will run: {str(none).partition(': ')[2]}")
+    return ()
+
+
+def _sizes(signals: tuple[Signal, ...], at: Array) -> Array:
+    """Size of each signal: its range, or else its value, 1 at least."""
+    ranges = np.array([s.upper - s.lower for s in signals], dtype=np.float64)
+    return np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(at), 1.0))
+
+
+def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest | None, HybridModel | None]:
+    """Where the prior rests, how fast it is there, what the outputs tell of it; and the prior as a deployed model."""
+    from hybrid_mpc.identify.fit import check_observable
+
+    dt = scenario.data.dt
+    second = max(10 * dt, scenario.data.warm_up)
+    x, u, w = rest_of(prior)
+    with report.part("prior"):
+        check_observable(prior, dt, second)
+    _check_equilibrium(report, prior, second)
+    model, substeps = None, 0
+    with report.part("prior"):
+        substeps = required_substeps(prior, dt)
+        programs = {f"prior/{name}": p for name, p in prior_programs(prior, dt).items()}
+        model = build_model("prior", programs, model_info(prior, dt))
+        chosen = scenario.disturbance_model
+        if chosen is None and scenario.control is not None and scenario.control.n_x == model.n_x:
+            chosen = default_disturbances(model, scenario.control)
+        model = replace(model, disturbance_model=chosen)
+    if model is None:
+        return None, None
+    modes = np.linalg.eigvals(flow_slope(prior.equations.xdot)(x, u, w, prior.p).full()).astype(np.complex128)
+    found = _equilibria(prior, model, x, u)
+    if prior.operating_point is None and 1 < len(found) <= FEW:
+        told = "; ".join(f"x = {(p.x.round(6) + 0.0).tolist()} ({p.stability})" for p in found)
+        report.warn(
+            f"prior: several equilibria under u = {u.tolist()}: {told}. Say around which one the machine works: "
+            "operating_point = OperatingPoint(x=(...), u=(...)). Until then the middle of the signals' ranges is taken"
+        )
+    return Rest(x, u, w, modes, substeps, found), model
+
+
+def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
+    """An operating point is an equilibrium."""
+    if moving := moves_at_rest(prior, second):
+        x, u, w = rest_of(prior)
+        report.add(
+            f"prior: operating_point is no equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}; give the input "
+            f"that holds it there, or the states where this input does{_nearest(prior, x, u, w)}"
+        )
+
+
+def moves_at_rest(prior: Prior, second: float) -> str:
+    """What moves at the operating point, in words; empty where nothing does, or no point is given.
+
+    ``second`` is the time [s] within which a state at rest may move by a hundredth of its size.
+    """
+    if prior.operating_point is None:
+        return ""
+    x, u, w = rest_of(prior)
+    rates = prior.equations.xdot(x, u, w, prior.p).full().ravel()
+    return ", ".join(
+        f"{s.name} changes by {r:.3g} {s.unit} a second"
+        for s, r, size in zip(prior.states, rates, _sizes(prior.states, x), strict=True)
+        if abs(r) * second > DRIFT * size
+    )
+
+
+def rests_no_more(prior: Prior, second: float) -> tuple[str, ...]:
+    """A warning where a fitted prior does not rest at its operating point, and where it does; as ``moves_at_rest``."""
+    moving = moves_at_rest(prior, second)
+    if not moving:
+        return ()
+    return (
+        f"with the fitted parameters the machine does not rest at operating_point ({moving}), where observers begin. "
+        "Write the fitted values into the prior's parameters, and where they rest into operating_point"
+        f"{_nearest(prior, *rest_of(prior))}",
+    )
+
+
+def _nearest(prior: Prior, x: Array, u: Array, w: Array) -> str:
+    """The equilibrium that Newton's method finds from a point, to be copied; nothing where it finds none."""
+    n_x, scale = len(x), np.concatenate([_sizes(prior.states, x), np.ones(len(u))])
+    equations, near = RateEquations(prior.equations.xdot, w, prior.p), np.concatenate([x, u])
+    found = rate_search(equations, scale, near, np.zeros(n_x), free=np.arange(n_x)).descend(near, x)
+    inside = all(s.lower <= v <= s.upper for s, v in zip(prior.states, found.v[:n_x], strict=True))
+    return f": x = {[float(f'{v:.6g}') for v in found.v[:n_x]]}" if found.steady and inside else ""
+
+
+def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[Equilibrium, ...]:
+    region = []
+    for signal, near in zip(prior.states, x, strict=True):
+        turn = signal.unit == "rad"
+        reach = math.pi if turn else 10.0 * max(1.0, abs(near))
+        low, high = (-math.inf, math.inf) if signal.periodic and turn else (signal.lower, signal.upper)
+        region.append(
+            (low if math.isfinite(low) else near - reach, high if math.isfinite(high) else near + reach)
+        )
+    return equilibria(model, u, region, starts=STARTS).points
+
+
+def _check_recordings(
+    report: Report, prior: Prior, recordings: Callable[[], Dataset], rest: Rest | None, spec: DataSpec
+) -> Dataset | None:
+    """The recordings can be read, move what is to be learned, and have been where the machine works."""
+    dataset = None
+    with report.part("recordings"):
+        dataset = recordings()
+    if dataset is None:
+        return None
+    for finding in dataset.findings:
+        report.warn(f"recordings: {finding}")
+    for file, sampling in zip(dataset.files, dataset.sampling, strict=True):
+        if sampling > COARSE * spec.dt:
+            report.warn(
+                f"recordings: {file} is sampled every {sampling:.3g} s, the model's period is {spec.dt:g} s: what lies "
+                "between is made up; raise dt in the DataSpec, or record faster"
+            )
+    train = dataset.by_role("train")
+    free = sum(not p.fixed for p in prior.parameters)
+    with report.part("recordings"):
+        for warning in check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free):
+            report.warn(f"recordings: {warning}")
+    for warning in short_runs(spec, dataset.by_role("test")):
+        report.warn(f"recordings: {warning}")
+    if rest is not None and prior.operating_point is not None:
+        y = prior.equations.output(rest.x, rest.u, rest.w, prior.p).full().ravel()
+        for signals, values, key in ((prior.inputs, rest.u, "u"), (prior.outputs, y, "y")):
+            every = np.concatenate([getattr(t, key) for t in dataset.whole])
+            for j, (signal, value) in enumerate(zip(signals, values, strict=True)):
+                known = every[np.isfinite(every[:, j]), j]
+                low, high = (known.min(), known.max()) if len(known) else (value, value)
+                beyond = max(low - value, value - high)
+                if beyond > 0.5 * (high - low) and not signal.periodic:
+                    report.warn(
+                        f"recordings: {signal.label} goes from {low:.4g} to {high:.4g}, at the operating point it is "
+                        f"{value:.4g}; record there, or correct the operating point or a unit"
+                    )
+    return dataset
+
+
+def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
+    """As many columns as signals, in units that can be turned into theirs; causes that the prior has."""
+    spec = scenario.data
+    for what, columns, signals in (
+        ("inputs", spec.inputs, prior.inputs),
+        ("outputs", spec.outputs, prior.outputs),
+        ("disturbances", spec.disturbances, prior.disturbances),
+    ):
+        if len(columns) != len(signals):
+            report.add(
+                f"data: {len(columns)} columns of {what} {list(columns)}, the prior has {len(signals)}: "
+                f"{[s.name for s in signals]}"
+            )
+            continue
+        for column, signal in zip(columns, signals, strict=True):
+            with report.part("data"):
+                check_unit(spec, column, signal)
+    unknown = [
+        name
+        for names in scenario.causes.values()
+        for name in names
+        if name not in prior.values and name not in {f"gain of {s.name}" for s in prior.inputs}
+    ]
+    if unknown:
+        report.add(
+            f"causes: the prior has no parameter {', '.join(unknown)}; it has: {', '.join(prior.values)}"
+        )
+
+
+def _check_control(
+    report: Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None, rest: Rest | None
+) -> None:
+    control = scenario.control
+    if control is None:
+        if scenario.tasks:
+            report.add("tasks: there is no control problem to run them with; give control=OCP(...)")
+        return
+    before = len(report.problems)
+    _check_sensors(report, scenario, prior)
+    if len(report.problems) > before:  # what stands on them says no more
+        model = None
+    _check_problem(report, scenario, "control", control, prior, model, rest)
+    built = {_structure(control)}
+    with report.part("safe_input"):
+        loop_settings(replace(scenario, sensor_sigma=(), first_sigma=None))
+    for task in scenario.tasks:
+        if task.control is not None:  # a controller is built once for all that differ in numbers alone
+            new = _structure(task.control) not in built
+            built.add(_structure(task.control))
+            what = f"control of task {task.name}"
+            _check_problem(report, scenario, what, task.control, prior, model if new else None, rest)
+
+
+def _structure(control: OCP) -> tuple[Any, ...]:
+    """What tells controllers apart that are built differently."""
+    bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())
+    expressions = control.soft, control.hard, id(control.economic)
+    return control.horizon, control.blocks, control.du_max is None, bounded, expressions
+
+
+def _check_sensors(report: Report, scenario: Scenario, prior: Prior | None) -> None:
+    if prior is not None and len(scenario.sensor_sigma) != len(prior.outputs):
+        given = scenario.sensor_sigma
+        report.add(f"sensor_sigma needs {len(prior.outputs)} numbers, got {len(given)}: {given}")
+    for name in ("sensor_sigma", "first_sigma"):
+        values = getattr(scenario, name)
+        if values is not None and not all(s > 0 for s in values):
+            report.add(f"{name} must be positive, got {values}")
+    for name, sigma in scenario.state_noise.items():
+        if prior is not None and name not in [s.name for s in prior.states]:
+            names = ", ".join(s.name for s in prior.states)
+            report.add(f"state_noise: no state {name!r}; there are: {names}")
+        if not sigma > 0:
+            report.add(f"state_noise of {name} must be positive, got {sigma}")
+
+
+def _check_problem(
+    report: Report,
+    scenario: Scenario,
+    what: str,
+    control: OCP,
+    prior: Prior | None,
+    model: HybridModel | None,
+    rest: Rest | None,
+) -> None:
+    before = len(report.problems)
+    if prior is None:
+        return
+    for name, size in {"q": len(prior.states), "r": len(prior.inputs)}.items():
+        values = getattr(control, name)
+        if len(values) != size:
+            report.add(f"{what}: {name} needs {size} numbers, got {len(values)}: {values}")
+    if model is None or rest is None or len(report.problems) > before:
+        return
+    # each start is sought from for seconds, and their shapes are known to be right
+    control = control.changed(starts=())
+    with report.part(f"{what}: estimator"):
+        estimator = make_estimator(model, scenario, QUIET * Sizes(model, control).states, control)
+    with report.part(f"{what}: controller"):
+        controller = make_controller(model, model, control)
+    if len(report.problems) > before:
+        return
+    with report.part(f"{what}: a period of the loop"):
+        loop = Loop(estimator, controller)
+        y = model.output(rest.x, rest.u, rest.w, model.p).full().ravel()
+        loop.start(y)
+        loop.step(y)
+
+
+def _check_plant(
+    report: Report, scenario: Scenario, prior: Prior | None, model: HybridModel | None, rest: Rest | None
+) -> None:
+    plant: Plant | None = None
+    if scenario.plant is not None and prior is not None:
+        with report.part("plant"):
+            plant = scenario.plant()
+            _check_methods(plant, prior, scenario.data.dt)
+            if model is not None and rest is not None:
+                _check_answer(report, plant, model, rest)
+    for task in scenario.tasks if prior is not None else ():
+        assert prior is not None
+        _check_task(report, task, scenario, prior, plant, rest)
+    if scenario.oracle is not None and model is not None:
+        with report.part("oracle"):
+            oracle = scenario.oracle(model.dt)
+            sizes = oracle.n_x, oracle.n_u, oracle.n_y
+            if sizes != (model.n_x, model.n_u, model.n_y):
+                raise InputError(
+                    f"its model has (states, inputs, outputs) = {sizes}, the prior "
+                    f"{(model.n_x, model.n_u, model.n_y)}"
+                )
+
+
+def _check_methods(plant: Plant, prior: Prior, dt: float) -> None:
+    n_x, n_u, n_y = len(prior.states), len(prior.inputs), len(prior.outputs)
+    point = prior.operating_point
+    x, u = (np.zeros(n_x), np.zeros(n_u)) if point is None else (np.array(point.x), np.array(point.u))
+    if (len(x), len(u)) != (n_x, n_u):  # told by the prior
+        return
+    step: Any = plant.step
+    state = step(plant.reset(x, 0), u, dt, *((rest_of(prior)[2],) if prior.disturbances else ()))
+    y, x = plant.measure(state, np.random.default_rng(0)), plant.truth(state)
+    for name, found, size in (("measure", y, n_y), ("truth", x, n_x)):
+        if np.shape(found) != (size,):
+            raise InputError(f"{name} must return the shape ({size},), got {np.shape(found)}")
+        if not np.all(np.isfinite(found)):
+            raise InputError(f"{name} gives {found} one period after rest; it must be finite")
+
+
+def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) -> None:
+    """Plant and prior answer to a step of each input in the same direction."""
+    ranges = np.array([s.upper - s.lower for s in model.inputs])
+    steps = np.where(np.isfinite(ranges), 0.1 * ranges, 1.0)
+    room = np.array([s.upper for s in model.inputs]) - rest.u
+    steps = np.where(room >= steps, steps, -steps)
+    sizes = _sizes(model.states, rest.x)
+    step: Any = plant.step
+    held = (rest.w,) if len(rest.w) else ()
+
+    def after(u: Array) -> tuple[Array, Array]:
+        state, x = plant.reset(rest.x, 0), rest.x
+        for _ in range(ANSWER):
+            state = step(state, u, model.dt, *held)
+            x = model.step(x, np.zeros(0), u, rest.w, model.p)[0].full().ravel()
+        return np.asarray(plant.truth(state), dtype=np.float64), x
+
+    base = after(rest.u)
+    for j, signal in enumerate(model.inputs):
+        moved = after(rest.u + steps * (np.arange(model.n_u) == j))
+        own, expected = ((one - other) / sizes for one, other in zip(moved, base, strict=True))
+        lengths = float(np.linalg.norm(own)), float(np.linalg.norm(expected))
+        if min(lengths) > 0 and float(own @ expected) < AGAINST * lengths[0] * lengths[1]:
+            told = ", ".join(
+                f"{s.name} by {a * k:.3g} and {b * k:.3g} {s.unit}"
+                for s, a, b, k in zip(model.states, own, expected, sizes, strict=True)
+            )
+            report.warn(
+                f"plant: a step of {signal.label} by {steps[j]:g} moves plant and prior different ways within {ANSWER} "
+                f"periods: {told}; is a sign or a unit wrong in one of them?"
+            )
+
+
+def _check_task(
+    report: Report, task: Task, scenario: Scenario, prior: Prior, plant: Plant | None, rest: Rest | None
+) -> None:
+    n_x, dt, what = len(prior.states), scenario.data.dt, f"task {task.name}"
+    control = task.control or scenario.control
+    n_p = 0 if control is None else control.n_p
+    if len(task.x0) != n_x:
+        report.add(f"{what}: x0 needs {n_x} numbers, got {task.x0}")
+    else:
+        with report.part(what):
+            _check_within("x0", np.array([task.x0]), np.zeros(1), prior.states)
+    if plant is not None:
+        with report.part(what):
+            names = ([s.name for s in signals] for signals in (prior.outputs, prior.inputs))
+            check_channels(install(plant, task.faults)[1], *names)
+    if task.duration < dt:
+        report.add(f"{what}: duration must be at least a period of {dt} s, got {task.duration}")
+        return
+    t = np.arange(0.0, task.duration, dt)
+    by_output = control is not None and control.n_y > 0
+    signals = prior.outputs if by_output else prior.states
+    n_r = len(signals) + n_p
+    for name, preview, columns in (("reference", task.reference, n_r), ("weight", task.weight, n_x)):
+        if preview is None:
+            continue
+        with report.part(what):
+            values = np.asarray(preview(t))
+            if values.shape != (len(t), columns):
+                raise InputError(
+                    f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
+                    + (
+                        f"; the last {n_p} for the parameters of the economic cost and of bounds"
+                        if columns > len(signals)
+                        else ""
+                    )
+                )
+            if not np.all(np.isfinite(values)):
+                k = int(np.argmax(~np.isfinite(values).all(axis=1)))
+                raise InputError(f"{name} is {values[k]} at {t[k]:g} s; it must be finite during the task")
+            if name == "weight" and np.any(values < 0):
+                raise InputError("weight: factors must not be negative")
+            if name == "reference":
+                _check_within(name, values[:, : len(signals)], t, signals)
+                if control is not None and rest is not None:
+                    set_points = values[:, : len(signals)]
+                    _check_set_point(report, task, set_points, control, prior, rest, by_output)
+
+
+def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal]) -> None:
+    """Values are within their signals' ranges."""
+    for j, signal in enumerate(signals):
+        beyond = (values[:, j] < signal.lower) | (values[:, j] > signal.upper)
+        if beyond.any():
+            k = int(np.argmax(beyond))
+            raise InputError(
+                f"{name}: {signal.label} is {values[k, j]:g} at {t[k]:g} s, outside its range from {signal.lower:g} to "
+                f"{signal.upper:g}; correct its unit, or the bounds of the signal"
+            )
+
+
+def _check_set_point(
+    report: Report, task: Task, reference: Array, control: OCP, prior: Prior, rest: Rest, by_output: bool
+) -> None:
+    """Where a reference of states or outputs comes to rest, the inputs' limits let the machine rest, too."""
+    n_x, n_u = len(prior.states), len(prior.inputs)
+    last = reference[-max(2, len(reference) // 10) :]
+    weights, signals = (control.q_y, prior.outputs) if by_output else (control.q, prior.states)
+    if len(weights) != len(signals) or len(control.q) != n_x or len(control.u_min) != n_u:
+        return
+    tied = weights > 0
+    if np.ptp(last, axis=0)[tied].any() or not tied.any():
+        return
+    target, sizes, wanted = last[-1], _sizes(prior.states, rest.x), _sizes(signals, last[-1])
+    first = np.concatenate([rest.x, np.clip(rest.u, control.u_min, control.u_max)])
+    if not by_output:
+        sizes, first[:n_x] = wanted, np.where(tied, target, rest.x)
+    equations = RateEquations(
+        prior.equations.xdot, rest.w, prior.p, prior.equations.output if by_output else None
+    )
+    none = Range.none(n_x + n_u, len(signals))
+    low = np.concatenate([none.lower[:n_x], control.u_min])
+    high = np.concatenate([none.upper[:n_x], control.u_max])
+    search = rate_search(
+        equations, np.concatenate([sizes, control.input_range]), first, np.where(tied, 1.0 / wanted, 0.0),
+        bounds=replace(none, lower=low, upper=high),
+    )  # fmt: skip
+    found = search.descend(first, target)
+    if not found.steady:
+        found = search.follow(first, equations.shown(first)[0], target, sure=False) or found
+    nearest, what = found.y, "y" if by_output else "x"
+    if (np.abs(nearest - target)[tied] / wanted[tied] > REACHED).any():
+        report.warn(
+            f"task {task.name}: its reference comes to rest at {what} = {target.round(6).tolist()}, which no input "
+            f"within its limits holds; the nearest point of rest is {what} = {(nearest.round(4) + 0.0).tolist()} under "
+            f"u = {found.v[n_x:].round(4).tolist()}"
+        )

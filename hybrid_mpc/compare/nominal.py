@@ -1,0 +1,162 @@
+"""Nominal loops of a simulated machine, which limits are learned from, and loops in which something breaks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybrid_mpc.compare.loops import MODEL, LoopSpec
+from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.loop.faults import Fault, install
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.scenario import Budget, Scenario, Task
+from hybrid_mpc.watch.lengths import block_seconds, settling_samples
+
+CONTROLLER = "hybrid_observer"
+"""The controller of these loops."""
+BLOCKS = 9
+"""Whole blocks (of five of the machine's seconds) in a loop. Four such loops suffice for a threshold of two false
+alarms an hour, eight for one."""
+FEWEST, MOST = 4, 16
+"""Loops: one for each seed of the budget, within these."""
+FIRST_SEED = 500
+"""Their numbers begin here, away from those of the compared loops."""
+SMALLEST = 0.6
+"""Every time round, the reference is scaled by a factor drawn from here to 1: no two rounds are alike."""
+AGEING, DRIFT_S = (1.0, 1.1, 0.9), 30.0
+"""Where the plant knows it, friction drifts to these shares, in turn, within so many of the machine's seconds:
+ageing, of which no monitor is to speak."""
+WEAKER = 0.8
+"""What is left of an actuator's force where it weakens."""
+LOAD_SHARE = 0.2
+"""Unknown load, as a share of half the input's range."""
+
+
+def nominal_tasks(scenario: Scenario) -> list[Task]:
+    """Tracking tasks in which nothing goes wrong; if there are none, other tasks without faults.
+
+    Raises:
+        InputError: If something goes wrong in every task.
+    """
+    calm = [task for task in scenario.tasks if not task.faults]
+    tasks = [task for task in calm if task.weight is None] or calm
+    if not tasks:
+        raise InputError(
+            f"scenario {scenario.name}: every task brings a fault; limits are learned from one without"
+        )
+    return tasks
+
+
+def nominal_loops(
+    scenario: Scenario, budget: Budget, model: HybridModel, *, named: str = "", run_seed: int = 0
+) -> list[LoopSpec]:
+    """The loops of a budget: calm tasks in turn, each round of them scaled by its own share.
+
+    Raises:
+        InputError: If something goes wrong in every task.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> from hybrid_mpc.scenario import load_scenario
+        >>> golf, model = load_scenario("golf_robot"), SimpleNamespace(dt=0.02, time_unit=1.0)
+        >>> loops = nominal_loops(golf, golf.budgets["quick"], model)
+        >>> [(loop.task, [fault.value for fault in loop.faults]) for loop in loops]  # doctest: +NORMALIZE_WHITESPACE
+        [('track_sine', []), ('track_step', [1.1]), ('track_sine', [0.9]), ('track_step', []), ('track_sine', [1.1]),
+         ('track_step', [0.9])]
+    """
+    tasks, unit = nominal_tasks(scenario), model.time_unit
+    ages = AGEING if knows(scenario, "plant_friction") else AGEING[:1]
+    blocks = BLOCKS * max(round(block_seconds(model.dt, unit) / model.dt), 1)
+    seconds, found = (settling_samples(model) + blocks) * model.dt, []
+    for i in range(min(max(budget.seeds, FEWEST), MOST)):
+        task, friction, seed = tasks[i % len(tasks)], ages[i % len(ages)], FIRST_SEED + i
+        drift = Fault(0.0, math.inf, "plant_friction", friction, ramp=DRIFT_S * unit)
+        shares = np.random.default_rng([run_seed, seed]).uniform(
+            SMALLEST, 1.0, math.ceil(seconds / task.duration)
+        )
+        found.append(
+            LoopSpec(
+                named or scenario.name, MODEL, task.name, CONTROLLER, monitor="none", seed=seed, duration=seconds,
+                faults=() if friction == 1.0 else (drift,), run_seed=run_seed, rounds=tuple(shares.tolist()),
+                keep=("t", "y", "u", "w"),
+            )
+        )  # fmt: skip
+    return found
+
+
+def stage_of(spec: LoopSpec) -> str:
+    """Name of a nominal loop's file in ``checkpoints``."""
+    return f"nominal/{spec.task}-{spec.seed}"
+
+
+def knows(scenario: Scenario, target: str) -> bool:
+    """Whether the scenario's plant can show a fault of its own."""
+    if scenario.plant is None:
+        return False
+    try:
+        install(scenario.plant(), (Fault(0.0, 1.0, target, 1.0),))
+    except InputError:
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class Broken:
+    """What breaks in a loop: a short name, the same in words, and the fault."""
+
+    name: str
+    title: str
+    fault: Fault
+
+
+def broken(scenario: Scenario, model: HybridModel, control: OCP, start: float) -> list[Broken]:
+    """What is tried from ``start`` [s] on: friction twice as large where the plant knows it, each actuator a fifth
+    weaker, an unknown load at the first input, each sensor frozen.
+
+    Example:
+        >>> from types import SimpleNamespace as Some
+        >>> model = Some(inputs=[Some(name="u")], outputs=[Some(name="phi")])
+        >>> ocp = OCP(9, [1.0], [1.0], [1.0], u_min=[-1.0], u_max=[1.0])
+        >>> for one in broken(Some(plant=None), model, ocp, 3.0):
+        ...     print(one.title, one.fault.target, one.fault.value)
+        u loses a fifth of its force input_gain 0.8
+        a load of 0.2 at u input_offset 0.2
+        the sensor of phi freezes measurement_freeze 0.0
+    """
+    found, end = [], math.inf
+    if knows(scenario, "plant_friction"):
+        found.append(Broken("friction", "friction doubles", Fault(start, end, "plant_friction", 2.0)))
+    found += [
+        Broken(
+            f"weak_{s.name}",
+            f"{s.name} loses a fifth of its force",
+            Fault(start, end, "input_gain", WEAKER, s.name),
+        )
+        for s in model.inputs
+    ]
+    load, first = unknown_load(control), model.inputs[0].name
+    found.append(
+        Broken("load", f"a load of {load:.3g} at {first}", Fault(start, end, "input_offset", load, first))
+    )
+    found += [
+        Broken(
+            f"freeze_{s.name}",
+            f"the sensor of {s.name} freezes",
+            Fault(start, end, "measurement_freeze", 0.0, s.name),
+        )
+        for s in model.outputs
+    ]
+    return found
+
+
+def unknown_load(control: OCP) -> float:
+    """Load of the demonstration at the first input [its unit].
+
+    Example:
+        >>> unknown_load(OCP(9, [1.0], [1.0] * 2, [1.0] * 2, u_min=[-5.0, -1.0], u_max=[0.0, 1.0]))
+        0.5
+    """
+    return LOAD_SHARE * float(0.5 * control.input_range[0])

@@ -1,0 +1,512 @@
+"""What a study is: the loops that it expands to, the things it draws, its YAML file, and the built-in studies."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from importlib.util import find_spec
+from itertools import count, product
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from hybrid_mpc.compare.controllers import CONTROLLERS, OBSERVERS, ORACLES
+from hybrid_mpc.compare.loops import ALARMING, GUARDS, MONITORS, Intervals, LoopSpec
+from hybrid_mpc.compare.tasks import ready, selected_tasks
+from hybrid_mpc.control.ocp import MOST_HORIZON
+from hybrid_mpc.errors import InputError, named_extra
+from hybrid_mpc.files import read_bytes
+from hybrid_mpc.kit.assembly import SOLVERS
+from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault, parsed_fault
+from hybrid_mpc.records import Fields, known, plain, record
+from hybrid_mpc.rules import MOST_SEED, Duration, Label, Name, NameOrNone, Number, Seconds, name_problem
+from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
+
+LATE = "late"
+"""A target beside those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
+DEFAULT_CONTROLLERS = OBSERVERS
+MOST_DRAWS = 1_000_000
+"""Most seeds, and most draws, of a study: all of them are in memory."""
+AXES = ("models", "tasks", "controllers", "solvers", "horizons", "monitors", "faults", "seeds")
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One kind of fault and how large it gets.
+
+    Args:
+        target: Target of a :class:`~hybrid_mpc.loop.faults.Fault`, or ``"late"``: solves miss their deadline.
+        low: Smallest size.
+        high: Largest size; drawn uniformly between.
+        signed: Whether it takes either sign. Default: no.
+        ramp: Time [s] over which it grows. Default: at once.
+        length: Shortest and longest duration [s] of this kind, which then always ends. Default: the common one.
+        channel: Name of the output or input concerned. Default: the only one.
+
+    Raises:
+        InputError: If the target is unknown or a range is empty.
+
+    Example: ``FaultKind("plant_friction", 1.5, 4.0)``
+    """
+
+    target: Name
+    low: Number = 0.0
+    high: Number = 0.0
+    signed: bool = False
+    ramp: Duration = 0.0
+    length: Sequence[float] | None = None
+    channel: NameOrNone = ""
+
+    def __post_init__(self) -> None:
+        Fields(self, f"random fault {self.target}").refuse()
+        if self.target != LATE and not str(self.target).startswith("plant_"):
+            known(self.target, (*SIGNAL_TARGETS, LATE), "fault target")
+        _span((self.low, self.high), f"random fault {self.target}: low to high")
+        if self.length is not None:
+            span = _span(self.length, f"random fault {self.target}: length", above=0.0)
+            object.__setattr__(self, "length", span)
+
+
+@dataclass(frozen=True)
+class RandomFaults:
+    """Faults that a draw takes at random.
+
+    Args:
+        kinds: What can happen; mappings of :class:`FaultKind`'s fields are taken too.
+        at_once: Fewest and most kinds in one draw. Default: 1 to 3.
+        start: Earliest and latest instant [s] at which one begins. Default: 1.4 to 2.
+        length: Shortest and longest duration [s] of one that ends. Default: 0.2 to 2.
+        lasting: Share of those that never end. Default: a half.
+
+    Raises:
+        InputError: If there is no kind, more are asked for than there are, or a range is empty.
+
+    Example:
+        >>> some = RandomFaults([{"target": "input_gain", "low": 0.7, "high": 0.9}], at_once=(1, 1))
+        >>> faults, late = some.drawn(np.random.default_rng(0))
+        >>> faults[0].target, 0.7 <= faults[0].value <= 0.9, late
+        ('input_gain', True, ())
+    """
+
+    kinds: Sequence[FaultKind | Mapping[str, Any]]
+    at_once: Sequence[int] = (1, 3)
+    start: Sequence[float] = (1.4, 2.0)
+    length: Sequence[float] = (0.2, 2.0)
+    lasting: float = 0.5
+
+    def __post_init__(self) -> None:
+        kinds = tuple(
+            k if isinstance(k, FaultKind) else record(FaultKind, k, f"random_faults.kinds[{i}]")
+            for i, k in enumerate(self.kinds)
+        )
+        object.__setattr__(self, "kinds", kinds)
+        object.__setattr__(self, "start", _span(self.start, "random_faults: start", least=0.0))
+        object.__setattr__(self, "length", _span(self.length, "random_faults: length", above=0.0))
+        fewest, most = (int(n) for n in _span(self.at_once, "random_faults: at_once", least=0.0))
+        object.__setattr__(self, "at_once", (fewest, most))
+        if most < 1 or most > len(kinds):
+            raise InputError(f"random_faults: at_once goes up to {most}; there are {len(kinds)} kinds")
+        if not 0.0 <= self.lasting <= 1.0:
+            raise InputError(f"random_faults: lasting is a share from 0 to 1, got {self.lasting}")
+
+    def drawn(self, rng: np.random.Generator) -> tuple[tuple[Fault, ...], Intervals]:
+        """Faults, and the intervals [s] in which solves are late."""
+        n = int(rng.integers(self.at_once[0], self.at_once[1] + 1))
+        faults, late = [], []
+        for i in rng.choice(len(self.kinds), size=n, replace=False).tolist():
+            kind = self.kinds[i]
+            assert isinstance(kind, FaultKind)
+            size, start = rng.uniform(kind.low, kind.high), float(rng.uniform(self.start[0], self.start[1]))
+            sign = float(rng.choice([-1.0, 1.0])) if kind.signed else 1.0
+            shortest, longest = kind.length or self.length
+            length, lasts = rng.uniform(shortest, longest), rng.random() < self.lasting
+            end = math.inf if lasts and kind.length is None else start + float(length)
+            if kind.target == LATE:
+                late.append((start, end))
+            else:
+                faults.append(Fault(start, end, kind.target, float(sign * size), kind.channel, kind.ramp))
+        return tuple(faults), tuple(late)
+
+    def examples(self) -> tuple[Fault, ...]:
+        """The largest fault of each kind, to be checked against a plant."""
+        found = []
+        for kind in self.kinds:
+            assert isinstance(kind, FaultKind)
+            if kind.target != LATE:
+                found.append(Fault(0.0, 1.0, kind.target, kind.high, kind.channel, kind.ramp))
+        return tuple(found)
+
+
+def generator(seed: int, draw: int, what: str) -> np.random.Generator:
+    """Random numbers of one thing in one draw, whatever else is drawn."""
+    key = hashlib.sha256(f"{seed}/{draw}/{what}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(key[:16], "big"))
+
+
+def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tuple[str, float], ...]:
+    """Factors of the plant's parameters in a draw, uniform in ``1 - span`` to ``1 + span``."""
+    return tuple(
+        (name, float(1.0 + span * generator(seed, draw, name).uniform(-1.0, 1.0))) for name, span in vary
+    )
+
+
+def _span(
+    values: Sequence[float], what: str, *, least: float = -math.inf, above: float = -math.inf
+) -> tuple[float, float]:
+    """Two numbers in order, or InputError."""
+    try:
+        low, high = (float(v) for v in values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what}: two numbers are needed, got {values!r}") from error
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high and low >= least and low > above):
+        bounds = f" of {least:g} or more" if math.isfinite(least) else ""
+        bounds = f" above {above:g}" if math.isfinite(above) else bounds
+        raise InputError(
+            f"{what}: [{low:g}, {high:g}] is no range; needed are two finite numbers{bounds}, the smaller one first"
+        )
+    return low, high
+
+
+@dataclass(frozen=True)
+class Study:
+    """Closed loops of every combination of what is listed.
+
+    Lists may be given as any sequence; they become tuples, so that a study can be compared and hashed.
+
+    Args:
+        scenario: Registered name or path of a user's file.
+        models: Artifact folders (or folders of runs) by label; a single folder gets the label ``"model"``.
+        tasks: Names of tasks, or their beginnings. Default: all.
+        controllers: Names in :data:`~hybrid_mpc.compare.controllers.CONTROLLERS`. Default: prior and hybrid, with
+            observer.
+        solvers: ``"rti"``, ``"native"``, ``"sqp"``, ``"ipopt"``. Default: the first.
+        horizons: Periods; None for the task's own, which is the default.
+        monitors: Names in :data:`~hybrid_mpc.compare.loops.MONITORS`. Default: ``"own"``, without thresholds.
+        faults: Sets of faults, each one text (``"plant_friction=2@1.5 + input_gain=0.8"``; ``"none"``), a
+            :class:`~hybrid_mpc.loop.faults.Fault` or a sequence of either. Default: one empty set.
+        vary: Parameters of the plant, and by what share each is varied at most in either direction. Default: none.
+        random_faults: Faults that a draw takes at random. Default: none.
+        draws: How many times the random things are drawn; all controllers meet the same draws. Default: 1.
+        seeds: Numbers of the loops, or how many. Default: 10.
+        seed: Seed of the draws.
+        duration: Longest duration of a loop [s]. Default: the task's own.
+        guard: What an alarm does, in :data:`~hybrid_mpc.compare.loops.GUARDS`; it needs monitors that alarm, and
+            hybrids. Default: nothing.
+        run_seed: Times 1000 it is added to the numbers of the loops, as in the main job. Default: 0.
+        name: For tables and the report.
+
+    Raises:
+        InputError: If a name is unknown (with the nearest one), a number is impossible, or a combination is.
+
+    Example:
+        >>> study = Study("golf_robot", "runs/golf/model", tasks=["track"], vary={"m": 0.2}, draws=3, seeds=2)
+        >>> study.size, len({run.id for run in study.runs()})
+        (24, 24)
+        >>> Study("golf_robot", "m", controllers=["hybird"])
+        Traceback (most recent call last):
+        hybrid_mpc.errors.InputError: no controller 'hybird'; did you mean 'hybrid'? There are: prior, prior_observer, \
+hybrid, hybrid_observer, oracle, oracle_state
+    """
+
+    scenario: str
+    models: str | Path | Mapping[str, str | Path] | Sequence[tuple[str, str]]
+    tasks: Sequence[str] = ()
+    controllers: Sequence[str] = DEFAULT_CONTROLLERS
+    solvers: Sequence[str] = ("rti",)
+    horizons: Sequence[int | None] = (None,)
+    monitors: Sequence[str] = ("own",)
+    faults: Sequence[str | Fault | Sequence[str | Fault]] = ((),)
+    vary: Mapping[str, float] | Sequence[tuple[str, float]] = ()
+    random_faults: RandomFaults | Mapping[str, Any] | None = None
+    draws: int = 1
+    seeds: int | Sequence[int] = 10
+    seed: int = 0
+    duration: Seconds | None = None
+    guard: str = ""
+    run_seed: int = 0
+    name: Label = "study"
+
+    def __post_init__(self) -> None:
+        for field, value in _normal(self).items():
+            object.__setattr__(self, field, value)
+        for name in AXES:
+            values = getattr(self, name)
+            if not values and name != "tasks":
+                raise InputError(f"study: {name} is empty; leave it out for the default")
+            if len(set(values)) != len(values):
+                raise InputError(f"study: {name} lists something twice: {values}")
+        for what, table in (("controllers", CONTROLLERS), ("solvers", SOLVERS), ("monitors", MONITORS)):
+            for word in getattr(self, what):
+                known(word, table, what[:-1])
+        if self.guard:
+            known(self.guard, GUARDS[1:], "guard")
+        own = Fields(self, f"study {self.name!r}")
+        own.add(f"models: {wrong}" for label in self.folders if (wrong := name_problem(label)))
+        own.refuse()
+        self._check_numbers()
+        self._check_combinations()
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """Folders of the models by label."""
+        return {label: Path(folder) for label, folder in cast("Sequence[tuple[str, str]]", self.models)}
+
+    @property
+    def spans(self) -> tuple[tuple[str, float], ...]:
+        """Varied parameters with their shares."""
+        return cast("tuple[tuple[str, float], ...]", self.vary)
+
+    @property
+    def loop_seeds(self) -> tuple[int, ...]:
+        """Numbers of the loops."""
+        return cast("tuple[int, ...]", self.seeds)
+
+    @property
+    def fault_sets(self) -> tuple[tuple[Fault, ...], ...]:
+        """Sets of faults."""
+        return cast("tuple[tuple[Fault, ...], ...]", self.faults)
+
+    @property
+    def axes(self) -> dict[str, int]:
+        """How many of each thing there are; their product is the number of runs."""
+        lengths = {name: len(getattr(self, name)) for name in AXES}
+        tasks = len(selected_tasks(ready(load_scenario(self.scenario)), self.tasks))
+        return {**lengths, "tasks": tasks, "draws": self.draws}
+
+    @property
+    def size(self) -> int:
+        """Number of runs."""
+        return math.prod(self.axes.values())
+
+    def runs(self) -> Iterator[LoopSpec]:
+        """The runs, one by one, those of a controller next to each other."""
+        tasks = [t.name for t in selected_tasks(ready(load_scenario(self.scenario)), self.tasks)]
+        drawn = [self._drawn(i) for i in range(self.draws)]
+        outer = product(
+            self.folders, tasks, self.controllers, self.solvers, self.horizons, self.monitors, self.fault_sets
+        )
+        number = count()
+        for model, task, controller, solver, horizon, monitor, faults in outer:
+            for draw, (parameters, some, late) in enumerate(drawn):
+                for seed in self.loop_seeds:
+                    yield LoopSpec(
+                        self.scenario, model, task, controller, solver, horizon, monitor,
+                        faults, some, late, parameters, draw, seed, self.duration, self.guard, self.run_seed,
+                        number=next(number),
+                    )  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        """The study as plain data, without where its models lie."""
+        whole: dict[str, Any] = plain(asdict(self))
+        return {**whole, "models": list(self.folders)}
+
+    def _drawn(self, i: int) -> tuple[tuple[tuple[str, float], ...], tuple[Fault, ...], Intervals]:
+        faults: tuple[tuple[Fault, ...], Intervals] = ((), ())
+        if isinstance(self.random_faults, RandomFaults):
+            faults = self.random_faults.drawn(generator(self.seed, i, "faults"))
+        return factors(self.spans, self.seed, i), *faults
+
+    def _check_numbers(self) -> None:
+        lists: tuple[tuple[str, Sequence[int | None], int, int], ...] = (
+            ("draws", [self.draws], 1, MOST_DRAWS),
+            ("seed", [self.seed], 0, MOST_SEED),
+            ("run_seed", [self.run_seed], 0, MOST_SEED),
+            ("seeds", self.loop_seeds, 0, MOST_SEED),
+            ("horizons", [h for h in self.horizons if h is not None], 1, MOST_HORIZON),
+        )
+        for name, values, least, most in lists:
+            for number in values:
+                whole = isinstance(number, int) and not isinstance(number, bool)
+                if not whole or not least <= number <= most:  # type: ignore[operator]
+                    raise InputError(
+                        f"study: {name}: whole numbers from {least} to {most} are needed, got {str(number)[:40]}"
+                    )
+        for name, span in self.spans:
+            if not (isinstance(span, int | float) and 0.0 < span < 1.0):
+                raise InputError(f"study: vary {name}: a share between 0 and 1 is needed, got {span!r}")
+
+    def _check_combinations(self) -> None:
+        oracles = [name for name in self.controllers if name in ORACLES]
+        if oracles and set(self.solvers) != {"rti"}:
+            raise InputError(
+                f"study: {oracles[0]} has a solver of its own (several starts); leave it or solvers out"
+            )
+        if oracles and self.vary:
+            raise InputError(
+                f"study: {oracles[0]} knows the machine as it is built, not as it is drawn; leave it or vary out"
+            )
+        if self.draws > 1 and not self.vary and self.random_faults is None:
+            raise InputError(
+                f"study: {self.draws} draws, and nothing that is drawn: give vary or random_faults, or use seeds"
+            )
+        others = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
+        alarming = [name for name in self.monitors if name in ALARMING]
+        if self.guard and others:
+            raise InputError(
+                f"the guard watches with the hybrid, controller {others[0]} has another model; with a guard give the "
+                "controllers hybrid_observer or hybrid alone"
+            )
+        if self.guard and len(alarming) < len(self.monitors):
+            raise InputError(f"study: a guard acts on alarms; give monitors {' or '.join(ALARMING)}")
+        if alarming and others:
+            raise InputError(
+                f"study: monitor {alarming[0]} is calibrated for the hybrid, {others[0]} has none; take monitor own, "
+                "or controllers with a hybrid"
+            )
+
+
+def _normal(s: Study) -> dict[str, Any]:
+    """The fields that may be given in several forms, as tuples."""
+    models = {"model": s.models} if isinstance(s.models, str | Path) else s.models
+    try:
+        pairs = tuple((str(k), str(v)) for k, v in _items(models))
+        vary = tuple((str(k), v) for k, v in _items(s.vary))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"study: models and vary are mappings (name: value); {error}") from error
+    drawn = s.random_faults
+    if isinstance(drawn, Mapping):
+        drawn = record(RandomFaults, drawn, "random_faults")
+    lists: dict[str, Any] = {
+        name: _listed(getattr(s, name), name)
+        for name in ("tasks", "controllers", "solvers", "horizons", "monitors")
+    }
+    if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
+        if not 1 <= s.seeds <= MOST_DRAWS:
+            raise InputError(
+                f"study: seeds: their number must be from 1 to {MOST_DRAWS}, got {str(s.seeds)[:40]}"
+            )
+        seeds: tuple[Any, ...] = tuple(range(s.seeds))
+    else:
+        seeds = _listed(s.seeds, "seeds")
+    faults = tuple(_fault_set(entry) for entry in _listed(s.faults, "faults"))
+    return {**lists, "models": pairs, "vary": vary, "random_faults": drawn, "seeds": seeds, "faults": faults}
+
+
+def _items(value: Any) -> Any:
+    return value.items() if isinstance(value, Mapping) else value
+
+
+def _listed(value: Any, name: str) -> tuple[Any, ...]:
+    if isinstance(value, str | Fault) or value is None or not isinstance(value, Sequence):
+        raise InputError(f"study: {name} is a list, got {value!r}; write [{value!r}]")
+    return tuple(value)
+
+
+def _fault_set(entry: Any) -> tuple[Fault, ...]:
+    if isinstance(entry, Fault):
+        return (entry,)
+    if isinstance(entry, str):
+        words = [word.strip() for word in entry.split(" + ")]
+        return () if words in (["none"], [""]) else tuple(parsed_fault(word) for word in words)
+    if not isinstance(entry, Sequence):
+        raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r}")
+    return tuple(fault for part in entry for fault in _fault_set(part))
+
+
+MOST_YAML = 2**16
+"""Largest study [bytes] that is read."""
+
+
+def read_study(path: str | Path, **instead: Any) -> Study:
+    """The study that a YAML file describes: its keys are the fields of :class:`Study`.
+
+    Folders of models are meant from the folder of the YAML file; the name is that of the file if it gives none. A
+    settings file runs nothing: its scenario must be registered; a ``.py`` file is given as ``instead["scenario"]``.
+
+    Raises:
+        InputError: If the file is missing or no YAML, its scenario is not registered, a key is unknown (with the
+            nearest valid one), or the study is not valid.
+    """
+    path = Path(path)
+    keys = _mapping(path)
+    models, here = keys.get("models"), path.parent
+    if isinstance(models, str):
+        models = {"model": models}
+    if isinstance(models, dict):
+        keys["models"] = {label: here / str(folder) for label, folder in models.items()}
+    keys.update(instead)
+    if "scenario" not in instead and isinstance(keys.get("scenario"), str):
+        scenario_of(keys["scenario"], path)
+    if "models" not in keys:
+        raise InputError(f"{path}: no models; add 'models: {{label: FOLDER}}', or give --model FOLDER")
+    study = record(Study, keys, str(path))
+    return study if "name" in keys else replace(study, name=path.stem)
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    with named_extra("a study's file"):
+        import yaml
+
+    try:
+        found = yaml.load(read_bytes(path, MOST_YAML), Loader=_loader())
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is no YAML: {' '.join(str(error).split())[:300]}") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: a mapping of keys to values is needed, got {type(found).__name__}")
+    return {str(key): value for key, value in found.items()}
+
+
+@cache
+def _loader() -> Any:
+    """A YAML loader of plain data: texts, numbers, true, false, null, lists and mappings with each key once.
+
+    It reads YAML 1.2's core schema: PyYAML's 1.1 makes of ``on`` a flag and of ``1:30`` a number. Anchors and aliases,
+    with which a small file becomes a huge one, are refused.
+    """
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  its own, none of YAML 1.1
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            event = self.peek_event()
+            if getattr(event, "anchor", None) is not None:
+                why = "anchors (&) and aliases (*) are not read; write the value out"
+                raise yaml.composer.ComposerError(None, None, why, event.start_mark)
+            return super().compose_node(parent, index)
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+            if len(set(keys)) < len(keys):
+                twice = next(key for key in keys if keys.count(key) > 1)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{twice!r} stands twice", node.start_mark
+                )
+            return super().construct_mapping(node, deep)
+
+    for tag, pattern, first in _PLAIN:
+        Loader.add_implicit_resolver(f"tag:yaml.org,2002:{tag}", re.compile(rf"^(?:{pattern})$"), list(first))
+    return Loader
+
+
+_PLAIN = (
+    ("bool", "true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("int", r"[-+]?[0-9]{1,20}", "-+0123456789"),
+    ("float", r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+     "-+.0123456789"),
+)  # fmt: skip
+"""Kinds of plain words of YAML 1.2's core schema, with the letters that they begin with."""
+
+
+def built_in_studies() -> dict[str, Path]:
+    """Files of the studies that registered scenarios bring, by name; the first line of each says what it is about."""
+    found: dict[str, Path] = {}
+    for place in registered_scenarios().values():
+        module = find_spec(place.partition(":")[0])
+        for folder in (module.submodule_search_locations if module else None) or ():
+            found |= {path.stem: path for path in sorted((Path(folder) / "studies").glob("*.yaml"))}
+    return found
+
+
+def built_in_study(name: str, models: str | Path | Mapping[str, str | Path]) -> Study:
+    """The built-in study of that name with these models."""
+    files = built_in_studies()
+    return read_study(files[known(name, files, "built-in study")], models=models)

@@ -1,0 +1,287 @@
+"""What a study's folder holds: a note of what it is made of, the rows of its runs, and the table of all of them.
+
+Rows are appended as runs end, and are whole after a kill at any moment; the table is one Parquet file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from hybrid_mpc.errors import InputError, named_extra
+from hybrid_mpc.files import locked, replacing
+from hybrid_mpc.folder import read_note
+from hybrid_mpc.records import NUMBERS, plain, record
+from nn_export.files import parse_json
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+NOUN = "study"
+SCHEMA_VERSION = 2
+RUNS = "runs"
+"""Folder of the log in that of its study."""
+RESULTS = "results.parquet"
+METADATA = b"hybrid_mpc.study"
+STATUS = ("done", "failed")
+MOST_LINE = 2**24
+"""Largest row [bytes]: a run's figures, or the traceback of one that failed."""
+SEGMENT_ROWS = 10_000
+"""Rows of one file: a study of a million runs has a hundred of them."""
+GROUP_ROWS = 20_000
+"""Rows that are in memory at a time."""
+
+
+@dataclass(frozen=True)
+class NoiseNote:
+    """Process noise of a model's filters: where it is from, and standard deviations per period by controller."""
+
+    source: str
+    sigma_x: Mapping[str, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class ModelNote:
+    """A model of a study: hash of its folder, what it says of itself, and what its filters assume."""
+
+    sha256: str
+    provenance: Mapping[str, Any]
+    noise: NoiseNote
+
+
+@dataclass(frozen=True)
+class StudyNote:
+    """What a study is made of; ``study`` is its settings as plain data, ``engine`` is empty until it is finished."""
+
+    study: Mapping[str, Any]
+    title: str
+    description: str
+    models: Mapping[str, ModelNote]
+    runs: int
+    versions: Mapping[str, str] = field(default_factory=dict)
+    kind: str = "loops"
+    scenario_sha256: str | None = None
+    engine: str = ""
+    workers_died: int = 0
+    schema_version: int = SCHEMA_VERSION
+
+
+def study_note(folder: Path) -> StudyNote:
+    """What a study's folder says of itself.
+
+    Raises:
+        InputError: If it is no folder of a study, damaged, or of another version.
+    """
+    if not (folder / f"{NOUN}.json").is_file():
+        raise InputError(f"{folder} holds no study; give the folder that 'study run --out' made")
+    note = read_note(folder, NOUN)
+    del note["settings"]
+    return note_of(note, str(folder / f"{NOUN}.json"))
+
+
+def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
+    """A note from plain data; InputError if it is of another version, or a field does not fit."""
+    if data.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"{where}: a study of schema version {str(data.get('schema_version'))[:20]}, this version of hybrid-mpc "
+            f"reads {SCHEMA_VERSION}; run it anew"
+        )
+    return record(StudyNote, data, where)
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """The row of a run: what it was and what it found (``columns``), ``"done"`` or ``"failed"``, and then its
+    traceback.
+    """
+
+    id: str
+    status: str
+    error: str
+    columns: Mapping[str, Any]
+
+    def plain(self) -> dict[str, Any]:
+        """The row as one flat mapping: ``id``, its columns, ``status`` and ``error``."""
+        return {"id": self.id, **self.columns, "status": self.status, "error": self.error}
+
+
+class RunLog:
+    """Append-only JSON lines in a few numbered files, one row a finished run.
+
+    What :meth:`append` has returned from is on the disk. A line that a kill tore apart is cut off when the log is
+    opened again: its run counts as not finished. One process at a time may hold the log.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._held = ExitStack()
+        self._held.enter_context(locked(folder))
+        files = segments(folder)
+        self._number = len(files) - 1 if files else 0
+        self._rows = _repaired(files[-1]) if files else 0
+        self._file = self._open()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the files; the log may be opened again."""
+        os.close(self._file)
+        self._held.close()
+
+    def append(self, new: Iterable[RunRow]) -> None:
+        """Add rows; on return they are on the disk. On a full disk what was there before is unharmed."""
+        lines = [json.dumps(plain(row.plain()), separators=(",", ":")) + "\n" for row in new]
+        if not lines:
+            return
+        if self._rows >= SEGMENT_ROWS:
+            os.close(self._file)
+            self._number, self._rows = self._number + 1, 0
+            self._file = self._open()
+        end = os.fstat(self._file).st_size
+        try:
+            left = memoryview("".join(lines).encode())
+            while left:
+                left = left[os.write(self._file, left) :]
+            os.fsync(self._file)
+        except OSError as error:
+            os.ftruncate(self._file, end)  # needs no room
+            raise InputError(
+                f"{self._folder}: cannot write ({error.strerror}); the runs that were finished before are kept. Make "
+                "room, then the same command with --resume goes on"
+            ) from error
+        self._rows += len(lines)
+
+    def _open(self) -> int:
+        path = self._folder / f"{self._number:06}.jsonl"
+        binary = getattr(os, "O_BINARY", 0)  # on Windows: line ends as they are written
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | binary, 0o644)
+
+
+def segments(folder: Path) -> list[Path]:
+    """Files of a log, in order."""
+    return sorted(path for path in folder.glob("[0-9]*.jsonl") if path.is_file())
+
+
+def rows(folder: Path) -> Iterator[RunRow]:
+    """Rows of a log, in the order in which they were written; a torn last line is left out.
+
+    Raises:
+        InputError: If a line within is damaged.
+    """
+    for path in segments(folder):
+        with path.open("rb") as file:
+            for number, line in enumerate(iter(partial(file.readline, MOST_LINE), b""), 1):
+                if not line.endswith(b"\n") and len(line) < MOST_LINE:
+                    return
+                yield _parsed(line, path, number)
+
+
+def _parsed(line: bytes, path: Path, number: int) -> RunRow:
+    try:
+        if len(line) == MOST_LINE:
+            raise ValueError(f"longer than {MOST_LINE} bytes")
+        row = parse_json(line)
+        if not (isinstance(row, dict) and isinstance(row.get("id"), str) and row.get("status") in STATUS):
+            raise ValueError("no row of a run: id and status are needed")
+    except ValueError as error:
+        raise InputError(
+            f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again"
+        ) from error
+    name, status, why = (row.pop(key, "") for key in ("id", "status", "error"))
+    columns = {key: NUMBERS.get(v, v) if isinstance(v, str) else v for key, v in row.items()}
+    return RunRow(name, status, str(why), columns)
+
+
+def _repaired(path: Path) -> int:
+    """Rows of a file, after a torn line at its end was cut off."""
+    count = whole = 0
+    with path.open("rb") as file:
+        for line in file:
+            if line.endswith(b"\n"):
+                count, whole = count + 1, whole + len(line)
+    if whole < path.stat().st_size:
+        os.truncate(path, whole)
+    return count
+
+
+@named_extra("a study")
+def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
+    """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    last: dict[str, int] = {}
+    kinds: dict[str, set[type]] = {}
+    for i, row in enumerate(rows(log)):
+        last[row.id] = i
+        for key, value in row.plain().items():
+            kinds.setdefault(key, set()).add(type(value))
+    columns = {key: _column(found - {type(None)}) for key, found in kinds.items()}
+    schema = pa.schema([(key, kind) for key, (kind, _) in columns.items()])
+    schema = schema.with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
+    final = (row.plain() for i, row in enumerate(rows(log)) if last[row.id] == i)
+    with replacing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
+        while group := list(islice(final, GROUP_ROWS)):
+            for values in group:
+                values |= {
+                    k: make(values[k]) for k, (_, make) in columns.items() if values.get(k) is not None
+                }
+            writer.write_table(pa.Table.from_pylist(group, schema=schema))
+
+
+@named_extra("a study")
+def intact(path: Path) -> bool:
+    """Whether a Parquet file is there and can be read to its end."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    if not path.is_file():
+        return False
+    try:
+        provenance_of(path)
+        for group in pq.ParquetFile(path).iter_batches():
+            group.validate(full=True)
+    except (InputError, OSError, ValueError, pa.ArrowException):
+        return False
+    return True
+
+
+@named_extra("a study")
+def provenance_of(path: Path) -> dict[str, Any]:
+    """What a Parquet file of a study says of itself; InputError if it is no such file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{path} is missing or damaged: {error}") from error
+    if METADATA not in metadata:
+        raise InputError(f"{path} is no table of a study")
+    try:
+        return dict(parse_json(metadata[METADATA]))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged: {error}") from error
+
+
+def _column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:
+    """Type of a column whose values are of these kinds, and what makes them of it."""
+    import pyarrow as pa
+
+    if found == {bool}:
+        return pa.bool_(), bool
+    if found == {int}:
+        return pa.int64(), int
+    return (pa.float64(), float) if found <= {int, float} else (pa.string(), str)

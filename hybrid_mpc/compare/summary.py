@@ -1,0 +1,121 @@
+"""Closed loops summed up: means with intervals, by task and controller."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybrid_mpc.compare.loops import LoopRow
+from hybrid_mpc.compare.sequential import LEVEL, level_at
+from hybrid_mpc.control.safeguard import Source
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean with its 95 % interval (Student's t).
+
+    Args:
+        mean: The mean; None where a value is not finite, or there is none.
+        ci95: Half width of the interval, which holds under stopping where loops stop early; None of a single value.
+        n: Number of values.
+    """
+
+    mean: float | None
+    ci95: float | None
+    n: int
+
+
+def interval(values: Sequence[float], level: float = LEVEL) -> Mean:
+    """Mean of values and half width of its interval.
+
+    Args:
+        values: ``(n,)``.
+        level: Probability that the interval holds the mean, of normal values. Default 0.95; more where the number of
+            values was chosen by looking at them (:func:`~hybrid_mpc.compare.sequential.level_at`).
+
+    Example:
+        >>> interval([1.0])
+        Mean(mean=1.0, ci95=None, n=1)
+        >>> found = interval([1.0, 2.0])  # t(0.975, 1) = 12.706, standard error 0.5
+        >>> found.mean, round(found.ci95, 3)
+        (1.5, 6.353)
+    """
+    from scipy.stats import t as student
+
+    x, n = np.asarray(values, dtype=float), len(values)
+    if not (n and np.all(np.isfinite(x))):
+        return Mean(None, None, n)
+    half = float(student.ppf(0.5 + level / 2, n - 1) * x.std(ddof=1) / math.sqrt(n)) if n > 1 else None
+    return Mean(float(x.mean()), half, n)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The loops of one task and controller summed up.
+
+    Args:
+        cost: Closed-loop cost.
+        tracking_rmse: Tracking errors by signal.
+        figures: The task's own figures.
+        mean_abs_figures: Their magnitudes.
+        sources: Share of periods by what gave the input.
+        limits: Largest share of each limit that any loop used.
+    """
+
+    cost: Mean
+    tracking_rmse: Mapping[str, Mean]
+    figures: Mapping[str, Mean]
+    mean_abs_figures: Mapping[str, Mean]
+    sources: Mapping[str, float]
+    limits: Mapping[str, float]
+
+
+def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
+    """Rows by task and controller, in the order in which they come."""
+    table: dict[str, dict[str, list[LoopRow]]] = {}
+    for row in rows:
+        table.setdefault(row.task, {}).setdefault(row.controller, []).append(row)
+    return table
+
+
+def summaries(rows: Sequence[LoopRow], most: int | None = None) -> dict[str, dict[str, Summary]]:
+    """Summaries of loops by task and controller.
+
+    Args:
+        rows: The loops.
+        most: Largest number of seeds where tasks stop early (:mod:`hybrid_mpc.compare.sequential`): intervals then hold
+            together with 95 % at all looks. Default: the number of loops was fixed.
+
+    Example: ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
+    """
+    found = {}
+    for task, cells in by_task(rows).items():
+        # all controllers of a task stop together, those with fewer seeds of their own too
+        level = LEVEL if most is None else level_at(max(map(len, cells.values())), most)
+        found[task] = {name: summary(own, level) for name, own in cells.items()}
+    return found
+
+
+def summary(rows: Sequence[LoopRow], level: float = LEVEL) -> Summary:
+    """The summary of loops of one task and controller, at least one, with intervals of a ``level``."""
+
+    def of(
+        pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float
+    ) -> dict[str, Mean]:
+        return {key: interval([change(pick(row)[key]) for row in rows], level) for key in pick(rows[0])}
+
+    limits: dict[str, float] = {}
+    for row in rows:
+        for key, share in row.limits.items():
+            limits[key] = max(share, limits.get(key, 0.0))
+    return Summary(
+        cost=interval([row.cost for row in rows], level),
+        tracking_rmse=of(lambda row: row.tracking_rmse),
+        figures=of(lambda row: row.figures),
+        mean_abs_figures=of(lambda row: row.figures, abs),
+        sources={s.name: float(np.mean([row.sources[s.name] for row in rows])) for s in Source},
+        limits=limits,
+    )

@@ -1,1 +1,0 @@
-"""Jobs: the main job and its stages, closed loops compared, studies, and the engine that runs them."""

@@ -1,0 +1,585 @@
+"""``hybrid-mpc benchmark``: fit, train and choose on some recordings, and evaluate free runs over others.
+
+What is chosen (settings, networks, the recommended model) depends on training and validation parts alone.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
+from hybrid_mpc.folder import JobNote, versions, write_note
+from hybrid_mpc.identify.choose import Choice, evidence_of, recommend
+from hybrid_mpc.identify.evaluate import OutputErrors, free_runs, unseen_runs
+from hybrid_mpc.identify.fit import fit_prior, refit, smoothed
+from hybrid_mpc.identify.linear import BASELINES, LinearModel
+from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.settings import TrainingSettings, kinds_of
+from hybrid_mpc.identify.step import PriorStep, Step
+from hybrid_mpc.identify.train import Trained
+from hybrid_mpc.kit.parts import BENCHMARK_NOTE
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.specification import BenchmarkBudget
+from hybrid_mpc.records import plain, record
+from hybrid_mpc.scenario import Scenario, load_scenario
+from hybrid_mpc.workflow.benchmark_runs import (
+    BenchmarkRun,
+    Recordings,
+    benchmark_of,
+    in_runs,
+    read_test,
+    read_training,
+    run_error,
+    run_freely,
+    scored_signals,
+    warm_samples,
+)
+from hybrid_mpc.workflow.stages.choose import CANDIDATES
+from hybrid_mpc.workflow.stages.identify import PARTS, load_trained, save_trained, train_kinds
+
+Array = NDArray[np.float64]
+SCHEMA = 3
+SHOWN = 20.0
+"""Length of a run that is drawn sample by sample [the machine's seconds]."""
+IN_MOTION = 0.1
+"""Least length [the machine's seconds] that is given of a validation piece: it begins in motion, while a recording that
+gives less (EMPS, 20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
+REFIT_LENGTHS = (0.5, 1.0, 3.0)
+"""Free runs [the machine's seconds] of a refit, the short ones first: from parameters that are far off a long one leads
+nowhere. Short ones alone spend what little there is on their first states; 3 are what a refit mostly gets, whole."""
+FEWEST_RUNS = 3
+"""Free runs of a refit at least: one alone would be fitted by any parameters."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """What one benchmark computes.
+
+    ``data`` and ``test`` are recordings to train and to evaluate on (default: what the training holds back); ``model``
+    is the folder of one made before, in place of training. ``refit`` is the length [s] of each test file's start that
+    the prior's parameters are fitted to anew, for a machine that has changed; the rest is evaluated with old and new
+    ones.
+    """
+
+    scenario: str
+    data: tuple[Path, ...] = ()
+    test: tuple[Path, ...] = ()
+    model: Path | None = None
+    budget: str = "quick"
+    seed: int = 0
+    workers: int = 1
+    refit: float | None = None
+
+
+@dataclass(frozen=True)
+class _Description:
+    """What the JSON file next to the networks holds, see :class:`BenchmarkModel`."""
+
+    scenario: str
+    dt: float
+    fit: PriorFit
+    hybrid: str
+    validation: Mapping[str, OutputErrors]
+    long: Mapping[str, OutputErrors]
+    kinds: tuple[str, ...]
+    linear: Mapping[str, LinearModel]
+    no_linear: Mapping[str, str]
+    choice: Choice
+
+
+@dataclass(frozen=True)
+class BenchmarkModel(_Description):
+    """Everything that a free run over another recording needs: prior, recommended model (``hybrid``), networks by kind.
+
+    ``validation`` and ``long`` are the errors of every model on validation pieces and on :attr:`Recordings.long`;
+    ``linear`` are the linear baselines by name, ``no_linear`` says why there is none of a name. ``choice`` says which
+    kinds surely beat the prior where they were not trained.
+    """
+
+    networks: Mapping[str, Trained]
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A changed machine: errors over what follows the seconds that the prior was fitted to, with its old and new
+    parameters.
+    """
+
+    seconds: float
+    prior: Sequence[Mapping[str, Any]]
+    before: Mapping[str, OutputErrors]
+    after: Mapping[str, OutputErrors]
+
+
+@dataclass(frozen=True)
+class FileResult:
+    """A test file: its free runs, which count ``scored_s`` seconds, and the errors by model; ``"hybrid"`` is the
+    recommended.
+    """
+
+    runs: Sequence[BenchmarkRun]
+    errors: Mapping[str, OutputErrors]
+    scored_s: float
+    refit: Refit | None = None
+
+
+@dataclass(frozen=True)
+class BenchmarkResults:
+    """The model of a benchmark, and what its free runs over each test file came to."""
+
+    model: BenchmarkModel
+    test: Mapping[str, FileResult]
+
+
+def benchmark(
+    settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None
+) -> BenchmarkResults:
+    """Fit, train and evaluate; or evaluate a model made before. The same command goes on where it was interrupted.
+
+    ``out`` gets ``results.json`` and, if something is trained, ``model/`` and ``checkpoints/``.
+
+    Raises:
+        InputError: If a file, the model, the budget or the folder does not fit.
+    """
+    progress, scenario = progress or Progress(), load_scenario(settings.scenario)
+    _check(settings, scenario)
+    check_scenario(replace(scenario, plant=None))  # no loop is closed here
+    data, tests, warnings = _read(settings, scenario)
+    for warning in warnings:
+        progress.warn(warning)
+    check_writable(out)
+    with locked(out):
+        started = time.monotonic()
+        if data is None:
+            assert settings.model is not None
+            model = load_model(settings.model, scenario.name)
+        else:
+            model = _make(settings, scenario, data, out, progress)
+            tests = tests or ({"held back": data.held_back} if data.held_back else {})
+        for warning in model.fit.warnings:
+            progress.warn(f"fit of the prior: {warning}")
+        progress.start("free runs over the test files")
+        found = {}
+        for i, (name, trajectories) in enumerate(tests.items()):
+            progress.update("files", i, len(tests), name)
+            found[name] = _evaluate(scenario, model, trajectories, settings.refit)
+        progress.finish("")
+        results = BenchmarkResults(model, found)
+        document = _document(settings, scenario, data, results, warnings)
+        write_json(out / "results.json", {**document, "timing": {"seconds": time.monotonic() - started}})
+        return results
+
+
+def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
+    budgets = benchmark_of(scenario).budgets
+    scored_signals(scenario.prior().outputs, benchmark_of(scenario))  # refuses units of what is no output
+    if settings.budget not in budgets:
+        raise InputError(
+            f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"
+        )
+    if settings.model is None and not settings.data:
+        raise InputError(
+            "give recordings to train on with --data FILE, or a model made before with --model DIR"
+        )
+    if settings.model is not None and settings.data:
+        raise InputError(
+            "--model is evaluated as it is: leave --data out, or leave --model out to train anew"
+        )
+    if settings.model is not None and not settings.test:
+        raise InputError("a model made before needs recordings to be evaluated on: --test FILE")
+    names = [path.name for path in settings.test]
+    if len(set(names)) < len(names):
+        raise InputError(f"two test files have the same name: {', '.join(sorted(names))}; rename one")
+
+
+def _read(
+    settings: BenchmarkSettings, scenario: Scenario
+) -> tuple[Recordings | None, dict[str, tuple[Trajectory, ...]], list[str]]:
+    """Training files if there are to be some, test files by name, and warnings about them."""
+    data: Recordings | None = None
+    tests: dict[str, tuple[Trajectory, ...]] = {}
+    problems: list[str] = []
+    warnings: list[str] = []
+    if settings.model is None:
+        try:
+            data = read_training(scenario, settings.data)
+            warnings += [str(finding) for finding in data.dataset.findings]
+        except InputError as error:
+            problems += error.problems
+    for path in settings.test:
+        try:
+            tests[path.name] = read_test(scenario, path, warnings.append)
+        except InputError as error:
+            problems += error.problems
+    refuse(problems)
+    return data, tests, list(dict.fromkeys(warnings))
+
+
+# The model: fitted, trained and chosen, or what the folder holds of it.
+
+
+def _make(
+    settings: BenchmarkSettings, scenario: Scenario, data: Recordings, out: Path, progress: Progress
+) -> BenchmarkModel:
+    _claim(out, settings, data)
+    spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
+    progress.start("fitting the prior")
+    fit = _fitted_prior(scenario, data, out, progress)
+    progress.finish("")
+    progress.start("training the networks")
+    warm = warm_samples(warm_up, fit.delay, dt)
+    train, valid = (list(smoothed(scenario.prior, fit, part, dt)) for part in (data.train, data.valid))
+    budget = spec.budgets[settings.budget]
+    whole = train_kinds(
+        settings.scenario, fit.values, train, valid,
+        {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in kinds_of(scenario.prior())},
+        out / "checkpoints", workers=settings.workers, on_progress=progress.update,
+    )  # fmt: skip
+    progress.finish("")
+    progress.start("fitting the linear baselines")
+    linear, no_linear = _baselines(scenario, data)
+    progress.finish("")
+    choice, prior = _choice(scenario, fit, whole, train, valid), scenario.prior(fit.values)
+    networks = {kind: trained.shrunk(prior, choice.share(kind)) for kind, trained in whole.items()}
+    errors = partial(candidate_errors, scenario, fit, networks, linear)
+    validation = errors(data.valid, max(warm_up, IN_MOTION * time_unit(data.train, dt)))
+    long = errors(data.long, warm_up) if data.long else {}
+    hybrid = recommended(
+        *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=choice.sure
+    )
+    model = BenchmarkModel(
+        scenario.name, dt, fit, hybrid, validation, long, tuple(networks), linear, no_linear, choice, networks
+    )
+    save_model(out / "model", model)
+    return model
+
+
+def _baselines(scenario: Scenario, data: Recordings) -> tuple[dict[str, LinearModel], dict[str, str]]:
+    """Linear models by name, chosen on the same validation pieces, and why there is none of a name."""
+    dt, found, missing = scenario.data.dt, {}, {}
+    # the others start knowing this sample
+    warm = warm_samples(max(scenario.data.warm_up, IN_MOTION), 0.0, dt) + 1
+    for name, fitted in BASELINES.items():
+        try:
+            found[name] = fitted(data.train, data.valid, dt, warm=warm)
+        except InputError as error:
+            missing[name] = str(error)
+    return found, missing
+
+
+def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
+    """Note in ``out`` what is trained there; another training in the same folder is refused."""
+    own = {
+        "scenario": settings.scenario,
+        "data": data.dataset.hash,
+        "budget": settings.budget,
+        "seed": settings.seed,
+        "pieces": digest(
+            [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
+        ),
+    }
+    write_note(out, JobNote("benchmark", own), resume=None)
+
+
+def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> PriorFit:
+    """The fitted prior; a fit that ``out`` holds is not made again."""
+    note, spec = out / "checkpoints" / "prior.json", benchmark_of(scenario)
+    if note.is_file():
+        held = read_document(note, "delete it, and the same command fits the prior anew")
+        return record(PriorFit, held, str(note))
+    fit = fit_prior(
+        scenario.prior, data.train, data.valid, dt=scenario.data.dt, length=spec.length or spec.piece,
+        largest_delay=scenario.data.largest_delay, on_progress=partial(progress.update, "prior"),
+    )  # fmt: skip
+    write_document(note, plain(fit))
+    return fit
+
+
+def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> TrainingSettings:
+    """Settings of one kind: free runs are trained on the error of the position, which the benchmark scores."""
+    return TrainingSettings(
+        kind=kind,  # type: ignore[arg-type]
+        seed=seed,
+        warm=warm,
+        objectives=("output", "balances"),
+        parts=max(PARTS, budget.networks),
+        **asdict(budget),
+    )
+
+
+def candidate_errors(
+    scenario: Scenario,
+    fit: PriorFit,
+    networks: Mapping[str, Trained],
+    linear: Mapping[str, LinearModel],
+    trajectories: Sequence[Trajectory],
+    warm_up: float,
+) -> dict[str, OutputErrors]:
+    """Errors of every model's free runs; ``warm_up`` [s] of each recording is given."""
+    spec, prior = benchmark_of(scenario), scenario.prior(fit.values)
+    runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length, linear=linear)
+    return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
+
+
+def _choice(
+    scenario: Scenario,
+    fit: PriorFit,
+    networks: Mapping[str, Trained],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+) -> Choice:
+    """Which kinds of networks surely beat the prior where they were not trained; trajectories are smoothed."""
+    prior, dt = scenario.prior(fit.values), scenario.data.dt
+    settings, smoother = networks["pgrnn"].settings, fit.smoother(prior, dt)
+    runs = unseen_runs(settings, training, validation, smoother, benchmark_of(scenario).length)
+
+    def errors(step_of: Callable[[int | None], Step]) -> list[Array]:
+        return [
+            run.squared_errors(smoother.sizes.y)
+            for own, them in runs
+            for run in free_runs(step_of(own), prior, them, settings.warm)
+        ]
+
+    plain_prior = PriorStep(prior, dt, fit.substeps)
+    found = {"phy": errors(lambda own: plain_prior)}
+
+    def of_kind(kind: str, share: float = 1.0) -> list[Array]:
+        trained = networks[kind].shrunk(prior, share)
+        return errors(lambda own: trained.step(prior, dt, own))
+
+    found |= {kind: of_kind(kind) for kind in networks if kind in CANDIDATES}
+    recordings, evidence = evidence_of(runs)
+    return recommend(
+        found, samples=max(1, round(time_unit(training, dt) / dt)), recordings=recordings, evidence=evidence,
+        shrunk=of_kind,
+    )  # fmt: skip
+
+
+def recommended(
+    validation: Mapping[str, float], long: Mapping[str, float], *, sure: Sequence[str] = ("pgrnn", "mopgrnn")
+) -> str:
+    """The candidate whose larger error, over the prior's, is least: on validation pieces and on runs of full length.
+
+    Nothing was trained on validation pieces, but they may be shorter than the runs of the test, and then do not show
+    drift. Of the networks only those kinds count that are ``sure`` to beat the prior on what they were not trained on
+    (:func:`~hybrid_mpc.identify.choose.recommend`).
+    """
+
+    def larger(name: str) -> float:
+        over_prior = [
+            1.0 if name == "phy" else part[name] / part["phy"] for part in (validation, long) if part
+        ]
+        return max(math.inf if math.isnan(v) else v for v in over_prior)  # NaN: both have diverged
+
+    able = ("phy", *sure)
+    return min((n for n in CANDIDATES if n in validation and n in able), key=larger)
+
+
+def save_model(folder: Path, model: BenchmarkModel) -> None:
+    """Write a model; the note comes last, so a folder that has it is whole."""
+    for trained in model.networks.values():
+        save_trained(folder, trained)
+    description = {f.name: getattr(model, f.name) for f in fields(_Description)}
+    write_document(folder / BENCHMARK_NOTE, {"schema": SCHEMA, **description})
+
+
+def load_model(folder: Path, scenario: str) -> BenchmarkModel:
+    """Read a model from its folder, or from that of the run which made it.
+
+    Raises:
+        InputError: If there is none, it is damaged, or of another machine.
+    """
+    folder = folder if (folder / BENCHMARK_NOTE).is_file() else folder / "model"
+    path = folder / BENCHMARK_NOTE
+    if not path.is_file():
+        raise InputError(
+            f"{folder.parent} holds no model of a benchmark; give the folder that 'hybrid-mpc benchmark {scenario} "
+            "--data FILE --out DIR' has made"
+        )
+    document = read_document(path, "make the benchmark anew")
+    schema = document.pop("schema", None)
+    if schema != SCHEMA:
+        raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; train anew")
+    found = record(_Description, document, str(path))
+    if found.scenario != scenario:
+        raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario}")
+    return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in found.kinds})
+
+
+# The evaluation.
+
+
+def _evaluate(
+    scenario: Scenario, model: BenchmarkModel, trajectories: Sequence[Trajectory], refit: float | None
+) -> FileResult:
+    runs = _runs(scenario, model, model.fit, trajectories)
+    spec, outputs = benchmark_of(scenario), scenario.prior().outputs
+    names = {**{m: m for m in ("phy", *model.kinds)}, "hybrid": model.hybrid, **{m: m for m in model.linear}}
+    return FileResult(
+        runs,
+        {name: run_error(runs, candidate, outputs, spec) for name, candidate in names.items()},
+        sum(len(run.t) for run in runs) * model.dt,
+        None if refit is None else _refit(scenario, model, trajectories[0], refit),
+    )
+
+
+def _runs(
+    scenario: Scenario, model: BenchmarkModel, fit: PriorFit, trajectories: Sequence[Trajectory]
+) -> list[BenchmarkRun]:
+    prior, spec = scenario.prior(fit.values), benchmark_of(scenario)
+    warm_up, dt = scenario.data.warm_up, model.dt
+    if spec.repeated and spec.length is not None:
+        # behind what is given and what is scored the last input, and the sample that it leads to
+        trajectories = in_runs(trajectories, round(warm_up / dt) + round(spec.length / dt) + 2)
+    return run_freely(
+        prior, fit, model.networks, trajectories, warm_up=warm_up, length=spec.length, linear=model.linear
+    )
+
+
+def _refit(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds: float) -> Refit:
+    fit, rest = refitted(scenario.prior, model.fit, whole, seconds=seconds, dt=model.dt)
+    spec, outputs, errors = benchmark_of(scenario), scenario.prior().outputs, []
+    for own in (model.fit, fit):
+        runs = _runs(scenario, model, own, [rest])
+        names = {"phy": "phy", "hybrid": model.hybrid}
+        errors.append({name: run_error(runs, of, outputs, spec) for name, of in names.items()})
+    return Refit(seconds, fit.rows(scenario.prior().parameters), *errors)
+
+
+def refitted(
+    make: Callable[..., Prior], fit: PriorFit, trajectory: Trajectory, *, seconds: float, dt: float
+) -> tuple[PriorFit, Trajectory]:
+    """The prior fitted to the first seconds of a recording of a changed machine, and the rest of the recording.
+
+    The delay stays. First states are free, near those that the old prior smooths.
+
+    Raises:
+        InputError: If the recording is no longer than what is to be fitted, or that is too short.
+    """
+    lengths = [time_unit([trajectory], dt) * own for own in REFIT_LENGTHS]
+    n, least = round(seconds / dt), FEWEST_RUNS * lengths[0]
+    if n >= len(trajectory.t) - 1 or seconds < least:
+        raise InputError(
+            f"{trajectory.name}: {seconds:g} s are to be fitted; that takes at least {least:g} s and a recording that "
+            f"is longer than it ({len(trajectory.t) * dt:g} s)"
+        )
+    index = np.arange(len(trajectory.t))
+    first = trajectory.part(index < n, trajectory.name, trajectory.role)
+    rest = trajectory.part(index >= n, trajectory.name, trajectory.role)
+    return refit(make, fit, [first], dt=dt, lengths=lengths), rest
+
+
+# What is written and printed.
+
+
+def _document(
+    settings: BenchmarkSettings,
+    scenario: Scenario,
+    data: Recordings | None,
+    results: BenchmarkResults,
+    warnings: Sequence[str],
+) -> dict[str, Any]:
+    """The content of ``results.json`` but for the time it took."""
+    trained = settings.model is None
+    notes = {}
+    if data is not None:
+        parts = {"train": data.train, "valid": data.valid, "held_back": data.held_back}
+        notes["data"] = {
+            "files": data.dataset.files,
+            "hash": data.dataset.hash,
+            "seconds": {role: sum(len(t.t) for t in part) * results.model.dt for role, part in parts.items()},
+            "validated_on": [piece.name for piece in data.valid],
+        }
+    test = {
+        name: {**row.errors, **({} if row.refit is None else {"refit": row.refit}), "scored_s": row.scored_s}
+        for name, row in results.test.items()
+    }
+    return {
+        "schema": SCHEMA,
+        "machine": scenario.name,
+        "budget": settings.budget if trained else None,
+        "seed": settings.seed if trained else None,
+        **notes,
+        "warnings": warnings,
+        "model": describe(results.model, scenario),
+        "test": test,
+        "versions": versions(),
+    }
+
+
+def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
+    """A model: parameters, delay, smoother, errors by candidate and network."""
+    fit = model.fit
+    return {
+        "prior": fit.rows(scenario.prior().parameters),
+        "identifiability": fit.identifiability,
+        "fits": fit.stages,
+        "delay_s": fit.delay,
+        "smoother": {"sigma": fit.sigma, "walk": fit.walk},
+        "hybrid": model.hybrid,
+        "choice": model.choice,
+        "validation": model.validation,
+        "long": model.long,
+        "baselines": {name: {"chosen": own.chosen.text} for name, own in model.linear.items()}
+        | {name: {"reason": why} for name, why in model.no_linear.items()},
+        "networks": {kind: trained.validation for kind, trained in model.networks.items()},
+        "faults": {kind: trained.failures for kind, trained in model.networks.items()},
+    }
+
+
+def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]:
+    """Draw the longest free run of every test file into ``out/figures``."""
+    from hybrid_mpc.plots.fit import benchmark_run
+    from hybrid_mpc.plots.style import save
+
+    hybrid = results.model.hybrid
+    chosen = "fitted prior" if hybrid == "phy" else hybrid.upper()
+    made, prior = [], scenario.prior()
+    units = [(signal.unit, scale) for signal, scale in scored_signals(prior.outputs, benchmark_of(scenario))]
+    for file, found in results.test.items():
+        run = max(found.runs, key=lambda part: len(part.t))
+        drawn = {name: run.y_hat[m] for name, m in (("phy", "phy"), ("rnn", "rnn"), ("hybrid", hybrid))}
+        figure = benchmark_run(
+            run.t, run.y, drawn, run.u, outputs=prior.outputs, inputs=prior.inputs, units=units,
+            shown=SHOWN * time_unit(found.runs, results.model.dt),
+            title=f"{scenario.title}: free run over {file}", names={"hybrid": f"hybrid ({chosen})"},
+        )  # fmt: skip
+        made.append(save(figure, out / "figures" / f"{Path(file).stem}.png"))
+    return made
+
+
+def table(results: BenchmarkResults) -> list[str]:
+    """The results as lines: a row for each test file and model, with each output's error and fit."""
+    lines: list[str] = []
+    for file, row in results.test.items():
+        for name, found in row.errors.items():
+            by_output = [(f"RMSE {label}", value) for label, value in found.rmse.items()]
+            by_output += [
+                (f"FIT {label.partition(' [')[0]} [%]", found.fit_percent.get(label, math.nan))
+                for label in found.rmse
+            ]
+            if not lines:
+                heads = " ".join(f"{head:>{max(12, len(head))}}" for head, _ in by_output)
+                lines.append(f"{'file':28} {'model':10} {'error [-]':>12} {heads}")
+            cells = " ".join(f"{value:>{max(12, len(head))}.4g}" for head, value in by_output)
+            lines.append(f"{file:28} {name:10} {found.error:>12.4g} {cells}")
+    lines += [f"no {name}: {why}" for name, why in results.model.no_linear.items()]
+    model, shares = results.model, {kind: results.model.choice.share(kind) for kind in results.model.kinds}
+    lines += [
+        f"{kind}: {100 * share:.0f} % of its correction" for kind, share in shares.items() if share != 1
+    ]
+    return [*lines, f"hybrid: {model.hybrid}"]

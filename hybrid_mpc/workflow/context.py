@@ -1,0 +1,210 @@
+"""A run in its folder: settings, scenario, data, and the results of its stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from hybrid_mpc.compare.tasks import ready
+from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import digest
+from hybrid_mpc.folder import versions
+from hybrid_mpc.kit.artifact import Kit, load
+from hybrid_mpc.kit.parts import artifact_digest
+from hybrid_mpc.machine.specification import DataSpec, Role
+from hybrid_mpc.scenario import Budget, Scenario
+from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stage import Absent, Stage, Stored, read_stage, write_stage
+
+if TYPE_CHECKING:
+    from hybrid_mpc.workflow.stages.identify import PriorResult
+
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Context:
+    """A run in its folder: what it computes, the machine, and where it reports to.
+
+    ``pictures`` are those that this process has drawn, by part of the report: section, file, caption. On ``cluster``
+    (address of a dask scheduler or a ``distributed.Client``) networks are trained and loops run; None: on this machine.
+    """
+
+    settings: RunSettings
+    scenario: Scenario
+    out: Path
+    progress: Progress = field(default_factory=Progress)
+    cluster: Any = field(default=None, repr=False, compare=False)
+    pictures: dict[str, list[tuple[str, Path, str]]] = field(default_factory=dict, repr=False, compare=False)
+    _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
+    _kits: dict[str, Kit] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def budget(self) -> Budget:
+        """The scenario's budget of the run's name."""
+        budgets = self.scenario.budgets
+        if self.settings.budget not in budgets:
+            raise InputError(
+                f"scenario {self.scenario.name} has no budget {self.settings.budget!r}; "
+                f"it has: {', '.join(budgets)}"
+            )
+        return budgets[self.settings.budget]
+
+    @property
+    def spec(self) -> DataSpec:
+        """The scenario's data specification with the user's columns, which hold for every file; units and delays of
+        columns in whose place others are read are left out.
+        """
+        s, own = self.settings, self.scenario.data
+        spec = own
+        if s.inputs:
+            spec = replace(spec, inputs=s.inputs, inputs_of={})
+        spec = replace(spec, time=s.time or spec.time, outputs=s.outputs or spec.outputs)
+        gone = own.columns - spec.columns
+        return replace(
+            spec,
+            units={name: unit for name, unit in spec.units.items() if name not in gone},
+            delays={name: delay for name, delay in spec.delays.items() if name not in gone},
+            delays_of={
+                stem: {name: delay for name, delay in delays.items() if name not in gone}
+                for stem, delays in spec.delays_of.items()
+            },
+        )
+
+    @property
+    def scenario_path(self) -> str:
+        """Name of the scenario, or the full path of its file, as processes elsewhere find it."""
+        name = self.settings.scenario
+        return str(Path(name).resolve()) if Path(name).is_file() else name
+
+    @property
+    def warm(self) -> int:
+        """Samples of the warm-up."""
+        return round(self.spec.warm_up / self.spec.dt)
+
+    @property
+    def files(self) -> list[Path]:
+        """The user's recordings, or those that the simulated machine made."""
+        made = self.out / "data"
+        return list(self.settings.data) or sorted(made.glob("*.csv")) or sorted(made.glob("*.npz"))
+
+    def forget_data(self) -> None:
+        """Remove recordings that a simulated machine made before."""
+        self.__dict__.pop("dataset", None)
+        if not self.settings.data:
+            for path in self.files:
+                path.unlink()
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """All trajectories of the run's recordings."""
+        return load_trajectories(self.files, self.scenario.prior(), self.spec)
+
+    @cached_property
+    def time_unit(self) -> float:
+        """The machine's second [s], of the training recordings."""
+        return time_unit(self.trajectories("train"), self.spec.dt)
+
+    def trajectories(self, role: Role) -> list[Trajectory]:
+        """Trajectories of one role."""
+        return list(self.dataset.by_role(role))
+
+    def smoothed(self, role: Role) -> list[Trajectory]:
+        """Trajectories of one role with the states that the fitted prior's equations smooth them to.
+
+        Their inputs are those that act. Samples before the first delayed input arrives are left out.
+        """
+        from hybrid_mpc.identify.delay import shifted
+
+        return self._with_states(shifted(self.trajectories(role), self.prior.fit.delay))
+
+    def commanded(self, role: Role) -> list[Trajectory]:
+        """The same with the inputs as they were commanded: what the deployed models, which hold the delay, take."""
+        from hybrid_mpc.identify.delay import lost_samples
+
+        found = []
+        for t in self.trajectories(role):
+            lost = lost_samples(self.prior.fit.delay, t.dt)
+            found.append(t.part(np.arange(len(t.t)) >= lost, t.name, t.role) if lost else t)
+        return self._with_states(found)
+
+    @property
+    def prior(self) -> PriorResult:
+        """The fitted prior."""
+        from hybrid_mpc.workflow.stages.identify import PRIOR
+
+        return self.read(PRIOR)
+
+    @property
+    def ready(self) -> Scenario:
+        """The scenario; where it gets default tasks, with those from where the fitted prior rests."""
+        return ready(self.scenario, self.kit.fitted)
+
+    def _with_states(self, trajectories: list[Trajectory]) -> list[Trajectory]:
+        arrays = self.prior.arrays
+        return [replace(t, x=arrays[f"{t.name}/x"], xdot=arrays[f"{t.name}/xdot"]) for t in trajectories]
+
+    @property
+    def kit(self) -> Kit:
+        """The run's artifact as it is now, with the control problems that the scenario now states.
+
+        It is read again only where one of its files has changed.
+        """
+        folder = self.out / "model"
+        content = artifact_digest(folder)
+        if content not in self._kits:
+            self._kits.clear()
+            self._kits[content] = load(folder).on(self.scenario)
+        return self._kits[content]
+
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """Versions of what a result depends on."""
+        return versions()
+
+    def path(self, stage: str) -> Path:
+        """File of a stage."""
+        return self.out / "checkpoints" / f"{stage}.json"
+
+    def stored(self, stage: Stage[R]) -> Stored[R] | None:
+        """What the folder holds of a stage, or None; InputError, which names what to delete, if its file is damaged."""
+        if stage.name not in self._read:
+            path = self.path(stage.name)
+            if not path.is_file():
+                return None
+            remedy = f"delete {stage.name}.* in {path.parent}, and --resume computes it anew"
+            self._read[stage.name] = read_stage(path, stage, remedy)
+        return self._read[stage.name]
+
+    def keep(self, stage: Stage[R], keys: Mapping[str, str], result: R | Absent) -> None:
+        """Write a stage's result."""
+        self._read[stage.name] = write_stage(self.path(stage.name), stage, keys, result)
+
+    def leave_out(self, stage: Stage[Any], reason: str) -> None:
+        """Go on without a stage; its file, if there is one, stays."""
+        self._read[stage.name] = Stored({}, Absent(reason), digest(reason))
+
+    def find(self, stage: Stage[R]) -> R | Absent:
+        """Result of a stage, or why there is none."""
+        stored = self.stored(stage)
+        return Absent(f"stage {stage.name} has not run") if stored is None else stored.result
+
+    def read(self, stage: Stage[R]) -> R:
+        """Result of a stage; InputError with the reason if there is none."""
+        found = self.find(stage)
+        if isinstance(found, Absent):
+            raise InputError(found.reason)
+        return found
+
+    def digest_of(self, stage: Stage[Any]) -> str:
+        """Digest of a stage's result, or of why there is none."""
+        stored = self.stored(stage)
+        return "" if stored is None else stored.content

@@ -1,0 +1,205 @@
+"""``hybrid-mpc monitor``: what watches a machine over recordings of it, or what it alarms by learned from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from hybrid_mpc.compare.controllers import find_noise
+from hybrid_mpc.data.trajectories import Cut, Dataset, load_trajectories
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import read_object, write_json, write_text
+from hybrid_mpc.kit.artifact import Kit, load
+from hybrid_mpc.kit.assembly import sensor_steps
+from hybrid_mpc.kit.parts import artifact_folder
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.records import record
+from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.explain import Alarm, explained, table
+from hybrid_mpc.watch.learn import learn_limits
+from hybrid_mpc.watch.lengths import rest_speeds
+from hybrid_mpc.watch.monitor import Monitor, make_monitor, make_readings, reads_energy
+from hybrid_mpc.watch.readings import ENERGY, RESIDUALS
+from hybrid_mpc.watch.replay import EstimatorLike, along
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """Alarms on a recording, and why parts of it gave no valid reading: the window was not full (``warm_up_s``),
+    samples were missing, or model or estimator gave no finite number.
+    """
+
+    recording: str
+    seconds: float
+    valid_s: float
+    warm_up_s: float
+    missing_s: float
+    not_finite_s: float
+    alarms: tuple[Alarm, ...]
+
+
+@dataclass(frozen=True)
+class MonitorResult:
+    """What :func:`watch` found in each recording, the gaps in them, and parts too short to be watched."""
+
+    recordings: tuple[RecordingResult, ...]
+    gaps: tuple[Cut, ...]
+    not_watched: tuple[Cut, ...]
+
+
+@dataclass(frozen=True)
+class MonitorJob:
+    """What ``hybrid-mpc monitor`` needs.
+
+    Args:
+        kit: The models, and what was learned with them.
+        data: The recordings.
+        kind: Kind of readings, ``"energy"`` or ``"residuals"``.
+        limits: What the channels are compared with. Default: none.
+        resolution: Step of each sensor. Default: the limits know how far each may be predicted to move.
+    """
+
+    kit: Kit
+    data: Dataset
+    kind: str
+    limits: WatchLimits | None = None
+    resolution: tuple[float, ...] | None = None
+
+    @property
+    def model(self) -> HybridModel:
+        """The model that is compared with the machine: the recommended one."""
+        return self.kit.models[self.kit.recommended]
+
+    @cached_property
+    def estimator(self) -> EstimatorLike:
+        """The estimator of the closed loops."""
+        return self.kit.observer()
+
+    @cached_property
+    def monitor(self) -> Monitor:
+        """What watches the recordings."""
+        rest = None if self.limits is not None and self.limits.rest_speed else self.kit.known_rest
+        return make_monitor(
+            self.model, self.limits, kind=self.kind, resolution=self.resolution, rest_speed=rest,
+            input_range=self.kit.problem().input_range,
+        )  # fmt: skip
+
+
+def prepared(
+    scenario: Scenario | None,
+    model: Path,
+    recordings: Sequence[Path],
+    *,
+    resolution: tuple[float, ...] | None = None,
+    calibration: Path | None = None,
+    residuals: bool = False,
+) -> MonitorJob:
+    """Load and check everything.
+
+    ``model`` is an artifact's folder or its run's. Without a ``scenario`` the artifact says how recordings are read,
+    and what the estimator assumes; with one, the scenario does. The ``resolution`` is the step of each sensor; default:
+    the limits know it. ``calibration`` is a ``calibration.json`` with limits; default: the artifact's, if it has them.
+    ``residuals``: watch these where the energy can be watched, too.
+
+    Raises:
+        InputError: If there is no control problem, a file is bad, or things do not fit each other; without a scenario
+            also if the artifact does not say how its recordings are read.
+    """
+    if scenario is not None and scenario.control is None:
+        raise InputError(
+            f"scenario {scenario.name} defines no control problem, so the estimator knows no input range; give the "
+            "scenario control=OCP(...)"
+        )
+    folder = artifact_folder(model)
+    kit = load(folder)
+    if scenario is not None:
+        kit, spec = kit.on(scenario), scenario.data
+    elif kit.predicting is not None:
+        spec = kit.predicting.data
+    else:
+        raise InputError(
+            f"{folder} does not say how its recordings are read: an older version wrote it; give --scenario, or run "
+            "the scenario again"
+        )
+    watched = kit.models[kit.recommended]
+    if abs(watched.dt - spec.dt) > 1e-9:
+        raise InputError(
+            f"the model's period is {watched.dt} s, scenario {kit.name} resamples to {spec.dt} s"
+        )
+    # all of a recording is watched: nothing warms up, and no part of it has a role
+    spec = replace(spec, windows={}, warm_up=spec.dt, fractions=(1.0, 0.0, 0.0))
+    data = load_trajectories(recordings, watched, spec, needed=())
+    if not data.whole:
+        cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
+        raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
+    if scenario is not None:
+        kit = kit.with_noise(find_noise(scenario, kit, (f"{kit.recommended}_observer",), 0)[0])
+    kind = RESIDUALS if residuals or not reads_energy(watched) else ENERGY
+    if calibration is not None:
+        limits: WatchLimits | None = read_limits(calibration, kind)
+    else:
+        own = kit.watch.get(kit.recommended)
+        limits = None if own is None else own.limits.get(kind)
+    return MonitorJob(kit, data, kind, limits, resolution)
+
+
+def read_limits(path: Path, kind: str) -> WatchLimits:
+    """Limits of a kind in a ``calibration.json`` that :func:`learn` wrote; InputError if there are none."""
+    stored = read_object(path)
+    if stored.get(kind) is None:
+        raise InputError(f"{path} holds no limits of {kind}; make them with hybrid-mpc monitor ... --learn 1")
+    return record(WatchLimits, stored[kind], f"{path}: {kind}")
+
+
+def learn(job: MonitorJob, rate: float, out: Path, progress: Progress | None = None) -> WatchLimits:
+    """Learn limits for ``rate`` false alarms an hour from nominal recordings; writes ``calibration.json``."""
+    model, say = job.model, progress or Progress()
+    say.start("replaying the recordings")
+    rest = None
+    if job.kind == ENERGY:
+        rest = job.kit.rest_speed or rest_speeds(job.data.whole, model)
+    limits = learn_limits(
+        make_readings(model, job.kind, rest_speed=rest), job.estimator, job.data.whole, false_alarms_per_hour=rate,
+        resolution=job.resolution or (sensor_steps(job.kit.sensor_sigma) if job.kind == ENERGY else None),
+        data_hash=job.data.hash, on_progress=lambda done, total: say.update("recordings", done, total, "samples"),
+    )  # fmt: skip
+    say.finish("")
+    write_json(out / "calibration.json", {job.kind: limits})
+    return limits
+
+
+def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> MonitorResult:
+    """Replay the monitor over each recording: ``NAME.csv`` and ``NAME.png``, and last ``monitor.json``."""
+    from hybrid_mpc.plots.monitor import channels
+    from hybrid_mpc.plots.style import save
+
+    progress, rows, monitor = progress or Progress(), [], job.monitor
+    diagnoser = None if job.limits is None else job.kit.diagnoser
+    progress.start("replaying the recordings")
+    for recording, report in along(job.data.whole, progress.update):
+        name, seconds = recording.name.replace("#", "_"), len(recording.t) * recording.dt
+        trace, alarms = explained(monitor, job.estimator, recording, diagnoser, report)
+        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
+        write_text(out / f"{name}.csv", table(trace, recording.y, job.model.outputs, monitor))
+        notes = [(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis]
+        figure = channels(
+            trace, recording.y, outputs=job.model.outputs, limits=job.limits, notes=notes, title=name
+        )
+        save(figure, out / f"{name}.png")
+    progress.finish("")
+    gaps, short = ([cut for cut in job.data.cuts if ("gap" in cut.why) is gap] for gap in (True, False))
+    result = {
+        "kind": job.kind,
+        "recordings": rows,
+        "warnings": [str(finding) for finding in job.data.findings],
+        "gaps": [cut._asdict() for cut in gaps],
+        "not_watched": [cut._asdict() for cut in short],
+        "limits": job.limits,
+        "data_hash": job.data.hash,
+    }
+    write_json(out / "monitor.json", result)
+    return MonitorResult(tuple(rows), tuple(gaps), tuple(short))

@@ -1,0 +1,128 @@
+"""``hybrid-mpc predict``: what a model predicts of recordings, from its artifact alone; tables, figures, numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hybrid_mpc.data.files import write_csv
+from hybrid_mpc.data.recording import COARSE, MIN_SCORED
+from hybrid_mpc.data.trajectories import Trajectory, load_trajectories
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.files import write_json
+from hybrid_mpc.identify.delay import lost_samples
+from hybrid_mpc.identify.predict import Predicted, Prediction, predict
+from hybrid_mpc.kit.artifact import Kit
+from hybrid_mpc.records import known
+
+
+@dataclass(frozen=True)
+class RunFigures:
+    """RMSE and FIT [%] by output, and the share of measurements within the band beside that which it is to hold."""
+
+    rmse: Mapping[str, float | None]
+    fit_percent: Mapping[str, float | None]
+    inside: Mapping[str, float | None]
+    share: float
+
+
+@dataclass(frozen=True)
+class RecordingFigures:
+    """What ``predict.json`` says of a recording: its length after the warm-up, and both kinds of predictions; without
+    one-step predictions their reason.
+    """
+
+    recording: str
+    seconds: float
+    free_run: RunFigures
+    one_step: RunFigures | None
+    reason: str
+
+
+def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory], list[str]]:
+    """Recordings as the artifact says that they are read, and what is doubtful about them.
+
+    Raises:
+        InputError: Naming all that is wrong with all files, a line each.
+    """
+    if kit.predicting is None:
+        raise InputError(
+            f"the model of scenario {kit.name or '(unnamed)'} does not say how its recordings are read: an older "
+            "version wrote it; run the scenario again"
+        )
+    spec, problems, found, doubts = kit.predicting.data, [], [], []
+    if twice := sorted({p.name for p in paths if [q.stem for q in paths].count(p.stem) > 1}):
+        raise InputError(f"recordings need different names, got {', '.join(twice)} more than once")
+    whole = replace(spec, fractions=(1.0, 0.0, 0.0))
+    for path in paths:
+        try:
+            data = load_trajectories([path], kit.models["prior"], whole, needed=())
+        except InputError as error:
+            problems += str(error).splitlines()
+            continue
+        doubts += [str(finding) for finding in data.findings]
+        if data.sampling[0] > COARSE * spec.dt:
+            problems.append(
+                f"{path}: sampled every {data.sampling[0]:.3g} s, the model's period is {spec.dt:g} s: what lies "
+                "between would be made up; record at least once a period"
+            )
+        late = lost_samples(kit.input_delay, spec.dt) * spec.dt
+        least = spec.warm_up + MIN_SCORED * spec.dt + late
+        long = [t for t in data.whole if len(t.t) * spec.dt > least - 0.5 * spec.dt]
+        if not long:
+            parts = [t.t[-1] - t.t[0] + spec.dt for t in data.whole]
+            parts += [c.end - c.start for c in data.cuts if not c.why.startswith("gap")]
+            problems.append(
+                f"{path}: too short: its longest part without a gap has {max(parts, default=0.0):.4g} s, the warm-up "
+                f"of {spec.warm_up:g} s and {MIN_SCORED} periods need {least:.4g} s"
+            )
+        found += long
+    refuse(problems)
+    return found, doubts
+
+
+def predict_recordings(
+    kit: Kit, trajectories: Sequence[Trajectory], out: Path, model: str = "", progress: Progress | None = None
+) -> list[Prediction]:
+    """Predict recordings; write of each ``NAME.csv`` and ``NAME.png``, and last ``predict.json``.
+
+    Raises:
+        InputError: If there is no such model, or a recording is too short.
+        StorageError: If something cannot be written.
+    """
+    # half a second to import: what is refused, is refused before
+    known(model or kit.recommended, kit.models, "model")
+    from hybrid_mpc.plots.fit import prediction
+    from hybrid_mpc.plots.style import save
+
+    say, found = progress or Progress(), []
+    say.start("predicting")
+    for i, trajectory in enumerate(trajectories):
+        say.update("recordings", i, len(trajectories), trajectory.name)
+        one = predict(kit, trajectory, model)
+        name = trajectory.name.replace("#", "_")
+        write_csv(out / f"{name}.csv", one.columns())
+        runs = {"free run": one.free_run, "one step ahead": one.one_step}
+        bands = {label: (run.y_hat, run.half_width) for label, run in runs.items() if run is not None}
+        figure = prediction(
+            one.t, one.y, bands, outputs=one.outputs, model=one.model, title=f"{name}: {one.model}"
+        )
+        save(figure, out / f"{name}.png")
+        found.append(one)
+    figures = {"model": found[0].model, "recordings": [figures_of(one) for one in found]}
+    write_json(out / "predict.json", figures)
+    say.finish("")
+    return found
+
+
+def figures_of(one: Prediction) -> RecordingFigures:
+    """The numbers of a prediction."""
+
+    def of(run: Predicted) -> RunFigures:
+        return RunFigures(run.rmse, run.fit_percent, run.inside, run.share)
+
+    seconds = len(one.t) * float(one.t[1] - one.t[0])
+    step = None if one.one_step is None else of(one.one_step)
+    return RecordingFigures(one.name, seconds, of(one.free_run), step, one.reason)

@@ -1,0 +1,219 @@
+"""The main job: its stages in their order, each computed only where what it reads has changed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.errors import InputError, named_extra, no_exit
+from hybrid_mpc.files import read_object
+from hybrid_mpc.folder import open_folder
+from hybrid_mpc.records import known
+from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.settings import RunSettings, check_device, run_note
+from hybrid_mpc.workflow.stage import Absent, Stage, bring_up_to_date, changed, differing
+from hybrid_mpc.workflow.stages.analyze import ANALYSIS
+from hybrid_mpc.workflow.stages.choose import CANDIDATES, CHOICE
+from hybrid_mpc.workflow.stages.compare import CONTROL
+from hybrid_mpc.workflow.stages.estimate import ESTIMATION
+from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, TASKS
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
+from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
+from hybrid_mpc.workflow.stages.promises import PROMISES
+from hybrid_mpc.workflow.stages.report import REPORT, report_so_far
+from hybrid_mpc.workflow.stages.results import Results, read_results
+from hybrid_mpc.workflow.stages.watch import WATCH
+
+STAGES: tuple[Stage[Any], ...] = (
+    DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, TASKS, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES,
+    WATCH, ANALYSIS, REPORT,
+)  # fmt: skip
+"""Stages in their order."""
+NAMES = tuple(stage.name for stage in STAGES)
+ALWAYS = (TASKS.name, REPORT.name)
+"""Stages that ``only`` does not leave out: they copy what the scenario and the other stages say."""
+SECONDS = {
+    "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4, "tasks": 1,
+    "control": 42,
+    "on_model": 14, "estimation": 1, "promises": 6, "watch": 36, "analysis": 1,
+    "report": 9,
+}  # fmt: skip
+"""What each stage of `make demo` takes on two idle cores [s], ``on_model`` where there is no plant: how long the rest
+of a run may take follows from what its first stages took."""
+
+
+@no_exit()
+@named_extra("a run")
+def run(
+    settings: RunSettings,
+    out: Path,
+    *,
+    resume: bool = False,
+    only: Sequence[str] = (),
+    skip: Sequence[str] = (),
+    progress: Progress | None = None,
+    cluster: Any = None,
+) -> Results | None:
+    """Run the main job into the folder ``out``; the results stand in its ``results.json``, too.
+
+    With ``only`` it ends at the first stage that nothing can be taken of, and gives None: ``only=("data", "prior")`` of
+    a new run fits the prior and leaves the first page of the report.
+
+    Every stage leaves its result in ``out/checkpoints``. With ``resume`` a stage runs again only where something that
+    it reads has changed: after an edit of a task its loops and the report are made anew, and nothing is trained again.
+    A stage after the export that cannot run costs its own part of the report, which then has the reason.
+
+    Args:
+        settings: What to compute.
+        out: Folder to make; it must be new or empty unless ``resume``.
+        resume: Go on with the run that ``out`` holds.
+        only: Names of the stages that may run; the others are taken as they are. ``tasks`` and ``report``
+            always run. Default: all.
+        skip: Names of stages after the export that are not to run. Default: none.
+        progress: Where to report; default: nowhere.
+        cluster: Address of a dask scheduler or a ``distributed.Client``, whose workers train the networks and run the
+            closed loops; they must see ``out`` under the same path. Default: processes of this machine.
+
+    Raises:
+        InputError: For any bad input; nothing half-written is left behind that a later run would trip over.
+        StorageError: If something cannot be written; finished stages are kept.
+
+    Example:
+        >>> results = run(RunSettings("golf_robot"), Path("out"))  # doctest: +SKIP
+    """
+    check_choice(only, skip)
+    scenario = load_scenario(settings.scenario)
+    context = Context(settings, scenario, out, progress or Progress(), cluster)
+    found = check_scenario(scenario, context.budget, (lambda: context.dataset) if settings.data else None)
+    for warning in found.warnings:
+        context.progress.warn(warning)
+    check_data(context)
+    check_device(settings.device)
+    if settings.deploy:
+        there = models_of(scenario.prior())
+        known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
+    end = _end(context, only)
+    took: dict[str, float] = {}
+    without = "on_model" if scenario.plant is not None else "control"
+    with open_folder(out, run_note(settings), resume=resume):
+        for i, stage in enumerate(STAGES):
+            if stage is end:
+                report_so_far(context)
+                return None
+            ahead = [
+                s.name for s in STAGES[i:] if s.name not in (*skip, without) and (not only or s.name in only)
+            ]
+            context.progress.start(stage.title + remaining(took, ahead))
+            begun = time.monotonic()
+            if only and stage.name not in (*only, *ALWAYS):
+                context.progress.finish(_as_it_is(context, stage, only))
+            else:
+                said = bring_up_to_date(context, stage, stage.name in skip)
+                if not said and stage in (PRIOR, TRAINING, EVALUATION):
+                    report_so_far(context)
+                if not said:
+                    took[stage.name] = time.monotonic() - begun
+                context.progress.finish(said)
+    return read_results(read_object(out / "results.json"), str(out / "results.json"))
+
+
+def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
+    """How long the stages ahead may take, for the user; nothing before the first long one is done.
+
+    Args:
+        took: What stages have taken [s].
+        ahead: Names of those that are still to run.
+
+    Example:
+        >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["watch", "analysis", "report"])
+        ' (about 2 min left)'
+        >>> remaining({"data": 4.0}, ["prior"])
+        ''
+    """
+    known_ = sum(SECONDS[name] for name in took)
+    left = sum(SECONDS[name] for name in ahead)
+    if known_ < SECONDS["training"] or not left:
+        return ""
+    seconds = left * sum(took.values()) / known_
+    if seconds < 90:
+        return f" (about {max(10, 10 * round(seconds / 10)):.0f} s left)"
+    return f" (about {seconds / 60:.0f} min left)"
+
+
+def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
+    """Refuse names that are no stages, and leaving out what all others need."""
+    for name in (*only, *skip):
+        known(name, NAMES, "stage")
+    optional = [stage.name for stage in STAGES if stage.optional]
+    needed = [name for name in skip if name not in optional]
+    if needed:
+        raise InputError(
+            f"--skip {needed[0]}: without it there is no model; what can be left out: {', '.join(optional)}"
+        )
+
+
+def _end(context: Context, only: Sequence[str]) -> Stage[Any] | None:
+    """The first stage that others need, and that has not run and may not; None where there is none.
+
+    Raises:
+        InputError: If a stage that may run needs it.
+    """
+    if not only:
+        return None
+    for i, stage in enumerate(STAGES):
+        if stage.optional or stage.name in (*only, *ALWAYS):
+            continue
+        stored = context.stored(stage)
+        if stored is not None and not stored.unfit:
+            continue
+        later = [s.name for s in STAGES[i:] if s.name in only and s is not REPORT]
+        if later:
+            why = f"has not run in {context.out}" if stored is None else f"must run again: {stored.unfit}"
+            raise InputError(f"stage {stage.name} {why}, and {later[0]} needs it; leave --only out")
+        return stage
+    return None
+
+
+def _as_it_is(context: Context, stage: Stage[Any], only: Sequence[str] = ()) -> str:
+    """Take a stage as the folder holds it; its part of the artifact is put back where nothing has changed.
+
+    Raises:
+        InputError: If what it read differs, and a stage that may run (``only``) needs it.
+    """
+    stored = context.stored(stage)
+    if stored is None or stored.unfit:
+        context.leave_out(stage, f"stage {stage.name} was left out")
+        return "left out"
+    keys = stage.keys(context)
+    if differ := differing(stored.keys, keys):
+        needing = [s.name for s in STAGES if s.name in only and s is not REPORT and stage in _needed(s)]
+        if needing:
+            raise InputError(
+                f"stage {stage.name} is out of date: {differ}, and {needing[0]} needs it; add --only {stage.name}, "
+                "or leave --only out"
+            )
+    why = changed(stored.keys, keys)
+    if not why and not isinstance(stored.result, Absent):
+        why = stage.restore(context, stored.result)
+    if why:
+        context.progress.warn(f"stage {stage.name} is out of date: {why}")
+    return "taken as it is"
+
+
+def _needed(stage: Stage[Any]) -> list[Stage[Any]]:
+    """All stages that a stage reads, directly or by others."""
+    return [one for need in stage.needs for one in (need, *_needed(need))]
+
+
+def failed_stages(out: Path) -> dict[str, str]:
+    """Why stages of a run could not run, by stage; empty where all did."""
+    context = Context(RunSettings(""), None, out)  # type: ignore[arg-type]
+    found = {stage.name: context.stored(stage) for stage in STAGES}
+    absent = {name: stored.result for name, stored in found.items() if stored is not None}
+    return {name: a.reason for name, a in absent.items() if isinstance(a, Absent) and a.failed}

@@ -1,0 +1,115 @@
+"""Settings of a run: what decides what it computes, networks from a file, the device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.errors import InputError, named_extra
+from hybrid_mpc.files import read_json, sha256
+from hybrid_mpc.folder import JobNote
+
+WHOLE = ("hidden", "networks", "teacher_steps", "free_run_steps", "horizon", "validation_horizon", "batch")
+MOST = {
+    "hidden": 4096, "networks": 1024, "teacher_steps": 10**8, "free_run_steps": 10**8, "horizon": 10**5,
+    "validation_horizon": 10**6, "batch": 10**6, "decay": 1e12, "learning_rates": 1.0, "prior_replay": 1e12,
+}  # fmt: skip
+"""Largest values: a file of settings must not ask for more memory than a machine has."""
+NETWORK = (*WHOLE, "decay", "learning_rates", "prior_replay")
+"""What a file of network settings may hold: arguments of :class:`~hybrid_mpc.identify.settings.TrainingSettings`."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Everything that decides what a run computes.
+
+    Args:
+        scenario: Registered name or path of a user's Python file.
+        data: Recordings of the user, in order; empty for a simulated machine.
+        seed: Seed of data, training and closed loops.
+        budget: Name of the scenario's budget.
+        inputs: Columns that replace the scenario's inputs; default: the scenario's.
+        outputs: Columns that replace the scenario's outputs; default: the scenario's.
+        time: Column that replaces the scenario's time; default: the scenario's.
+        network_file: JSON object with settings of the networks that replace the budget's, as ``hybrid-mpc tune``
+            writes them; default: none.
+        device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
+        deploy: Model that is recommended whatever validation says: ``"phy"`` (the fitted prior), ``"pgrnn"`` or
+            ``"mopgrnn"``. Default: what validation recommends.
+    """
+
+    scenario: str
+    data: tuple[Path, ...] = ()
+    seed: int = 0
+    budget: str = "quick"
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    time: str = ""
+    network_file: Path | None = None
+    device: str = "cpu"
+    deploy: str = ""
+
+    def network(self) -> dict[str, Any]:
+        """Settings of the networks that replace the budget's: what the file holds, checked."""
+        return {} if self.network_file is None else read_network(self.network_file)
+
+    def options(self, name: Callable[[Path], str]) -> list[str]:
+        """Words of a command line that give the recordings, each file by its ``name``, and their columns."""
+        words = [word for path in self.data for word in ("--data", name(path))]
+        for option, columns in (("--input-column", self.inputs), ("--output-column", self.outputs)):
+            words += [word for column in columns for word in (option, column)]
+        return words + (["--time-column", self.time] if self.time else [])
+
+    def identity(self) -> dict[str, Any]:
+        """Settings as plain data, with the content hash of every file in place of where it lies."""
+        files = [{"name": path.name, "sha256": sha256(path)} for path in self.data]
+        scenario = self.scenario
+        if scenario.endswith(".py") and Path(scenario).is_file():
+            scenario = f"{Path(scenario).name} {sha256(Path(scenario))}"
+        plain = {**asdict(replace(self, data=(), scenario=scenario)), "data": files}
+        return plain | {"network_file": self.network()}
+
+
+def read_network(path: Path) -> dict[str, Any]:
+    """Settings of networks from a JSON file: any of ``NETWORK``; ``learning_rates`` are four numbers.
+
+    Raises:
+        InputError: If the file is missing, damaged or holds anything else.
+    """
+    held = read_json(path)
+    if not isinstance(held, dict) or (unknown := sorted(set(held) - set(NETWORK))):
+        what = "no JSON object" if not isinstance(held, dict) else f"also {', '.join(unknown)}"
+        raise InputError(f"{path} holds {what}; network settings are any of: {', '.join(NETWORK)}")
+    for name, value in held.items():
+        numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
+        kinds = (int,) if name in WHOLE else (int, float)
+        good = all(isinstance(v, kinds) and not isinstance(v, bool) and abs(v) <= MOST[name] for v in numbers)
+        positive = good and all(v > 0 or (v == 0 and name in ("decay", "prior_replay")) for v in numbers)
+        if not positive or (name == "learning_rates" and len(numbers) != 4):
+            needed = f"a whole number from 1 to {MOST[name]}" if name in WHOLE else "a number of 0 or more"
+            needed = "four positive numbers of at most 1" if name == "learning_rates" else needed
+            raise InputError(f"{path}: {name} is {str(value)[:40]}; it must be {needed}")
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
+
+
+def run_note(settings: RunSettings) -> JobNote:
+    """What the folder of the main job says of it. Only the machine must stay the same; stages see all the rest."""
+    return JobNote("run", {"scenario": Path(settings.scenario).name}, {"run": settings.identity()})
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that cannot compute with 64-bit floats, before a long job starts."""
+    if device == "cpu":
+        return
+    with named_extra(f"--device {device}"):
+        import torch
+
+    try:
+        torch.ones(1, dtype=torch.float64, device=device).sum().item()
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:  # torch raises any of them
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(
+            f"--device {device}: torch cannot compute there ({reason}); leave it out to use cpu"
+        ) from error

@@ -1,0 +1,323 @@
+"""The closed loops of a run: every task under every controller, seeds until costs are told apart."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.compare.controllers import CONTROLLERS, OBSERVERS, ORACLES
+from hybrid_mpc.compare.loops import (
+    DRAWN,
+    MODEL,
+    Bench,
+    LoopRow,
+    LoopSpec,
+    arrays_of,
+    read_rows,
+    run_loops,
+    with_arrays,
+    write_rows,
+)
+from hybrid_mpc.compare.sequential import Comparison, compare_costs, hardest, looks
+from hybrid_mpc.compare.summary import by_task
+from hybrid_mpc.compare.tasks import tasks_of
+from hybrid_mpc.engine import WORKERS, run_jobs
+from hybrid_mpc.files import digest
+from hybrid_mpc.kit.artifact import load
+from hybrid_mpc.kit.parts import LoopSettings, artifact_digest, loop_settings, read_parts
+from hybrid_mpc.loop.loop import Loop
+from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stage import UNKNOWN, Absent, Stage, source_of, sources
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, observed
+
+if TYPE_CHECKING:
+    from hybrid_mpc.control.safeguard import SafeController
+    from hybrid_mpc.data.trajectories import Trajectory
+    from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
+    from hybrid_mpc.estimate.switching import SwitchingFilter
+    from hybrid_mpc.watch.monitor import Monitor
+
+Array = NDArray[np.float64]
+BASELINES = ("prior", "prior_observer")
+REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
+"""Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
+TIMED_PERIODS = 1000
+"""Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
+TIMED = OBSERVERS
+"""Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Loops that run and are kept together: one task under one controller, by their numbers.
+
+    A ``timed`` part runs alone on the machine, so that the durations of its steps count.
+    """
+
+    task: Task
+    controller: str
+    seeds: tuple[int, ...]
+    timed: bool = False
+
+    @property
+    def stage(self) -> str:
+        """Name of its checkpoint."""
+        return f"loops/{self.task.name}-{self.controller}-{self.seeds[0]}"
+
+    def specs(self, scenario: str, run_seed: int) -> list[LoopSpec]:
+        """Its loops."""
+        first = (*DRAWN, "step_ms", "plans") if self.timed else DRAWN
+        return [
+            LoopSpec(
+                scenario, MODEL, self.task.name, self.controller, seed=seed, run_seed=run_seed,
+                keep=first if seed == 0 else (),
+            )
+            for seed in self.seeds
+        ]  # fmt: skip
+
+
+def parts_of(scenario: Scenario, tasks: Sequence[Task], budget: Budget, seeds: range) -> list[Part]:
+    """Loops of the tasks with some of a budget's seeds, in the order in which they run.
+
+    First come the timed ones, then the slow ones.
+    """
+    parts = [Part(task, name, (0,), timed=True) for task in tasks for name in TIMED if 0 in seeds]
+    for name in reversed(list(CONTROLLERS)):
+        most = _seeds(name, scenario, budget.seeds, budget.oracle_seeds)
+        own = range(max(seeds.start, 1 if name in TIMED else 0), min(seeds.stop, most))
+        together = 1 if name in ORACLES else max(1, len(own))
+        for task in tasks:
+            parts += [Part(task, name, tuple(own[i : i + together])) for i in range(0, len(own), together)]
+    return parts
+
+
+@dataclass(frozen=True)
+class ControlResult:
+    """The closed loops of a run.
+
+    Args:
+        rows: The loops by task, controller and seed.
+        reason: Why there are none, where only steps could be timed. Default: there are loops.
+        arrays: Signals that are drawn, ``"NUMBER/NAME"`` with the number of the row; without loops ``step_ms``.
+    """
+
+    rows: tuple[LoopRow, ...]
+    reason: str = ""
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def drawn(self) -> list[LoopRow]:
+        """The loops whose signals were kept, with these."""
+        return [row for row in with_arrays(self.rows, self.arrays) if row.arrays] if self.rows else []
+
+
+def control_stage(context: Context) -> ControlResult | Absent:
+    """Closed loops of every task with prior, hybrid and oracle; or only timing where there is no plant."""
+    if context.scenario.control is None:
+        return Absent(f"scenario {context.scenario.name} defines no control problem")
+    context.read(NOISE)
+    if context.scenario.plant is None:
+        return _only_timing(context)
+    rows = compare(context)
+    return ControlResult(tuple(replace(row, arrays={}) for row in rows), "", arrays_of(rows))
+
+
+def compare(context: Context) -> list[LoopRow]:
+    """Run the loops on the run's model; the timed ones alone, the others side by side in processes.
+
+    A task gets no more seeds where the costs of its hybrid and of the harder baseline are told apart
+    (:mod:`hybrid_mpc.compare.sequential`). Every part is kept as it ends; what a run that was killed has kept is not
+    run again.
+    """
+    scenario, budget, settings = context.scenario, context.budget, context.settings
+    every = tasks_of(scenario, budget.tasks)
+    tasks, rows, done = list(every), list[LoopRow](), 0
+    for seeds in looks(budget.seeds):
+        parts = parts_of(scenario, tasks, budget, range(done, seeds))
+        specs = {part.stage: part.specs(settings.scenario, settings.seed) for part in parts}
+        found = run_or_read(context, specs, alone=[part.stage for part in parts if part.timed])
+        rows += [row for part in parts for row in found[part.stage]]
+        own = by_task(rows)
+        tasks, done = [task for task in tasks if not decided(own[task.name], budget.seeds)], seeds
+    order = [task.name for task in every]
+    return sorted(rows, key=lambda row: (order.index(row.task), row.controller, row.seed))
+
+
+def comparisons(cells: Mapping[str, Sequence[LoopRow]], most: int) -> dict[str, Comparison]:
+    """The cost of a task's hybrid with observer over that of each baseline, by baseline, at most ``most`` seeds."""
+    costs = {
+        name: [row.cost for row in sorted(rows, key=lambda row: row.seed)] for name, rows in cells.items()
+    }
+    return {name: compare_costs(costs[REPORTED["hybrid"]], costs[name], most) for name in BASELINES}
+
+
+def decided(cells: Mapping[str, Sequence[LoopRow]], most: int) -> bool:
+    """Whether more seeds of a task would tell nothing more: its hybrid is told apart from the harder baseline."""
+    found = comparisons(cells, most)
+    return found[hardest(found)].decided
+
+
+def _only_timing(context: Context) -> ControlResult:
+    kit, whole = context.kit, context.dataset.whole
+    most = max(2, TIMED_PERIODS // len(whole))
+    controller, estimator, durations = kit.controller(), kit.observer(), []
+    for i, recording in enumerate(whole):
+        context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
+        durations.append(time_on_recording(controller, estimator, kit.monitor(kind="own"), recording, most))
+    reason = f"scenario {context.scenario.name} has no plant to close the loop with"
+    return ControlResult((), reason, {"step_ms": np.concatenate(durations)})
+
+
+def time_on_recording(
+    controller: SafeController,
+    estimator: ExtendedKalmanFilter | SwitchingFilter,
+    monitor: Monitor,
+    trajectory: Trajectory,
+    most: int,
+) -> Array:
+    """Durations [ms] of a loop's steps on at most ``most`` recorded samples, without a plant.
+
+    The controller is asked to hold the rest position from wherever the recording is; the loop takes the recorded input
+    as the one that acted, not its own.
+    """
+    loop = Loop(estimator, controller, monitor=monitor)
+    loop.start(trajectory.y[0])
+    durations = []
+    for k in range(1, min(most, len(trajectory.t))):
+        loop.finish()
+        loop.step(trajectory.y[k], applied=trajectory.u[k - 1])
+        loop.finish()
+        durations.append(1e3 * sum(loop.spent.values()))
+    return np.array(durations)
+
+
+def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
+    if name not in ORACLES:
+        return seeds
+    # with the true state, seeds differ only in the rivals' plans
+    return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
+
+
+def run_specs(
+    scenario: str,
+    folder: Path,
+    specs: Sequence[LoopSpec],
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> list[LoopRow]:
+    """Rows of loops on a run's own model.
+
+    Loops whose monitors alarm by nothing that was learned run as in a run's first pass, which has learned nothing yet.
+    """
+    learned = any(spec.monitor not in ("own", "none") for spec in specs)
+    bench = _bench(scenario, folder, artifact_digest(folder), learned)
+    return list(run_loops(bench, specs, report))
+
+
+@lru_cache(maxsize=1)
+def _bench(scenario: str, folder: Path, content: str, learned: bool) -> Bench:
+    """A bench with a run's model, of the folder with this ``content``, with what its monitors have learned or not."""
+    kit = load(folder)
+    return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, watch={})})
+
+
+def run_or_read(
+    context: Context, parts: Mapping[str, Sequence[LoopSpec]], *, alone: Collection[str] = ()
+) -> dict[str, list[LoopRow]]:
+    """Rows of loops on the run's model: those that ``checkpoints`` holds are read, the others run.
+
+    A part is what runs together. It is written as it ends, so a killed run goes on from there. It is read only if it
+    was run with the present model, noise, machine and control problem. Parts named in ``alone`` run in this process
+    with nothing beside them, so that the durations of their steps count; the others side by side in processes.
+    """
+    of = {part: identity(context, specs) for part, specs in parts.items()}
+    found = {part: read_rows(context.path(part), of[part]) for part in parts}
+    rows = {part: held for part, held in found.items() if held is not None}
+
+    def write(part: str, made: list[LoopRow]) -> None:
+        write_rows(context.path(part), made, of[part])
+        rows[part] = made
+
+    common = context.scenario_path, (context.out / "model").resolve()
+    missing = [part for part in parts if part not in rows]
+    timed = [part for part in missing if part in alone]
+    for i, part in enumerate(timed):
+        spec = parts[part][0]
+        context.progress.update("timed loops", i, len(timed), f"{spec.task}, {spec.controller}")
+        write(part, run_specs(*common, parts[part]))
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        part: (run_specs, (*common, parts[part])) for part in missing if part not in alone
+    }
+    run_jobs(jobs, context.progress.update, WORKERS, write, fresh=False, cluster=context.cluster)
+    return rows
+
+
+def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
+    """Digest of all that decides what loops of a run compute: specifications, machine, tasks, model and program."""
+    parts = read_parts(context.out / "model")
+    model = parts.description
+    scenario = context.ready
+    tasks = {task.name: task for task in scenario.tasks}
+    loop = loop_settings(scenario, parts.loop.process_noise)
+    oracle = source_of(scenario.oracle) if any(spec.controller in ORACLES for spec in specs) else None
+    contents = [task_content(tasks[spec.task], context.spec.dt, loop) for spec in specs]
+    read = contents, source_of(scenario.plant), oracle
+    if any(value is UNKNOWN for value in (*contents, *read[1:])):
+        return f"unknown {time.monotonic_ns()}"
+    loops, estimators = [(spec.id, spec.keep) for spec in specs], replace(loop, control={})
+    made_by = sources(__name__), context.versions
+    return digest([loops, model.programs_sha256, model.model, estimators, read, made_by])
+
+
+def task_content(task: Task, dt: float, loop: LoopSettings) -> object:
+    """All of a task that decides how its loops go: its references sampled on the grid, its control problem.
+
+    ``UNKNOWN`` where nobody knows what its figures are made of.
+    """
+    figures = source_of(task.figures)
+    if figures is UNKNOWN:
+        return UNKNOWN
+    problem = loop.control.get(task.name, loop.control.get(""))
+    horizon = 0 if problem is None else problem.horizon
+    t = np.arange(round(task.duration / dt) + horizon + 1, dtype=np.float64) * dt
+    return {
+        "name": task.name,
+        "duration": task.duration,
+        "x0": task.x0,
+        "faults": task.faults,
+        "reference": np.asarray(task.reference(t)),
+        "weight": None if task.weight is None else np.asarray(task.weight(t)),
+        "measured disturbances": None if task.w is None else np.asarray(task.w(t)),
+        "control problem": problem,
+        "figures": figures,
+    }
+
+
+def what_loops_read(context: Context) -> dict[str, object]:
+    """The machine, its tasks, and how many loops there are."""
+    scenario, budget = context.scenario, context.budget
+    loop = loop_settings(scenario)
+    read: dict[str, object] = {
+        **observed(context),
+        "control problem": scenario.control,
+        "plant": source_of(scenario.plant),
+        "seed": context.settings.seed,
+        "number of loops": (looks(budget.seeds), budget.oracle_seeds, budget.tasks),
+        "safe input": scenario.safe_input,
+    }
+    for task in tasks_of(scenario, budget.tasks) if scenario.plant is not None else ():
+        read[f"task {task.name}"] = task_content(task, context.spec.dt, loop)
+    return read
+
+
+CONTROL = Stage(
+    "control", "closing the loop", ControlResult, control_stage,
+    lambda context: {**what_loops_read(context), "what is drawn": DRAWN}, (EXPORT, NOISE), optional=True,
+)  # fmt: skip

@@ -1,0 +1,112 @@
+"""Stage estimation: do the observers believe what they should, on recordings that nothing was tuned on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.compare.controllers import CONTROLLERS, OBSERVERS
+from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.consistency import consistency
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stage import Absent, Stage
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, observed
+from hybrid_mpc.workflow.stages.identify import DATA
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+PERIODS = 1000
+RECORDINGS = 4
+"""So many periods of so many test recordings are looked at: a few seconds of computing for both observers."""
+
+
+@dataclass(frozen=True)
+class ObserverTest:
+    """What the innovations of an observer say; see :func:`~hybrid_mpc.estimate.consistency.consistency`.
+
+    Args:
+        mean_nis: Mean normalised innovation squared; 1 for an observer that believes what it should.
+        nis_low: Lower end of its 95 % band.
+        nis_high: Upper end.
+        nis_inside: Share of samples below the 95 % quantile.
+        ljung_box: Statistic of their autocorrelation.
+        ljung_box_limit: Its 95 % quantile for white innovations.
+        samples: Samples looked at.
+        correlation_band: 95 % band of one autocorrelation.
+    """
+
+    mean_nis: float
+    nis_low: float
+    nis_high: float
+    nis_inside: float
+    ljung_box: float
+    ljung_box_limit: float
+    samples: int
+    correlation_band: float
+
+
+@dataclass(frozen=True)
+class ObservedRecording:
+    """A recording, or its beginning, that the observers were tested on."""
+
+    name: str
+    samples: int
+
+
+@dataclass(frozen=True)
+class EstimationResult:
+    """Tests of the observers.
+
+    Args:
+        recordings: What they were tested on.
+        observers: What was found, by observer, or why nothing.
+        arrays: ``"OBSERVER/autocorrelation"``, and ``"OBSERVER/nis/k"`` of recording ``k``.
+    """
+
+    recordings: tuple[ObservedRecording, ...]
+    observers: Mapping[str, ObserverTest | Absent]
+    arrays: Mapping[str, Array]
+
+
+def estimation_stage(context: Context) -> EstimationResult | Absent:
+    """Test the innovations of the observers on prior and hybrid; skipped where no control problem tunes them."""
+    if context.scenario.control is None:
+        return Absent("the observers need the scenario's control problem (input range, sensor noise)")
+    context.read(NOISE)
+    kit, parts = context.kit, parts_for_tests(context.trajectories("test"))
+    found: dict[str, ObserverTest | Absent] = {}
+    arrays: dict[str, Array] = {}
+    for i, name in enumerate(OBSERVERS):
+        context.progress.update("observers", i, len(OBSERVERS), name)
+        estimator = kit.observer(CONTROLLERS[name].model, load=CONTROLLERS[name].observer)
+        try:
+            tested = consistency(estimator, parts)
+        except InputError as too_short:
+            found[name] = Absent(str(too_short))
+            continue
+        found[name] = ObserverTest(
+            tested.mean_nis, *tested.nis_band, tested.nis_inside, tested.ljung_box, tested.ljung_box_limit,
+            tested.samples, tested.correlation_band,
+        )  # fmt: skip
+        arrays[f"{name}/autocorrelation"] = tested.autocorrelation
+        arrays |= {f"{name}/nis/{k}": run.nis for k, run in enumerate(tested.runs)}
+    return EstimationResult(tuple(ObservedRecording(p.name, len(p.t)) for p in parts), found, arrays)
+
+
+def parts_for_tests(recordings: Sequence[Trajectory]) -> list[Trajectory]:
+    """The first samples of a few recordings, evenly chosen, that the tests can take the time for."""
+    chosen = [recordings[i] for i in evenly(len(recordings), RECORDINGS)]
+    return [r.part(slice(PERIODS // max(1, len(chosen)))) for r in chosen]
+
+
+ESTIMATION = Stage(
+    "estimation", "testing the observers", EstimationResult, estimation_stage, observed, (DATA, EXPORT, NOISE),
+    optional=True,
+)  # fmt: skip

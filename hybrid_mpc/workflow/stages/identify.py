@@ -1,0 +1,663 @@
+"""Stages data, prior, training and evaluation: from recordings to models and their free runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from numpy.typing import NDArray
+
+from hybrid_mpc.check.preflight import rests_no_more
+from hybrid_mpc.data import scales
+from hybrid_mpc.data.excitation import check_excitation, short_runs
+from hybrid_mpc.data.trajectories import ROLES, Trajectory
+from hybrid_mpc.engine import WORKERS, run_jobs
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.evaluate import (
+    FreeRun,
+    OutputErrors,
+    evaluation_trajectories,
+    free_runs,
+    measured_as,
+    output_errors,
+    score,
+    stacked_free_runs,
+)
+from hybrid_mpc.identify.fit import POOR, beyond_ranges, fit_prior, smoothed
+from hybrid_mpc.identify.linear import BASELINES, LinearModel
+from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
+from hybrid_mpc.identify.smooth import Smoother
+from hybrid_mpc.identify.sound import (
+    BoundCost,
+    bound_costs,
+    bounds_doubt,
+    constant_runs,
+    correlation_of_errors,
+    fit_doubt,
+    growth_time,
+    no_gain,
+    problems,
+    structure_doubt,
+    trial_length,
+)
+from hybrid_mpc.identify.step import PriorStep, Scaling
+from hybrid_mpc.identify.structure import causes, causes_of_refusal, named
+from hybrid_mpc.identify.train import Trained, TrainingFailure, train
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.records import plain, record
+from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stage import Stage, source_of
+from nn_export.program import to_json
+
+Array = NDArray[Any]
+
+MODELS = ("phy_nominal", "phy", *KINDS)
+"""Models that may be evaluated; those of a prior: :func:`models_of`."""
+PARTS = 4
+"""Parts of the training data at least: a network that leaves one out still sees three quarters."""
+REMEDY = (
+    "Correct the prior: a sign, a unit, or a term or state that is missing (docs/prior-wrong.md). Fix parameters that "
+    "the recordings do not tell. 'hybrid-mpc check MACHINE --data FILE --fit' shows the fit"
+)
+"""What to do about a fit that nothing may be built on."""
+IN_DOUBT = "the structure of the prior is in doubt"
+"""Said before each reason for it."""
+ERRORS = {"error": "E_sim", "output": "RMSE over the spread"}
+"""What the validation of a training is called, by its first objective."""
+
+
+@dataclass(frozen=True)
+class DataResult:
+    """The recordings of a run.
+
+    Args:
+        files: Names of the files.
+        hash: Hash of their contents.
+        cuts: What is not used as it was recorded, and why.
+        pieces: Number of trajectories by role.
+        seconds: Their length [s] by role.
+        warnings: What is doubtful about the recordings.
+    """
+
+    files: tuple[str, ...]
+    hash: str
+    cuts: tuple[CutPart, ...]
+    pieces: Mapping[str, int]
+    seconds: Mapping[str, float]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CutInterval:
+    """A part of a recording that is not used as it was recorded: its file, from and to [s]."""
+
+    file: str
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class CutPart(CutInterval):
+    """The same, and why."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class BaselineScores:
+    """Free-run errors of a simpler model and its orders, or why there is none."""
+
+    errors: OutputErrors | None = None
+    chosen: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class PriorResult:
+    """The fitted prior, and the states that its equations smooth the recordings to.
+
+    Args:
+        fit: Parameters with their standard errors, the inputs' delay, and what the smoother assumes.
+        nominal: Parameters before the fit.
+        units: Units of the parameters.
+        baselines: Errors on the test recordings of simpler models, by name: ``"constant"`` (the training mean) and
+            linear models of inputs and outputs.
+        bounds: Parameters at a bound, and what each bound costs.
+        in_doubt: Why the prior's structure is in doubt, what names the cause first.
+        errors: Errors on the test recordings of the prior with nominal (``"phy_nominal"``) and fitted (``"phy"``)
+            parameters.
+        no_gain: Why nothing may be built on this fit: a constant or the nominal parameters are better. Empty: it may.
+        error_correlation: Correlation of the smoother's one-step errors with those of the sample before, by output;
+            zero is white.
+        longest_run: Length [s] of the free runs that models are judged by; None: whole recordings.
+        arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
+    """
+
+    fit: PriorFit
+    nominal: Mapping[str, float]
+    units: Mapping[str, str]
+    baselines: Mapping[str, BaselineScores]
+    bounds: tuple[BoundCost, ...]
+    in_doubt: tuple[str, ...]
+    errors: Mapping[str, OutputErrors]
+    no_gain: str
+    error_correlation: Mapping[str, float]
+    longest_run: float | None
+    arrays: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The trained networks; their weights lie in files of their own.
+
+    Args:
+        folder: Folder of the weights in ``checkpoints/training``.
+        validation: Validation error of the best network by kind, of its first objective.
+        skipped_updates: Updates that were skipped because a number was not finite, by kind.
+        failures: What went wrong in a training, by kind.
+        weights: Digest of the weights by kind.
+    """
+
+    folder: str
+    validation: Mapping[str, float]
+    skipped_updates: Mapping[str, int]
+    failures: Mapping[str, tuple[TrainingFailure, ...]]
+    weights: Mapping[str, str]
+
+
+def check_data(context: Context) -> None:
+    """Read the user's recordings before anything is written: bad ones leave no folder behind."""
+    if context.settings.data:
+        doubts(context)  # reads and checks the recordings
+    elif context.scenario.make_data is None:
+        raise InputError(
+            f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
+            f"(once for each file)"
+        )
+
+
+def what_data_reads(context: Context) -> dict[str, object]:
+    """What the recordings and their roles are made of."""
+    prior, settings = context.scenario.prior(), context.settings
+    read: dict[str, object] = {
+        "data specification": context.spec,
+        "signals of the prior": (prior.states, prior.inputs, prior.outputs),
+    }
+    if settings.data:
+        return {**read, "recordings": [(path.name, sha256(path)) for path in settings.data]}
+    make = source_of(context.scenario.make_data)
+    return {**read, "seed": settings.seed, "budget": settings.budget, "how recordings are made": make}
+
+
+def data_stage(context: Context) -> DataResult:
+    """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
+    if not context.settings.data:
+        assert context.scenario.make_data is not None
+        context.progress.update("files", 0, 1, "recording the simulated machine")
+        context.forget_data()
+        context.scenario.make_data(context.out / "data", context.settings.seed, context.settings.budget)
+    dataset, warnings = context.dataset, doubts(context)
+    for warning in warnings:
+        context.progress.warn(warning)
+    return DataResult(
+        tuple(dataset.files),
+        dataset.hash,
+        tuple(CutPart(*cut) for cut in dataset.cuts),
+        {role: len(context.trajectories(role)) for role in ROLES},
+        {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in ROLES},
+        warnings,
+    )
+
+
+def recordings_are_there(context: Context, found: DataResult) -> str:
+    """Whether the recordings of a simulated machine lie where the run left them; a text if not."""
+    if context.settings.data or (context.files and context.dataset.hash == found.hash):
+        return ""
+    return "the recordings are gone or were changed"
+
+
+def doubts(context: Context) -> tuple[str, ...]:
+    """What is doubtful about the recordings, and what the training ones do not excite; some of it is refused.
+
+    Raises:
+        InputError: If a recording is bad, an input does nothing in those for training, or an output.
+    """
+    found = tuple(str(finding) for finding in context.dataset.findings)
+    prior = context.scenario.prior()
+    free = sum(not p.fixed for p in prior.parameters)
+    train = context.trajectories("train")
+    if not train:  # the prior's fit says so
+        return found
+    return (
+        *found,
+        *short_runs(context.spec, context.trajectories("test")),
+        *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
+    )
+
+
+def what_prior_reads(context: Context) -> dict[str, object]:
+    """The prior's equations as a traced program, and its parameters."""
+    prior = context.scenario.prior()
+    programs = prior_programs(prior, context.spec.dt)
+    return {
+        "equations of the prior": {name: to_json(program) for name, program in programs.items()},
+        "parameters of the prior": prior.parameters,
+        "largest delay": context.spec.largest_delay,
+        "longest free run": (context.spec.free_run, context.warm),
+    }
+
+
+def prior_stage(context: Context) -> PriorResult:
+    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it.
+
+    Raises:
+        InputError: If the fit is impossible, or what it gives is of no use to later stages.
+    """
+    found = examined_prior(context)
+    refuse(stops(found))
+    return found
+
+
+def stops(found: PriorResult, *, cause: bool = True) -> tuple[str, ...]:
+    """What must be mended before anything is built on a fitted prior, with the likeliest ``cause``."""
+    if not found.no_gain:
+        return ()
+    why = f". In doubt: {found.in_doubt[0]}" if found.in_doubt and cause else ""
+    return (f"fit of the prior: {found.no_gain}{why}. {REMEDY}",)
+
+
+def examined_prior(context: Context) -> PriorResult:
+    """:func:`prior_stage` without its end: a fit that nothing may be built on is told in ``no_gain``.
+
+    Raises:
+        InputError: If the fit is impossible, or what it gives is not finite or has run away
+            (:func:`~hybrid_mpc.identify.sound.problems`).
+    """
+    make, spec = context.scenario.prior, context.spec
+    train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
+    longest = spec.free_run or max(
+        ((len(t.t) - context.warm) * spec.dt for t in (*valid, *test)), default=None
+    )
+    try:
+        fit = fit_prior(
+            make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay,
+            time_unit=context.time_unit,
+            on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
+        )  # fmt: skip
+    except InputError as error:
+        wrong = named(causes_of_refusal(make, train, spec.dt, longest or math.inf, context.time_unit))
+        raise InputError(f"{error}. In doubt: {wrong}" if wrong else str(error)) from error
+    every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
+    fitted = make(fit.values)
+    smoother = fit.smoother(fitted, spec.dt)
+    refuse([f"fit of the prior: {one}" for one in problems(smoother, fit, every)])
+    context.progress.update("free runs", 1, 1, "comparing with simpler models")
+    trial = trial_length(make, fit, every, spec.dt, longest, context.time_unit)
+    bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)
+    told = *beyond_ranges(fitted, every), *rests_no_more(fitted, max(10 * spec.dt, spec.warm_up))
+    fit = replace(fit, warnings=(*fit.warnings, *(str(one) for one in bounds if one.costs), *told))
+    for warning in fit.warnings:
+        context.progress.warn(f"fit of the prior: {warning}")
+    unseen = every[len(train) + len(valid) :]
+    judge, linear = _Judge(context, fitted, fit, smoother), _linear_models(context)
+    longest_run = spec.free_run
+    errors, baselines = judge.errors(unseen, longest_run, linear)
+    told, shorter = (), growth_time(make, fit, every, spec.dt)
+    grows = shorter < (longest or 0.0)
+    if longest_run is None and grows and errors["phy"].error > _error_of(baselines["constant"]):
+        # whole runs say nothing of a machine that runs away
+        longest_run = max(shorter, 2 * spec.dt)
+        errors, baselines = judge.errors(unseen, longest_run, linear)
+        told = (
+            f"small errors grow tenfold in {shorter:.2g} s, so long free runs say nothing of a model: models are "
+            "trained and judged by free runs of that length; free_run of the DataSpec sets another",
+        )
+        context.progress.warn(told[0])
+    fit = replace(fit, warnings=(*fit.warnings, *told))
+    own = {name: one.error for name, one in errors.items()} | {"constant": _error_of(baselines["constant"])}
+    training: dict[str, float] = {}
+    if own["phy"] >= own["constant"]:
+        seen, mean = judge.errors(every[: len(train)], longest_run)
+        training = {"phy": seen["phy"].error, "constant": _error_of(mean["constant"])}
+    # of a machine that runs away, recorded under its controller, inputs tell linear models what outputs will be
+    compared = baselines if not told else {"constant": baselines["constant"]}
+    simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
+    acting, unit = shifted(train, fit.delay), context.time_unit
+    length = longest_run or longest or trial
+    context.progress.update("free runs", 1, 1, "looking for wrong terms")
+    off = zip(errors["phy"].rmse.items(), smoother.sizes.y, strict=True)
+    reasons = [
+        named(causes(make, fit.values, acting, spec.dt, length, unit)),
+        bounds_doubt(bounds, len(fit.standard_errors)),
+    ]
+    # where small errors grow, those of first states do: free runs with fitted ones tell whether the equations are right
+    short = grows and longest_run is not None
+    follows = short and min(row["validation_error"] for row in fit.stages) <= POOR
+    if not follows:
+        reasons += [
+            structure_doubt(own["phy"], simpler),
+            fit_doubt(errors["phy"].fit_percent, {name: e / size for (name, e), size in off}),
+        ]
+    in_doubt = tuple(one for one in reasons if one)
+    for doubt in in_doubt:
+        context.progress.warn(f"{IN_DOUBT}: {doubt}")
+    one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
+    return PriorResult(
+        fit,
+        make().values,
+        {p.name: p.unit for p in make().parameters},
+        baselines,
+        bounds,
+        in_doubt,
+        errors,
+        "" if follows else no_gain(own, training),
+        {s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)},
+        longest_run,
+        {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
+    )
+
+
+def _error_of(baseline: BaselineScores) -> float:
+    """Error of a baseline; infinite where there is none."""
+    return math.inf if baseline.errors is None else baseline.errors.error
+
+
+def _linear_models(context: Context) -> dict[str, LinearModel | str]:
+    """Linear models of inputs and outputs by name, or why there is none."""
+    train, valid = context.trajectories("train"), context.trajectories("valid")
+    found: dict[str, LinearModel | str] = {}
+    for name, fit_linear in BASELINES.items():
+        try:
+            found[name] = fit_linear(train, valid, context.spec.dt, warm=context.warm + 1)
+        except InputError as error:
+            found[name] = str(error)
+    return found
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Free runs of a prior and of simpler models over the same trajectories, from the same warm-up."""
+
+    context: Context
+    fitted: Prior
+    fit: PriorFit
+    smoother: Smoother
+
+    def errors(
+        self,
+        trajectories: Sequence[Trajectory],
+        length: float | None,
+        linear: Mapping[str, LinearModel | str] = MappingProxyType({}),
+    ) -> tuple[dict[str, OutputErrors], dict[str, BaselineScores]]:
+        """Errors of the nominal and the fitted prior, and of a constant and linear models, by name.
+
+        Args:
+            trajectories: Smoothed trajectories.
+            length: Length [s] of the runs; None: whole trajectories.
+            linear: Linear models, or why there is none.
+        """
+        context, fitted = self.context, self.fitted
+        runs = evaluation_trajectories(trajectories, self.smoother, context.warm, length)
+        dt, own = context.spec.dt, {}
+        for name, step in (
+            ("phy_nominal", PriorStep(context.scenario.prior(), dt)),
+            ("phy", PriorStep(fitted, dt, self.fit.substeps)),
+        ):
+            found = score(free_runs(step, fitted, runs, context.warm), fitted, self.smoother.sizes.y)
+            own[name] = OutputErrors(found.error, found.rmse, found.fit_percent)
+        warm = context.warm + 1  # the prior starts from a state that knows this sample
+        simpler = {
+            "constant": self._scored(constant_runs(context.trajectories("train"), runs, warm), runs, warm)
+        }
+        for name, model in linear.items():
+            if isinstance(model, str):
+                simpler[name] = BaselineScores(reason=model)
+            else:
+                scored = self._scored(model.free_runs(runs, warm), runs, warm)
+                simpler[name] = replace(scored, chosen=model.chosen.text)
+        return own, simpler
+
+    def _scored(self, y_hat: Sequence[Array], runs: Sequence[Trajectory], warm: int) -> BaselineScores:
+        shown = [measured_as(self.fitted, own) for own in y_hat]
+        measured = [t.y[warm:] for t in runs]
+        return BaselineScores(output_errors(shown, measured, self.fitted.outputs, self.smoother.sizes.y))
+
+
+def what_training_reads(context: Context) -> dict[str, object]:
+    """Settings of the networks, the device, and the period of the recordings."""
+    return {
+        "settings of the networks": {
+            kind: training_settings(context, kind) for kind in kinds_of(context.scenario.prior())
+        },
+        "device": context.settings.device,
+        "period": context.spec.dt,
+    }
+
+
+def models_of(prior: Prior) -> tuple[str, ...]:
+    """Models of a prior that are evaluated: without and with fitted parameters, and each kind of network."""
+    return ("phy_nominal", "phy", *kinds_of(prior))
+
+
+def training_stage(context: Context) -> TrainingResult:
+    """Train the networks of every kind, two kinds at once."""
+    # networks of other settings or data lie in a folder of their own
+    name = digest(TRAINING.keys(context))[:12]
+    folder = context.out / "checkpoints" / "training" / name
+    trained = train_kinds(
+        context.scenario_path,
+        context.prior.fit.values,
+        context.smoothed("train"),
+        context.smoothed("valid"),
+        {kind: _as_long_as_judged(context, kind) for kind in kinds_of(context.scenario.prior())},
+        folder.resolve(),
+        device=context.settings.device,
+        on_progress=context.progress.update,
+        cluster=context.cluster,
+    )
+    return TrainingResult(
+        name,
+        {k: float(t.validation.min()) for k, t in trained.items()},
+        {k: int(t.skipped.sum()) for k, t in trained.items()},
+        {k: t.failures for k, t in trained.items()},
+        {k: sha256(folder / f"{k}.json") for k in trained},
+    )
+
+
+def train_kinds(
+    scenario: str,
+    values: Mapping[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: Mapping[str, TrainingSettings],
+    folder: Path,
+    *,
+    device: str = "cpu",
+    workers: int = WORKERS,
+    on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
+    cluster: Any = None,
+) -> dict[str, Trained]:
+    """Train the networks of every kind that ``folder`` does not hold yet; an interrupted training is resumed."""
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        kind: (_train_kind, (scenario, dict(values), training, validation, settings[kind], folder, device))
+        for kind in reversed(list(settings))
+        if not is_trained(folder, settings[kind])
+    }
+    run_jobs(jobs, on_progress, workers, cluster=cluster)
+    return {kind: load_trained(folder, kind) for kind in settings}
+
+
+def _train_kind(
+    scenario: str,
+    values: dict[str, float],
+    training: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    settings: TrainingSettings,
+    folder: Path,
+    device: str,
+    report: Callable[[int, int, str], None],
+) -> None:
+    """Job of one process: train one kind and leave its files."""
+    label = ERRORS.get(settings.objectives[0], settings.objectives[0])
+    trained = train(
+        load_scenario(scenario).prior(values),
+        training,
+        validation,
+        settings,
+        checkpoint=folder / f"{settings.kind}.safetensors",
+        device=device,
+        on_progress=lambda done, total, error: report(done, total, f"validation {label} {error:.4g}"),
+    )
+    save_trained(folder, trained)
+
+
+def networks_are_there(context: Context, found: TrainingResult) -> str:
+    """Whether the weights lie where the training left them; a text if not."""
+    folder = context.out / "checkpoints" / "training" / found.folder
+    for kind, content in found.weights.items():
+        path = folder / f"{kind}.json"
+        if not path.is_file() or sha256(path) != content:
+            return f"networks {kind} are gone or were changed"
+    return ""
+
+
+def trained_models(context: Context, kind: str) -> Trained:
+    """The trained networks of one kind."""
+    return load_trained(context.out / "checkpoints" / "training" / context.read(TRAINING).folder, kind)
+
+
+def runs_of(
+    context: Context, name: str, phy: Prior, trajectories: Sequence[Trajectory], own: int | None = None,
+    share: float = 1.0,
+) -> list[list[FreeRun]]:  # fmt: skip
+    """Free runs of one model: of the model itself, then of each of its networks, if it has several.
+
+    The model is the mean of its networks, or network ``own`` alone, where the others have seen what it runs over. Of
+    the networks' correction ``share`` counts.
+    """
+    dt, warm = context.spec.dt, context.warm
+    if name in ("phy_nominal", "phy"):
+        fitted, nominal = (phy, dt, context.prior.fit.substeps), (context.scenario.prior(), dt)
+        step = PriorStep(*fitted) if name == "phy" else PriorStep(*nominal)
+        return [free_runs(step, phy, trajectories, warm)]
+    trained = trained_models(context, name).shrunk(phy, share)
+    if len(trained.validation) == 1:
+        return [free_runs(trained.step(phy, dt), phy, trajectories, warm)]
+    every = stacked_free_runs(trained, phy, dt, phy, trajectories, warm)
+    return [
+        every[own] if own is not None else free_runs(trained.step(phy, dt), phy, trajectories, warm),
+        *every,
+    ]
+
+
+def training_settings(context: Context, kind: str) -> TrainingSettings:
+    """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
+    b = context.budget
+    settings = TrainingSettings(
+        kind=kind,  # type: ignore[arg-type]
+        hidden=b.hidden,
+        networks=b.networks,
+        teacher_steps=b.teacher_steps,
+        free_run_steps=b.free_run_steps,
+        seed=context.settings.seed,
+        warm=context.warm,
+        decay=b.decay,
+        prior_replay=b.prior_replay,
+        parts=max(PARTS, b.networks),
+    )
+    return replace(settings, **context.settings.network())
+
+
+def _as_long_as_judged(context: Context, kind: str) -> TrainingSettings:
+    """The same, with free runs no longer than those by which a machine that runs away is judged."""
+    settings, longest = training_settings(context, kind), context.prior.longest_run
+    if context.spec.free_run is not None or longest is None:
+        return settings
+    most = scales.periods(longest, context.spec.dt, 2)
+    validation = settings.validation_horizon or most
+    return replace(settings, horizon=min(settings.horizon, most), validation_horizon=validation)
+
+
+@dataclass(frozen=True)
+class _Note:
+    """What the JSON file of trained networks holds; the arrays are in a file next to it."""
+
+    settings: TrainingSettings
+    scaling: Scaling
+    failures: tuple[TrainingFailure, ...]
+
+
+def save_trained(folder: Path, trained: Trained) -> None:
+    """Write the networks of one kind."""
+    kind = trained.settings.kind
+    arrays: dict[str, Any] = {f"weights.{n}": v for n, v in trained.weights.items()}
+    arrays |= {f"curve.{n}": v for n, v in trained.curve.items()}
+    arrays |= {"own.validation": trained.validation, "own.skipped": trained.skipped}
+    note = _Note(trained.settings, trained.scaling, trained.failures)
+    write_document(folder / f"{kind}.json", plain(note), arrays)
+
+
+def is_trained(folder: Path, settings: TrainingSettings) -> bool:
+    """Whether a folder holds finished networks of these settings.
+
+    Raises:
+        InputError: If it holds networks of the same kind and other settings.
+
+    Example:
+        >>> is_trained(Path("nowhere"), TrainingSettings("pgrnn", 4, 1, 5, 5, seed=0, warm=2))
+        False
+    """
+    if not (folder / f"{settings.kind}.json").is_file():
+        return False
+    found, own = (asdict(s) for s in (load_trained(folder, settings.kind).settings, settings))
+    changed = [f"{name} {found[name]} instead of {own[name]}" for name in own if found[name] != own[name]]
+    if changed:
+        raise InputError(
+            f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
+            "version or scenario; choose another --out"
+        )
+    return True
+
+
+def load_trained(folder: Path, kind: str) -> Trained:
+    """Read the networks of one kind.
+
+    Raises:
+        InputError: If a file is missing or damaged.
+    """
+    path = folder / f"{kind}.json"
+    remedy = f"delete {kind}.* in {folder}, and the same command trains these networks anew"
+    note = record(_Note, read_document(path, remedy), str(path))
+    arrays = read_document_arrays(path, remedy)
+    part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}
+    for name, value in arrays.items():
+        group, _, key = name.partition(".")
+        part[group][key] = value
+    return Trained(
+        note.settings,
+        note.scaling,
+        part["weights"],
+        part["own"]["validation"],
+        part["curve"],
+        part["own"]["skipped"],
+        note.failures,
+    )
+
+
+DATA = Stage(
+    "data", "reading the measurements", DataResult, data_stage, what_data_reads, restore=recordings_are_there
+)
+PRIOR = Stage("prior", "fitting the prior", PriorResult, prior_stage, what_prior_reads, (DATA,))
+TRAINING = Stage(
+    "training", "training the networks", TrainingResult, training_stage, what_training_reads, (DATA, PRIOR),
+    restore=networks_are_there,
+)  # fmt: skip

@@ -1,0 +1,129 @@
+"""Stage promises: what the kit promises of its loops, examined and written beside its models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybrid_mpc.compare.loops import LoopRow
+from hybrid_mpc.compare.promises import TaskEnd, Tested, examine, task_end
+from hybrid_mpc.compare.tasks import tasks_of
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.kit.promises import Promise, PromiseTable, read_promises, write_promises
+from hybrid_mpc.scenario import Task
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stage import Absent, Stage
+from hybrid_mpc.workflow.stages.compare import CONTROL, what_loops_read
+from hybrid_mpc.workflow.stages.estimate import ESTIMATION
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE
+from hybrid_mpc.workflow.stages.identify import PRIOR, PriorResult
+from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, what_on_model_reads
+
+STRUCTURE = "structure of the prior"
+"""Name of the row about the prior on which all models stand."""
+MEND = "Correct the prior first: docs/prior-wrong.md says how to read each reason."
+"""What to do about a prior whose structure is in doubt."""
+
+
+@dataclass(frozen=True)
+class PromisesResult:
+    """The table "What this kit promises": its rows in their order, and the digest of what it was made of."""
+
+    rows: tuple[Promise, ...]
+    of: str = ""
+
+
+def promises_stage(context: Context) -> PromisesResult | Absent:
+    """Examine the recommended model's loop, and write ``promises.json`` beside the models."""
+    if context.scenario.control is None and not any(task.control for task in context.scenario.tasks):
+        return Absent(f"scenario {context.scenario.name} defines no control problem")
+    context.read(NOISE)
+    kit, tasks = context.kit, _tasks(context)
+    controller = f"{kit.recommended}_observer"
+    rows, where = _loops(context, controller)
+    ends: dict[str, TaskEnd] = {}
+    for row in rows:
+        task = next((one for one in tasks if one.name == row.task), None)
+        if task is not None and row.arrays and (end := task_end(kit, task, row.arrays)) is not None:
+            ends.setdefault(row.task, end)
+    given_way = {row.task: row.given_way for row in rows if row.given_way}
+    found = examine(
+        kit, tasks, ends=tuple(ends.values()), where=where, given_way=given_way,
+        tested=_tested(context, controller, kit.models[kit.recommended].n_y),
+        report=lambda done, total, text: context.progress.update("promises", done, total, text),
+    )  # fmt: skip
+    result = PromisesResult((structure(context.prior), *found), kit.identity)
+    put_promises(context, result)
+    return result
+
+
+def structure(prior: PriorResult) -> Promise:
+    """Whether the structure of the fitted prior, on which all models stand, is in doubt."""
+    errors = {
+        "the fitted prior": prior.errors["phy"].error,
+        "the nominal one": prior.errors["phy_nominal"].error,
+    }
+    errors |= {name: one.errors.error for name, one in prior.baselines.items() if one.errors is not None}
+    figures = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
+    evidence = f"error of free runs on unseen recordings over the outputs' spread: {figures}"
+    if not prior.in_doubt:
+        return Promise(STRUCTURE, "shown", f"no term, signal or bound is in doubt; {evidence}")
+    return Promise(STRUCTURE, "doubted", f"{'; '.join(prior.in_doubt)}; {evidence}", MEND)
+
+
+def _tasks(context: Context) -> tuple[Task, ...]:
+    """The scenario's tasks, or the default ones; none where these cannot be made."""
+    try:
+        return tasks_of(context.ready, context.budget.tasks)
+    except InputError:  # the stage on_model says so
+        return ()
+
+
+def _loops(context: Context, controller: str) -> tuple[list[LoopRow], str]:
+    """The run's loops of a controller, with what was kept of them, and what they ran on."""
+    control, on_model = context.find(CONTROL), context.find(LOOPS_ON_MODEL)
+    if not isinstance(control, Absent) and control.rows:
+        drawn = {(row.task, row.controller, row.seed): row for row in control.drawn}
+        rows = [drawn.get((row.task, row.controller, row.seed), row) for row in control.rows]
+        return [row for row in rows if row.controller == controller], "on the scenario's plant"
+    if isinstance(on_model, Absent):
+        return [], ""
+    rows = [row for row in on_model.drawn if row.controller == controller]
+    return rows, f"on the model {on_model.plants.get(controller, '')}, not the machine"
+
+
+def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
+    """What the innovations of the controller's observer said on test recordings, or why nothing."""
+    found = context.find(ESTIMATION)
+    if isinstance(found, Absent):
+        return found.reason
+    own = found.observers[controller]
+    if isinstance(own, Absent):
+        return own.reason
+    correlation = float(np.abs(found.arrays[f"{controller}/autocorrelation"]).max())
+    return Tested(correlation, own.mean_nis / n_y, own.samples)
+
+
+def put_promises(context: Context, found: PromisesResult) -> str:
+    """Write the table beside the models, unless it is there."""
+    folder, table = context.out / "model", PromiseTable(found.of, found.rows)
+    try:
+        there = read_promises(folder) == table
+    except InputError:  # damaged, or of another version: it is written anew
+        there = False
+    if not there:
+        write_promises(folder, table)
+    return ""
+
+
+def what_promises_read(context: Context) -> Mapping[str, object]:
+    """What loops read, on a plant or on a model."""
+    return {**what_on_model_reads(context), **what_loops_read(context)}
+
+
+PROMISES = Stage(
+    "promises", "examining what the kit promises", PromisesResult, promises_stage, what_promises_read,
+    (PRIOR, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
+)  # fmt: skip

@@ -1,0 +1,602 @@
+"""Stage report: figures, ``report.html`` and ``results.json``."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.compare.controllers import CONTROLLERS
+from hybrid_mpc.compare.loops import DRAWN_PRIOR, ON_MODEL
+from hybrid_mpc.compare.sequential import SAME, hardest
+from hybrid_mpc.compare.step_response import step_responses
+from hybrid_mpc.compare.summary import Summary
+from hybrid_mpc.compare.tasks import tasks_of
+from hybrid_mpc.files import write_json
+from hybrid_mpc.identify.evaluate import OutputErrors
+from hybrid_mpc.identify.settings import NO_BALANCE
+from hybrid_mpc.plots.style import name_of, number
+from hybrid_mpc.report.page import Report, Section, Table, words, write_report
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stage import Absent, Stage, source_of
+from hybrid_mpc.workflow.stages.advice import advice, doubt_of
+from hybrid_mpc.workflow.stages.analyze import ANALYSIS
+from hybrid_mpc.workflow.stages.answers import answer_all
+from hybrid_mpc.workflow.stages.choose import CHOICE
+from hybrid_mpc.workflow.stages.compare import CONTROL
+from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
+from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.export import EXPORT
+from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, models_of, training_settings
+from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
+from hybrid_mpc.workflow.stages.promises import PROMISES
+from hybrid_mpc.workflow.stages.results import (
+    REPORTED,
+    Analysis,
+    Control,
+    Data,
+    Export,
+    Identification,
+    OnModel,
+    Promises,
+    Results,
+    Timing,
+    collect,
+    finite,
+    identification,
+    recordings,
+)
+from hybrid_mpc.workflow.stages.watch import RATES, WATCH, WatchResult
+from hybrid_mpc.workflow.stages.watching import watching_table
+
+TITLES: Mapping[str, str] = {
+    "promises": "What this kit promises",
+    "data": "Data",
+    "models": "Prior and models",
+    "training": "Training",
+    "free_run": "Free runs: how well the models predict",
+    "export": "Export",
+    "control": "Closed loops",
+    "on_model": "Closed loops on the model, not the machine",
+    "estimation": "Estimation: are the observers as sure as they may be",
+    "timing": "Time of a controller step",
+    "watch": "Monitor",
+    "analysis": "Linear analysis",
+    "glossary": "Names and definitions",
+}
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    """The report: its file, and the pictures in it."""
+
+    file: str
+    figures: tuple[str, ...]
+
+
+def report_stage(context: Context) -> ReportResult:
+    """Draw, write the report, and last the results."""
+    results = collect(context)
+    figures = draw_all(context)
+    write_report(context.out / "report.html", _report(context, results, figures))
+    write_json(context.out / "results.json", results.plain())
+    drawn = tuple(path.name for group in figures.values() for path, _ in group)
+    return ReportResult("report.html", drawn)
+
+
+def report_so_far(context: Context) -> None:
+    """Write a page of the stages up to the free runs, of those that have run, while the others go on."""
+    figures = draw_first(context)
+    tables: dict[str, Sequence[Table]] = {
+        "data": [_data_table(recordings(context))],
+        "models": [_prior_table(context)],
+    }
+    if "free_run" in figures:
+        tables["free_run"] = _free_run_tables(context, identification(context))
+    texts = words("run_words.html")
+    shown = [key for key in TITLES if key in figures or key in tables]
+    sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
+    going = "This run goes on: the page is written anew after the first stages and at the end. Load it again."
+    s, title = context.scenario, f"hybrid-mpc: {context.scenario.name}"
+    doubt = doubt_of(context.prior.in_doubt)
+    page = Report(title, s.title, s.description, command(context), (), sections, going, doubt=doubt)
+    write_report(context.out / "report.html", page)
+
+
+def report_is_there(context: Context, found: ReportResult) -> str:
+    """Whether the report and the results lie where the run left them; a text if not."""
+    there = all((context.out / name).is_file() for name in (found.file, "results.json"))
+    return "" if there else "the report is gone"
+
+
+def what_report_reads(context: Context) -> dict[str, object]:
+    """What the report says of the machine beside the results."""
+    scenario, prior = context.scenario, context.scenario.prior()
+    return {
+        "titles": (scenario.title, scenario.description, [task.title for task in scenario.tasks]),
+        "labels": (prior.states, prior.inputs, prior.outputs, prior.parameters),
+        "drawing": source_of(scenario.draw),
+        "own figures": source_of(scenario.figures),
+        "command": command(context, Path(context.settings.scenario).name),
+    }
+
+
+def command(context: Context, scenario: str = "") -> str:
+    """The command line that makes this run; ``scenario`` stands for the scenario as it was given."""
+    s = context.settings
+    words = ["hybrid-mpc", "run", scenario or s.scenario, *s.options(lambda path: path.name)]
+    words += ["--settings", s.network_file.name] if s.network_file else []
+    words += ["--deploy", s.deploy] if s.deploy else []
+    return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
+
+
+def _report(context: Context, results: Results, figures: Figures) -> Report:
+    found = results.identification
+    tables: dict[str, Sequence[Table | None]] = {
+        "promises": [_promises_table(results.promises)],
+        "data": [_data_table(results.data)],
+        "models": [_prior_table(context)],
+        "free_run": _free_run_tables(context, found),
+        "export": [_export_table(results.export)],
+        "control": [
+            _control_table(results.control),
+            _comparison_table(results.control),
+            _tracking_table(results.control),
+            _response_table(context),
+        ],
+        "on_model": _on_model_tables(results.on_model),
+        "estimation": [_observer_table(results)],
+        "timing": [_timing_table(results.timing)],
+        "watch": _watch_tables(context),
+        "analysis": [_pole_table(results.analysis)],
+    }
+    instead, after = _notes(context, results)
+    for key in ("estimation", "timing", "watch"):
+        # words about pictures that are not there help nobody
+        if key in after and not figures.get(key) and not any(t is not None and t.rows for t in tables[key]):
+            instead[key] = after.pop(key)
+    texts = words("run_words.html")
+    sections = tuple(
+        Section(
+            TITLES[key],
+            instead.get(key, texts[key]),
+            figures.get(key, ()),
+            [t for t in tables.get(key, ()) if t is not None and t.rows],
+            after.get(key, ()),
+        )
+        for key in TITLES
+        if key != "on_model" or not results.on_model.reason
+    )
+    versions = ", ".join(f"{name} {v}" for name, v in results.versions.items())
+    return Report(
+        f"hybrid-mpc: {context.scenario.name}",
+        context.scenario.title,
+        context.scenario.description,
+        command(context),
+        (),
+        sections,
+        f"seed {results.seed}, budget {results.budget}; {versions}",
+        advice(results),
+        doubt_of(found.details.prior_parameters.in_doubt),
+        answer_all(results),
+    )
+
+
+Notes = dict[str, tuple[str, ...]]
+
+
+def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
+    """Paragraphs by section: those that replace the usual ones, and those after tables and pictures."""
+    instead: Notes = {}
+    after: Notes = {}
+    control = results.control
+    if results.promises.rows is None:
+        instead["promises"] = (
+            f"It was not examined what the kit promises: {results.promises.reason.rstrip('.')}.",
+        )
+    if control.gap_closed is None:
+        reason = control.gap_closed_reason.rstrip(".")
+        if control.hybrid.cost is None:
+            timed = " The controller was built and timed on recordings instead."
+            timed = "" if results.timing.misses is None else timed
+            if results.on_model.plants:
+                timed += f" Loops {ON_MODEL}, are in the next section."
+            instead["control"] = (f"There is no closed loop here: {reason}.{timed}",)
+        else:
+            after["control"] = (f"The gap closed is not defined: {reason}.",)
+    on_model = results.on_model
+    after["on_model"] = tuple(f"{name}: {why}." for name, why in on_model.left_out.items())
+    if DRAWN_PRIOR in on_model.plants.values():
+        after["on_model"] += (
+            f"{DRAWN_PRIOR} is the prior with parameters drawn from their fitted covariance: the networks correct "
+            "nothing, so no other model differs from the controller's.",
+        )
+    if on_model.default_tasks:
+        after["on_model"] += ("The tasks are default ones, since the scenario declares none.",)
+    tested = results.estimation
+    observers = (tested.prior_observer, tested.hybrid_observer)
+    without = [text for text in (tested.reason, *(o.reason for o in observers if o is not None)) if text]
+    if without:
+        after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
+    after["data"] = tuple(f"Warning: {text}" for text in results.data.details.warnings)
+    replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
+    lacking = "mopgrnn" not in models_of(context.scenario.prior())
+    after["training"] = ((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()) + _prior_replay_text(
+        replay
+    )
+    if context.prior.fit.warnings:
+        after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
+    if results.timing.misses is None:
+        after["timing"] = (f"No step was timed: {results.timing.misses_reason.rstrip('.')}.",)
+    watched: WatchResult | Absent = context.find(WATCH)
+    after["watch"] = (*_watch_words(watched), *coverage_words(results.watch.details.recordings))
+    if results.analysis.details is None:
+        instead["analysis"] = (f"There is no analysis here: {results.analysis.reason.rstrip('.')}.",)
+    else:
+        models = results.analysis.details.models
+        after["analysis"] = tuple(
+            f"{name}: {m.fixed_point_reason}" for name, m in models.items() if m.fixed_point_reason
+        )
+    return instead, after
+
+
+def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
+    """What limits were learned from, what they do not promise, and how many alarms there were beside those expected."""
+    if isinstance(found, Absent) or found.limits is None or found.clean is None:
+        return (f"No alarms here: {found.reason.rstrip('.')}.",)
+    limits, clean = found.limits, found.clean
+    rate, wanted = limits.false_alarms_per_hour, RATES[0] / limits.time_unit
+    learned = f"Limits were learned from {found.sources[found.kind]}, for {rate:g} false alarms an hour."
+    if not limits.rated:
+        learned = f"Limits are {limits.method}; they were learned from {found.sources[found.kind]}."
+    elif rate > wanted:
+        learned += (
+            f" Nominal data are too short for {wanted:g} an hour; a longer run (budget full), or recordings of the "
+            f"machine with hybrid-mpc monitor --learn {wanted:g}, give better limits."
+        )
+    verdict = "more than they promise" if clean.too_many(rate) else "within what they promise"
+    test = f"In the {clean.test_seconds:.0f} s of test data among them: {clean.test_alarms}."
+    words: tuple[str, ...] = (learned, f"Alarms: {clean.words(rate)}: {verdict}. {test}")
+    if found.loops:
+        words += (
+            "Recordings were driven otherwise, and wider, than the loops that limits were learned from: an alarm there "
+            "says that the model is less right where the loops do not go.",
+        )
+    return words
+
+
+def _prior_replay_text(weight: float) -> tuple[str, ...]:
+    words = "Corrections were asked to fade where no recording comes near; the prior stands alone there"
+    return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
+
+
+def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """What the monitor could not see of the recordings, in a sentence; nothing if that is but the warm-up.
+
+    Example:
+        >>> coverage_words([{"valid_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
+        ('Not monitored: 2 s in which model or estimator gave no finite number.',)
+    """
+    why = {
+        "missing_s": "with missing samples",
+        "not_finite_s": "in which model or estimator gave no finite number",
+    }
+    sums = {key: sum(float(row[key]) for row in recordings) for key in why}
+    parts = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
+    return (f"Not monitored: {', '.join(parts)}.",) if parts else ()
+
+
+def _data_table(data: Data) -> Table:
+    rows: list[tuple[Any, ...]] = list(data.details.seconds.items())
+    rows += [
+        (f"cut: {c.file}, {c.start_s:.2f} to {c.end_s:.2f} s: {why}", c.end_s - c.start_s)
+        for c, why in zip(data.cuts, data.details.why_cut, strict=True)
+    ]
+    caption = f"{len(data.files)} files; content hash {data.hash[:16]}."
+    return Table(("part", "length [s]"), rows, caption)
+
+
+def _prior_table(context: Context) -> Table:
+    prior = context.prior
+    rows = [
+        (p.label, p.description, prior.nominal[p.name], prior.fit.values[p.name],
+         prior.fit.standard_errors.get(p.name, "fixed"))
+        for p in context.scenario.prior().parameters
+    ]  # fmt: skip
+    colours = ", ".join(f"{label} {value:.2f}" for label, value in prior.error_correlation.items())
+    caption = (
+        "Parameters of the prior. Standard errors suppose that the prior's structure is right. Correlation of one-step "
+        f"errors with those of the sample before (0 is white): {colours}."
+    )
+    return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
+
+
+def _free_run_tables(context: Context, found: Identification) -> list[Table]:
+    """Errors of every model: by output; then of its rates and by balance; the choice, and the bands."""
+    prior = context.scenario.prior()
+    models = models_of(prior)
+    outputs = [s.label for s in prior.outputs]
+    base = _number(found.error["phy"])
+    rows: list[tuple[Any, ...]] = []
+    for m in models:
+        error = _number(found.error[m])
+        rmse, fit = ([_by(by[m], label) for label in outputs] for by in (found.rmse, found.fit_percent))
+        rows.append((name_of(m), error, _percent(error, base), *rmse, *fit))
+    for name, own in found.details.baselines.items():
+        errors = own.errors or OutputErrors(math.inf, {}, {})
+        error = finite(errors.error)
+        rmse, fit = ([_by(by, label) for label in outputs] for by in (errors.rmse, errors.fit_percent))
+        model = name if name == "constant" else f"{name} (linear)"
+        rows.append((model, error, _percent(error, base), *rmse, *fit))
+    columns = ("model", "error [spreads]", "over the prior's", *(f"RMSE of {label}" for label in outputs),
+               *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
+    tables = [Table(columns, rows, "Free runs on unseen data: outputs.")]
+    balances = [f"{b.name} [{b.rate_unit}]" for b in prior.equations.balances]
+    base = _number(found.e_sim["phy"])
+    rows = []
+    for m in models:
+        e_sim = _number(found.e_sim[m])
+        violations = [_by(found.balance_violation[m], label) for label in balances]
+        rows.append((name_of(m), e_sim, _percent(e_sim, base), *violations))
+    columns = (
+        "model",
+        "E_sim [spreads]",
+        "over the prior's",
+        *(f"violation of {label}" for label in balances),
+    )
+    caption = "Free runs on unseen data: rates of the states" + (" and balances." if balances else ".")
+    return [*tables, Table(columns, rows, caption), _choice_table(found), _band_table(context, found)]
+
+
+def _choice_table(found: Identification) -> Table:
+    choice = found.details.choice
+    rows = [
+        (name_of(name), None if name == "phy" else f"{100 * c.share:.0f} %", c.error, c.ratio,
+         None if name == "phy" else c.upper,
+         "recommended" if name == choice.recommended else "")
+        for name, c in choice.candidates.items()
+    ]  # fmt: skip
+    columns = ("model", "correction", "error [spreads]", "over the prior's", "at most, by 95 %", "")
+    caption = (
+        f"Parts of the training data that networks left out. {choice.reason} The error is that of all. Where there are "
+        "several, the ratio is the geometric mean of the ratios of each, and the bound is a bound of this mean. "
+        "Correction: how much of what its networks say a model has; less where the whole is not surely better."
+    )
+    return Table(columns, rows, caption)
+
+
+def _band_table(context: Context, found: Identification) -> Table:
+    rows: list[tuple[Any, ...]] = [
+        (name_of(name), output.label, f"{100 * b.share:g} %", f"{100 * b.coverage:.0f} %",
+         *(by[output.label] for by in (b.width, b.score, b.score_of_constant)))
+        for name, b in found.details.bands.items()
+        for output in context.scenario.prior().outputs
+    ]  # fmt: skip
+    what = ("mean width", "interval score", "of a constant band")
+    columns = ("model", "output", "is to hold", "all hold", *what)
+    caption = (
+        "Bands around free runs, calibrated on what was not trained on, on unseen data, in the outputs' units; a low "
+        "score is good."
+    )
+    return Table(columns, rows, caption)
+
+
+def _by(values: Any, label: str) -> float | None:
+    """The number of a signal, where there are any and all are finite."""
+    return values.get(label) if isinstance(values, Mapping) else None
+
+
+def _number(value: Any) -> float | None:
+    return value if isinstance(value, float) else None
+
+
+def _percent(value: float | None, base: float | None) -> str:
+    return "–" if value is None or not base else f"{100 * (value / base - 1):+.0f} %"
+
+
+def _promises_table(found: Promises) -> Table | None:
+    if not found.rows:
+        return None
+    rows = [(one.name, one.verdict, one.evidence, one.remedy) for one in found.rows]
+    return Table(("promise", "verdict", "evidence", "what to do"), rows)
+
+
+def _export_table(export: Export) -> Table:
+    rows = [
+        ("values", f"{export.parity_max_abs_error:.1e}", "1e-12"),
+        ("Jacobians", f"{export.jacobian_max_abs_error:.1e}", "1e-10"),
+    ]
+    caption = "Largest difference between the exported models and PyTorch, relative to the outputs' scale."
+    return Table(("compared", "largest difference", "allowed"), rows, caption)
+
+
+def _control_table(control: Control) -> Table | None:
+    details = control.details
+    if details is None:
+        return None
+    names = [n for n in CONTROLLERS if any(n in cells for cells in details.tasks.values())]
+    rows = []
+    for task, cells in details.tasks.items():
+        gap = details.gap_closed_by_task[task].value
+        costs = (_cost(cells.get(name)) for name in names)
+        rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
+    caption = (
+        "Closed-loop cost J on the true state: mean over its seeds with a 95 % interval of its own that holds although "
+        "a task's loops may stop early (none for one seed); squared deviations of all signals, each times its weight "
+        "in the control problem, which brings them to one scale. Gap: share of the distance from the better baseline "
+        "to the measuring oracle that the hybrid with observer covers; a dash where baseline and oracle do not differ "
+        "enough to say."
+    )
+    return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
+
+
+def _comparison_table(control: Control) -> Table | None:
+    """The hybrid's cost over that of each baseline on the same seeds, with the interval that early stopping leaves."""
+    details = control.details
+    if details is None:
+        return None
+    rows = [
+        (task, base.replace("_", ", ") + " *" * (base == hardest(own)), found.words, found.n, found.finding)
+        for task, own in details.comparisons.items()
+        for base, found in own.items()
+    ]
+    caption = (
+        f"Cost of the hybrid with observer over a baseline's on the same seeds: geometric mean, and a 95 % interval "
+        f"that holds although a task's loops stop where the larger ratio (*) is decided, at most after "
+        f"{details.most_seeds} seeds. Ratios within {100 * SAME:.0f} % of 1 are the same. The 95 % are those of one "
+        "row: of twenty rows one may be wrong."
+    )
+    return Table(("task", "baseline", "ratio of costs", "seeds", "finding"), rows, caption)
+
+
+def _tracking_table(control: Control) -> Table | None:
+    """Tracking errors of every signal that has a reference, in its unit."""
+    if control.details is None:
+        return None
+    cells = [
+        (task, name, own[name])
+        for task, own in control.details.tasks.items()
+        for name in CONTROLLERS
+        if name in own
+    ]
+    signals, errors = _tracking([cell for *_, cell in cells])
+    rows = [(task, name.replace("_", ", "), *own) for (task, name, _), own in zip(cells, errors, strict=True)]
+    caption = (
+        "Root mean square deviations from the reference, means over seeds: of true states, or of measured outputs "
+        "where references are theirs."
+    )
+    return Table(("task", "controller", *(f"RMSE of {s}" for s in signals)), rows, caption)
+
+
+def _response_table(context: Context) -> Table | None:
+    """Rise, settling, overshoot and offset in tasks that end at a set-point."""
+    scenario, found = context.scenario, context.find(CONTROL)
+    if isinstance(found, Absent) or scenario.control is None:
+        return None
+    drawn, prior = found.drawn, scenario.prior()
+    names = {controller: name for name, controller in REPORTED.items()}
+    rows = [
+        (
+            task.name, names[row.controller], signal.label, answer.rise, answer.settling, answer.overshoot,
+            answer.offset,
+        )
+        for task in tasks_of(scenario, context.budget.tasks)
+        for row in drawn
+        if row.task == task.name and row.controller in names
+        for signal, answer in step_responses(task.control or scenario.control, prior, row.arrays).items()
+    ]  # fmt: skip
+    caption = (
+        "Answers to the last set-point of each task that ends at one, first seed: time from 10 to 90 % of the step, "
+        "time until it stays within 5 % of it, how far it goes beyond, and the mean deviation over the last fifth, in "
+        "the signal's unit. A dash: there is no clear step, as where a load is rejected."
+    )
+    heads = ("task", "controller", "signal", "rise [s]", "settling [s]", "overshoot [%]", "offset")
+    return Table(heads, rows, caption)
+
+
+def _on_model_tables(found: OnModel) -> list[Table | None]:
+    """A table a controller: each met another plant, so no table holds two."""
+    tables: list[Table | None] = []
+    for name, cells in (found.details.controllers if found.details is not None else {}).items():
+        signals, errors = _tracking(list(cells.values()))
+        rows = [
+            (task, _cost(cell), *own, f"{100 * max(cell.limits.values(), default=0.0):.0f} %",
+             f"{100 * cell.sources['MPC']:.1f} %")
+            for (task, cell), own in zip(cells.items(), errors, strict=True)
+        ]  # fmt: skip
+        caption = (
+            f"Controller {name.replace('_', ', ')} on the model {found.plants[name]} in place of the machine: "
+            f"{ON_MODEL}. Cost J on the model's state, root mean square deviations from the reference, means over "
+            "seeds."
+        )
+        heads = ("task", "cost", *(f"RMSE of {s}" for s in signals), "largest share of a limit", "solved")
+        tables.append(Table(heads, rows, caption))
+    return tables
+
+
+def _tracking(cells: Sequence[Summary]) -> tuple[list[str], list[list[float | None]]]:
+    """Signals that any cell has an error of, and the means of each cell."""
+    signals = list(dict.fromkeys(s for cell in cells for s in cell.tracking_rmse))
+    errors = [{s: found.mean for s, found in cell.tracking_rmse.items()} for cell in cells]
+    return signals, [[own.get(s) for s in signals] for own in errors]
+
+
+def _cost(cell: Summary | None) -> str:
+    if cell is None:
+        return "–"
+    mean, half = cell.cost.mean, cell.cost.ci95
+    if mean is None:
+        return "diverged"
+    return f"{mean:.3g}" + (f" ± {half:.1g}" if half is not None else "")
+
+
+def _observer_table(results: Results) -> Table:
+    found = {name: getattr(results.estimation, name) for name in OBSERVERS}
+    rows = [
+        (OBSERVER_TITLES[name], r.mean_nis, f"{r.nis_low:.2f} to {r.nis_high:.2f}", f"{100 * r.nis_inside:.0f} %",
+         f"{r.ljung_box:.0f}", f"{r.ljung_box_limit:.0f}", r.samples)
+        for name, r in found.items()
+        if r is not None and r.mean_nis is not None
+    ]  # fmt: skip
+    columns = ("observer", "mean NIS", "consistent", "below 95 %", "Ljung-Box", "white below", "samples")
+    return Table(columns, rows, "Innovations on test recordings, the first 25 samples of each left out.")
+
+
+def _timing_table(timing: Timing) -> Table | None:
+    if timing.misses is None:
+        return None
+    ms = timing.controller_step_ms
+    row = (ms.median, ms.p95, ms.p99, ms.max, timing.period_ms, timing.misses)
+    return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
+
+
+def _watch_tables(context: Context) -> list[Table | None]:
+    """All that watches, the loops in which something breaks, and the alarms on recordings."""
+    found = context.find(WATCH)
+    if isinstance(found, Absent) or found.limits is None:
+        return []
+    tables = [watching_table(found)]
+    if found.faults:
+        heads = ("what breaks", "at [s]", "alarm after [s]", "alarms before", "guard")
+        rows = [
+            (
+                row.title, row.start_s, "never" if row.delay_s is None else f"{row.delay_s:.3g}", row.false_alarms,
+                ", ".join(f"{s.after.lower()} at {s.t_s:.2f} s" for s in row.switches) or "stays normal",
+            )
+            for row in found.faults
+        ]  # fmt: skip
+        tables.append(
+            Table(heads, rows, f"Loops of the task {found.faults[0].task} in which something breaks.")
+        )
+    alarms = [(a.file, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for a in found.alarms]
+    heads = ("recording", "from [s]", "to [s]", "channels", "what explains it")
+    return [*tables, Table(heads, alarms, "Alarms over the whole recordings.")]
+
+
+def _pole_table(analysis: Analysis) -> Table | None:
+    if analysis.details is None:
+        return None
+    rows = []
+    for model, found in analysis.details.models.items():
+        for point, a in found.points.items():
+            slow = [f"{number(w)} ({z:.2f})" for w, z in
+                    list(zip(a.frequency_rad_s, a.damping, strict=True))[:2] if w is not None]  # fmt: skip
+            rows.append((model, point, ", ".join(slow), a.stable, a.stabilisable, a.detectable))
+    columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
+    points = {"rest": "at rest", "moving": "at working speed"}
+    there = [
+        points[p] for p in points if any(p in found.points for found in analysis.details.models.values())
+    ]
+    return Table(columns, rows, f"Linearizations {' and '.join(there)}.")
+
+
+REPORT = Stage(
+    "report", "writing the report", ReportResult, report_stage, what_report_reads,
+    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES, WATCH,
+     ANALYSIS),
+    restore=report_is_there,
+)  # fmt: skip

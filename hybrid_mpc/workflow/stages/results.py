@@ -1,0 +1,651 @@
+"""What a run found, as ``results.json`` holds it: the dataclasses below, field by field.
+
+A value that a run does not have is null, and its reason stands beside it as ``NAME_reason``, or as ``reason`` for the
+whole object. Signals and balances are named with their unit, ``"phi [rad]"``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.compare.loops import LoopRow
+from hybrid_mpc.compare.sequential import Comparison
+from hybrid_mpc.compare.summary import Summary, by_task, summaries
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.evaluate import Scores
+from hybrid_mpc.identify.settings import NO_BALANCE
+from hybrid_mpc.kit.promises import Promise
+from hybrid_mpc.records import plain, record
+from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stage import Absent
+from hybrid_mpc.workflow.stages.analyze import ANALYSIS, ModelAnalysis
+from hybrid_mpc.workflow.stages.choose import CHOICE
+from hybrid_mpc.workflow.stages.compare import BASELINES, CONTROL, REPORTED, comparisons
+from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS, ObservedRecording, ObserverTest
+from hybrid_mpc.workflow.stages.evaluate import EVALUATION, BandScores
+from hybrid_mpc.workflow.stages.export import EXPORT
+from hybrid_mpc.workflow.stages.identify import DATA, MODELS, BaselineScores, CutInterval
+from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, by_controller
+from hybrid_mpc.workflow.stages.promises import PROMISES
+from hybrid_mpc.workflow.stages.watch import WATCH, CleanAlarms, FaultedLoop, NominalLoop, RecordedAlarm
+
+Array = NDArray[np.float64]
+SCHEMA_VERSION = 11
+Errors = Mapping[str, Mapping[str, float] | str | None]
+"""Error by model, each by signal with unit; a model without one has null, and ``MODEL_reason``."""
+
+
+@dataclass(frozen=True)
+class DataDetails:
+    """Seconds by role, why each cut was made, and what is doubtful about the recordings."""
+
+    seconds: Mapping[str, float]
+    why_cut: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Data:
+    """The recordings: names of the files, hash of their contents, and what is not used of them."""
+
+    files: tuple[str, ...]
+    hash: str
+    cuts: tuple[CutInterval, ...]
+    details: DataDetails
+
+
+@dataclass(frozen=True)
+class FittedPrior:
+    """Parameters of the fitted prior, their standard errors, those before the fit, warnings, each stage's error, and
+    why the prior's structure is in doubt.
+    """
+
+    values: Mapping[str, float]
+    standard_errors: Mapping[str, float]
+    nominal: Mapping[str, float]
+    warnings: tuple[str, ...]
+    stages: tuple[Mapping[str, Any], ...]
+    in_doubt: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SmootherNoise:
+    """What the smoother assumes: noise of each sensor, and the random walk of the unexplained acceleration."""
+
+    sigma: tuple[float, ...]
+    walk: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class IdentificationDetails:
+    """Behind the errors. ``by_file`` is the RMSE by recording, model and output, None where a run diverged;
+    ``hybrid_over_phy`` the hybrid's ``error`` and ``e_sim`` over the fitted prior's; ``network_settings`` what replaced
+    the budget's.
+    """
+
+    prior_parameters: FittedPrior
+    scores_of_all_networks: Mapping[str, tuple[Scores, ...]]
+    by_file: Mapping[str, Mapping[str, Mapping[str, float] | None]]
+    smoother: SmootherNoise
+    hybrid_over_phy: Mapping[str, float | None]
+    choice: ModelChoice
+    bands: Mapping[str, BandScores]
+    baselines: Mapping[str, BaselineScores]
+    network_settings: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """Which model validation recommends, which hybrid is exported, figures of all candidates, and the reason."""
+
+    recommended: str
+    hybrid: str
+    reason: str
+    candidates: Mapping[str, CandidateErrors]
+
+
+@dataclass(frozen=True)
+class CandidateErrors:
+    """Error of a candidate on left-out parts of the training data [spreads of the outputs], its ratio to the prior's
+    (of several recordings the geometric mean of each one's), and that one's upper bound; None where a run diverged or
+    the bound is not known. ``share`` is that of the networks' correction that the model has.
+    """
+
+    error: float | None
+    ratio: float | None
+    upper: float | None
+    share: float
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Errors of free runs on unseen data by model; see :class:`~hybrid_mpc.identify.evaluate.Scores`."""
+
+    error: Mapping[str, float | str | None]
+    rmse: Errors
+    fit_percent: Errors
+    e_sim: Mapping[str, float | str | None]
+    balance_violation: Errors
+    details: IdentificationDetails
+
+
+@dataclass(frozen=True)
+class Export:
+    """Largest differences between the exported models and PyTorch, relative to the outputs' scale."""
+
+    parity_max_abs_error: float
+    jacobian_max_abs_error: float
+
+
+@dataclass(frozen=True)
+class ControllerCosts:
+    """Cost on the plant's true state, summed over the tasks, and tracking error by signal: that of the states, or
+    of the outputs where tasks have references of those.
+    """
+
+    cost: float | None
+    tracking_rmse: Mapping[str, float] | None
+    cost_reason: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Share of the distance from the better baseline to the oracle that the hybrid covers; or why there is none."""
+
+    value: float | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ControlDetails:
+    """Figures by task and controller, the gap closed by task, and the hybrid's cost over that of each baseline by task.
+
+    ``most_seeds`` is the number of seeds at which a task's loops stop at the latest.
+    """
+
+    tasks: Mapping[str, Mapping[str, Summary]]
+    gap_closed_by_task: Mapping[str, Gap]
+    comparisons: Mapping[str, Mapping[str, Comparison]]
+    most_seeds: int
+
+
+@dataclass(frozen=True)
+class Control:
+    """Closed loops: the three controllers, and the gap closed, a mean over the tasks."""
+
+    prior: ControllerCosts
+    hybrid: ControllerCosts
+    oracle: ControllerCosts
+    gap_closed: float | None
+    gap_closed_reason: str = ""
+    details: ControlDetails | None = None
+
+
+@dataclass(frozen=True)
+class OnModelDetails:
+    """Figures by controller and task."""
+
+    controllers: Mapping[str, Mapping[str, Summary]]
+
+
+@dataclass(frozen=True)
+class OnModel:
+    """Closed loops of a machine without plant, by controller, each on another model than its own. They tell whether two
+    models agree, and nothing of the machine; each controller met another plant, so they compare nothing.
+
+    ``plants`` names the models in place of the machine; ``default_tasks`` says that the scenario declares no tasks;
+    ``left_out`` why a controller has no loops.
+    """
+
+    plants: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    default_tasks: bool = False
+    details: OnModelDetails | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class EstimationDetails:
+    """What the observers were tested on."""
+
+    recordings: tuple[ObservedRecording, ...]
+
+
+@dataclass(frozen=True)
+class ObserverFigures:
+    """What the innovations of an observer say; see :class:`~hybrid_mpc.workflow.stages.estimate.ObserverTest`."""
+
+    mean_nis: float | None = None
+    nis_low: float | None = None
+    nis_high: float | None = None
+    nis_inside: float | None = None
+    ljung_box: float | None = None
+    ljung_box_limit: float | None = None
+    samples: int | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """Tests of the observers on test recordings."""
+
+    prior_observer: ObserverFigures | None
+    hybrid_observer: ObserverFigures | None
+    details: EstimationDetails | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Promises:
+    """The table "What this kit promises" (:attr:`~hybrid_mpc.kit.artifact.Kit.promises`); None: it was not examined."""
+
+    rows: tuple[Promise, ...] | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """Durations of whole controller steps [ms]."""
+
+    median: float | None = None
+    p95: float | None = None
+    p99: float | None = None
+    max: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Durations of the hybrid's steps, the period [ms], and how many steps took longer."""
+
+    controller_step_ms: StepTimes
+    period_ms: float
+    misses: int | None
+    misses_reason: str = ""
+
+
+@dataclass(frozen=True)
+class WatchDetails:
+    """What limits were learned from, limits by model and kind of readings, how much of each recording was watched, and
+    alarms where nothing disturbs the machine, in all and by channel.
+    """
+
+    sources: Mapping[str, str] = field(default_factory=dict)
+    loops: tuple[NominalLoop, ...] = ()
+    limits: Mapping[str, Mapping[str, WatchLimits]] = field(default_factory=dict)
+    recordings: tuple[Mapping[str, float | str], ...] = ()
+    clean: CleanAlarms | None = None
+    by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What watches the machine: the kind of its readings, wanted false alarms [1/h], length of the nominal data [h],
+    alarms an hour where nothing disturbs it, alarms on the recordings, and loops in which something breaks.
+    """
+
+    kind: str | None = None
+    wanted_per_hour: float | None = None
+    hours: float | None = None
+    false_alarms_per_hour: float | None = None
+    alarms: tuple[RecordedAlarm, ...] | None = None
+    faults: tuple[FaultedLoop, ...] | None = None
+    faults_reason: str = ""
+    details: WatchDetails = WatchDetails()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class AnalysisDetails:
+    """The models by name at rest and at working speed, and that speed."""
+
+    models: Mapping[str, ModelAnalysis]
+    working_speed: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The hybrid at rest: eigenvalues as (real part, imaginary part), and its properties."""
+
+    eigenvalues: tuple[tuple[float, float], ...] | None = None
+    stabilisable: bool | None = None
+    detectable: bool | None = None
+    details: AnalysisDetails | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """The content of ``results.json``."""
+
+    schema_version: int
+    scenario: str
+    seed: int
+    budget: str
+    versions: Mapping[str, str]
+    data: Data
+    identification: Identification
+    export: Export
+    control: Control
+    on_model: OnModel
+    estimation: Estimation
+    promises: Promises
+    timing: Timing
+    watch: Watch
+    analysis: Analysis
+
+    def plain(self) -> dict[str, Any]:
+        """The results in JSON's own types; empty reasons and details are left out."""
+        found: dict[str, Any] = _without_empty(plain(self))
+        return found
+
+
+def _without_empty(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_without_empty(v) for v in value]
+    if not isinstance(value, Mapping):
+        return value
+    return {
+        key: _without_empty(v)
+        for key, v in value.items()
+        if not (v == "" and (key == "reason" or key.endswith("_reason")))
+        and not (v is None and key == "details")
+    }
+
+
+def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
+    """Results from the content of ``results.json``, checked; ``where`` is the file, for messages.
+
+    Raises:
+        InputError: Naming what is missing, unknown or of the wrong kind, or null without a reason.
+    """
+    results = record(Results, values, where)
+    if results.schema_version != SCHEMA_VERSION:
+        raise InputError(
+            f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
+        )
+    for group in (
+        "identification", "control", "estimation", "promises", "timing", "watch", "analysis",
+    ):  # fmt: skip
+        _check_values(values[group], group, where)
+    return results
+
+
+def _check_values(values: Mapping[str, Any], path: str, where: str) -> None:
+    for key, value in values.items():
+        if value is None and not (values.get(f"{key}_reason") or values.get("reason")):
+            raise InputError(
+                f"{where}: {path}.{key} is null without a reason; put '{key}_reason' or 'reason' beside it"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"{where}: {path}.{key} is {value}; it must be a finite number")
+        if isinstance(value, Mapping) and key != "details":
+            _check_values(value, f"{path}.{key}", where)
+
+
+def collect(context: Context) -> Results:
+    """Results of all stages."""
+    return Results(
+        SCHEMA_VERSION,
+        context.scenario.name,
+        context.settings.seed,
+        context.settings.budget,
+        context.versions,
+        recordings(context),
+        identification(context),
+        Export(context.read(EXPORT).parity_max_abs_error, context.read(EXPORT).jacobian_max_abs_error),
+        _control(context),
+        _on_model(context),
+        _estimation(context),
+        promises(context),
+        _timing(context),
+        _watch(context),
+        _analysis(context),
+    )
+
+
+def recordings(context: Context) -> Data:
+    """What the recordings are."""
+    data = context.read(DATA)
+    return Data(
+        data.files,
+        data.hash,
+        tuple(CutInterval(c.file, c.start_s, c.end_s) for c in data.cuts),
+        DataDetails(data.seconds, tuple(c.why for c in data.cuts), data.warnings),
+    )
+
+
+def identification(context: Context) -> Identification:
+    """How well the models predict, and which one is recommended."""
+    found, prior, chosen = context.read(EVALUATION), context.prior, context.read(CHOICE).choice
+    network = context.settings.network()
+    model = {name: scores.model for name, scores in found.scores.items()}
+    error = {name: finite(scores.error) for name, scores in model.items()}
+    e_sim = {name: finite(scores.e_sim) for name, scores in model.items()}
+    details = IdentificationDetails(
+        FittedPrior(
+            prior.fit.values,
+            prior.fit.standard_errors,
+            prior.nominal,
+            prior.fit.warnings,
+            prior.fit.stages,
+            prior.in_doubt,
+        ),
+        {name: scores.networks for name, scores in found.scores.items()},
+        {
+            stem: {m: _all_finite(by[stem].rmse) for m, by in found.by_file.items()}
+            for stem in found.by_file["phy"]
+        },
+        SmootherNoise(prior.fit.sigma, prior.fit.walk),
+        {
+            "error": ratio(error[chosen.hybrid], error["phy"]),
+            "e_sim": ratio(e_sim[chosen.hybrid], e_sim["phy"]),
+        },
+        ModelChoice(
+            chosen.recommended,
+            chosen.hybrid,
+            chosen.reason,
+            {
+                name: CandidateErrors(finite(c.error), finite(c.ratio), finite(c.upper), c.share)
+                for name, c in chosen.candidates.items()
+            },
+        ),
+        found.bands,
+        prior.baselines,
+        network or None,
+    )
+    return Identification(
+        _with_reasons(error),
+        _with_reasons({name: _all_finite(scores.rmse) for name, scores in model.items()}),
+        _with_reasons({name: _all_finite(scores.fit_percent) for name, scores in model.items()}),
+        _with_reasons(e_sim),
+        _with_reasons({name: _all_finite(scores.violation) for name, scores in model.items()}),
+        details,
+    )
+
+
+def _with_reasons(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by model; those that are none with their reason."""
+    every = {name: values.get(name) for name in MODELS}
+    reasons = {name: "a free run diverged" if name in values else NO_BALANCE for name in MODELS}
+    return every | {f"{name}_reason": reasons[name] for name, value in every.items() if value is None}
+
+
+def _all_finite(values: Mapping[str, float]) -> dict[str, float] | None:
+    """Values by signal, or None where one of them is not finite."""
+    return dict(values) if all(math.isfinite(value) for value in values.values()) else None
+
+
+def finite(value: float) -> float | None:
+    """The number, or None where it is none."""
+    return float(value) if math.isfinite(float(value)) else None
+
+
+def ratio(value: float | None, baseline: float | None) -> float | None:
+    """A value over the baseline's, or None where one of them is missing, or the baseline is zero."""
+    return None if value is None or not baseline else value / baseline
+
+
+def _control(context: Context) -> Control:
+    found = context.find(CONTROL)
+    if found.reason:
+        none = ControllerCosts(None, None, reason=found.reason)
+        return Control(none, none, none, None, found.reason)
+    assert not isinstance(found, Absent)
+    rows = found.rows
+    table, means = by_task(list(rows)), summaries(list(rows), context.budget.seeds)
+    costs = {name: _costs(controller, rows, means) for name, controller in REPORTED.items()}
+    gaps = {task: Gap(*gap_closed(cells)) for task, cells in table.items()}
+    defined = [gap.value for gap in gaps.values() if gap.value is not None]
+    return Control(
+        **costs,
+        gap_closed=float(np.mean(defined)) if defined else None,
+        gap_closed_reason="" if defined else "; ".join(dict.fromkeys(gap.reason for gap in gaps.values())),
+        details=ControlDetails(
+            means,
+            gaps,
+            {task: comparisons(cells, context.budget.seeds) for task, cells in table.items()},
+            context.budget.seeds,
+        ),
+    )
+
+
+def _costs(
+    controller: str, rows: Sequence[LoopRow], means: Mapping[str, Mapping[str, Summary]]
+) -> ControllerCosts:
+    own = [cells[controller].cost.mean for cells in means.values() if controller in cells]
+    loops = [row for row in rows if row.controller == controller]
+    if not own:
+        return ControllerCosts(None, None, reason="the scenario has no oracle")
+    squares: dict[str, dict[str, list[float]]] = {}  # by task: each may have another number of seeds
+    for row in loops:
+        for signal, rmse in row.tracking_rmse.items():
+            squares.setdefault(signal, {}).setdefault(row.task, []).append(rmse**2)
+    tracking = {
+        signal: math.sqrt(np.mean([np.mean(own) for own in by.values()])) for signal, by in squares.items()
+    }
+    known = [cost for cost in own if cost is not None]
+    diverged = len(known) < len(own)
+    return ControllerCosts(
+        None if diverged else float(sum(known)), tracking, "a loop diverged" if diverged else ""
+    )
+
+
+def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, str]:
+    """Share of the distance from the better baseline to the measuring oracle that the hybrid covers in a task.
+
+    The baselines are the fitted prior with and without disturbance observer; the hybrid is the one with it. None, with
+    a reason, where the distance is below twice its standard error; one seed has no standard error.
+    """
+    if "oracle" not in cells:
+        return None, "the scenario has no oracle"
+    costs = {name: np.array([row.cost for row in rows]) for name, rows in cells.items()}
+    baseline = min((costs[n] for n in BASELINES if n in costs), key=lambda c: float(c.mean()))
+    hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
+    if min(len(baseline), len(oracle)) < 2:
+        return None, "one seed has no standard error: more seeds and oracle_seeds are needed (budget full)"
+    if not all(np.all(np.isfinite(c)) for c in (baseline, hybrid, oracle)):
+        return None, "a loop diverged"
+    gap = float(baseline.mean() - oracle.mean())
+    error = math.sqrt(sum(float(c.var(ddof=1)) / len(c) for c in (baseline, oracle)))
+    if gap <= 2.0 * error:
+        return None, f"baseline {baseline.mean():.4g} and oracle {oracle.mean():.4g} do not differ enough"
+    return float(baseline.mean() - hybrid.mean()) / gap, ""
+
+
+def _on_model(context: Context) -> OnModel:
+    found = context.find(LOOPS_ON_MODEL)
+    if isinstance(found, Absent):
+        return OnModel(reason=found.reason)
+    tables = {
+        name: {task: cells[name] for task, cells in summaries(rows).items()}
+        for name, rows in by_controller(found.rows).items()
+        if rows
+    }
+    return OnModel(found.plants, found.left_out, found.default_tasks, OnModelDetails(tables))
+
+
+def _estimation(context: Context) -> Estimation:
+    found = context.find(ESTIMATION)
+    if isinstance(found, Absent):
+        return Estimation(None, None, reason=found.reason)
+    own = {name: _observer(found.observers[name]) for name in OBSERVERS}
+    return Estimation(own["prior_observer"], own["hybrid_observer"], EstimationDetails(found.recordings))
+
+
+def _observer(test: ObserverTest | Absent) -> ObserverFigures:
+    if isinstance(test, Absent):
+        return ObserverFigures(reason=test.reason)
+    return ObserverFigures(
+        test.mean_nis, test.nis_low, test.nis_high, test.nis_inside, test.ljung_box, test.ljung_box_limit,
+        test.samples,
+    )  # fmt: skip
+
+
+def promises(context: Context) -> Promises:
+    """What the kit promises, or why that was not examined."""
+    found = context.find(PROMISES)
+    return Promises(reason=found.reason) if isinstance(found, Absent) else Promises(found.rows)
+
+
+def step_times(context: Context) -> dict[str, Array]:
+    """Durations [ms] of whole controller steps by controller."""
+    found = context.find(CONTROL)
+    if isinstance(found, Absent):
+        return {}
+    if "step_ms" in found.arrays:
+        return {"hybrid": found.arrays["step_ms"]}
+    timed = [row for row in found.drawn if "step_ms" in row.arrays]
+    own = {
+        n: [r.arrays["step_ms"] for r in timed if r.controller == REPORTED[n]] for n in ("prior", "hybrid")
+    }
+    return {name: np.concatenate(times) for name, times in own.items() if times}
+
+
+def _timing(context: Context) -> Timing:
+    period = 1e3 * context.spec.dt
+    ms = step_times(context).get("hybrid")
+    if ms is None:
+        reason = context.find(CONTROL).reason
+        return Timing(StepTimes(reason=reason), period, None, reason)
+    median, p95, p99 = (float(np.quantile(ms, q)) for q in (0.5, 0.95, 0.99))
+    return Timing(StepTimes(median, p95, p99, float(ms.max())), period, int((ms > period).sum()))
+
+
+def _watch(context: Context) -> Watch:
+    found = context.find(WATCH)
+    if isinstance(found, Absent):
+        return Watch(reason=found.reason)
+    limits = {model: dict(own.limits) for model, own in found.watch.items()}
+    details = WatchDetails(
+        found.sources, found.loops, limits, found.recordings, found.clean, found.by_channel
+    )
+    if found.limits is None or found.clean is None:
+        return Watch(found.kind, details=details, reason=found.reason)
+    clean, own = found.clean, found.limits
+    lacks = "plant that could break" if context.scenario.plant is None else "task in which nothing goes wrong"
+    return Watch(
+        found.kind, own.false_alarms_per_hour, own.hours,
+        clean.alarms / (clean.seconds / 3600.0) if clean.seconds else 0.0,
+        found.alarms, found.faults,
+        f"scenario {context.scenario.name} has no {lacks}" if found.faults is None else "",
+        details,
+    )  # fmt: skip
+
+
+def _analysis(context: Context) -> Analysis:
+    found = context.find(ANALYSIS)
+    if isinstance(found, Absent):
+        return Analysis(reason=found.reason)
+    rest = found.models["hybrid"].rest
+    return Analysis(
+        rest.poles, rest.stabilisable, rest.detectable, AnalysisDetails(found.models, found.working_speed)
+    )

@@ -1,0 +1,462 @@
+"""Stage watch: limits of all channels, learned, put into the kit, tried on recordings and on loops with faults."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import poisson
+
+from hybrid_mpc.compare.loops import MODEL, Bench, LoopSpec, ModeChange
+from hybrid_mpc.compare.nominal import CONTROLLER, broken, nominal_loops, nominal_tasks, stage_of
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.kit.artifact import Kit
+from hybrid_mpc.kit.assembly import sensor_steps
+from hybrid_mpc.kit.parts import WatchFile, read_parts, write_watch
+from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.diagnose import Diagnoser
+from hybrid_mpc.watch.explain import begun, explained
+from hybrid_mpc.watch.learn import limits_of
+from hybrid_mpc.watch.lengths import rest_speeds
+from hybrid_mpc.watch.monitor import Monitor, make_readings, reads_energy
+from hybrid_mpc.watch.readings import ENERGY, RESIDUALS, Channel
+from hybrid_mpc.watch.replay import Trace, TrajectoryLike, along, replay, stretches
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.stage import Absent, Stage
+from hybrid_mpc.workflow.stages.compare import run_or_read, what_loops_read
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE
+from hybrid_mpc.workflow.stages.identify import DATA
+
+if TYPE_CHECKING:
+    from hybrid_mpc.data.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+RATES = (1.0, 2.0, 5.0, 10.0)
+"""False alarms an hour (of the machine's seconds, see :func:`rates`) on nominal data: the first that the data are long
+enough for."""
+NOMINAL = ("train", "valid", "nominal")
+"""Roles of undisturbed parts of recordings."""
+HELD: tuple[str, ...] = ("valid", "nominal")
+WITH_TRAINING = (*HELD, "train")
+"""Those that no parameter was fitted to, and with them the training's. Test recordings are kept to try limits on."""
+LEARNED_FROM: Mapping[tuple[str, ...], str] = {
+    HELD: "recordings that nothing was trained on",
+    WITH_TRAINING: "undisturbed recordings, also those of the training, which the model fits better than new ones",
+}
+"""What limits are learned from, in words."""
+FAULT_SEED = 600
+"""Number of the loops in which something breaks, away from those that limits are learned from."""
+UNLIKELY = 0.05
+"""Alarms of which so many or more are less likely than this are more than the limits were learned for."""
+SHOWN_RECORDINGS = 4
+"""Recordings that are drawn."""
+KEPT = ("t", "values", "levels", "share", "on", "frozen", "alarm")
+"""What of a trace is kept for the report."""
+NO_PROBLEM = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
+
+
+def rates(model: HybridModel) -> tuple[float, ...]:
+    """The rates of ``RATES`` on the machine of a model [1/h].
+
+    Example:
+        >>> rates(SimpleNamespace(time_unit=10.0))
+        (0.1, 0.2, 0.5, 1.0)
+    """
+    return tuple(rate / model.time_unit for rate in RATES)
+
+
+@dataclass(frozen=True)
+class RecordedAlarm:
+    """An alarm on a recording: file, from and to [s], the channels that alarmed in their order, what explains it."""
+
+    file: str
+    start_s: float
+    end_s: float
+    channels: tuple[str, ...] = ()
+    diagnosis: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.start_s <= self.end_s:
+            raise InputError(
+                f"an alarm on {self.file} ends at {self.end_s} s, before it starts at {self.start_s} s"
+            )
+
+
+@dataclass(frozen=True)
+class CleanAlarms:
+    """Alarms where nothing disturbs the machine: time known to be undisturbed [s] and the alarms that begin in it, then
+    those of test data alone.
+    """
+
+    seconds: float = 0.0
+    alarms: int = 0
+    test_seconds: float = 0.0
+    test_alarms: int = 0
+
+    def too_many(self, per_hour: float) -> bool:
+        """Whether these are more than a rate of false alarms [1/h] explains: so many or more have a probability below
+        5 % (Poisson).
+
+        Example:
+            >>> [CleanAlarms(300.0, alarms).too_many(10.0) for alarms in (0, 1, 3, 4)]
+            [False, False, False, True]
+        """
+        return self.alarms > 0 and float(poisson.sf(self.alarms - 1, self.expected(per_hour))) < UNLIKELY
+
+    def expected(self, per_hour: float) -> float:
+        """Alarms expected in that time at a rate of false alarms [1/h]."""
+        return per_hour * self.seconds / 3600.0
+
+    def words(self, per_hour: float) -> str:
+        """The alarms beside those that the limits were learned for.
+
+        Example:
+            >>> CleanAlarms(300.0, 1).words(10.0)
+            '1 in 300 s without a disturbance; at 10 false alarms an hour 0.83 are expected'
+        """
+        return (
+            f"{self.alarms} in {self.seconds:.0f} s without a disturbance; at {per_hour:g} false alarms an hour "
+            f"{self.expected(per_hour):.2g} are expected"
+        )
+
+
+@dataclass(frozen=True)
+class NominalLoop:
+    """A loop that limits were learned from: its task and number, the share to which friction drifts, its length [s] and
+    its cost.
+    """
+
+    task: str
+    seed: int
+    friction: float
+    seconds: float
+    cost: float
+
+
+@dataclass(frozen=True)
+class FaultedLoop:
+    """A loop in which something breaks.
+
+    Args:
+        fault: Short name of the fault.
+        title: In words.
+        task: Name of the task.
+        start_s: When it sets in [s].
+        delay_s: Time to the first alarm that begins from then on [s]; None: never.
+        channels: The channels of that alarm, in the order in which they alarmed.
+        diagnosis: What the diagnosis takes it for; empty where it says nothing.
+        false_alarms: Alarms before it sets in.
+        switches: Changes of the guard's mode.
+    """
+
+    fault: str
+    title: str
+    task: str
+    start_s: float
+    delay_s: float | None
+    channels: tuple[str, ...]
+    diagnosis: str
+    false_alarms: int
+    switches: tuple[ModeChange, ...] = ()
+
+
+@dataclass(frozen=True)
+class WatchResult:
+    """What was learned, and what the monitor of the recommended model says of recordings and loops.
+
+    Args:
+        watch: What the kit holds, by model, the recommended one last.
+        kind: Kind of the readings that watch the machine.
+        sources: What limits were learned from, in words, by kind.
+        reason: Why nothing watches. Default: limits were learned.
+        loops: Loops that limits were learned from. Default: recordings.
+        channels: The channels. Default: nothing watches.
+        recordings: Seconds that were watched and that were not, by recording and reason.
+        alarms: Alarms on whole recordings.
+        clean: Alarms where nothing disturbs the machine; ``by_channel`` those of each channel and frozen sensor.
+        faults: Loops in which something breaks; None without a plant or without a calm task.
+        shown: Names of the recordings whose traces are kept.
+        arrays: Traces, see :func:`read_trace`.
+    """
+
+    watch: Mapping[str, WatchFile]
+    kind: str
+    sources: Mapping[str, str] = field(default_factory=dict)
+    reason: str = ""
+    loops: tuple[NominalLoop, ...] = ()
+    channels: tuple[Channel, ...] = ()
+    recordings: tuple[Mapping[str, float | str], ...] = ()
+    alarms: tuple[RecordedAlarm, ...] = ()
+    clean: CleanAlarms | None = None
+    by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
+    faults: tuple[FaultedLoop, ...] | None = None
+    shown: tuple[str, ...] = ()
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def limits(self) -> WatchLimits | None:
+        """What the machine is watched by; None: nothing was learned."""
+        own = list(self.watch.values())
+        return own[-1].limits.get(self.kind) if own else None
+
+
+@dataclass(frozen=True)
+class Data:
+    """What limits are learned from: records, which samples of each count, in words what they are, their hash."""
+
+    records: Sequence[TrajectoryLike]
+    masks: Sequence[NDArray[np.bool_]]
+    source: str
+    data_hash: str
+    loops: tuple[NominalLoop, ...] = ()
+
+
+def watch_stage(context: Context) -> WatchResult | Absent:
+    """Learn limits with hybrid, prior and the recommended model, put them into the kit, and try those of the last.
+
+    Where none can be learned for the readings that would watch the machine the result holds the reason.
+    """
+    scenario = context.scenario
+    if scenario.control is None:
+        return Absent(NO_PROBLEM)
+    context.read(NOISE)
+    kit, parts = context.kit, read_parts(context.out / "model")
+    loops = _loop_data(context) if scenario.plant is not None and _calm(context) else None
+    watch: dict[str, WatchFile] = {}
+    sources: dict[str, str] = {}
+    energy = reads_energy(kit.models["hybrid"])
+    rest: tuple[float, ...] = ()
+    reasons = []
+    if energy:
+        try:
+            nominal = [t for t in context.dataset.trajectories if t.role in NOMINAL]
+            rest = rest_speeds(nominal, kit.models["hybrid"])
+        except InputError as short:
+            reasons.append(f"no rest speeds: {short}")
+    others = [name for name in ("hybrid", "prior") if name != kit.recommended]
+    for name in (*others, kit.recommended):
+        limits: dict[str, WatchLimits] = {}
+        missing = list(reasons)
+        for kind in (ENERGY, RESIDUALS) if energy else (RESIDUALS,):
+            data = loops if kind == ENERGY else None
+            try:
+                limits[kind], sources[kind] = _learned(context, kit, name, kind, rest or kit.known_rest, data)
+            except InputError as none:
+                missing.append(f"no limits of {kind} could be learned: {none}")
+        watch[name] = WatchFile(limits, "; ".join(missing), rest, parts.observer(name))
+    write_watch(context.out / "model", watch)
+    kit = context.kit
+    kind = ENERGY if energy else RESIDUALS
+    found = WatchResult(watch, kind, sources, loops=() if loops is None or not energy else loops.loops)
+    if found.limits is None:
+        return replace(found, reason=watch[kit.recommended].reason)
+    found = _on_recordings(context, kit, found)
+    if scenario.plant is not None and _calm(context) and kind in watch["hybrid"].limits:
+        context.progress.update("faults", 0, 1, "loops in which something breaks")
+        found = _faulted(context, kit, found)
+    return found
+
+
+def put_limits(context: Context, found: WatchResult) -> str:
+    """Write ``watch/NAME.json`` of each model."""
+    write_watch(context.out / "model", found.watch)
+    return ""
+
+
+def _calm(context: Context) -> bool:
+    return any(not task.faults for task in context.scenario.tasks)
+
+
+def _learned(
+    context: Context, kit: Kit, name: str, kind: str, rest: tuple[float, ...] | None, data: Data | None
+) -> tuple[WatchLimits, str]:
+    """Limits of a model's readings, and what they were learned from.
+
+    Of recordings those that nothing was fitted to, if they suffice; else with those of the training.
+    """
+    model, estimator = kit.models[name], kit.observer(name)
+    readings = make_readings(model, kind, rest_speed=rest)
+    resolution = sensor_steps(kit.sensor_sigma) if kind == ENERGY else None
+    traces: dict[int, Trace] = {}
+
+    def from_data(data: Data) -> tuple[WatchLimits, str]:
+        monitor = Monitor(readings)
+        new = [r for r in data.records if id(r) not in traces]
+        for record, say in along(new, context.progress.update):
+            traces[id(record)] = replay(monitor, estimator, record, on_progress=say)
+        own = [traces[id(record)] for record in data.records]
+        limits = limits_of(
+            readings, [r.y for r in data.records], own, false_alarms_per_hour=rates(model), nominal=data.masks,
+            resolution=resolution, data_hash=data.data_hash,
+        )  # fmt: skip
+        return limits, data.source
+
+    if data is not None:
+        return from_data(data)
+    try:
+        found, source = from_data(_recorded(context, HELD))
+        if found.rated:
+            return found, source
+    except InputError:
+        pass  # nothing of them is long enough; the others may be
+    return from_data(_recorded(context, WITH_TRAINING))
+
+
+def _recorded(context: Context, roles: tuple[str, ...]) -> Data:
+    """Undisturbed parts of recordings with these roles; recordings without one are left out."""
+    masks = {r.name: inside(context, r, roles) for r in context.dataset.whole}
+    records = [r for r in context.dataset.whole if masks[r.name].any()]
+    return Data(records, [masks[r.name] for r in records], LEARNED_FROM[roles], context.dataset.hash)
+
+
+def _loop_data(context: Context) -> Data:
+    """Loops of the simulated machine, like those that will be watched."""
+    settings, model = context.settings, context.kit.models["hybrid"]
+    wanted = nominal_loops(
+        context.scenario, context.budget, model, named=settings.scenario, run_seed=settings.seed
+    )
+    found = run_or_read(context, {stage_of(spec): [spec] for spec in wanted})
+    content, records, loops = hashlib.sha256(), [], []
+    for spec in wanted:
+        (row,) = found[stage_of(spec)]
+        friction = spec.faults[0].value if spec.faults else 1.0
+        loops.append(NominalLoop(row.task, row.seed, friction, row.seconds, row.cost))
+        records.append(SimpleNamespace(name=f"loop {row.seed}", **row.arrays))
+        for name in ("y", "u"):
+            content.update(np.ascontiguousarray(row.arrays[name], dtype="<f8").tobytes())
+    minutes = sum(row.seconds for row in loops) / 60
+    source = f"{len(loops)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
+    masks = [np.ones(len(r.t), dtype=bool) for r in records]
+    return Data(records, masks, source, content.hexdigest(), tuple(loops))
+
+
+def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
+    """Whole recordings, watched: alarms, those where nothing disturbs the machine, and traces to be drawn."""
+    whole, monitor, estimator = context.dataset.whole, kit.monitor(), kit.observer()
+    made: list[Diagnoser] = []
+
+    def diagnoser() -> Diagnoser:
+        made.extend([] if made else [kit.diagnoser()])
+        return made[0]
+
+    traces, alarms = [], []
+    for recording, say in along(whole, context.progress.update):
+        trace, own = explained(monitor, estimator, recording, diagnoser, say)
+        traces.append(trace)
+        alarms += [RecordedAlarm(recording.name, a.start_s, a.end_s, a.channels, a.diagnosis) for a in own]
+    every = [np.hstack([t.on, t.frozen]) for t in traces]
+    names = traces[0].names if traces else ()
+    each = {name: clean_alarms(context, whole, [on[:, i] for on in every]) for i, name in enumerate(names)}
+    alarmed, tested = {a.file for a in alarms}, {t.file for t in context.trajectories("test")}
+    ranked = sorted(
+        zip(whole, traces, strict=True),
+        key=lambda pair: (pair[0].name not in alarmed, pair[0].file not in tested),
+    )[:SHOWN_RECORDINGS]
+    arrays: dict[str, Array] = {}
+    for recording, trace in ranked:
+        arrays |= trace_arrays(recording.name, trace, recording.y)
+    return replace(
+        found, channels=monitor.readings.channels, alarms=tuple(alarms), by_channel=each, arrays=arrays,
+        recordings=tuple(
+            {"file": r.name, **t.coverage(monitor.model.dt)} for r, t in zip(whole, traces, strict=True)
+        ),
+        clean=clean_alarms(context, whole, [t.alarm for t in traces]), shown=tuple(r.name for r, _ in ranked),
+    )  # fmt: skip
+
+
+def _faulted(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
+    """A loop of each fault, from the middle of a calm task on; a guard takes the input away where a sensor freezes, if
+    the scenario says with which input the machine may be left.
+    """
+    scenario, settings = context.scenario, context.settings
+    bench, model, task = Bench(scenario, {MODEL: kit}), kit.models["hybrid"], nominal_tasks(scenario)[0]
+    start = model.dt * round(0.5 * task.duration / model.dt)
+    guard = "rest" if scenario.safe_input is not None else ""
+    base = LoopSpec(
+        settings.scenario, MODEL, task.name, CONTROLLER, monitor="guard", guard=guard, seed=FAULT_SEED,
+        run_seed=settings.seed,
+    )  # fmt: skip
+    loops, arrays, tried = [], dict(found.arrays), broken(scenario, model, bench.problem(base), start)
+    for i, case in enumerate(tried):
+        context.progress.update("faults", i, len(tried), case.title)
+        spec = replace(base, faults=(case.fault,))
+        row, result = bench.run(spec)
+        # the estimator is deterministic: over the record it says again what it said in the loop
+        trace, alarms = explained(
+            kit.monitor("hybrid", task=task.name),
+            bench.parts(spec)[0],
+            result,
+            lambda: kit.diagnoser("hybrid"),
+        )
+        before, seen = begun(alarms, start)
+        loops.append(
+            FaultedLoop(
+                case.name, case.title, task.name, start, seen[0].start_s - start if seen else None,
+                seen[0].channels if seen else (), seen[0].diagnosis if seen else "", len(before), tuple(row.switches),
+            )
+        )  # fmt: skip
+        arrays |= trace_arrays(case.name, trace, result.y)
+    return replace(found, faults=tuple(loops), arrays=arrays)
+
+
+def trace_arrays(name: str, trace: Trace, y: Array) -> dict[str, Array]:
+    """A trace's arrays and the outputs ``y`` ``(n, n_y)`` under a name, for the checkpoint."""
+    return {f"{name}/{key}": np.asarray(getattr(trace, key)) for key in KEPT} | {f"{name}/y": y}
+
+
+def read_trace(arrays: Mapping[str, Any], name: str, found: WatchResult, outputs: Sequence[str]) -> Trace:
+    """The trace that :func:`trace_arrays` kept; what the report does not show is empty."""
+    own, none = {key: arrays[f"{name}/{key}"] for key in KEPT}, np.zeros((0, 0))
+    return Trace(
+        channels=found.channels, outputs=tuple(outputs), terms=none, travel=none, repeats=none.astype(int),
+        inside=none > 0, settled=none > 0, validity=none.astype(int), blind=none > 0, **own,
+    )  # fmt: skip
+
+
+def clean_alarms(
+    context: Context, recordings: Sequence[Trajectory], on: Sequence[NDArray[np.bool_]]
+) -> CleanAlarms:
+    """Alarms that are ``on`` ``(n,)`` in the undisturbed parts of the recordings, which have any role.
+
+    An alarm counts where it begins: it may reach in from a disturbed part.
+    """
+    seconds, counts = [0.0, 0.0], [0, 0]
+    for recording, alarm in zip(recordings, on, strict=True):
+        starts, _ = stretches(alarm)
+        for i, roles in enumerate(((*NOMINAL, "test"), ("test",))):
+            clean = inside(context, recording, roles)
+            seconds[i] += float(clean.sum() * recording.dt)
+            counts[i] += int(clean[starts].sum())
+    return CleanAlarms(seconds[0], counts[0], seconds[1], counts[1])
+
+
+def clean_windows(
+    context: Context, recording: Trajectory, roles: tuple[str, ...]
+) -> list[tuple[float, float]]:
+    """Stretches of a recording whose role says that nothing disturbs the machine there, ``(start, end)`` [s]."""
+    stem = recording.file
+    if stem in context.spec.windows:
+        return [(w.start, w.end) for w in context.spec.windows[stem] if w.role in roles]
+    pieces = [t for t in context.dataset.trajectories if t.file == stem and t.role in roles]
+    return [(float(t.t[0]), float(t.t[-1])) for t in pieces]
+
+
+def inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Which samples ``(n,)`` of a recording lie in stretches of such roles in which nothing disturbs the machine."""
+    found = np.zeros(len(recording.t), dtype=bool)
+    for start, end in clean_windows(context, recording, roles):
+        found |= (recording.t >= start) & (recording.t <= end)
+    return found
+
+
+WATCH = Stage(
+    "watch", "learning what to alarm by", WatchResult, watch_stage,
+    lambda context: {**what_loops_read(context), "causes": context.scenario.causes}, (DATA, EXPORT, NOISE),
+    optional=True, restore=put_limits,
+)  # fmt: skip

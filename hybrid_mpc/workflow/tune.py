@@ -1,0 +1,138 @@
+"""``hybrid-mpc tune``: data and prior of the main job, then trainings of one kind of network with other settings."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import write_json, write_text
+from hybrid_mpc.folder import JobNote, open_folder, versions
+from hybrid_mpc.identify.tune import SearchResult, SearchSpace, check_numbers, tune
+from hybrid_mpc.plots import tune as plots
+from hybrid_mpc.plots.style import save
+from hybrid_mpc.report.page import Cell, Table
+from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stage import bring_up_to_date
+from hybrid_mpc.workflow.stages.identify import DATA, MODELS, PRIOR, check_data, training_settings
+
+SCHEMA_VERSION = 1
+RATES = ("learning_rate", "free_run_learning_rate")
+
+
+@dataclass(frozen=True)
+class TuneSettings(RunSettings):
+    """What ``hybrid-mpc tune`` computes: the settings of a run, whose networks are the first trial, the kind of
+    network, and what is searched.
+    """
+
+    kind: str = "mopgrnn"
+    space: SearchSpace = field(default_factory=SearchSpace)
+
+    def __post_init__(self) -> None:
+        kinds = [name for name in MODELS if not name.startswith("phy")]
+        if self.kind not in kinds:
+            raise InputError(f"kind: unknown {self.kind!r}; choose one of: {', '.join(kinds)}")
+        if self.kind == "rnn" and self.space.prior_replay is not None:
+            raise InputError("an rnn has no prior to replay; leave prior_replay out of what is varied")
+
+
+def run_tuning(
+    settings: TuneSettings,
+    out: Path,
+    *,
+    trials: int = 20,
+    timeout: float | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> SearchResult:
+    """Search the settings of one kind of network, and write settings, tables and figures into ``out``.
+
+    Data and prior are the main job's stages with the same seed: a run with the settings found trains what the best
+    trial trained. Only training and validation recordings are read. A resumed search may be given more ``trials``; none
+    starts after ``timeout`` [s] of searching.
+
+    Raises:
+        InputError: For any bad input.
+    """
+    check_numbers(trials, settings.seed, timeout)
+    context = Context(settings, load_scenario(settings.scenario), out, progress or Progress())
+    check_scenario(replace(context.scenario, plant=None), context.budget)  # no loop is closed here
+    check_data(context)
+    with open_folder(out, JobNote("run", settings.identity()), resume=resume):
+        for stage in (DATA, PRIOR):
+            context.progress.start(stage.title)
+            context.progress.finish(bring_up_to_date(context, stage))
+        context.progress.start(f"searching, {trials} trials")
+        found = tune(
+            context.scenario.prior(context.prior.fit.values),
+            context.smoothed("train"),
+            context.smoothed("valid"),
+            training_settings(context, settings.kind),
+            settings.space,
+            trials=trials,
+            storage=out / "tune.jsonl",
+            seed=settings.seed,
+            timeout=timeout,
+            on_progress=lambda number, done, total, error: context.progress.update(
+                "trials",
+                number * total + done,
+                trials * total,
+                f"trial {number}: validation E_sim {error:.4g}",
+            ),
+        )
+        context.progress.finish(f"{len(found.trials)} trials")
+        _write(context, settings, found)
+        return found
+
+
+def usage(settings: RunSettings, out: Path) -> str:
+    """The command line of a run with the settings found."""
+    effort = "--seed", str(settings.seed), "--budget", settings.budget
+    found = "--settings", str(out / "settings.json"), "--out", f"{out}-run"
+    return shlex.join(["hybrid-mpc", "run", settings.scenario, *settings.options(str), *effort, *found])
+
+
+def best_settings(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
+    """The best settings as ``settings.json`` holds them: what was searched and what goes with it."""
+    names = {"learning_rates" if name in RATES else name: None for name in space.names}
+    return {name: getattr(found.settings, name) for name in names}
+
+
+def _write(context: Context, settings: TuneSettings, found: SearchResult) -> None:
+    """Settings, table, figures, and results.json last."""
+    out, names, best = context.out, settings.space.names, best_settings(found, settings.space)
+    data = context.read(DATA)
+    results = {
+        "schema": "hybrid-mpc tune",
+        "schema_version": SCHEMA_VERSION,
+        "scenario": context.scenario.name,
+        "seed": settings.seed,
+        "budget": settings.budget,
+        "kind": settings.kind,
+        "space": {name: settings.space.bounds(name) for name in names},
+        "base_settings": training_settings(context, settings.kind),
+        "versions": versions(),
+        "data": {"hash": data.hash, "warnings": data.warnings},
+        "base_value": found.base,
+        "best": found.best,
+        "settings": best,
+        "importance": found.importance,
+        "trials": found.trials,
+    }
+    rows: list[tuple[Cell, ...]] = [
+        (t.number, t.state, t.value, t.mean, t.steps, t.duration, *(t.values[n] for n in names))
+        for t in found.trials
+    ]
+    columns = ("number", "state", "value", "mean", "steps", "duration_s", *names)
+    write_text(out / "trials.csv", Table(columns, rows).csv())
+    save(plots.history(found.trials, base=found.base), out / "figures" / "tune_history.png")
+    save(plots.settings(found.trials, names), out / "figures" / "tune_settings.png")
+    write_json(out / "settings.json", best)
+    write_json(out / "results.json", results)

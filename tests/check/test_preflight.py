@@ -1,0 +1,569 @@
+"""What is wrong with a scenario is told before any work, all of it at once, whatever it is."""
+
+import dataclasses
+import math
+
+import casadi as ca
+import numpy as np
+import pytest
+import torch
+from example_priors import Tanks
+from online_models import StatePlant
+
+from hybrid_mpc import (
+    OCP,
+    Balance,
+    Budget,
+    DataSpec,
+    Disturbance,
+    Fault,
+    HardBound,
+    InputError,
+    MechanicalPrior,
+    OperatingPoint,
+    Parameter,
+    Prior,
+    Scenario,
+    Signal,
+    Task,
+    TorchPrior,
+    load_scenario,
+)
+from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.scenario import registered_scenarios
+
+
+class Pendulum(MechanicalPrior):
+    states = (Signal("phi", "rad"), Signal("phi_dot", "rad/s"))
+    inputs = (Signal("tau", "N m", -3, 3),)
+    outputs = (Signal("phi", "rad", -7, 7),)
+    parameters = (Parameter("J", 0.1, "kg m^2", 0.05, 0.2), Parameter("mgl", 1.0, "N m", 0.3, 3.0))
+
+    def mass_matrix(self, q, p):
+        return p.J
+
+    def potential(self, q, p):
+        return -p.mgl * ca.cos(q.phi)
+
+
+class Tank(Prior):
+    """A heated tank, in CasADi."""
+
+    states = (Signal("level", "m", 0.0, 1.0), Signal("warmth", "K", 0.0, 90.0))
+    inputs = (Signal("inflow", "m^3/s", 0.0, 1.0),)
+    outputs = states
+    parameters = (Parameter("area", 2.0, "m^2", 1.0, 4.0), Parameter("k", 0.2, "m^2.5/s", 0.0, 1.0))
+
+    def xdot(self, x, u, w, p):
+        return (u.inflow - p.k * ca.sqrt(ca.fmax(x.level, 1e-6))) / p.area, -0.1 * x.warmth
+
+    def balances(self, x, u, w, p):
+        out = p.k * ca.sqrt(ca.fmax(x.level, 1e-6))
+        return (Balance("volume", p.area * x.level, u.inflow, out, "m^3", "m^3/s"),)
+
+
+class TorchTank(TorchPrior):
+    """The same in torch."""
+
+    states, inputs, outputs, parameters = Tank.states, Tank.inputs, Tank.outputs, Tank.parameters
+
+    def xdot(self, x, u, w, p):
+        return (u.inflow - p.k * torch.sqrt(x.level.clamp_min(1e-6))) / p.area, -0.1 * x.warmth
+
+    def balances(self, x, u, w, p):
+        out = p.k * torch.sqrt(x.level.clamp_min(1e-6))
+        return (Balance("volume", p.area * x.level, u.inflow, out, "m^3", "m^3/s"),)
+
+
+class Plant(StatePlant):
+    def step(self, state, u, dt):
+        return state + dt * np.array([state[1], 10 * u[0] - 10 * np.sin(state[0])])
+
+
+DATA = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.2, warm_up=0.5)
+CONTROL = OCP(10, (25, 0.25), (1,), (1,), (-1,), (1,))
+TASK = Task("hold", "Hold", 1.0, (0.1, 0.0), lambda t: np.zeros((len(t), 2)))
+GOOD = Scenario(
+    "mine", "Mine", "", prior=Pendulum, data=DATA, control=CONTROL, sensor_sigma=(1e-3,), plant=Plant, tasks=(TASK,),
+    budgets={"quick": Budget(4, 1, 5, 5, 1)},
+)  # fmt: skip
+
+
+TANK = Scenario(
+    "mine", "Mine", "", prior=Tank, budgets=GOOD.budgets,
+    data=dataclasses.replace(DATA, inputs=("inflow",), outputs=("level", "warmth")),
+)  # fmt: skip
+
+
+def prior(**members):
+    """Makes the fields of a scenario with a prior that differs."""
+    return lambda: {"prior": type("Changed", (Pendulum,), members)}
+
+
+def data(**fields):
+    return {"data": dataclasses.replace(DATA, **fields)}
+
+
+def control(**fields):
+    return lambda: {"control": CONTROL.changed(**fields)}
+
+
+def task(**fields):
+    return lambda: {"tasks": (dataclasses.replace(TASK, **fields),)}
+
+
+def plant(**members):
+    return lambda: {"plant": type("Changed", (Plant,), members)}
+
+
+def budget(**fields):
+    return lambda: {"budgets": {"quick": dataclasses.replace(GOOD.budgets["quick"], **fields)}}
+
+
+def field(**fields):
+    return lambda: fields
+
+
+def raises(*given):
+    raise KeyError("forgotten")
+
+
+def flow(*rates):
+    """``xdot`` of these rates of the tank, each a function of ``(x, u, p, m)``; ``m`` is casadi or torch."""
+
+    def members(m):
+        def xdot(self, x, u, w, p):
+            return tuple(rate(x, u, p, m) for rate in rates)
+
+        return {"xdot": xdot, "balances": Prior.balances}
+
+    return members
+
+
+def level(rate):
+    """The tank's flow with another rate of the level."""
+    return flow(rate, lambda x, u, p, m: -0.1 * x.warmth)
+
+
+def balance(*terms, **named):
+    """A balance of the tank's warmth with these terms, each a function of ``(x, u, m)``."""
+
+    def members(m):
+        def balances(self, x, u, w, p):
+            return (Balance("heat", *(term(x, u, m) for term in terms), **named),)
+
+        return {"balances": balances}
+
+    return members
+
+
+def members(**given):
+    return lambda m: given
+
+
+def warmth(x, u, m):
+    return x.warmth
+
+
+def lost(x, u, m):
+    return 0.1 * x.warmth
+
+
+def nothing(x, u, m):
+    return 0.0
+
+
+PLACE = "test_preflight.py"
+EACH = "one for each of level, warmth is needed"
+AT = ["at x = [0.0, 0.0], u = [0.0]", "within the signals' ranges"]
+IN_BOTH = {
+    # what a user gets wrong in the same way in CasADi and in torch
+    "too few rates": (flow(lambda x, u, p, m: u.inflow / p.area),
+                      ["Changed.xdot(x, u, w, p) must give 2 values, got 1: " + EACH]),
+    "too many rates": (flow(*3 * [lambda x, u, p, m: u.inflow]), ["must give 2 values, got 3: " + EACH]),
+    "no tuple": (members(xdot=lambda self, x, u, w, p: u.inflow), ["must give 2 values, got 1: " + EACH]),
+    "no return": (members(xdot=lambda self, x, u, w, p: None), ["Changed.xdot", "NoneType", "'return' missing"]),
+    "xdot raises": (members(xdot=lambda self, x, u, w, p: raises()), ["prior raised KeyError: 'forgotten'", PLACE]),
+    "a typing error": (flow(lambda x, u, p, m: x.levle), ["nothing is called 'levle'", "level, warmth", PLACE]),
+    "no such parameter": (level(lambda x, u, p, m: p.volume), ["nothing is called 'volume'", "area, k", PLACE]),
+    "output of another shape": (members(output=lambda self, x, u, w, p: (x.level,)),
+                                ["Changed.output(x, u, w, p) must give 2 values, got 1: " + EACH]),
+    "output without return": (members(output=lambda self, x, u, w, p: None), ["Changed.output", "'return' missing"]),
+    "output raises": (members(output=lambda self, x, u, w, p: raises()), ["prior raised KeyError", PLACE]),
+    "an output that is no state": (members(outputs=(Tank.states[0], Signal("hot", "K"))),
+                                   ["no state is called hot", "level, warmth", "Define output(x, u, w, p)"]),
+    "NaN": (level(lambda x, u, p, m: m.sqrt(x.level - 0.5)), ["xdot(x, u, w, p): it is not finite", *AT]),
+    "infinite": (level(lambda x, u, p, m: u.inflow / x.level), ["xdot(x, u, w, p): it is not finite", *AT]),
+    "infinite slope": (level(lambda x, u, p, m: u.inflow - m.sqrt(x.level)),
+                       ["xdot(x, u, w, p): its derivative by x is not finite", *AT, "fmax(level, 1e-6)"]),
+    "infinite slope by an input": (level(lambda x, u, p, m: m.sqrt(u.inflow)), ["its derivative by u is", *AT]),
+    "infinite slope by a parameter": (level(lambda x, u, p, m: x.level**p.k * u.inflow**p.k),
+                                      ["its derivative by", "is not finite", *AT]),
+    "NaN of an output": (members(output=lambda self, x, u, w, p: (1 / x.level, x.warmth)),
+                         ["output(x, u, w, p): it is not finite", *AT]),
+    "balance with a wrong sign": (balance(warmth, lost), ["balance heat [W]: dS/dt - supply + loss is", "at x = ",
+                                                          "along the prior's own flow", "sign left out"]),
+    "balance without a term": (balance(warmth, nothing), ["along the prior's own flow", "a term or a sign"]),
+    "negative loss": (balance(warmth, lambda x, u, m: -0.2 * x.warmth, lambda x, u, m: -0.1 * x.warmth),
+                      ["balance heat [W]: the loss is -", "at x = ", "must not be negative", "into the supply"]),
+    "balance of NaN": (balance(lambda x, u, m: m.log(x.warmth), lambda x, u, m: -0.1 + 0 * x.warmth, unit="1"),
+                       ["balance heat [W]: it is not finite", *AT]),
+    "storage of the input": (balance(lambda x, u, m: x.warmth * u.inflow, nothing, lost),
+                             ["balance heat: the storage must be a function of x and p alone"]),
+    "balance of nothing": (balance(nothing, lost, lost), ["balance heat [W]: the storage does not change with level, "
+                                                          "warmth", "leave the balance out"]),
+    "balances that are none": (members(balances=lambda self, x, u, w, p: (x.level,)),
+                               ["Changed.balances(x, u, w, p) must give a tuple of Balance(...)"]),
+    "one balance without its tuple": (members(balances=lambda self, x, u, w, p: Balance("heat", x.warmth, 0.0)),
+                                      ["must give a tuple of Balance(...)"]),
+    "balances of one name": (members(balances=lambda self, x, u, w, p: 2 * (Balance("heat", x.warmth, 0.0),)),
+                             ["two have the same name: ['heat', 'heat']"]),
+    "corrects no state": (members(corrects=("levle",)), ["corrects names levle", "its states are: level, warmth"]),
+    "operating point of one": (members(operating_point=OperatingPoint((0.2,), (0.1,))),
+                               ["operating_point: x needs 2 numbers (level, warmth), got 1: (0.2,)"]),
+    "operating point without input": (members(operating_point=OperatingPoint((0.2, 9.0), ())),
+                                      ["operating_point: u needs 1 numbers (inflow), got 0"]),
+    "operating point with a disturbance": (members(operating_point=OperatingPoint((0.2, 9.0), (0.1,), (1.0,))),
+                                           ["operating_point: w needs 0 numbers (there are none), got 1"]),
+    "operating point out of range": (members(operating_point=OperatingPoint((0.2, 100.0), (0.1,))),
+                                     ["x = (0.2, 100.0) is outside the range of warmth [K] from 0 to 90", "correct"]),
+    "operating point of numbers": (members(operating_point=(0.2, 9.0)),
+                                   ["operating_point must be OperatingPoint(x=(...), u=(...)), got (0.2, 9.0)"]),
+    "parameters of one name": (members(parameters=(*Tank.parameters, Parameter("k", 1.0, "-", 0.0, 2.0))),
+                               ["two parameters have the same name: ['area', 'k', 'k']"]),
+    "states of one name": (members(states=(Tank.states[0], Tank.states[0])), ["two of the states have the same name"]),
+    "no states": (members(states=()), ["states must be a tuple of one Signal or more, got ()"]),
+    "states that are texts": (members(states=("level", "warmth")), ["Changed: states must be a tuple of Signal"]),
+    "parameters by name": (members(parameters={"k": 1.0}), ["parameters must be a tuple of Parameter", "{'k': 1.0}"]),
+}  # fmt: skip
+"""Members of a class, made by a function of the module that the tank is written in, and words of what is told."""
+BLIND = {"outputs": Tank.outputs[:1]}
+"""A tank whose temperature nobody measures, and which the level does not hang on."""
+TOGETHER = {
+    "outputs": Tank.outputs[:1],
+    "xdot": lambda self, x, u, w, p: (u.inflow - x.up - x.down, x.down, x.up),
+    "states": (Tank.states[0], Signal("up", "m/s", -1.0, 1.0), Signal("down", "m/s", -1.0, 1.0)),
+    "balances": Prior.balances,
+}
+"""Only the sum of two states can be seen."""
+WRONG = {
+    # the prior
+    "raises when made": (field(prior=raises), ["prior raised KeyError"]),
+    "is no prior": (field(prior=lambda values=None: 3), ["makes a int"]),
+    "ignores its values": (field(prior=lambda values=None: Pendulum({"J": 0.06} if values is None else None)),
+                           ["must take its values over"]),
+    "takes no values": (field(prior=lambda: Pendulum()), ["prior raised TypeError"]),
+    "no xdot": (field(prior=type("Empty", (Prior,), {k: getattr(Tank, k) for k in ("states", "inputs", "outputs")})),
+                ["Empty must define xdot(x, u, w, p)"]),
+    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)),
+                     ["data: 0 columns of disturbances [], the prior has 1: ['wind']"]),
+    # a mechanical prior
+    "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), ["mass_matrix(q, p) is 0.0", "be positive"]),
+    "negative inertia": (prior(mass_matrix=lambda self, q, p: -p.J), ["mass_matrix(q, p) is -0.1", "be positive"]),
+    "no inertia": (prior(mass_matrix=MechanicalPrior.mass_matrix), ["must define mass_matrix(q, p)"]),
+    "inertia without return": (prior(mass_matrix=lambda self, q, p: None), ["gives None; is a 'return' missing?"]),
+    "inertia of two": (prior(mass_matrix=lambda self, q, p: ((p.J, 0), (0, p.J))), ["1 rows of 1 values", "got 4"]),
+    "friction that drives": (prior(friction=lambda self, q, v, p: -0.1 * v.phi_dot),
+                             ["balance energy [W]: the loss is -", "must not be negative"]),
+    "friction of two": (prior(friction=lambda self, q, v, p: (v.phi_dot, v.phi_dot)),
+                        ["Changed.friction(q, v, p) must give 1 values, got 2: one for each of phi_dot"]),
+    "potential without return": (prior(potential=lambda self, q, p: None), ["Changed.potential(q, p)", "'return'"]),
+    "force of two": (prior(force=lambda self, q, v, u, w, p: (u.tau, u.tau)), ["got 2: one for each of phi_dot"]),
+    "two inputs and no force": (lambda: prior(inputs=(Signal("a", "N"), Signal("b", "N")))() | data(inputs=("a", "b")),
+                                ["2 inputs drive 1 degrees of freedom; define force(q, v, u, w, p)"]),
+    "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), ["[q, v] in pairs"]),
+    # data
+    "too few columns": (field(data=dataclasses.replace(DATA, inputs=())), ["0 columns of inputs", "'tau'"]),
+    "too many columns": (field(data=dataclasses.replace(DATA, outputs=("phi", "x"))), ["2 columns of outputs"]),
+    "unknown cause": (field(causes={"mass": ("m",)}), ["no parameter m", "J, mgl"]),
+    # control
+    "horizon 0": (control(horizon=0), ["horizon must be a whole number of periods"]),
+    "horizon half": (control(horizon=2.5), ["horizon must be a whole number of periods"]),
+    "crossed bounds": (control(u_min=(1,), u_max=(-1,)), ["input bounds cross", "u_min"]),
+    "NaN weight": (control(q=(math.nan, 1)), ["q: weights must be finite and not negative"]),
+    "negative weight": (control(r=(-1,)), ["r: weights must be finite and not negative"]),
+    "no weight at all": (control(r=(0,), r_delta=(0,)), ["every input needs a positive weight"]),
+    "weights of too few": (
+        field(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["control: q needs 2 numbers, got 1"]
+    ),
+    "inputs of too many": (
+        field(control=OCP(10, (25, 1), (1, 1), (1, 1), (-1, -1), (1, 1))), ["control: r needs 1 numbers, got 2"]
+    ),
+    "bounds of too many": (control(u_min=(-1, -1), u_max=(1, 1)), ["u_min"]),
+    "a problem that is none": (field(control={"horizon": 10}), ["control: OCP(...) is needed"]),
+    "a field there is not": (control(horizn=9), ["'horizn'; did you mean 'horizon'?"]),
+    "no sensor_sigma": (field(sensor_sigma=()), ["sensor_sigma needs 1 numbers, got 0"]),
+    "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["sensor_sigma must be positive"]),
+    "NaN sensor_sigma": (field(sensor_sigma=(math.nan,)), ["sensor_sigma[0]"]),
+    "absurd sensor_sigma": (field(sensor_sigma=(1e300,)), ["sensor_sigma[0]"]),
+    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["first_sigma needs 1 standard deviations", "(phi_dot)"]),
+    "noise of no state": (field(state_noise={"phi_dott": 0.1}), ["state_noise: no state 'phi_dott'", "phi_dot"]),
+    "zero state_noise": (field(state_noise={"phi": 0.0}), ["state_noise of phi must be positive"]),
+    "zero du_max": (control(du_max=(0,)), ["du_max"]),
+    "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["state bounds cross"]),
+    "hard bounds of too many outputs": (
+        control(hard=[HardBound("y", (-1.0,) * 3, (1.0,) * 3)]), ["controller: hard bound on y: 3 values given"]
+    ),
+    "hard bound out of reach": (
+        control(hard=[HardBound(ca.Function("one", [ca.SX.sym("x", 2), ca.SX.sym("u")], [ca.SX(1)]), [0.0], [2.0])]),
+        ["hard bound on one: no input of the plan reaches it"],
+    ),
+    "working point of one": (control(working_point=((0.0,), (0.0,))), ["working_point x: 1 values given, 2 needed"]),
+    "starts of another shape": (control(starts=(((0.0,),),)), ["starts[0]: shape (1, 1) given", "(10, 1)"]),
+    # tasks
+    "no reference for all": (task(reference=lambda t: np.zeros((len(t), 1))), ["task hold: reference", "(50, 2)"]),
+    "reference that raises": (task(reference=raises), ["task hold raised KeyError"]),
+    "reference of NaN": (task(reference=lambda t: np.full((len(t), 2), np.nan)), ["reference is", "finite"]),
+    "negative factors": (task(weight=lambda t: -np.ones((len(t), 2))), ["not be negative"]),
+    "no duration": (task(duration=0.0), ["task 'hold': duration"]),
+    "endless": (task(duration=math.inf), ["task 'hold': duration"]),
+    "x0 of one": (task(x0=(0.0,)), ["x0 needs 2"]),
+    "x0 of NaN": (task(x0=(math.nan, 0.0)), ["x0[0]"]),
+    "task's own weights": (
+        task(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["control of task hold: q needs 2 numbers"]
+    ),
+    "same tasks": (field(tasks=(TASK, TASK)), ["'hold' stands twice"]),
+    "fault of a channel": (
+        task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), ["no input 'third'; there are"],
+    ),
+    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["takes no faults"]),
+    "tasks without control": (field(control=None), ["no control problem"]),
+    # plant and oracle
+    "plant that raises": (plant(step=raises), ["plant raised KeyError"]),
+    "plant measures all": (plant(measure=lambda self, state, rng: state), ["measure must return the shape (1,)"]),
+    "plant tells less": (plant(truth=lambda self, state: state[:1]), ["truth must return the shape (2,)"]),
+    "plant of NaN": (plant(step=lambda self, s, u, dt: s * np.nan), ["must be finite"]),
+    "oracle that raises": (field(oracle=raises), ["oracle raised KeyError"]),
+    # budgets
+    "no networks": (budget(networks=0), ["budget: networks"]),
+    "half a unit": (budget(hidden=2.5), ["budget: hidden"]),
+    "negative decay": (budget(decay=-1.0), ["budget: decay"]),
+}  # fmt: skip
+
+
+ALSO_IN_TORCH = ("no tuple", "NaN", "output raises", "negative loss", "operating point of numbers")
+"""Of each kind one; torch takes half a second to trace a prior, so the full set has the others."""
+
+
+@pytest.mark.parametrize(
+    ("name", "base"),
+    [
+        pytest.param(name, base, marks=[] if base is Tank or name in ALSO_IN_TORCH else pytest.mark.full)
+        for name in IN_BOTH
+        for base in (Tank, TorchTank)
+    ],
+)
+def test_every_wrong_prior_is_told_in_both_ways_of_writing(name, base):
+    make, words = IN_BOTH[name]
+    with pytest.raises(InputError) as told:
+        check_scenario(changed(base, make(ca if base is Tank else torch)))
+    for word in words:
+        assert word in str(told.value)
+
+
+def changed(base, members):
+    """The tank's scenario with a prior that differs; a prior that cannot be seen whole has one column less."""
+    own = type("Changed", (base,), members)
+    columns = dataclasses.replace(TANK.data, outputs=TANK.data.outputs[: len(own.outputs)])
+    return dataclasses.replace(TANK, prior=own, data=columns)
+
+
+@pytest.mark.parametrize("base", [Tank, TorchTank])
+@pytest.mark.parametrize(("members", "states"), [(BLIND, "warmth"), (TOGETHER, "up, down")])
+def test_states_that_no_output_sees_are_named(base, members, states):
+    with pytest.raises(InputError, match=rf"no output tells of {states} \(outputs: level\).*Measure it"):
+        check_scenario(changed(base, members))
+
+
+NO_TORCH = ["Changed.xdot", "written in torch? Then it must be a TorchPrior"]
+NO_CASADI = ["Changed.xdot", "written in CasADi? Then it must be a Prior"]
+
+
+def if_else(x, u, p, m):
+    return u.inflow if x.level > 0.5 else -u.inflow
+
+
+@pytest.mark.parametrize(
+    ("base", "rate", "words"),
+    [
+        (Tank, if_else, ["truth value", PLACE, "ca.if_else(condition, one, other)"]),
+        (TorchTank, if_else, ["Changed.xdot decides by the values", PLACE, "torch.where instead of if"]),
+        (
+            TorchTank,
+            lambda x, u, p, m: float(x.level) * u.inflow,
+            ["Changed.xdot", PLACE, "instead of float(x)"],
+        ),
+        (
+            TorchTank,
+            lambda x, u, p, m: torch.special.bessel_j0(x.level),
+            ["Changed.xdot", "bessel", "operators.md"],
+        ),
+        (TorchTank, lambda x, u, p, m: x.level.float(), ["Changed.xdot", "less than float64"]),
+        (TorchTank, lambda x, u, p, m: ca.sqrt(x.level), NO_CASADI),
+        (Tank, lambda x, u, p, m: torch.sqrt(x.level), NO_TORCH),
+        (Tank, lambda x, u, p, m: x.level.clamp_min(1e-6), NO_TORCH),
+    ],
+)
+def test_what_one_way_of_writing_cannot_do_is_told(base, rate, words):
+    with pytest.raises(InputError) as told:
+        check_scenario(changed(base, level(rate)(None)))
+    for word in words:
+        assert word in str(told.value)
+
+
+@pytest.mark.parametrize("changes", [v for v, _ in WRONG.values()], ids=WRONG)
+@pytest.mark.full
+def test_every_wrong_scenario_is_told(changes):
+    words = next(w for v, w in WRONG.values() if v is changes)
+    with pytest.raises(InputError) as told:
+        check_scenario(dataclasses.replace(GOOD, **changes()))
+    for word in words:
+        assert word in str(told.value)
+
+
+def test_all_problems_are_told_at_once():
+    wrong = {
+        **prior(mass_matrix=lambda self, q, p: None)(),
+        **field(sensor_sigma=(0.0,))(),
+        **task(x0=(0.0,))(),
+    }
+    with pytest.raises(InputError) as told:
+        check_scenario(dataclasses.replace(GOOD, **wrong))
+    message = str(told.value)
+    assert "3 problems" in message
+    for word in ("mass_matrix", "sensor_sigma", "x0 needs 2"):
+        assert word in message
+
+
+def test_a_problem_with_prices_asks_for_them_in_the_reference():
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p")
+    priced = dataclasses.replace(
+        GOOD, control=CONTROL.changed(economic=ca.Function("f", [x, u, p], [p * u**2]))
+    )
+    with pytest.raises(
+        InputError, match=r"\(50, 3\) for 50 times, got \(50, 2\); the last 1 for the parameters"
+    ):
+        check_scenario(priced)
+    told = dataclasses.replace(TASK, reference=lambda t: np.ones((len(t), 3)))
+    check_scenario(dataclasses.replace(priced, tasks=(told,)))
+
+
+def test_a_good_scenario_passes():
+    check_scenario(GOOD)
+    for base in (Tank, TorchTank):
+        point = OperatingPoint((0.25, 0.0), (0.1,))
+        check_scenario(changed(base, {"operating_point": point}))
+    check_scenario(dataclasses.replace(GOOD, control=None, tasks=(), plant=None))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", registered_scenarios())
+def test_the_ready_scenarios_pass(name):
+    if name == "double_pendulum":
+        pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    check_scenario(load_scenario(name))
+
+
+def test_the_command_tells_it_before_it_reads_anything(call, tmp_path):
+    machine = tmp_path / "machine.py"
+    machine.write_text(
+        "from tests.check.test_preflight import GOOD, control\nimport dataclasses\n"
+        "scenario = dataclasses.replace(GOOD, **control(horizon=0)())\n"
+    )
+    code, _, message = call("run", machine, "--data", tmp_path / "none.csv", "--out", tmp_path / "out")
+    assert code == 2
+    assert "horizon must be a whole number of periods, from 1 to 10000; got 0" in message
+    assert "machine.py:3" in message
+    assert not (tmp_path / "out").exists()
+
+
+class RainyTanks(Tanks):
+    """Their operating point: both levels rest under inflow and rain."""
+
+    outputs = (Signal("lower", "m", 0.0, 2.0),)
+    operating_point = OperatingPoint((0.64, 0.64), (0.12,), (0.05,))
+    parameters = (
+        Parameter("a_1", 1.0, "m^2", 1.0, 1.0),
+        Parameter("a_2", 1.2, "m^2", 0.3, 3.0),
+        Parameter("k_1", 0.15, "m^2.5/s", 0.05, 0.6),
+        Parameter("k_2", 0.2125, "m^2.5/s", 0.05, 0.6),
+    )
+
+
+class RainyPlant(StatePlant):
+    """The prior itself, by small steps of Euler."""
+
+    def __init__(self):
+        self._prior = RainyTanks()
+
+    def step(self, state, u, dt, w):
+        p = self._prior.p
+        for _ in range(50):
+            state = state + dt / 50 * self._prior.equations.xdot(state, u, w, p).full().ravel()
+        return state
+
+    def measure(self, state, rng):
+        return state[1:]
+
+
+def filled(to):
+    """A step of the lower tank's level, the only output."""
+    return lambda t: np.where(t[:, None] < 20.0, 0.64, to)
+
+
+def rain(t):
+    return np.full((len(t), 1), 0.05)
+
+
+def rainy(**changes):
+    task = Task(
+        "fill",
+        "More in the lower tank",
+        60.0,
+        (0.64, 0.64),
+        filled(0.8),
+        w=lambda t: np.full((len(t), 1), 0.05),
+    )
+    made = Scenario(
+        "tanks", "Two tanks in the rain", "Levels.", RainyTanks,
+        DataSpec("t", ("inflow",), ("lower",), 1.0, 3.0, 4.0, 20.0, disturbances=("rain",)),
+        plant=RainyPlant, control=OCP(20, (0.0, 0.0), (1.0,), (1.0,), (0.0,), (0.4,), q_y=(25.0,)),
+        sensor_sigma=(1e-3,), first_sigma=(0.1,), safe_input=(0.12,), tasks=(task,),
+        disturbance_model=(Disturbance("output", "lower", 0.1),),
+    )  # fmt: skip
+    return dataclasses.replace(made, **changes)
+
+
+def test_set_points_of_outputs_measured_disturbances_and_a_disturbance_model_pass():
+    check_scenario(rainy())
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (lambda t: filled(2.5)(t), ["reference: lower [m] is 2.5 at 20 s, outside its range from 0 to 2"]),
+        (
+            lambda t: np.zeros((len(t), 2)),
+            ["reference must return the shape (60, 1) for 60 times, got (60, 2)"],
+        ),
+    ],
+    ids=["beyond the range", "of the states"],
+)
+def test_a_set_point_of_outputs_that_cannot_be_is_told(changed, words):
+    task = dataclasses.replace(rainy().tasks[0], reference=changed)
+    with pytest.raises(InputError) as told:
+        check_scenario(rainy(tasks=(task,)))
+    for word in words:
+        assert word in str(told.value)
+
+
+def test_a_set_point_of_outputs_that_no_input_holds_is_told():
+    """At most 0.2 flows in: 1.9 m are within the signal's range and out of reach."""
+    task, weak = (
+        dataclasses.replace(rainy().tasks[0], reference=filled(1.9)),
+        rainy().control.changed(u_max=(0.2,)),
+    )
+    found = check_scenario(rainy(tasks=(task,), control=weak))
+    (told,) = [w for w in found.warnings if "comes to rest" in w]
+    assert "its reference comes to rest at y = [1.9], which no input within its limits holds" in told
+    assert "under u = [0.2]" in told

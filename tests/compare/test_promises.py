@@ -1,0 +1,349 @@
+"""What a kit promises: each promise is shown on a good loop, and broken on purpose once, and the table says so."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from time import thread_time
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Disturbance,
+    ExtendedKalmanFilter,
+    HybridModel,
+    InputError,
+    Kit,
+    LoopSettings,
+    Parameter,
+    Promise,
+    Provenance,
+    Signal,
+    Task,
+    load,
+    set_process_noise,
+)
+from hybrid_mpc.compare import promises as p
+from hybrid_mpc.control.safeguard import SafeController
+from hybrid_mpc.control.soft import HardBound
+from hybrid_mpc.kit.promises import PROMISES, PromiseTable, read_promises, write_promises
+
+LEVEL, VALVE = Signal("level", "m", -5.0, 5.0), Signal("valve", "m/s", -1.0, 1.0)
+
+
+def tank(a=0.9, b=0.1, dt=0.1, spread=1.0, **options):
+    """``x_next = a x + b g u``: a tank with a leak, whose valve's gain a fit may move."""
+    x, u, g = ca.MX.sym("x"), ca.MX.sym("u"), ca.MX.sym("g")
+    nxt = a * x + b * g * u
+    model = HybridModel.of(
+        "tank", dt, (LEVEL,), (VALVE,), (LEVEL,), x=x, u=u, p=g, x_next=nxt, xdot=(nxt - x) / dt, y=x,
+        parameters=(Parameter("g", 1.0, "-", 0.5, 2.0),), **options,
+    )  # fmt: skip
+    return replace(model, state_spread=(spread,))
+
+
+def kit_of(model, problem=None, noise=0.002, sigma=0.01):
+    """The kit of a prior alone."""
+    problem = problem or OCP(20, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0])
+    loop = LoopSettings(
+        {"": problem}, (sigma,) * model.n_y, process_noise={"prior_observer": (noise,) * model.n_x},
+        disturbance_model=model.disturbance_model,
+    )  # fmt: skip
+    return Kit({"prior": model}, None, Provenance("tank"), loop=loop, recommended="prior")
+
+
+def hold(level=0.3, name="hold"):
+    return Task(name, "Hold", 6.0, (0.0,), lambda t: np.full((len(t), 1), level))
+
+
+def point_of(kit, task=None):
+    (found,) = p.set_points(kit, [task or hold()])
+    return found
+
+
+def verdicts(rows):
+    return {row.name: row.verdict for row in rows}
+
+
+WHITE = p.Tested(0.1, 1.1, 500)
+
+
+@pytest.fixture(scope="module")
+def good():
+    kit = kit_of(tank())
+    end = p.TaskEnd("hold", (p.Deviation(LEVEL, 0.01, 0.002, 0.011),))
+    return kit, p.examine(kit, [hold()], ends=(end,), where="on the plant", tested=WHITE)
+
+
+def test_a_good_kit_promises_everything(good):
+    assert verdicts(good[1]) == dict.fromkeys(
+        (
+            "no offset", "set-points of the tasks", "step time", "horizon", "stability margins", "limits",
+            "process noise", "innovations", "disturbance model",
+        ),
+        "shown",
+    )  # fmt: skip
+    assert all(not row.remedy for row in good[1])
+
+
+def test_trials_are_on_wrong_models_with_loads_and_always_the_same(good):
+    point = point_of(good[0])
+    gains = [p.wrong_model(point.model, draw).p[0] for draw in range(8)]
+    assert gains[0] == 1.0
+    assert set(np.round(gains[1:], 12)) == {0.8, 1.2}
+    # a fifth of the room from the input at 0.3 to the limit at -1, or 1, on the side that meets the load
+    found = {round(abs(p.loads(point, draw)[0]), 6) for draw in range(8)}
+    assert found == {0.26, 0.14}
+    first, again = (p.trial(point, 1, 120) for _ in range(2))
+    np.testing.assert_array_equal(first.result.y, again.result.y)
+    assert not first.why
+    # the true level, without noise, ends at the set-point: the load and the wrong gain are met
+    assert np.abs(first.result.x[-40:, 0] - 0.3).max() < 0.01
+    assert first.result.d[-1, 0] != pytest.approx(0.0, abs=0.05)
+
+
+# No offset.
+
+
+def no_offset_of(kit, task=None, draws=2):
+    point = point_of(kit, task)
+    trials = [p.trial(point, draw, p.LASTS * point.problem.horizon) for draw in range(draws)]
+    return p.no_offset(point, trials)
+
+
+def test_a_set_point_at_the_limit_of_the_input_is_no_longer_promised():
+    found = no_offset_of(kit_of(tank()), hold(0.95), draws=8)
+    assert found.verdict == "doubted"
+    assert "valve is at its limit" in found.evidence
+    assert re.search(r"level 0\.\d+ m off \(noise 0\.01 m\)", found.evidence)
+
+
+def test_a_weight_on_the_input_asks_for_an_offset():
+    problem = OCP(20, [10.0], [10.0], [0.1], [-1.0], [1.0])
+    found = no_offset_of(kit_of(tank(), problem), hold(0.6))
+    assert found.verdict == "doubted"
+    assert "weight r" in found.evidence
+    assert no_offset_of(kit_of(tank(), problem.changed(r=[0.0])), hold(0.6)).verdict == "shown"
+
+
+def test_an_observer_drowned_in_noise_is_slow_and_one_that_never_finds_a_load_cannot_be_made():
+    bad = p.examine(kit_of(tank(), noise=3.0), [hold()], tested=WHITE)
+    found = {row.name: row for row in bad}
+    assert found["process noise"].verdict == "doubted"
+    assert found["disturbance model"].verdict == "doubted"
+    assert found["no offset"].verdict == "doubted"
+    assert p.SLOW in found["no offset"].evidence
+    assert "in a loop of" in found["no offset"].evidence
+    for noise in (1e4, 7e16):  # as deployed once
+        with pytest.raises(InputError, match="never finds a load at the input valve"):
+            kit_of(tank(), noise=noise).observer()
+    assert kit_of(tank(), noise=1e4).with_noise({"prior": [1e4]}).observer(load=False)
+
+
+def test_a_disturbance_model_without_steps_does_not_move():
+    point = point_of(kit_of(tank()))
+    dead = ExtendedKalmanFilter(point.model, sigma_y=[0.01], sigma_x=[0.002], sigma_x0=[0.01])
+    broken = replace(point, estimator=dead)
+    trials = [p.trial(broken, draw, 120) for draw in range(2)]
+    row = p.disturbance_model([broken], trials[:1])
+    assert (row.verdict, "gain on it is zero" in row.evidence) == ("not promised", True)
+    row = p.no_offset(broken, trials)
+    assert (row.verdict, "does not move" in row.evidence) == ("doubted", True)
+
+
+def test_ranks_that_lack_and_economic_costs_promise_nothing():
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    nxt = ca.vertcat(0.9 * x[0] + 0.1 * u, 0.8 * x[1] + 0.1 * u)
+    pair = (Signal("left", "m", -5.0, 5.0), Signal("right", "m", -5.0, 5.0))
+    model = HybridModel.of("two", 0.1, pair, (VALVE,), pair, x=x, u=u, x_next=nxt, xdot=(nxt - x) / 0.1, y=x)
+    problem = OCP(20, [0.0, 0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[1.0, 1.0])
+    task = Task("hold", "Hold", 6.0, (0.0, 0.0), lambda t: np.full((len(t), 2), 0.1))
+    found = no_offset_of(kit_of(model, problem), task, draws=1)
+    assert found.verdict == "not promised"
+    assert "2 outputs (left, right) are held by 1 input" in found.evidence
+    level = ca.MX.sym("level")
+    price = ca.Function("price", [level, u], [u])
+    cheap = OCP(20, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0], economic=price)
+    assert no_offset_of(kit_of(tank(), cheap), draws=1).verdict == "not promised"
+
+
+@pytest.mark.parametrize(
+    "where", [Disturbance("rate", "level", 0.5), Disturbance("output", "level", 0.2)], ids=["rate", "output"]
+)
+def test_loads_act_where_the_disturbance_model_says(where):
+    kit = kit_of(tank(disturbance_model=(where,)))
+    point = point_of(kit)
+    size = 0.2 * where.size
+    assert abs(p.loads(point, 0)[0]) == pytest.approx(size)
+    found = p.trial(point, 0, 400)
+    assert not found.why
+    assert found.result.d[-50:, 0].mean() == pytest.approx(p.loads(point, 0)[0], abs=0.1 * size)
+
+
+# Every other promise, broken once.
+
+
+def test_the_error_of_the_run_s_own_hold_task_is_a_doubt():
+    angle = Signal("angle", "deg")
+    end = p.TaskEnd("hold", (p.Deviation(angle, 0.1, -4.4, 0.1),))
+    row = p.tasks_end([end], "on the model hybrid, not the machine")
+    assert row.verdict == "doubted"
+    assert "hold: angle 4.4 deg off (noise 0.1 deg)" in row.evidence
+    swings = replace(end, deviations=(p.Deviation(angle, 0.1, 0.0, 2.0),))
+    assert p.tasks_end([swings], "").verdict == "doubted"
+    lost = replace(end, deviations=(p.Deviation(angle, 0.1, np.nan, np.nan),))
+    assert "runs away" in p.tasks_end([lost], "").evidence
+    assert p.tasks_end([], "").verdict == "not promised"
+
+
+def test_the_end_of_a_task_is_that_of_its_measured_outputs():
+    kit, n = kit_of(tank()), 60
+    y = np.full((n, 1), 0.3)
+    y[-20:] += 0.25
+    end = p.task_end(kit, hold(), {"u": np.zeros((n, 1)), "y": y})
+    assert end.deviations[0].offset == pytest.approx(0.25)
+    moving = Task("ramp", "Ramp", 6.0, (0.0,), lambda t: t[:, None])
+    assert p.task_end(kit, moving, {"u": np.zeros((n, 1)), "y": y}) is None
+
+
+class Late(CondensedController):
+    """It works for longer than a period of processor time in every step."""
+
+    def finish(self, *given, **also):
+        begin = thread_time()
+        while thread_time() - begin < 1.2 * self.model.dt:
+            pass
+        return super().finish(*given, **also)
+
+
+def test_late_steps_are_no_promise():
+    kit = kit_of(tank(dt=0.01))
+    point = point_of(kit)
+    slow = SafeController(Late(point.model, point.controller.controller.ocp), point.model)
+    trials = [p.trial(replace(point, controller=slow), 0, 40)]
+    row = p.step_time(trials, 10.0)
+    assert row.verdict == "not promised"
+    assert "the period is 10 ms" in row.evidence
+    assert p.step_time(trials, 20.0).verdict == "doubted"  # more than half of it
+    assert p.step_time(trials, 1000.0).verdict == "shown"
+
+
+def test_a_horizon_shorter_than_the_slowest_mode_is_a_doubt():
+    slow = tank(a=0.98, b=0.02)
+    problem = OCP(5, [0.0], [0.0], [100.0], [-1.0], [1.0], q_y=[1.0])
+    row = p.horizon([point_of(kit_of(slow, problem))])
+    assert row.verdict == "doubted"
+    assert re.search(r"the 5 periods \(0\.5 s\) hold \d+(\.\d+)? % of the cost", row.evidence)
+    wanted = int(re.search(r"A horizon of (\d+) periods", row.remedy)[1])
+    longer = p.horizon([point_of(kit_of(slow, problem.changed(horizon=wanted)))])
+    assert longer.verdict == "shown"
+
+
+def test_a_loop_with_small_margins_is_a_doubt():
+    """An unstable lag under a controller that knows no limit of speed, with an observer that is slow."""
+    wild = tank(a=2.5, b=0.3)
+    problem = OCP(20, [0.0], [0.0], [1e-6], [-50.0], [50.0], q_y=[10.0])
+    row = p.margins([point_of(kit_of(wild, problem, noise=1e-4, sigma=0.5), hold(0.0))])
+    assert row.verdict == "doubted"
+    assert "at valve" in row.evidence
+    tame = point_of(kit_of(tank()), hold(0.0))  # a prior in whose place the network has other margins
+    by_network = p.margins([point_of(kit_of(wild, problem, noise=1e-4, sigma=0.5), hold(0.0))], [tame])
+    assert f"the distance is {p._margins_at(tame)[0][1].modulus:.2g}" in by_network.evidence
+    assert (row.remedy, by_network.remedy) == (p.SOFTER, p.BY_NETWORK)
+    stuck = p.margins([point_of(kit_of(tank(), OCP(20, [10.0], [0.0], [0.1], [0.0], [1.0])), hold(0.0))])
+    assert (stuck.verdict, "lies on a bound" in stuck.evidence) == ("not promised", True)
+
+
+def test_a_hard_bound_that_no_plan_keeps_is_a_doubt():
+    escapes = tank(a=1.5)
+    problem = OCP(
+        10, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0], hard=[HardBound("x", [-1.0], [1.0])]
+    )  # fmt: skip
+    point = point_of(kit_of(escapes, problem), hold(0.0))
+    assert [float(x[0]) for _, x in p.starts_near(point)] == pytest.approx([-0.95, 0.95])
+    row = p.limits([point], [], {})
+    assert row.verdict == "doubted"
+    assert "level = 0.95 m the bound of level gives way" in row.evidence
+    kept = point_of(kit_of(tank(), problem), hold(0.0))
+    assert p.limits([kept], [], {}).verdict == "shown"
+    told = p.limits([kept], [], {"hold": {"level": 0.02}})
+    assert (told.verdict, "2 % of the periods" in told.evidence) == ("doubted", True)
+
+
+def test_noise_beyond_the_spread_and_innovations_that_tell_of_each_other_are_doubts():
+    assert p.process_noise(kit_of(tank(spread=0.001), noise=0.002)).verdict == "doubted"
+    assert p.process_noise(kit_of(replace(tank(), state_spread=()))).verdict == "not promised"
+    assert p.innovations(p.Tested(0.6, 1.0, 500)).verdict == "doubted"
+    assert p.innovations(p.Tested(0.1, 9.0, 500)).verdict == "doubted"
+    assert p.innovations("too short").verdict == "not promised"
+
+
+def test_without_set_points_the_operating_point_is_examined():
+    kit = kit_of(tank())
+    moving = Task("ramp", "Ramp", 6.0, (0.0,), lambda t: 0.1 * t[:, None])
+    assert point_of(kit, moving).reference.tolist() == [0.0]
+    (alone,) = p.set_points(kit, [])
+    assert alone.title == "the operating point"
+
+
+# The table of a kit.
+
+
+@pytest.fixture
+def artifact(golf_artifact, tmp_path):
+    folder = shutil.copytree(golf_artifact, tmp_path / "model")
+    set_process_noise(folder, {"hybrid_observer": (1e-4, 2e-2)})
+    return folder
+
+
+ROW = Promise("step time", "doubted", "99 % of the steps take 19 ms", "Solver native.")
+
+
+def test_a_kit_reads_its_table_and_says_where_it_does_not_fit(artifact):
+    old = load(artifact)
+    assert [row.verdict for row in old.promises] == ["not promised"]
+    assert "holds no table" in old.promises[0].evidence
+    write_promises(artifact, PromiseTable(old.identity, (ROW,)))
+    kit = load(artifact)
+    assert kit.promises == (ROW,)
+    other = kit.with_noise({"hybrid_observer": (1e-3, 2e-2)})
+    assert [row.name for row in other.promises] == ["promises"]
+    set_process_noise(artifact, {"hybrid_observer": (1e-3, 2e-2)})
+    assert "are others than those" in load(artifact).promises[0].evidence
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("doubted", "shown"),
+        lambda text: text[:-20],
+        lambda text: text.replace('"schema_version": 1', '"schema_version": 2'),
+    ],
+    ids=["by hand", "cut", "version"],
+)
+def test_a_damaged_table_is_refused(artifact, change):
+    write_promises(artifact, PromiseTable("x", (ROW,)))
+    path = artifact / PROMISES
+    path.write_text(change(path.read_text()))
+    with pytest.raises(InputError, match=PROMISES):
+        load(artifact)
+
+
+def test_a_run_leaves_its_table_in_the_model_s_folder_on_the_page_and_on_the_terminal(finished):
+    kit, results = load(finished), json.loads((finished / "results.json").read_text())
+    rows = kit.promises
+    assert len(rows) >= 9
+    assert results["promises"]["rows"] == [
+        {"name": r.name, "verdict": r.verdict, "evidence": r.evidence, "remedy": r.remedy} for r in rows
+    ]
+    assert read_promises(finished / "model").of == kit.identity
+    page = (finished / "report.html").read_text()
+    table, told = page.index("What this kit promises</h2>"), (finished.parent / "told.txt").read_text()
+    assert table < page.index("Data</h2>")
+    for row in rows:
+        assert page.index(f"<td>{row.name}</td>") > table
+        assert f"  {row.verdict:12}  {row.name}:" in told.replace("\n", " ").replace("  ", "  ")
