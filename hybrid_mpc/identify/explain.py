@@ -620,7 +620,7 @@ class _Explain:
         if begun is not None:
             self._resume(begun)
         last: tuple[Trial, ...] = ()
-        reason = f"the search ends after {most} steps"
+        reason = f"{most} steps were asked for at most"
         while sum(step.action == "added" for step in self.steps) < most:
             trials, scored, chosen = self._step()
             if chosen is None:

@@ -107,12 +107,12 @@ def equation(law: str) -> str:
     """Equation of a law, from its docstring.
 
     Example:
-        >>> equation("viscous"), equation("storage")
-        ('`-d v`', "`k (s - x)` with `tau s' = x - s`")
+        >>> equation("viscous_by_direction"), equation("storage")
+        ('`-a abs(v)`', "`k (s - x)` with `tau s' = x - s`")
     """
     words = inspect.getdoc(getattr(terms, law)) or ""
     spans = re.findall(r"``(.*?)``", words, re.DOTALL)
-    found = [f"`{' '.join(span.split())}`".replace("|", "\\|") for span in spans]
+    found = [f"`{re.sub(r'[|]([^|]+)[|]', r'abs(\1)', ' '.join(span.split()))}`" for span in spans]
     more = [span for span in found[1:2] if "s' =" in span]
     kind = "potential " if "potential" in words.partition("``")[0] else ""
     return kind + " with ".join([*found[:1], *more]) if found else "constant"

@@ -188,7 +188,8 @@ class Search:
             self._keep("steps", told)
             last = next(step for step in reversed(told.steps) if step.action == "added")
             progress.finish(f"{last.name}: the held-out error is {last.held_out.ratio:.2f} of that before")
-            progress.start(f"search, step {1 + _added(told)}")
+            if _added(told) < self.most:
+                progress.start(f"search, step {1 + _added(told)}")
 
         found = search(
             self.make, fit.values, known_, dt=self.dt, length=self.length, warm_up=self.context.spec.warm_up,
