@@ -112,7 +112,9 @@ def equation(law: str) -> str:
     """
     words = inspect.getdoc(getattr(terms, law)) or ""
     spans = re.findall(r"``(.*?)``", words, re.DOTALL)
-    found = [f"`{re.sub(r'[|]([^|]+)[|]', r'abs(\1)', ' '.join(span.split()))}`" for span in spans]
+    # a bar ends a cell of a table
+    plain = [re.sub(r"\|([^|]+)\|", r"abs(\1)", " ".join(span.split())) for span in spans]
+    found = [f"`{span}`" for span in plain]
     more = [span for span in found[1:2] if "s' =" in span]
     kind = "potential " if "potential" in words.partition("``")[0] else ""
     return kind + " with ".join([*found[:1], *more]) if found else "constant"
