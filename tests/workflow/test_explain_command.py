@@ -115,6 +115,31 @@ def test_the_command_goes_on_and_prints_the_table(explained, machine, files, cal
     assert "terms" in said
 
 
+def test_a_stopped_command_goes_on_after_its_last_step(machine, files, tmp_path, monkeypatch):
+    settings, whole = RunSettings(str(machine / "my_machine.py"), files), explain_search.search
+    begun = []
+
+    def stopped(*given, on_step, **more):
+        def kept(told):
+            on_step(told)
+            raise KeyboardInterrupt
+
+        return whole(*given, on_step=kept, **more)
+
+    def resumed(*given, **more):
+        begun.append(more["begun"])
+        return whole(*given, **more)
+
+    monkeypatch.setattr(explain_search, "search", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        hm.explain(settings, tmp_path / "out", terms=LAWS)
+    monkeypatch.setattr(explain_search, "search", resumed)
+    monkeypatch.setattr(explain_search, "fit_prior", None)  # the fit is kept
+    found = hm.explain(settings, tmp_path / "out", terms=LAWS)
+    assert [step.name for step in begun[0].steps] == [step.name for step in found.explanation.steps]
+    assert found.explanation.steps[0].terms[0].made.maker == "coulomb"
+
+
 def test_what_it_refuses(machine, files, tmp_path, call):
     path = machine / "my_machine.py"
     few = write(tmp_path / "few.csv", recording(3, seconds=3.0))
