@@ -87,20 +87,20 @@ def row(name: str, fold: int, scenario: Scenario, files: list[Path], kind: str) 
         if which == "fitted":
             began = time.process_time()
             known = smoothed(make, fit, [*train, *valid], dt)
-            told = explain(make, fit.values, known, dt=dt, length=length)
+            told = explain(make, fit.values, known, dt=dt, length=length, warm_up=spec.warm_up)
             seconds = time.process_time() - began
-            better = told.prior(told.values)
+            better = told.prior(make)(told.values)
             acting, substeps = shifted([*train, *valid], fit.delay), required_substeps(better, dt)
             smoother = (
                 fit_smoother(better, acting, dt, time_unit=unit, substeps=substeps)
-                if told.steps
+                if told.found
                 else fit.smoother(fitted, dt)
             )
             found["explained"] = (
-                error(better, smoother, held, warm, spec.free_run, spread) if told.steps else found["fitted"]
+                error(better, smoother, held, warm, spec.free_run, spread) if told.found else found["fitted"]
             )
-            terms, doubt = "; ".join(s.term.name for s in told.steps), told.reason
-            promised = float(np.prod([s.ratio for s in told.steps]))
+            terms, doubt = "; ".join(term.name for term in told.found), told.reason
+            promised = told.after.ratio
     found.setdefault("own", found["fitted"])
     made = {
         "machine": name, "fold": fold, "prior": kind, "fitted": round(found["fitted"], 4),

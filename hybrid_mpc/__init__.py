@@ -94,6 +94,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.identify.windows import FirstStates as FirstStates
     from hybrid_mpc.check.preflight import check_scenario as check_scenario
     from hybrid_mpc.workflow.check_fit import check_fit as check_fit
+    from hybrid_mpc.workflow.explain import explain as explain
     from hybrid_mpc.compare.controllers import find_noise as find_noise
     from hybrid_mpc.compare.loops import Bench as Bench, LoopRow as LoopRow, LoopSpec as LoopSpec, varied as varied
     from hybrid_mpc.workflow.run import run as run
@@ -124,10 +125,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.loop.loop import Loop as Loop
     from hybrid_mpc.loop.realtime import Runner as Runner, SafeEnd as SafeEnd
     from hybrid_mpc.loop.simulate import ClosedLoopResult as ClosedLoopResult, simulate as simulate
-    from hybrid_mpc.machine.friction import (
-        Coulomb as Coulomb, LoadDependent as LoadDependent, Stribeck as Stribeck, Viscous as Viscous,
-        with_friction as with_friction,
-    )
+    from hybrid_mpc.machine import terms as terms
     from hybrid_mpc.machine.mechanical import MechanicalPrior as MechanicalPrior
     from hybrid_mpc.machine.prior import Balance as Balance, OperatingPoint as OperatingPoint, Prior as Prior
     from hybrid_mpc.machine.signals import Parameter as Parameter, Signal as Signal
@@ -135,6 +133,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         BenchmarkBudget as BenchmarkBudget, BenchmarkSpec as BenchmarkSpec, DataSpec as DataSpec,
         Role as Role, Window as Window,
     )
+    from hybrid_mpc.machine.terms import Term as Term, extended as extended, with_nominal as with_nominal
     from hybrid_mpc.machine.torch_prior import TorchPrior as TorchPrior
     from hybrid_mpc.model.buffered import BufferedFunction as BufferedFunction
     from hybrid_mpc.model.delay import with_input_delay as with_input_delay
@@ -235,11 +234,11 @@ _ROOMS = {
     "loop.loop": ("Loop",),
     "loop.realtime": ("Runner", "SafeEnd"),
     "loop.simulate": ("ClosedLoopResult", "simulate"),
-    "machine.friction": ("Coulomb", "LoadDependent", "Stribeck", "Viscous", "with_friction"),
     "machine.mechanical": ("MechanicalPrior",),
     "machine.prior": ("Balance", "OperatingPoint", "Prior"),
     "machine.signals": ("Parameter", "Signal"),
     "machine.specification": ("BenchmarkBudget", "BenchmarkSpec", "DataSpec", "Role", "Window"),
+    "machine.terms": ("Term", "extended", "with_nominal"),
     "machine.torch_prior": ("TorchPrior",),
     "model.buffered": ("BufferedFunction",),
     "model.delay": ("with_input_delay",),
@@ -257,12 +256,15 @@ _ROOMS = {
     "watch.replay": ("Trace", "count_alarms", "replay"),
     "watch.residuals": ("ResidualReadings",),
     "workflow.check_fit": ("check_fit",),
+    "workflow.explain": ("explain",),
     "workflow.run": ("run",),
     "workflow.settings": ("RunSettings",),
 }  # fmt: skip
 """Public names by the module that defines them."""
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
-__all__ = sorted((*_HOME, "plots", "__version__"))
+_MODULES = {"plots": "plots", "terms": "machine.terms"}
+"""Public modules by their names."""
+__all__ = sorted((*_HOME, *_MODULES, "__version__"))
 
 
 def _version() -> str:
@@ -277,13 +279,13 @@ def _version() -> str:
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return _version()
-    if name != "plots" and name not in _HOME:
+    if name not in _MODULES and name not in _HOME:
         raise AttributeError(f"module 'hybrid_mpc' has no attribute {name!r}")
     from hybrid_mpc.errors import named_extra
 
     with named_extra(f"hybrid_mpc.{name}"):
-        if name == "plots":
-            return importlib.import_module("hybrid_mpc.plots")
+        if name in _MODULES:
+            return importlib.import_module(f"hybrid_mpc.{_MODULES[name]}")
         return getattr(importlib.import_module(f"hybrid_mpc.{_HOME[name]}"), name)
 
 

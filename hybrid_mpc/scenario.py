@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.loop.plant import Plant
     from hybrid_mpc.loop.simulate import ClosedLoopResult
     from hybrid_mpc.machine.prior import Prior
+    from hybrid_mpc.machine.terms import Term
     from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -190,6 +191,9 @@ class Scenario:
             many as outputs where the control problem weighs outputs, one at each input and at each output that is not
             weighed, as far as they are found (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`); else one at
             each input.
+        terms: What ``hybrid-mpc explain`` chooses missing terms from: names of laws of :mod:`hybrid_mpc.machine.terms`,
+            e.g. ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Own terms are tried beside the
+            laws. Default, where no law is named: all laws.
 
     Raises:
         InputError: If a field is of another kind, or two tasks have one name; all of it together.
@@ -221,6 +225,7 @@ class Scenario:
     benchmark: BenchmarkSpec | None = None
     beyond_recordings: bool = False
     disturbance_model: tuple[Disturbance, ...] | None = None
+    terms: tuple[Term | Name, ...] = ()
 
     def __post_init__(self) -> None:
         own = Fields(self, f"scenario {self.name!r}")

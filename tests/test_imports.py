@@ -190,7 +190,7 @@ def test_a_prior_in_casadi_is_written_and_fitted_without_torch():
     listed = [p for p in files if str(p.relative_to(ROOT)).startswith(TORCH)]
     assert all(with_torch(imports(p, at_load=True)) for p in listed)
     others = [p for p in files if p not in listed]
-    assert {"fit", "smooth", "simulation", "delay", "prior_result", "prior", "mechanical", "friction"} <= {
+    assert {"fit", "smooth", "simulation", "delay", "prior_result", "prior", "mechanical", "terms"} <= {
         p.stem for p in others
     }
     names = [".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in others]
@@ -209,7 +209,7 @@ def test_a_prior_in_casadi_is_written_and_fitted_without_torch():
         ("from hybrid_mpc import DataSpec, train", True),
         ("from hybrid_mpc.identify.step import PriorStep", True),
         ("from hybrid_mpc import DataSpec, OCP", False),
-        ("from hybrid_mpc import MechanicalPrior, Prior, fit_prior, fit_smoother, with_friction", False),
+        ("from hybrid_mpc import MechanicalPrior, Prior, extended, fit_prior, fit_smoother", False),
         ("from hybrid_mpc.identify.delay import delayed", False),
         ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from hybrid_mpc import TorchPrior", False),
         ("def prior():\n    from hybrid_mpc import TorchPrior", False),

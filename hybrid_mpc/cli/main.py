@@ -29,6 +29,7 @@ from hybrid_mpc.cli import (
     control,
     data,
     doctor,
+    explain,
     export,
     monitor,
     new,
@@ -45,6 +46,7 @@ BAD_INPUT, CTRL_C = 2, 130
 SAVED = {
     "run": "finished stages are saved: the same command with --resume goes on",
     "reproduce": "what is done is saved: the same command with --resume goes on",
+    "explain": "finished steps are saved: the same command goes on",
     "benchmark": "what is fitted and trained is saved: the same command goes on",
     "control": "finished loops are saved: the same command with --resume goes on",
     "tune": "finished trials are saved: the same command with --resume goes on",
@@ -99,6 +101,7 @@ app = typer.Typer(
 )
 app.command("new", cls=Command, epilog=new.EXAMPLES)(new.new)
 app.command("check", cls=Command, epilog=check.EXAMPLES)(check.check)
+app.command("explain", cls=Command, epilog=explain.EXAMPLES)(explain.explain)
 app.command("run", cls=Command, epilog=run.EXAMPLES)(run.run)
 app.command("predict", cls=Command, epilog=predict.EXAMPLES)(predict.predict)
 app.command("control", cls=Command, epilog=control.EXAMPLES)(control.control)

@@ -71,11 +71,17 @@ def run(
         list[str] | None, typer.Option(help="Stage after the export that is not to run, once for each.")
     ] = None,
     scheduler: Scheduler = None,
+    explain: Annotated[
+        bool,
+        typer.Option(
+            "--explain", help="Search for terms that the prior lacks first, and go on with those found."
+        ),
+    ] = False,
 ) -> None:
     """Fit the prior, train, export, close the loop, learn what to alarm by, analyze, and write a report.
 
-    The stages are data, prior, training, choice, evaluation, export, noise, control, on_model, estimation, promises,
-    watch, analysis and report. With --resume a stage runs again only where something that it reads
+    The stages are data, explain, prior, training, choice, evaluation, export, noise, control, on_model, estimation,
+    promises, watch, analysis and report. With --resume a stage runs again only where something that it reads
     has changed. Exit code 1 if a stage after the export could not run; the report then says why.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
@@ -86,7 +92,7 @@ def run(
     folder = out or Path("runs") / Path(scenario).stem
     settings = RunSettings(
         scenario, tuple(data or ()), seed, budget, tuple(input_column or ()), tuple(output_column or ()), time_column,
-        network_settings, device, deploy,
+        network_settings, device, deploy, explain,
     )  # fmt: skip
     with make_progress() as progress:
         results = run_job(

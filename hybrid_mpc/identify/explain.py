@@ -1,8 +1,8 @@
-"""Which physical terms a prior lacks: a search over a library of terms, judged by recordings that were left out.
+"""Which physical terms a prior lacks: a search over a library of terms, judged by held-out recordings.
 
 Each step scores all candidates by one Gauss-Newton step from the present fit, with the parameters and first states, in
-every fold; fits the best few in every fold; and keeps one only if it surely lowers the error of free runs over what was
-left out. No torch in here.
+every fold; fits the best few in every fold; and adds the best of those that surely lower the error. Where no single
+term does, pairs are tried. After each step, terms that later ones made needless are removed. No torch in here.
 """
 
 from __future__ import annotations
@@ -10,435 +10,113 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from hybrid_mpc.data.scales import evenly, robust_spread
 from hybrid_mpc.data.scales import periods as periods_of
-from hybrid_mpc.data.scales import robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.identify.explanation import (
+    Evidence,
+    ExplainStep,
+    Explanation,
+    FittedParameter,
+    FoundTerm,
+    HeldOutError,
+    Outcome,
+    TermPicture,
+    Trial,
+    bound,
+)
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import Points, visited
+from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.identify.windows import OutputWindows, cut_outputs
-from hybrid_mpc.machine import terms as laws
 from hybrid_mpc.machine.mechanical import MechanicalPrior
-from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.machine.signals import Parameter, Signal
-from hybrid_mpc.machine.terms import Place, Term, extended
-from hybrid_mpc.machine.units import parsed
+from hybrid_mpc.machine.prior import Prior, named
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.machine.terms import At, Term, extended
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
+Terms = tuple[Term, ...]
+Progress = Callable[[int, int, str], None]
 FOLDS = 5
-"""Groups of recordings that are left out in turn at most."""
+"""Groups of recordings that are held out in turn at most."""
 BLOCKS = 8
-"""Parts of a single recording that count as pieces of evidence."""
+"""Pieces of evidence at least: a few recordings are cut into as many blocks."""
 WINDOWS = 48
-"""Windows of the search at most, shared evenly by the recordings."""
+"""Windows of the search at most, shared evenly by the recordings; of short ones twice as many."""
+SHORTER = 5
+"""How much shorter the short windows are, by which candidates are scored and begun, too."""
 TRIED = 3
 """Candidates of a step that are fitted in every fold."""
+PAIRS = 3
+"""Pairs that are fitted in every fold where no single term is added."""
 STEPS = 8
-"""Terms that are added at most."""
+"""Steps at most."""
 ITERATIONS = 12
 """Gauss-Newton steps of a fit that starts near its end."""
-WORTH = 0.98
+WORTH = 0.95
 """Ratio of errors that a term has to reach at least: a parameter that takes off less is not worth its name."""
+HARM = 1.05
+"""Ratio of errors from which on a term does harm."""
+GAIN = 0.7
+"""Ratio of errors below which a gain counts no more in the upper bound: a bound that is larger for it, and that no
+single recording of a large gain widens."""
 DOUBT = 0.1
-"""Probability that a term that is kept does harm on the next recording, shared by the candidates that were fitted."""
-EQUAL = 1.02
-"""Ratio of two candidates' errors up to which the data do not tell them apart."""
+"""Probability of an error beyond an end of an interval, for all candidates of a step together that were fitted: a term
+is added where the upper end is below 1, so that it surely lowers the error."""
 REACH = 3.0
-"""Bound of a term's weight: what it does at most, over what the state's rate is in the recordings."""
-FAR = 3.0
 """Errors of a free run count up to so many spreads of their output: one that runs away is as bad as that."""
+FAR = 2.0
+"""A start whose error is larger by this than the other's is not tried."""
 RIDGE = 1e-6
 """Share that is added to the normal equations' diagonal: columns that are alike stay solvable."""
+SMALL = 0.1
+"""Share of the smaller mean squared error that is added to that of every piece: pieces in which both models err
+little say little."""
 FEWEST, MANY = 3, 5
 """Pieces of evidence from which on their scatter is known; and recordings from which on each is one piece."""
+LEAST_T = 2.0
+"""Standard errors that one parameter of each term has to differ from none at least: else the data do not tell it."""
+LEAST = 20
+"""Periods of the parts of a single recording at least."""
+ALONG = 4
+"""Steps of a period in which a term's state is followed along a recording."""
+SHORTEST = 4
+"""Samples of a block at least."""
+DRAWN = 200
+"""Points of a term's picture."""
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A term in one or several forms (of an exponent, an edge), of which the best is taken."""
+class _HeldOut:
+    """Windows with the piece of evidence of each sample and the fold of each window.
 
-    name: str
-    forms: tuple[Term, ...]
-
-
-@dataclass(frozen=True)
-class Added:
-    """A step of the search.
-
-    Args:
-        term: The term that was added.
-        ratio: Error of free runs over what was left out with the term, over that without [-]; the geometric mean of the
-            pieces of evidence.
-        upper: Upper bound of it; the chance of a larger one is ``DOUBT`` over the candidates that were fitted.
-        error: Root mean square of these errors with the term, over the outputs' spreads [-].
-        alternatives: Terms that the data do not tell from it.
+    ``starts`` are the trajectory and the sample that each window begins with.
     """
-
-    term: Term
-    ratio: float
-    upper: float
-    error: float
-    alternatives: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A prior with the terms that its recordings ask for.
-
-    Args:
-        base: The prior's class.
-        steps: The terms, in the order in which they were found.
-        values: Fitted values [their units] of all parameters by name.
-        standard_errors: Their standard errors.
-        before: Error of free runs over what was left out without the terms, over the outputs' spreads [-].
-        evidence: What pieces of evidence there were, e.g. ``"12 recordings in 5 groups"``.
-        tried: Candidates.
-        reason: Why the search ended.
-    """
-
-    base: type[Prior]
-    steps: tuple[Added, ...]
-    values: dict[str, float]
-    standard_errors: dict[str, float]
-    before: float
-    evidence: str
-    tried: int
-    reason: str
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """The terms."""
-        return tuple(step.term for step in self.steps)
-
-    @property
-    def prior(self) -> type[Prior]:
-        """The prior's class with the terms, its nominal values the fitted ones."""
-        return extended(self.base, *self.terms)
-
-
-def library(prior: Prior, points: Points, dt: float, length: float) -> tuple[Candidate, ...]:
-    """Terms that a prior may lack, with bounds and scales from where its machine was.
-
-    Which can apply follows from its structure and units: a state whose rate is another state is an axis' position;
-    terms that touch forces need a :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior`.
-
-    Args:
-        prior: The prior with fitted values.
-        points: States ``(n, n_x)``, inputs ``(n, n_u)`` and disturbances ``(n, n_w)`` of the recordings.
-        dt: Model period [s].
-        length: Length [s] of the free runs that models are judged by: no lag is longer than a quarter.
-    """
-    return tuple(_Library(prior, points, dt, length).candidates())
-
-
-class _Library:
-    """Scales of the signals, and the terms that are made with them."""
-
-    def __init__(self, prior: Prior, points: Points, dt: float, length: float) -> None:
-        self.prior, self.dt, self.length = prior, dt, length
-        self.x, self.u, self.w = points
-        rates = prior.equations.xdot(self.x.T, self.u.T, self.w.T, prior.p).full().T
-        self.rates = np.sqrt(np.mean(np.square(rates), axis=0))
-        self.positions = {v: q for q, v in prior.kinematics}
-        self.mechanical = isinstance(prior, MechanicalPrior)
-        if isinstance(prior, MechanicalPrior):
-            half = self.x.shape[1] // 2
-            mass = prior.masses.map(len(self.x))(
-                self.x[:, :half].T, np.tile(prior.p, (len(self.x), 1)).T
-            ).full()
-            mass = mass.reshape(half, len(self.x), half).swapaxes(0, 1)
-            forces = np.einsum("nij,nj->ni", mass, rates[:, half:])
-            self.rates = np.concatenate([self.rates[:half], np.sqrt(np.mean(np.square(forces), axis=0))])
-
-    def candidates(self) -> Iterator[Candidate]:
-        """All of them."""
-        exact = set(self.positions.values())
-        for i, state in enumerate(self.prior.states):
-            if i in self.positions:
-                yield from self._axis(i, state)
-            elif i not in exact and i in self.prior.corrected:
-                yield from self._process(i, state)
-        for i, signal in enumerate(self.prior.inputs):
-            yield from self._input(i, signal)
-        for i, signal in enumerate(self.prior.outputs):
-            yield from self._output(i, signal)
-
-    def _weight(
-        self, name: str, i: int, size: float, unit: str, *, positive: bool = False, words: str = ""
-    ) -> Parameter:
-        """A weight of what has this size on the rate of state ``i``."""
-        most = REACH * self.rates[i] / max(size, 1e-12)
-        return Parameter(name, 0.0, unit, 0.0 if positive else -most, most, words)
-
-    def _axis(self, i: int, state: Signal) -> Iterator[Candidate]:
-        own, q = state.name, self.positions[i]
-        v, position = self.x[:, i], self.x[:, q]
-        speed, turning = float(np.sqrt(np.mean(v**2))), self.prior.states[q].periodic
-        if not speed > 0:
-            return
-        place: Place = "force" if self.mechanical else "rate"
-        unit = _force_unit(state.unit) if self.mechanical else f"{state.unit}/s"
-        width = 0.05 * speed
-
-        def weight(
-            key: str, size: float, per: str = "", positive: bool = False, words: str = ""
-        ) -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, f"{unit}{per}", positive=positive, words=words)
-
-        per_speed = f" s/{_base(state.unit)}"
-        at: dict[str, Any] = {"width": width, "place": place}
-        yield _one(laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at))
-        yield _one(
-            laws.asymmetric(own, weight("F_a", 1.0, words="dry friction forwards more than backwards"), **at)
-        )
-        yield _one(laws.viscous(own, weight("d", speed, per_speed, True, "viscous friction"), place=place))
-        yield _one(
-            laws.viscous_by_direction(
-                own, weight("d_a", speed, per_speed, words="viscous friction by direction"), place=place
-            )
-        )
-        yield _one(
-            laws.quadratic(
-                own, weight("c", speed**2, f" s^2/{_base(state.unit)}^2", True, "drag"), place=place
-            )
-        )
-        yield Candidate(
-            f"Stribeck friction of {own}",
-            tuple(
-                laws.stribeck(
-                    own,
-                    weight(f"F_s{k}", 0.3, positive=True, words="friction near rest"),
-                    speed=share * speed,
-                    **at,
-                )
-                for k, share in enumerate((0.1, 0.3, 1.0), 1)
-            ),
-        )
-        for k, load in enumerate(("driven", "resting", "both"), 1):
-            mu = Parameter(f"mu_{k}_{own}", 0.0, "-", 0.0, 2.0, f"friction by {load} load")
-            yield _one(laws.loaded(own, mu, load=load, **at))
-        centre, span = float(np.mean(position)), float(np.std(position)) or 1.0
-        if turning:
-            sizes, per = (0.7, 0.7), ("", "")
-        else:
-            sizes, per = (span, span**2), (f"/{_base(state.unit)}", f"/{_base(state.unit)}^2")
-        names = [
-            weight(f"F_{k}", size, p, words="dry friction along the way")
-            for k, size, p in zip((1, 2), sizes, per, strict=True)
-        ]
-        yield _one(
-            laws.coulomb_by_position(own, *names, turning=turning, centre=0.0 if turning else centre, **at)
-        )
-        yield _one(laws.offset(own, weight("F_0", 1.0, words="offset"), place=place))
-        if not self.mechanical:
-            return
-        if turning:
-            yield _one(
-                laws.gravity_error(
-                    own, weight("G_s", 0.7, words="gravity by sin q"), weight("G_c", 0.7, words="by cos q")
-                )
-            )
-            yield Candidate(
-                f"cogging of {own}",
-                tuple(
-                    laws.cogging(
-                        own, weight(f"C_{n}s", 0.7, words="cogging by sin"), weight(f"C_{n}c", 0.7, words="by cos"),
-                        periods=float(n),
-                    )
-                    for n in (2, 3, 4, 6, 8, 12)
-                ),
-            )  # fmt: skip
-            return
-        stiff = f"/{_base(state.unit)}"
-        yield _one(laws.spring(own, weight("k", span, stiff, words="stiffness"), centre=centre))
-        low, high = np.quantile(position, (0.02, 0.98))
-        reach = 0.1 * (high - low)
-        yield _one(
-            laws.elastic_end(
-                own, weight("k_u", reach, stiff, True, "upper end"), edge=float(high - reach), upper=True
-            )
-        )
-        yield _one(
-            laws.elastic_end(
-                own, weight("k_l", reach, stiff, True, "lower end"), edge=float(low + reach), upper=False
-            )
-        )
-
-    def _process(self, i: int, state: Signal) -> Iterator[Candidate]:
-        own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
-        low, high = float(values.min()), float(values.max())
-        temperature = (parsed(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
-
-        def weight(
-            key: str, size: float, per: str = "", positive: bool = False, words: str = ""
-        ) -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, f"{unit}{per}", positive=positive, words=words)
-
-        yield _one(laws.offset(own, weight("r_0", 1.0, words="offset of the rate"), place="rate"))
-        forms = []
-        references: list[tuple[str | float, Array]] = (
-            [(0.0, np.zeros(len(values)))]
-            if low >= 0 and not temperature
-            else [(low, np.full(len(values), low))]
-        )
-        references += [(s.name, c) for s, c in self._alike(i, state.unit)]
-        for number, (reference, other) in enumerate(references, 1):
-            far = float(np.sqrt(np.mean((values - other) ** 2))) or 1.0
-            for exponent, key in ((1.0, "a"), (1.25, "b"), (0.5, "c"), (2.0, "d")):
-                if (temperature and exponent == 0.5) or (exponent == 1.25 and not temperature):
-                    continue
-                k = weight(f"k_{number}{key}", far**exponent, f"/{state.unit}^{exponent:g}", True, "loss")
-                forms.append(laws.loss(own, k, exponent=exponent, reference=reference))
-        yield Candidate(f"loss of {own}", tuple(forms))
-        if temperature:
-            kelvin = 0.0 if state.unit == "K" else 273.15
-            size = abs((np.mean(values) + kelvin) ** 4 - (low + kelvin) ** 4) / 1e8 or 1.0
-            yield _one(
-                laws.radiation(
-                    own,
-                    weight("e", float(size), " 1e8/K^4", True, "radiation"),
-                    kelvin=kelvin,
-                    surroundings=low,
-                )
-            )
-        width = 0.02 * (high - low) or 1.0
-        edges = [low + share * (high - low) for share in (0.6, 0.75, 0.9)]
-        yield Candidate(
-            f"overflow of {own}",
-            tuple(
-                laws.overflow(
-                    own,
-                    weight(f"s_{n}", high - edge, f"/{state.unit}", True, "overflow"),
-                    edge=edge,
-                    width=width,
-                )
-                for n, edge in enumerate(edges, 1)
-            ),
-        )
-        signals = [(s, c) for s, c in self._signals() if s.name != own]
-        for s, c in signals:
-            scale, centre = float(np.std(c)), float(np.mean(c))
-            if scale > 0:
-                k = weight(f"k_{_short(s.name)}", scale, f"/{_per(s.unit)}", words=f"of {s.name}")
-                yield _one(laws.coupling(own, k, source=s.name, centre=centre))
-        everything = [(state, values), *signals]
-        for a, (one, c) in enumerate(everything):
-            for two, d in everything[a:]:
-                size = float(np.std(c) * np.std(d))
-                if size > 0:
-                    key = f"k_{_short(one.name)}_{_short(two.name)}"
-                    k = weight(
-                        key,
-                        size,
-                        f"/{_per(one.unit)}/{_per(two.unit)}",
-                        words=f"of {one.name} and {two.name}",
-                    )
-                    centres = float(np.mean(c)), float(np.mean(d))
-                    yield _one(laws.product(own, k, one=one.name, two=two.name, centres=centres))
-
-    def _signals(self) -> Iterator[tuple[Signal, Array]]:
-        for group, values in (
-            (self.prior.states, self.x),
-            (self.prior.inputs, self.u),
-            (self.prior.disturbances, self.w),
-        ):
-            yield from zip(group, values.T, strict=True)
-
-    def _alike(self, i: int, unit: str) -> Iterator[tuple[Signal, Array]]:
-        """States and disturbances of the same unit."""
-        for k, (s, c) in enumerate(self._signals()):
-            if s.unit == unit and k != i and s.name not in {one.name for one in self.prior.inputs}:
-                yield s, c
-
-    def _input(self, i: int, signal: Signal) -> Iterator[Candidate]:
-        own, values = signal.name, self.u[:, i]
-        spread, centre = float(np.std(values)), float(np.mean(values))
-        if not spread > 1e-9 * max(abs(centre), 1e-300):
-            return
-
-        def of(key: str, most: float, unit: str = "-", words: str = "", positive: bool = False) -> Parameter:
-            return Parameter(f"{key}_{own}", 0.0, unit, 0.0 if positive else -most, most, words)
-
-        tau = Parameter(
-            f"tau_{own}", 2 * self.dt, "s", self.dt, max(0.25 * self.length, 4 * self.dt), "lag of the input"
-        )
-        yield _one(laws.input_lag(own, tau, state=replace(signal, name=f"{own}_acting")))
-        yield _one(laws.input_gain(own, of("g", 0.9, words="relative error of the gain")))
-        yield _one(laws.input_offset(own, of("o", 2 * spread, signal.unit, "offset of the input")))
-        if (values < 0).any() and (values > 0).any():
-            yield _one(laws.gain_by_direction(own, of("g_a", 0.9, words="gain forwards more than backwards")))
-            yield _one(
-                laws.dead_zone(own, of("z", spread, signal.unit, "dead zone", True), width=0.05 * spread)
-            )
-        yield _one(
-            laws.input_curve(
-                own,
-                of("g_c", 0.5, words="bend of the input"),
-                centre=centre if centre > 2 * spread else 0.0,
-                span=2 * spread,
-            )
-        )
-
-    def _output(self, i: int, signal: Signal) -> Iterator[Candidate]:
-        y = self.prior.equations.output(self.x.T, self.u.T, self.w.T, self.prior.p).full()[i]
-        own, spread = signal.name, float(np.std(y))
-        if not spread > 0:
-            return
-        unit = signal.unit
-
-        def of(key: str, most: float, own_unit: str = "-", words: str = "") -> Parameter:
-            return Parameter(f"{key}_{own}", 0.0, own_unit, -most, most, words)
-
-        tau = Parameter(
-            f"tau_{own}", 2 * self.dt, "s", self.dt, max(0.25 * self.length, 4 * self.dt), "lag of the sensor"
-        )
-        shown = Signal(f"{own}_shown", unit, signal.lower, signal.upper)
-        yield _one(laws.output_lag(own, tau, state=shown))
-        yield _one(laws.output_gain(own, of("s_g", 0.5, words="relative error of the sensor's gain")))
-        yield _one(laws.output_offset(own, of("s_o", 2 * spread, unit, "offset of the sensor")))
-        low, high = (float(v) for v in np.quantile(y, (0.0, 1.0)))
-        bend = of("s_b", 0.9 / (high - low), f"1/{_per(unit)}", "bend of the sensor")
-        yield _one(laws.output_curve(own, bend, lower=low, upper=high))
-
-
-def _one(term: Term) -> Candidate:
-    return Candidate(term.name, (term,))
-
-
-def _short(name: str) -> str:
-    return "".join(c if c.isalnum() else "_" for c in name)
-
-
-def _per(unit: str) -> str:
-    return unit if unit not in ("-", "") else "1"
-
-
-def _base(unit: str) -> str:
-    """The unit of a position, of that of its speed."""
-    return unit.removesuffix("/s")
-
-
-def _force_unit(unit: str) -> str:
-    return "N" if unit.startswith("m") else "N m"
-
-
-@dataclass(frozen=True)
-class _Evidence:
-    """Windows with the piece of evidence and the fold of each."""
 
     windows: OutputWindows
+    starts: tuple[tuple[Trajectory, int], ...]
     pieces: Places
     folds: Places
-    words: str
+    told: Evidence
+    warm: int
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """Samples ``(n, T + 1)`` that count."""
+        late = np.arange(self.windows.y.shape[1]) >= self.warm
+        return np.asarray(np.isfinite(self.windows.y).any(axis=-1) & late)
 
     def rows(self, keep: NDArray[np.bool_]) -> OutputWindows:
         """Some windows."""
@@ -448,54 +126,113 @@ class _Evidence:
             group=np.arange(int(keep.sum())),
         )  # fmt: skip
 
+    def compared(self, own: Array, other: Array, candidates: int) -> HeldOutError:
+        """Squared errors ``(n, T + 1)`` of one model over another's, which was the best of so many candidates."""
+        each = self._each(own, other)
+        n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[self.counted].mean()))
+        if n < FEWEST:
+            return HeldOutError(error, math.exp(mean), 0.0, math.inf, 1.0)
+        capped = np.maximum(each, math.log(GAIN))  # its mean is no less, its scatter not that of large gains
+        scatter, safe = (max(float(v.std(ddof=1)) / math.sqrt(n), 1e-9) for v in (each, capped))
+        wide = float(student.ppf(1.0 - DOUBT / candidates, n - 1))
+        upper = float(capped.mean()) + wide * safe
+        harm = float(student.cdf((float(capped.mean()) - math.log(HARM)) / safe, n - 1))
+        return HeldOutError(
+            error, math.exp(mean), math.exp(max(mean - wide * scatter, -700.0)), math.exp(min(upper, 700.0)),
+            min(1.0, candidates * harm),
+        )  # fmt: skip
 
-def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, most: int) -> _Evidence:
-    """Windows of all recordings, shared evenly, with what is left out together: whole recordings that are alike in
+    def needed(self, own: Array, other: Array, candidates: int) -> int:
+        """Recordings like these that it takes besides for a bound below 1; 0 where they would be more than tenfold."""
+        capped = np.maximum(self._each(own, other), math.log(GAIN))
+        mean, scatter, n = float(capped.mean()), float(capped.std(ddof=1)), len(capped)
+        for pieces in range(n + 1, 10 * n + 1):
+            wide = float(student.ppf(1.0 - DOUBT / candidates, pieces - 1)) * scatter / math.sqrt(pieces)
+            if mean + wide < 0:
+                return math.ceil((pieces - n) * self.told.recordings / n)
+        return 0
+
+    def _each(self, own: Array, other: Array) -> Array:
+        """Logarithm of the ratio of errors of each piece of evidence."""
+        seen = self.counted
+        sums = [np.bincount(self.pieces[seen], weights=v[seen]) for v in (own, other)]
+        counts = np.bincount(self.pieces[seen])
+        means = [total[counts > 0] / counts[counts > 0] for total in sums]
+        floor = SMALL * min(float(own[seen].mean()), float(other[seen].mean())) + 1e-300
+        return np.asarray(0.5 * np.log((means[0] + floor) / (means[1] + floor)))
+
+
+def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int, most: int) -> _HeldOut:
+    """Windows of all recordings, shared evenly, with what is held out together: whole recordings that are alike in
     kind, or blocks of a single one.
     """
     files = sorted({t.file for t in known})
     share = max(2 if len(files) > 1 else most, most // len(files))
     parts, of = [], []
+    starts: list[tuple[Trajectory, int]] = []
     for number, name in enumerate(files):
         own = [t for t in known if t.file == name and len(t.t) > periods]
         if own:
             parts.append(cut_outputs(own, periods, 0, share, prior.states))
             of += [number] * len(parts[-1].x)
-    if not parts:
-        raise InputError(
-            f"no recording is as long as the free runs of {periods} periods that terms are judged by"
-        )
+            begins = [(t, k) for t in own for k in range(0, len(t.t) - periods, periods)]
+            starts += [begins[i] for i in evenly(len(begins), share)]
     joined: dict[str, Any] = {
         key: np.concatenate([getattr(p, key) for p in parts])
         for key in ("y", "u", "w", "x", "censored", "known")
     }
     windows = replace(parts[0], **joined, group=np.arange(len(of)))
     recording, present = np.array(of), sorted(set(of))
-    groups = min(FOLDS, len(present))
+    groups, length = min(FOLDS, len(present)), periods * known[0].dt
     folds = np.zeros(len(of), dtype=np.int64)
     if groups > 1:
         order = _by_kind(windows, recording, present)
         fold = dict(zip(order, np.arange(len(order)) * groups // len(order), strict=True))
         folds = np.array([fold[own] for own in of])
+    samples = windows.y.shape[1]
+    warm = min(warm, samples // 3)
     if len(present) >= MANY:
-        return _Evidence(windows, recording, folds, f"{len(present)} recordings in {groups} groups")
-    pieces, count = np.zeros(len(of), dtype=np.int64), 0
-    for recorded in present:  # a few recordings are pieces of evidence in parts
+        pieces = np.repeat(recording[:, None], samples, axis=1)
+        text = f"{len(present)} recordings in {groups} groups"
+        return _HeldOut(
+            windows,
+            tuple(starts),
+            pieces,
+            folds,
+            Evidence(len(present), len(present), groups, length, text),
+            warm,
+        )
+    pieces, count, blocks_of = (
+        np.zeros((len(of), samples), dtype=np.int64),
+        0,
+        np.zeros(len(of), dtype=np.int64),
+    )
+    for recorded in present:  # a few recordings are pieces of evidence in blocks
         at = np.flatnonzero(recording == recorded)
-        blocks = min(len(at), math.ceil(BLOCKS / len(present)))
-        pieces[at] = count + np.arange(len(at)) * blocks // len(at)
+        whole = len(at) * samples
+        blocks = max(1, min(math.ceil(BLOCKS / len(present)), whole // SHORTEST))
+        pieces[at] = (count + np.arange(whole) * blocks // whole).reshape(len(at), samples)
+        blocks_of[at] = np.arange(len(at))
         count += blocks
     if groups == 1:
-        groups = min(FOLDS, count)
-        folds = pieces * groups // count
+        groups = min(FOLDS, len(of))
+        folds = blocks_of * groups // len(of)
+    if count < FEWEST or groups < 2:
+        raise InputError(
+            f"{len(present)} recording of {whole} samples is too little evidence for terms: record at least one more "
+            f"like it, or one of {2 * samples} samples and more"
+        )
     what = "one recording" if len(present) == 1 else f"{len(present)} recordings"
-    return _Evidence(windows, pieces, folds, f"{count} parts of {what} in {groups} groups")
+    text = f"{count} blocks of {what} in {groups} groups"
+    return _HeldOut(
+        windows, tuple(starts), pieces, folds, Evidence(len(present), count, groups, length, text), warm
+    )
 
 
 def _by_kind(windows: OutputWindows, pieces: Places, present: Sequence[int]) -> list[int]:
     """Recordings in the order of what differs most between them: mean and size of inputs, outputs and disturbances.
 
-    Neighbours are left out together, so that a group is of another kind than what is fitted: an inner choice flatters
+    Neighbours are held out together, so that a group is of another kind than what is fitted: an inner choice flatters
     where it is not.
     """
     rows = []
@@ -518,100 +255,213 @@ class _Search:
 
     base: type[Prior]
     dt: float
-    evidence: _Evidence
+    evidence: _HeldOut
+    short: _HeldOut
     sizes: Array
     points: Points
     spread: Array
-    fits: dict[tuple[Term, ...], OutputFit] = field(default_factory=dict)
+    fits: dict[Terms, OutputFit] = field(default_factory=dict)
 
-    def fit(self, terms: tuple[Term, ...]) -> OutputFit:
+    def fit(self, terms: Terms) -> OutputFit:
         """The fit of the prior with terms."""
         if terms not in self.fits:
             own = OutputFit(extended(self.base, *terms), self.dt)
-            x, u, w = self.points
-            added = [
-                u[:, self._place(t)] if t.place == "input" else self._shown(x, u, w)[:, self._place(t)]
-                for t in _lags(terms)
-            ]
-            own.points = np.column_stack([x, *added]), u, w
+            own.points = self.with_states(terms, self.points)
             self.fits[terms] = own
         return self.fits[terms]
 
-    def problem(self, terms: tuple[Term, ...], windows: OutputWindows) -> Shooting:
+    def with_states(self, terms: Terms, points: Points) -> Points:
+        """Points with the terms' states: each where its signal is."""
+        x, u, w = points
+        prior = self.base()
+        signals = {"rate": x, "input": u, "disturbance": w}
+        if any(term.place == "output" for term in _with_state(terms)):
+            signals["output"] = prior.equations.output(x.T, u.T, w.T, prior.p).full().T
+        added = [signals[t.place][:, _index(self.base, t)] for t in _with_state(terms)]
+        return np.column_stack([x, *added]), u, w
+
+    def problem(self, terms: Terms, windows: OutputWindows) -> Shooting:
         """Windows that the prior with terms is fitted to."""
         fit, sizes, first, known = self.fit(terms), self.sizes, windows.x, windows.known
-        for term in _lags(terms):
-            k = self._place(term)
-            own = windows.u[:, windows.lead, k] if term.place == "input" else windows.y[:, 0, k]
-            size = float(np.std(self.points[1][:, k])) if term.place == "input" else float(self.spread[k])
+        for term in _with_state(terms):
+            own, size = self._first(term, windows)
             first = np.column_stack([first, np.where(np.isfinite(own), own, np.nanmean(own))])
             known = np.column_stack([known, np.zeros(len(own), dtype=bool)])
             sizes = np.append(sizes, size or 1.0)
         return Shooting(fit, replace(windows, x=first, known=known), sizes, self.spread)
 
-    def _place(self, term: Term) -> int:
-        """Place of the signal that a term lags behind."""
-        group = self.base.inputs if term.place == "input" else self.base.outputs
-        return [s.name for s in group].index(term.of)
+    def _first(self, term: Term, windows: OutputWindows) -> tuple[Array, float]:
+        """First values ``(n,)`` of a term's state in windows, those of its signal, and its size."""
+        k = _index(self.base, term)
+        if term.place == "rate":
+            return windows.x[:, k], float(self.sizes[k])
+        if term.place == "input":
+            return windows.u[:, windows.lead, k], float(np.std(self.points[1][:, k]))
+        if term.place == "disturbance":
+            return windows.w[:, 0, k], float(np.std(self.points[2][:, k]))
+        return windows.y[:, 0, k], float(self.spread[k])
 
-    def _shown(self, x: Array, u: Array, w: Array) -> Array:
+    def judged(
+        self, by: _HeldOut, terms: Terms, theta: Array, keep: NDArray[np.bool_] | None = None
+    ) -> Shooting:
+        """Windows that the prior with terms is judged by: the warm-up alone determines the first states, and the rest
+        counts. States of terms begin where they are along the recording: a free one would explain what the term
+        does not.
+        """
+        some = np.ones(len(by.starts), dtype=bool) if keep is None else keep
+        problem = self.problem(terms, replace(by.rows(some), warm=by.warm))
+        added = _with_state(terms)
+        if not added:
+            return problem
+        values = self.fit(terms).values(theta)
+        n_x, windows = len(self.base.states), problem.windows
+        first, known = windows.x.copy(), windows.known.copy()
+        for k, term in enumerate(added, n_x):
+            along = {id(t): self._along(term, t, values) for t, _ in by.starts}
+            first[:, k] = [along[id(t)][at] for (t, at), kept in zip(by.starts, some, strict=True) if kept]
+            known[:, k] = True
+        return Shooting(problem.own, replace(windows, x=first, known=known), problem.sizes, self.spread)
+
+    def _along(self, term: Term, trajectory: Trajectory, values: dict[str, float]) -> Array:
+        """A term's state along a recording ``(n,)``, from its signal at the first sample on."""
         prior = self.base()
-        return np.asarray(prior.equations.output(x.T, u.T, w.T, prior.p).full().T)
+        x, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in ("x", "u", "w", "p"))
+        state, given = ca.SX.sym("s"), ca.SX.sym("q", len(term.parameters))
+        k = _index(self.base, term)
+        own = {"rate": x, "input": u, "disturbance": w}.get(term.place)
+        own = prior.equations.output(x, u, w, p)[k] if own is None else own[k]
+        names = (
+            named(prior.names_of(key), ca.vertsplit(v)) for key, v in zip("xuwp", (x, u, w, p), strict=True)
+        )
+        x_named, u_named, w_named, p_named = names
+        at = At(x_named, u_named, w_named, own, None, 0.0, 0.0, state, p_named)
+        rate = term.law(at, named(term.names, ca.vertsplit(given)))[1]
+        f = ca.Function("rate", [state, x, u, w, given, p], [rate])
+        h, one = self.dt / ALONG, state
+        for _ in range(ALONG):
+            half = one + 0.5 * h * f(one, x, u, w, given, p)
+            one = one + h * f(half, x, u, w, given, p)
+        step = ca.Function("step", [state, x, u, w, given, p], [one]).mapaccum(len(trajectory.t))
+        start = ca.Function("own", [x, u, w, p], [own])
+        base = ca.DM([values[q.name] for q in self.base.parameters])
+        mine = ca.DM([values[name] for name in term.names])
+        columns = [np.nan_to_num(getattr(trajectory, key)).T for key in ("x", "u", "w")]
+        first = start(*(ca.DM(c[:, :1]) for c in columns), base)
+        n = len(trajectory.t)
+        found = step(first, *columns, ca.repmat(mine, 1, n), ca.repmat(base, 1, n)).full().ravel()
+        return np.concatenate([first.full().ravel(), found[:-1]])
 
-    def left_out(self, terms: tuple[Term, ...], theta: Array) -> Array:
-        """Squared errors ``(n,)`` of every window by a fit to the other folds, each from ``theta`` on."""
-        squares = np.zeros(len(self.evidence.folds))
+    def held_out(self, terms: Terms, theta: Array) -> Array:
+        """Squared errors ``(n, T + 1)`` of every window by a fit to the other folds, each from ``theta`` on."""
+        squares = np.zeros(self.evidence.pieces.shape)
         for fold in sorted(set(self.evidence.folds.tolist())):
             held = self.evidence.folds == fold
             fitted = self.problem(terms, self.evidence.rows(~held)).solve(theta, ITERATIONS).theta
-            squares[held] = _squares(self.problem(terms, self.evidence.rows(held)), fitted)
+            squares[held] = _squares(self.judged(self.evidence, terms, fitted, held), fitted)
         return squares
 
-    def begun(self, terms: tuple[Term, ...], theta: Array) -> tuple[Fitted, Shooting]:
-        """A fit to all windows from ``theta`` of the terms but the last."""
-        problem = self.problem(terms, self.evidence.windows)
-        start = np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
-        return problem.solve(start, ITERATIONS), problem
-
-    def scores(self, terms: tuple[Term, ...], theta: Array, forms: Sequence[Term]) -> Array:
-        """Logarithm of the ratio ``(len(forms),)`` of errors over what is left out that each term promises, to first
-        order: by a Gauss-Newton step of all parameters and first states in every fold.
+    def begun(self, terms: Terms, theta: Array) -> Fitted:
+        """A fit to all windows from ``theta`` of the terms but the last ones: at once, and by way of short windows,
+        which lead further where long free runs go astray; the better one.
         """
+        start = np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
+        problem = self.problem(terms, self.evidence.windows)
+        near = self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
+        starts = (
+            [start, near] if problem.explained([near])[0] < FAR * problem.explained([start])[0] else [start]
+        )
+        fits = [problem.solve(one, ITERATIONS) for one in starts]
+        return min(fits, key=lambda fit: problem.explained([fit.theta])[0])
+
+    def untold(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
+        """Those of the new terms whose parameters all may be zero. Of a term with a state a weight and a time constant
+        are told together; there the held-out error alone decides.
+        """
+        errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+        names, found = self.fit(terms).names, []
+        for term in new:
+            weights = [p.name for p in term.parameters if p.value == 0.0 and not p.fixed]
+            at = [names.index(name) for name in weights]
+            if term.state is None and at and (np.abs(fitted.theta[at]) < LEAST_T * errors[at]).all():
+                found.append(term)
+        return found
+
+    def error(self, terms: Terms, theta: Array) -> float:
+        """Mean squared error over all windows."""
+        squares = _squares(self.judged(self.evidence, terms, theta), theta)
+        return max(float(squares[self.evidence.counted].mean()), 1e-300)
+
+    def without(self, terms: Terms, theta: Array, dropped: Term) -> tuple[Terms, Array]:
+        """The terms but one, and what is left of ``theta``."""
+        kept = tuple(term for term in terms if term is not dropped)
+        keep = [name not in dropped.names for name in self.fit(terms).names]
+        return kept, theta[keep]
+
+
+class _Promises:
+    """What terms promise of the error over held-out data, to first order: by a Gauss-Newton step of all parameters and
+    first states in every fold.
+    """
+
+    def __init__(
+        self, search: _Search, evidence: _HeldOut, terms: Terms, theta: Array, forms: Sequence[Term]
+    ) -> None:
         joint = (*terms, *forms)
-        problem = self.problem(joint, self.evidence.windows)
-        begun = self.problem(terms, self.evidence.windows).first_states(theta)
-        own = self.fit(joint)
-        start = np.concatenate([theta, np.zeros(len(own.nominal) - len(theta))])
-        slopes, errors = problem.linear(start, begun)
-        every = np.concatenate([slopes, errors[..., None]], axis=-1)
-        normal = every.swapaxes(1, 2) @ every  # (n, k + 1, k + 1)
-        low, high = own.lower - start, own.upper - start
-        present = list(range(len(theta)))
-        places, count = [], len(theta)
+        own = search.fit(joint)
+        start = np.concatenate([theta, own.nominal[len(theta) :]])
+        normals = []
+        for problem, before in (
+            (search.problem(joint, evidence.windows), search.problem(terms, evidence.windows)),
+            (search.judged(evidence, joint, start), search.judged(evidence, terms, theta)),
+        ):
+            x = before.first_states(theta)
+            slopes, errors = problem.linear(start, x)
+            every = np.concatenate([slopes, errors[..., None]], axis=-1)
+            normal = every.swapaxes(1, 2) @ every  # (n, k + 1, k + 1)
+            each = sorted(set(evidence.folds.tolist()))
+            normals.append([normal[evidence.folds == f].sum(axis=0) for f in each])
+        self.low, self.high = own.lower - start, own.upper - start
+        self.present, count = list(range(len(theta))), len(theta)
+        self.places: list[list[int]] = []
         for form in forms:
             free = [p for p in form.parameters if not p.fixed]
-            places.append(list(range(count, count + len(free))))
+            self.places.append(list(range(count, count + len(free))))
             count += len(free)
-        held = [
-            normal[self.evidence.folds == f].sum(axis=0) for f in sorted(set(self.evidence.folds.tolist()))
-        ]
-        total = np.sum(held, axis=0)
+        total = np.sum(normals[0], axis=0)
+        self.fitted = [total - own_normal for own_normal in normals[0]]
+        self.held = normals[1]
+        self.plain = self._left(self.present)
 
-        def left(columns: list[int]) -> float:
-            cost = 0.0
-            for own_held in held:
-                step = _step(total - own_held, columns, low, high)
-                moved = own_held[np.ix_(columns, columns)] @ step
-                cost += own_held[-1, -1] + 2.0 * float(own_held[columns, -1] @ step) + float(step @ moved)
-            return max(cost, 1e-300)
+    def _left(self, columns: list[int]) -> float:
+        cost = 0.0
+        for fitted, own in zip(self.fitted, self.held, strict=True):
+            step = _step(fitted, columns, self.low, self.high)
+            moved = own[np.ix_(columns, columns)] @ step
+            cost += own[-1, -1] + 2.0 * float(own[columns, -1] @ step) + float(step @ moved)
+        return max(cost, 1e-300)
 
-        plain = left(present)
-        return np.array([0.5 * math.log(left(present + place) / plain) for place in places])
+    def of(self, *forms: int) -> float:
+        """Logarithm of the ratio of errors that these forms together promise."""
+        columns = [*self.present, *(place for form in forms for place in self.places[form])]
+        return 0.5 * math.log(self._left(columns) / self.plain)
 
 
-def _lags(terms: Sequence[Term]) -> list[Term]:
+def _with_state(terms: Sequence[Term]) -> list[Term]:
     """Those with a state of their own, in order."""
     return [term for term in terms if term.state is not None]
+
+
+def _vanishes(term: Term) -> bool:
+    """Whether a term does nothing at its nominal values, so that slopes tell what it would do."""
+    return term.state is None and term.parameters[0].value == 0.0
+
+
+def _index(base: type[Prior], term: Term) -> int:
+    """Place of a term's signal among those of its kind."""
+    groups: dict[str, tuple[Signal, ...]] = {
+        "input": base.inputs, "disturbance": base.disturbances, "output": base.outputs,
+    }  # fmt: skip
+    return [s.name for s in groups.get(term.place, base.states)].index(term.of)
 
 
 def _step(normal: Array, columns: list[int], low: Array, high: Array) -> Array:
@@ -633,35 +483,52 @@ def _step(normal: Array, columns: list[int], low: Array, high: Array) -> Array:
 
 
 def _squares(problem: Shooting, theta: Array) -> Array:
-    """Mean squared error ``(n,)`` of each window's free run over the outputs' spreads, from its best first state."""
-    x = problem.first_states(theta)
-    point = problem.start(theta, x, "")
-    n = len(x)
-    over = (
-        np.clip(point.error / np.tile(problem.spread, problem.windows.y.shape[1]), -FAR, FAR) * problem.count
-    )
-    seen = (problem.seen.reshape(n, -1) * problem.count).sum(axis=1)
-    return np.asarray(np.square(over).sum(axis=1) / np.maximum(seen, 1.0))
+    """Squared error ``(n, T + 1)`` of each sample of free runs, mean over the outputs of the error over its spread,
+    from the best first states; zero where nothing was measured.
+    """
+    point = problem.start(theta, problem.first_states(theta), "")
+    shape = problem.windows.y.shape
+    over = np.clip(point.error / np.tile(problem.spread, shape[1]), -REACH, REACH) * problem.count
+    seen = problem.seen.sum(axis=-1)
+    return np.asarray(np.square(over).reshape(shape).sum(axis=-1) / np.maximum(seen, 1.0))
 
 
 @dataclass(frozen=True)
-class _Compared:
-    """Squared errors of one model over another's, by pieces of evidence."""
+class _Fitted:
+    """A candidate that was fitted in every fold."""
 
-    ratio: float
-    upper: float
-    error: float
+    forms: Terms
+    held_out: HeldOutError | None
+    theta: Array
+    squares: Array
+    reason: str = ""
+    sure: bool = False
 
 
-def _compared(own: Array, other: Array, pieces: Places, doubt: float) -> _Compared:
-    sums = [np.bincount(pieces, v) for v in (own, other)]
-    sums = [s[np.bincount(pieces) > 0] for s in sums]
-    each = 0.5 * np.log(np.maximum(sums[0], 1e-300) / np.maximum(sums[1], 1e-300))
-    n, error = len(each), float(np.sqrt(own.mean()))
-    upper = math.inf
-    if n >= FEWEST:
-        upper = float(each.mean() + student.ppf(1.0 - doubt, n - 1) * each.std(ddof=1) / math.sqrt(n))
-    return _Compared(math.exp(float(each.mean())), math.exp(min(upper, 700.0)), error)
+@dataclass(frozen=True)
+class _Ranked:
+    """Candidates with the logarithm of the ratio of errors that they promise, over long windows and short ones."""
+
+    long: list[tuple[float, Terms]]
+    short: list[tuple[float, Terms]]
+
+    def best(self, count: int, beyond: _Ranked | None = None) -> list[Terms]:
+        """So many of both that promise most; only those that promise more than all of others do."""
+        found: list[Terms] = []
+        others = ([], []) if beyond is None else (beyond.long, beyond.short)
+        for own, other in zip((self.long, self.short), others, strict=True):
+            enough = math.log(WORTH) + min([score for score, _ in other], default=0.0)
+            found += [forms for score, forms in sorted(own, key=lambda s: s[0])[:count] if score < enough]
+        return list({frozenset(form.name for form in forms): forms for forms in found}.values())
+
+
+@dataclass
+class _State:
+    """Where the search is: the terms, their fit, and the squared errors over held-out data."""
+
+    terms: Terms
+    theta: Array
+    squares: Array
 
 
 def explain(
@@ -671,8 +538,13 @@ def explain(
     *,
     dt: float,
     length: float,
+    warm_up: float = 0.0,
     candidates: Sequence[Candidate] | None = None,
-    on_progress: Callable[[int, int, str], None] = lambda done, total, text: None,
+    own: Sequence[Term] = (),
+    begun: Explanation | None = None,
+    most: int = STEPS,
+    on_progress: Progress = lambda done, total, text: None,
+    on_step: Callable[[Explanation], None] = lambda told: None,
 ) -> Explanation:
     """Search for the terms that a fitted prior lacks.
 
@@ -682,83 +554,481 @@ def explain(
         known: Recordings with inputs that act and smoothed states (:func:`~hybrid_mpc.identify.fit.smoothed`).
         dt: Model period [s].
         length: Length [s] of the free runs that models are judged by.
-        candidates: Terms to choose from. Default: :func:`library`.
-        on_progress: ``(done, total, text)`` after every fit.
+        warm_up: Length [s] of the part of a held-out free run that alone determines its first state, and does not
+            count; as where models are evaluated. Default: the whole run does both.
+        candidates: Terms to choose from. Default: :func:`~hybrid_mpc.identify.term_library.library`.
+        own: A user's own terms beside these.
+        begun: What ``on_step`` had of a search with the same arguments that was stopped: it goes on from there.
+        most: Steps that add terms, at most.
+        on_progress: ``(done, total, text)`` after every fit of a step.
+        on_step: What is known after each step, for a file from which a stopped search goes on.
 
     Raises:
-        InputError: If no recording is as long as that.
+        InputError: If there are too few recordings to judge terms by, two terms have one name, or an own term does not
+            fit to the prior, its units or its balances.
     """
-    prior = base(values)
-    longest = max(len(t.t) for t in known) - 1
-    if len({t.file for t in known}) == 1:  # parts of a single recording are its evidence
-        longest = max(sum(len(t.t) for t in known) // BLOCKS - 1, 2)
-    periods = min(periods_of(length, dt, 2), longest)
-    evidence = _gathered(known, prior, periods, WINDOWS)
-    points = visited(known)
-    columns = np.concatenate([t.x for t in known]).T
-    sizes = np.array([robust_spread(c) or 1.0 for c in columns])
-    y = evidence.windows.y
-    spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
-    search = _Search(base, dt, evidence, sizes, points, spread)
-    pool = list(library(prior, points, dt, length) if candidates is None else candidates)
-    tried = len(pool)
-    terms: tuple[Term, ...] = ()
-    theta = search.problem((), evidence.windows).solve(search.fit(()).scaled(values), ITERATIONS).theta
-    present = search.left_out((), theta)
-    before = float(np.sqrt(present.mean()))
-    steps: list[Added] = []
-    reason = f"{STEPS} terms were added"
-    for number in range(STEPS):
-        on_progress(number, STEPS, f"{len(pool)} candidates beside {len(terms)} terms")
-        plain = [(k, form) for k, one in enumerate(pool) for form in one.forms if form.state is None]
-        promised = search.scores(terms, theta, [form for _, form in plain])
-        best = {
-            k: min((score, i) for i, score in enumerate(promised) if plain[i][0] == k)
-            for k in {k for k, _ in plain}
-        }
-        scored = [(score, k, plain[i][1]) for k, (score, i) in best.items()]
-        now = math.log(float(_squares(search.problem(terms, evidence.windows), theta).mean()))
-        for k, one in enumerate(pool):
-            if one.forms[0].state is not None:  # at once a lag does what no slope tells
-                own, problem = search.begun((*terms, one.forms[0]), theta)
-                scored.append(
-                    (0.5 * (math.log(float(_squares(problem, own.theta).mean())) - now), k, one.forms[0])
+    found = _Explain(base, values, known, dt, length, warm_up, candidates, own, on_progress)
+    return found.run(begun, most, on_step)
+
+
+class _Explain:
+    """One search."""
+
+    def __init__(
+        self, base: type[Prior], values: dict[str, float], known: Sequence[Trajectory], dt: float, length: float,
+        warm_up: float, candidates: Sequence[Candidate] | None, own: Sequence[Term], on_progress: Progress,
+    ) -> None:  # fmt: skip
+        prior = base(values)
+        self.base, self.known, self.own, self.on_progress = base, known, tuple(own), on_progress
+        ends = {name: max(len(t.t) for t in known if t.file == name) - 1 for name in {t.file for t in known}}
+        longest = min(periods_of(length, dt, 2), max(ends.values()))
+        longest = min(
+            end for end in ends.values() if 2 * end >= longest
+        )  # no recording is left out for being shorter
+        if len({t.file for t in known}) == 1:  # parts of a single recording are its evidence
+            samples = sum(len(t.t) for t in known)
+            longest = samples // BLOCKS - 1
+            if longest < min(LEAST, periods_of(length, dt, 2)):
+                raise InputError(
+                    f"one recording of {samples} samples is too little evidence for terms, which are judged by "
+                    f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples "
+                    "more, or a second recording"
                 )
-        scored = sorted((one for one in scored if one[0] < math.log(WORTH)), key=lambda one: one[0])[:TRIED]
-        if not scored:
-            reason = "no other term promises to lower the error"
-            break
-        results = []
-        for _, k, form in scored:
-            with_it = (*terms, form)
-            own, _ = search.begun(with_it, theta)
-            squares = search.left_out(with_it, own.theta)
-            results.append(
-                (_compared(squares, present, evidence.pieces, DOUBT / len(scored)), form, own, squares, k)
-            )
-        results.sort(key=lambda r: r[0].ratio)
-        sure = [
-            r for r in results if r[0].ratio < WORTH and r[0].upper < 1.0 and r[3].mean() < present.mean()
+        periods = min(periods_of(length, dt, 2), longest)
+        self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
+        less = max(periods // SHORTER, min(periods, 2 * SHORTEST))
+        short = _gathered(known, prior, less, round(warm_up / dt), 2 * WINDOWS)
+        points = visited(known)
+        sizes = np.array([robust_spread(c) or 1.0 for c in np.concatenate([t.x for t in known]).T])
+        y = self.evidence.windows.y
+        spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
+        self.search = _Search(base, dt, self.evidence, short, sizes, points, spread)
+        given = library(prior, points, dt, length) if candidates is None else candidates
+        self.pool = [*given, *(Candidate(term.name, (term,)) for term in own)]
+        _check(prior, self.pool, own, points)
+        self.candidates = len(self.pool)
+        self.steps: list[ExplainStep] = []
+        search = self.search
+        theta = (
+            search.problem((), self.evidence.windows).solve(search.fit(()).scaled(values), ITERATIONS).theta
+        )
+        self.first = search.held_out((), theta)
+        self.nominal = math.sqrt(search.error((), search.fit(()).nominal))
+        self.now = _State((), theta, self.first)
+
+    def run(
+        self, begun: Explanation | None, most: int, on_step: Callable[[Explanation], None]
+    ) -> Explanation:
+        """The whole search."""
+        if begun is not None:
+            self._resume(begun)
+        last: tuple[Trial, ...] = ()
+        reason = f"{most} steps were asked for at most"
+        while sum(step.action == "added" for step in self.steps) < most:
+            trials, scored, chosen = self._step()
+            if chosen is None:
+                last, reason = trials, _reason(trials, self.evidence.told.pieces)
+                break
+            self._add(chosen, scored, trials)
+            self._remove()
+            on_step(self._told("the search was stopped", ()))
+        return self._told(reason, last)
+
+    def _resume(self, begun: Explanation) -> None:
+        terms = begun.terms(self.own)
+        search = self.search
+        theta = search.fit(terms).scaled({**search.fit(terms).prior.values, **begun.values})
+        self.steps = list(begun.steps)
+        self.now = _State(terms, theta, search.held_out(terms, theta))
+        there = {term.name for step in begun.steps for term in step.terms}
+        self.pool = [one for one in self.pool if not there & {form.name for form in one.forms}]
+
+    def _step(self) -> tuple[tuple[Trial, ...], int, _Fitted | None]:
+        """Candidates that were fitted, the number of those that were scored, and what is added."""
+        number = 1 + sum(step.action == "added" for step in self.steps)
+        singles, pairs, diverged = self._scored(number)
+        fitted = list(self._fitted(singles.best(TRIED), f"step {number}"))
+        chosen = _chosen(fitted)
+        if chosen is None:
+            some = pairs.best(PAIRS, singles)
+            both = list(self._fitted(some, f"step {number}, pairs"))
+            fitted += both
+            chosen = _chosen([one for one in both if self._both_needed(one)])
+        return (
+            tuple([self._trial(one, chosen) for one in fitted] + diverged),
+            len(self.pool),
+            chosen,
+        )
+
+    def _scored(self, number: int) -> tuple[_Ranked, _Ranked, list[Trial]]:
+        """Single terms and pairs with the logarithm of the ratio of errors that they promise; and candidates whose fit
+        failed.
+        """
+        search, now = self.search, self.now
+        self.on_progress(0, len(self.pool), f"step {number}: {len(self.pool)} candidates are scored")
+        plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if _vanishes(form)]
+        some = [form for _, form in plain]
+        promises = [
+            _Promises(search, by, now.terms, now.theta, some) for by in (search.evidence, search.short)
         ]
-        if not sure:
-            found, form, *_ = results[0]
-            reason = f"{form.name} has {found.ratio:.2f} of the error ({_bound(found.upper)}): not sure"
-            break
-        found, form, own, squares, k = sure[0]
-        alike = tuple(r[1].name for r in results if r[1] is not form and r[0].ratio < EQUAL * found.ratio)
-        steps.append(Added(form, found.ratio, found.upper, found.error, alike))
-        terms, theta, present = (*terms, form), own.theta, squares
-        pool.pop(k)
-    fit = search.fit(terms)
-    last = search.problem(terms, evidence.windows).solve(theta, ITERATIONS)
-    errors = (
-        np.sqrt(np.maximum(np.diag(last.covariance), 0.0)) * fit.unit if len(last.covariance) else np.zeros(0)
+        lists: list[list[tuple[float, Terms]]] = [[], []]
+        among: list[list[tuple[float, int]]] = [[], []]
+        for by, singles, ranked in zip(promises, lists, among, strict=True):
+            best: dict[int, tuple[float, int]] = {}
+            for i, (k, _) in enumerate(plain):
+                own = by.of(i), i
+                best[k] = min(best.get(k, own), own)
+            ranked += sorted(best.values())
+            singles += [(score, (plain[i][1],)) for score, i in ranked]
+        ends = search.error(now.terms, now.theta)
+        diverged = []
+        slow = [one for one in self.pool if not _vanishes(one.forms[0])]
+        for i, one in enumerate(slow, 1):  # at once a lag does what no slope tells
+            scores = []
+            for form in one.forms:
+                try:
+                    terms = (*now.terms, form)
+                    score = 0.5 * math.log(search.error(terms, search.begun(terms, now.theta).theta) / ends)
+                except (InputError, np.linalg.LinAlgError) as error:
+                    diverged.append(Trial((_found(form),), "diverged", None, str(error)))
+                    continue
+                scores.append((score, (form,)))
+            lists[0] += [min(scores, key=lambda s: s[0])] if scores else []
+            self.on_progress(
+                len(self.pool) - len(slow) + i, len(self.pool), f"step {number}: {one.name} is scored"
+            )
+        pairs: list[list[tuple[float, Terms]]] = [[], []]
+        for by, ranked, found in zip(promises, among, pairs, strict=True):
+            for (_, i), (_, j) in combinations(ranked, 2):
+                if not set(plain[i][1].names) & set(plain[j][1].names):
+                    found.append((by.of(i, j), (plain[i][1], plain[j][1])))
+        return _Ranked(*lists), _Ranked(*pairs), diverged
+
+    def _fitted(self, some: Sequence[Terms], text: str) -> Iterator[_Fitted]:
+        """Candidates, fitted in every fold and judged."""
+        search, now = self.search, self.now
+        for done, forms in enumerate(some):
+            self.on_progress(
+                done, len(some), f"{text}: {' and '.join(form.name for form in forms)} is fitted"
+            )
+            terms = (*now.terms, *forms)
+            try:
+                own = search.begun(terms, now.theta)
+                untold = search.untold(terms, own, forms)
+                squares = search.held_out(terms, own.theta)
+            except (InputError, np.linalg.LinAlgError) as error:
+                yield _Fitted(forms, None, np.zeros(0), np.zeros(0), str(error))
+                continue
+            yield self._judged(forms, own.theta, squares, len(some), untold)
+
+    def _judged(
+        self, forms: Terms, theta: Array, squares: Array, candidates: int, untold: Sequence[Term]
+    ) -> _Fitted:
+        found = self.evidence.compared(squares, self.now.squares, candidates)
+        reason = ""
+        if not np.isfinite(squares).all():
+            return _Fitted(forms, None, theta, squares, "its free runs diverge")
+        if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
+            reason = f"the error is {found.ratio:.2f} of that without it"
+        elif found.upper >= 1.0:
+            more = self.evidence.needed(squares, self.now.squares, candidates)
+            reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
+            if more:
+                reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
+        elif untold:
+            reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
+        return _Fitted(forms, found, theta, squares, reason, not reason)
+
+    def _both_needed(self, pair: _Fitted) -> bool:
+        """Whether each term of a pair lowers the error beside the other."""
+        if not pair.sure:
+            return False
+        terms = (*self.now.terms, *pair.forms)
+        for form in pair.forms:
+            kept, theta = self.search.without(terms, pair.theta, form)
+            alone = self.search.held_out(kept, theta)
+            if self.evidence.compared(pair.squares, alone, 1).ratio >= WORTH:
+                return False
+        return True
+
+    def _trial(self, one: _Fitted, chosen: _Fitted | None) -> Trial:
+        outcome: Outcome = "worse"
+        reason = one.reason
+        if one is chosen:
+            outcome = "added"
+        elif one.held_out is None:
+            outcome = "diverged"
+        elif chosen is not None and one.held_out.ratio < WORTH:
+            between = self.evidence.compared(one.squares, chosen.squares, 1)
+            outcome = "alternative" if between.lower <= 1.0 else "worse"
+            reason = f"the error is {between.ratio:.2f} of that with {chosen.forms[0].name}"
+        elif one.held_out.ratio < WORTH:
+            outcome = "unsure"
+        return Trial(tuple(_found(form) for form in one.forms), outcome, one.held_out, reason)
+
+    def _add(self, chosen: _Fitted, scored: int, trials: tuple[Trial, ...]) -> None:
+        assert chosen.held_out is not None
+        order = {"added": 0, "alternative": 1, "unsure": 2, "worse": 3, "diverged": 4}
+        ranked = sorted(
+            trials, key=lambda t: (order[t.outcome], t.held_out.ratio if t.held_out else math.inf)
+        )
+        found = tuple(_found(form) for form in chosen.forms)
+        self.now = _State((*self.now.terms, *chosen.forms), chosen.theta, chosen.squares)
+        self.steps.append(ExplainStep("added", found, chosen.held_out, (), scored, tuple(ranked)))
+        added = {form.name for form in chosen.forms}
+        self.pool = [one for one in self.pool if not added & {form.name for form in one.forms}]
+
+    def _remove(self) -> None:
+        """Remove the terms that the newest ones made needless, one after the other."""
+        newest = {term.name for term in self.steps[-1].terms}
+        while len(self.now.terms) > len(newest):
+            least: tuple[HeldOutError, Term, _State] | None = None
+            for term in self.now.terms:
+                if term.name in newest:
+                    continue
+                kept, theta = self.search.without(self.now.terms, self.now.theta, term)
+                fitted = self.search.begun(kept, theta)
+                squares = self.search.held_out(kept, fitted.theta)
+                found = self.evidence.compared(squares, self.now.squares, 1)
+                if least is None or found.ratio < least[0].ratio:
+                    least = found, term, _State(kept, fitted.theta, squares)
+            if least is None or least[0].ratio >= 1.0 / WORTH:
+                return
+            found, term, state = least
+            parameters = self._parameters(self.now.terms, self.now.theta)
+            own = tuple(p for p in parameters if p.name in term.names)
+            self.now = state
+            self.steps.append(ExplainStep("removed", (_found(term),), found, own, 0))
+
+    def _parameters(self, terms: Terms, theta: Array) -> tuple[FittedParameter, ...]:
+        """Values with standard errors of all parameters, after a last fit to all windows."""
+        fit = self.search.fit(terms)
+        last = self.search.problem(terms, self.evidence.windows).solve(theta, ITERATIONS)
+        sizes = (
+            np.sqrt(np.maximum(np.diag(last.covariance), 0.0)) * fit.unit
+            if len(last.covariance)
+            else np.zeros(0)
+        )
+        errors = dict(zip(fit.names, sizes.tolist(), strict=True))
+        values = fit.values(last.theta)
+        return tuple(
+            FittedParameter(
+                p.name, values[p.name], p.unit, errors.get(p.name, 0.0), p.lower, p.upper, p.description
+            )
+            for p in fit.prior.parameters
+        )
+
+    def _error(self, squares: Array) -> float:
+        return float(np.sqrt(squares[self.evidence.counted].mean()))
+
+    def _told(self, reason: str, last: tuple[Trial, ...]) -> Explanation:
+        terms = self.now.terms
+        parameters = self._parameters(terms, self.now.theta)
+        there = {term.name: term for term in terms}
+        pictures = _Pictures(self.search, terms, parameters, self.known)
+        steps = []
+        for step in self.steps:
+            own = [there[term.name] for term in step.terms if term.name in there]
+            if step.action == "added" and own:
+                names = {name for term in own for name in term.names}
+                drawn = [pictures.of(term) for term in own]
+                step = replace(
+                    step, parameters=tuple(p for p in parameters if p.name in names),
+                    pictures=tuple(one for one in drawn if one is not None),
+                )  # fmt: skip
+            steps.append(step)
+        return Explanation(
+            self.base.__name__, self.nominal, self._error(self.first),
+            self.evidence.compared(self.now.squares, self.first, 1), tuple(steps), last, parameters,
+            self.evidence.told, self.candidates, reason,
+        )  # fmt: skip
+
+
+def _chosen(fitted: Sequence[_Fitted]) -> _Fitted | None:
+    """The candidate of the lowest expected logarithm of the error, of those that surely lower it."""
+    sure = [one for one in fitted if one.sure]
+    return min(sure, key=lambda one: one.held_out.ratio if one.held_out else math.inf, default=None)
+
+
+def _reason(trials: Sequence[Trial], pieces: int) -> str:
+    """Why the search ends."""
+    judged = [trial for trial in trials if trial.held_out is not None]
+    if not judged:
+        return "no other term promises to lower the error"
+    best = min(judged, key=lambda trial: trial.held_out.ratio if trial.held_out else math.inf)
+    return f"{best.name}: {best.reason}" if best.reason else f"{best.name}: one of its terms is not needed"
+
+
+def _found(term: Term) -> FoundTerm:
+    return FoundTerm(
+        term.name, term.text, term.explanation or term.text, term.place, term.of, term.code, term.made
     )
-    return Explanation(
-        base, tuple(steps), fit.values(last.theta), dict(zip(fit.names, errors.tolist(), strict=True)), before,
-        evidence.words, tried, reason,
-    )  # fmt: skip
 
 
-def _bound(upper: float) -> str:
-    return f"at most {upper:.2f}" if math.isfinite(upper) and upper < 1e6 else "without a bound"
+def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points: Points) -> None:
+    """Refuse two terms of one name, and own terms that do not fit to the prior.
+
+    Raises:
+        InputError: With all that does not.
+    """
+    names = [name for one in pool for name in {form.name for form in one.forms}]
+    parameters = [name for one in pool for form in one.forms for name in form.names]
+    problems = []
+    for term in own:
+        if names.count(term.name) > 1:
+            problems.append(f"term {term.name!r} is there twice; rename one.")
+        problems += [
+            f"term {term.name!r}: parameter {name} is there twice; rename one."
+            for name in term.names
+            if parameters.count(name) > 1
+        ]
+        made = extended(type(prior), term)
+        if term.loss and term.state is None:
+            problems += _supplied(prior, made, term, points)
+    refuse(problems)
+
+
+def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> list[str]:
+    """Why a term that is declared a loss is none: it supplies where the recordings go."""
+    given = tuple(v.T for v in points)
+    values = {p.name: p.upper if math.isfinite(p.upper) else p.value or 1.0 for p in term.parameters}
+    full = made({**prior.values, **values})
+    for before, after in zip(prior.equations.balances, full.equations.balances, strict=True):
+        lost = after.loss(*given, full.p).full() - before.loss(*given, prior.p).full()
+        if lost.min() < -1e-6 * max(np.abs(lost).max(), 1e-300):
+            return [
+                f"term {term.name!r} is declared a loss, but supplies to the balance {before.name!r} at some of the "
+                "recordings' points; correct its sign, or leave loss=False."
+            ]
+    return []
+
+
+class _Pictures:
+    """Pictures of a model's terms over its recordings."""
+
+    def __init__(
+        self,
+        search: _Search,
+        terms: Terms,
+        parameters: Sequence[FittedParameter],
+        known: Sequence[Trajectory],
+    ) -> None:
+        self.base, self.terms, self.parameters = search.base, terms, parameters
+        columns = [np.concatenate([getattr(t, key) for t in known]) for key in ("x", "u", "w", "xdot", "y")]
+        whole = np.isfinite(np.hstack(columns[:4])).all(axis=1)
+        chosen = np.flatnonzero(whole)
+        chosen = chosen[evenly(len(chosen), DRAWN)]
+        self.bare_x, self.u, self.w, self.xdot, self.y = (c[chosen] for c in columns)
+        self.x, _, _ = search.with_states(terms, (self.bare_x, self.u, self.w))
+        self.values = np.array([p.value for p in parameters])
+        self.prior = extended(search.base, *terms)()
+        plain = search.base()
+        self.masses = plain.masses if isinstance(plain, MechanicalPrior) else None
+        self.n_p = len(plain.parameters)
+
+    def of(self, term: Term) -> TermPicture | None:
+        """The picture of one term; None where it has a state of its own, so that no curve shows it."""
+        if term.state is not None:
+            return None
+        places = [k for k, p in enumerate(self.parameters) if p.name in term.names]
+        value = self._added(term, self.values)
+        spread = np.zeros(len(value))
+        for k in places:
+            moved = self.values.copy()
+            moved[k] += self.parameters[k].standard_error
+            spread = spread + np.square(self._added(term, moved) - value)
+        spread = 2.0 * np.sqrt(spread)
+        over, abscissa = self._over(term)
+        order = np.argsort(over, kind="stable")
+        data = self._left(term)
+        asked = () if data is None else _numbers((value + data)[order])
+        at, drawn, low, high = (_numbers(c[order]) for c in (over, value, value - spread, value + spread))
+        return TermPicture(abscissa, self._ordinate(term), at, drawn, low, high, asked)
+
+    def _signal(self, name: str) -> tuple[Signal, Array]:
+        for group, values in (
+            (self.base.states, self.bare_x), (self.base.inputs, self.u), (self.base.disturbances, self.w),
+        ):  # fmt: skip
+            for k, signal in enumerate(group):
+                if signal.name == name:
+                    return signal, values[:, k]
+        raise KeyError(name)
+
+    def _over(self, term: Term) -> tuple[Array, str]:
+        """What a term is drawn over."""
+        if term.place == "output":
+            k = _index(self.base, term)
+            return self._shown(without=term)[:, k], self.base.outputs[k].label
+        options = {} if term.made is None else term.made.options
+        name = str(options.get("source") or options.get("one") or term.of)
+        positions = {self.base.states[v].name: self.base.states[q].name for q, v in self.base().kinematics}
+        if term.place == "potential" or (term.made is not None and term.made.maker == "coulomb_by_position"):
+            name = positions[term.of]
+        signal, values = self._signal(name)
+        return values, signal.label
+
+    def _ordinate(self, term: Term) -> str:
+        if term.place in ("input", "disturbance", "output"):
+            groups = {
+                "input": self.base.inputs, "disturbance": self.base.disturbances, "output": self.base.outputs,
+            }  # fmt: skip
+            return f"{term.name} [{groups[term.place][_index(self.base, term)].unit}]"
+        unit = self.base.states[_index(self.base, term)].unit
+        if term.place == "rate":
+            return f"{term.name} [{unit}/s]"
+        return f"{term.name} [{'N' if unit.startswith('m') else 'N m'}]"
+
+    def _zeroed(self, term: Term, values: Array) -> Array:
+        own = values.copy()
+        own[[k for k, p in enumerate(self.parameters) if p.name in term.names]] = 0.0
+        return own
+
+    def _shown(self, values: Array | None = None, without: Term | None = None) -> Array:
+        own = self.values if values is None else values
+        own = own if without is None else self._zeroed(without, own)
+        return np.asarray(self.prior.equations.output(self.x.T, self.u.T, self.w.T, own).full().T)
+
+    def _rates(self, values: Array) -> Array:
+        n_x = self.bare_x.shape[1]
+        return np.asarray(self.prior.equations.xdot(self.x.T, self.u.T, self.w.T, values).full().T)[:, :n_x]
+
+    def _as_force(self, rates: Array, term: Term) -> Array:
+        """Rates as a force on the term's axis where it adds one, else the rate of its state."""
+        k = _index(self.base, term)
+        if term.place == "rate" or self.masses is None:
+            return rates[:, k]
+        half = self.bare_x.shape[1] // 2
+        found = np.empty(len(rates))
+        for i, (q, own) in enumerate(zip(self.bare_x[:, :half], rates[:, half:], strict=True)):
+            found[i] = (self.masses(q, self.values[: self.n_p]).full() @ own)[k - half]
+        return found
+
+    def _added(self, term: Term, values: Array) -> Array:
+        """What a term adds at every point ``(n,)``."""
+        zero = self._zeroed(term, values)
+        if term.place == "output":
+            k = _index(self.base, term)
+            return (self._shown(values) - self._shown(zero))[:, k]
+        if term.place in ("input", "disturbance"):
+            signals = (
+                (self.base.states, self.bare_x), (self.base.inputs, self.u), (self.base.disturbances, self.w),
+            )  # fmt: skip
+            x, u, w = (named(tuple(s.name for s in group), [ca.DM(c) for c in of.T]) for group, of in signals)
+            own = ca.DM(self._signal(term.of)[1])
+            base = named(tuple(p.name for p in self.parameters[: self.n_p]), list(self.values[: self.n_p]))
+            given = [float(v) for v, p in zip(values, self.parameters, strict=True) if p.name in term.names]
+            acting = term.law(At(x, u, w, own, None, 0.0, 0.0, None, base), named(term.names, given))
+            return np.asarray((acting - own).full().ravel())
+        return self._as_force(self._rates(values) - self._rates(zero), term)
+
+    def _left(self, term: Term) -> Array | None:
+        """What the model leaves where the term acts ``(n,)``; None where nothing shows it."""
+        if term.place in ("input", "disturbance"):
+            return None
+        if term.place == "output":
+            return (self.y - self._shown())[:, _index(self.base, term)]
+        return self._as_force(self.xdot - self._rates(self.values), term)
+
+
+def _numbers(values: Array) -> tuple[float, ...]:
+    return tuple(float(v) for v in values)

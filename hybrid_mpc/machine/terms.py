@@ -8,22 +8,70 @@ a prior may lack, with bounds from its recordings, says :func:`hybrid_mpc.identi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 import casadi as ca
 
 from hybrid_mpc.errors import InputError, refuse
+from hybrid_mpc.machine import term_units
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Balance, OperatingPoint, Prior, named
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Line, Name
 
-Place: TypeAlias = Literal["force", "potential", "rate", "input", "output"]
-PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "output")
+Place: TypeAlias = Literal["force", "potential", "rate", "input", "disturbance", "output"]
+PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "disturbance", "output")
+REPLACED: tuple[Place, ...] = ("input", "disturbance", "output")
+"""Places whose signal a term replaces."""
+Option: TypeAlias = Signal | tuple[float, ...] | bool | float | str
+
+
+@dataclass(frozen=True)
+class Made:
+    """The call that makes a term, as data.
+
+    Args:
+        maker: Name of the function of this module.
+        of: Name of the signal.
+        parameters: The parameters, in the function's order.
+        options: Its other arguments by name.
+
+    Example:
+        >>> Made("viscous", "v", (Parameter("d", 0.0, "kg/s", 0.0, 1.0),), {"place": "rate"}).code
+        "terms.viscous('v', Parameter('d', 0.0, 'kg/s', 0.0, 1.0), place='rate')"
+    """
+
+    maker: Name
+    of: Name
+    parameters: tuple[Parameter, ...]
+    options: Mapping[str, Option] = field(default_factory=dict)
+
+    @property
+    def code(self) -> str:
+        """The call as code."""
+        more = [f"{key}={code_of(value)}" for key, value in self.options.items()]
+        return f"terms.{self.maker}({', '.join([repr(self.of), *map(code_of, self.parameters), *more])})"
+
+
+def again(made: Made) -> Term:
+    """The term of a call that was written as data.
+
+    Raises:
+        InputError: If there is no such function.
+
+    Example:
+        >>> again(Made("viscous", "v", (Parameter("d", 0.0, "N s/m", 0.0, 1.0),))).name
+        'viscous friction of v'
+    """
+    if made.maker not in EXPLANATIONS:
+        raise InputError(f"no law {made.maker!r} of a term; there are {', '.join(EXPLANATIONS)}")
+    term: Term = globals()[made.maker](made.of, *made.parameters, **made.options)
+    return term
 
 
 class At(NamedTuple):
@@ -38,6 +86,7 @@ class At(NamedTuple):
         driven: Force or rate by what the inputs do [unit of the force or rate], less what they do at rest.
         resting: Force or rate of the machine at rest where it is, as that of gravity or a spring.
         state: The term's own state; None where it has none.
+        p: Parameters of the prior, by name.
     """
 
     x: Any
@@ -48,6 +97,7 @@ class At(NamedTuple):
     driven: Any
     resting: Any
     state: Any
+    p: Any
 
 
 @dataclass(frozen=True)
@@ -57,16 +107,17 @@ class Term:
     Args:
         name: Name of the term, e.g. ``"Coulomb friction of phi_dot"``.
         place: Where it stands: ``"force"`` adds a generalised force to a mechanical prior's speed ``of``,
-            ``"potential"`` an energy of its position, ``"rate"`` adds to the rate of the state ``of``; ``"input"`` and
-            ``"output"`` replace what acts or is shown.
-        of: Name of the speed, state, input or output.
+            ``"potential"`` an energy of its position, ``"rate"`` adds to the rate of the state ``of``; ``"input"``,
+            ``"disturbance"`` and ``"output"`` replace what acts or is shown.
+        of: Name of the speed, state, input, disturbance or output.
         parameters: Its parameters; at zero of the first one, or at its nominal value, it hardly acts.
         law: ``(at, p) -> value``: the force or rate that is added, the energy, or the signal in place of ``at.own``.
             With a state ``(value, rate)``. ``p`` are its parameters in order, by name.
         text: Its formula.
         loss: Whether what it does to a balance is a loss, as friction; else it is a supply. Default: a supply.
         state: A state of its own, e.g. that of a lag; its nominal value is that of the signal. Default: none.
-        code: The call that makes it, for a file; empty if it has none.
+        explanation: What it is, in one sentence for tables.
+        made: The call that makes it, of a law of this module. Default: none.
 
     Raises:
         InputError: If a field is of another kind, or it has no parameter.
@@ -86,7 +137,8 @@ class Term:
     text: Line = ""
     loss: bool = False
     state: Signal | None = None
-    code: str = ""
+    explanation: Line = ""
+    made: Made | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         own = Fields(self, f"term {self.name!r}")
@@ -101,6 +153,11 @@ class Term:
         """Names of its parameters."""
         return tuple(p.name for p in self.parameters)
 
+    @property
+    def code(self) -> str:
+        """The call that makes it, for a file; empty for an own term."""
+        return "" if self.made is None else self.made.code
+
 
 def extended(base: type[Prior], *terms: Term) -> type[Prior]:
     """A prior class with terms beside what ``base`` has; their parameters and states come after those of ``base``.
@@ -110,8 +167,8 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
         terms: Terms, in any order. Default: none, ``base`` itself.
 
     Raises:
-        InputError: If a term's signal is not there, a parameter or state is there twice, or a force is added to a prior
-            that is not mechanical; all of it together.
+        InputError: If a term's signal is not there, a parameter or state is there twice, a force is added to a
+            prior that is not mechanical, the units do not fit, or a potential is none; all of it together.
 
     Example:
         >>> class Disk(MechanicalPrior):
@@ -126,8 +183,52 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
         >>> [b.loss([0.0, 2.0], 0.0, [], dragged.p) for b in dragged.equations.balances]
         [DM(0.8)]
     """
-    made: type[Prior] = _extended(cast(Any, base), terms) if terms else base
+    own: Any = base
+    if not terms:
+        return base
+    made: type[Prior] = _extended(getattr(own, "base", own), (*getattr(own, "terms", ()), *terms))
     return made
+
+
+def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]:
+    """A prior class with other nominal parameters, e.g. fitted ones; of an extended prior those of its terms, too.
+
+    Args:
+        prior: A prior; an extended one too.
+        values: Nominal values [their units] by name. Parameters that are not named keep theirs.
+
+    Raises:
+        InputError: If a name is no parameter.
+
+    Example:
+        >>> class Decay(Prior):
+        ...     states, inputs, outputs = (Signal("x", "m"),), (Signal("u", "m/s"),), (Signal("x", "m"),)
+        ...     parameters = (Parameter("k", 1.0, "1/s", 0.0, 9.0),)
+        ...     def xdot(self, x, u, w, p):
+        ...         return (u.u - p.k * x.x,)
+        >>> with_nominal(Decay, {"k": 2.0})().values
+        {'k': 2.0}
+    """
+    names = [p.name for p in prior.parameters]
+    if unknown := sorted(set(values) - set(names)):
+        raise InputError(
+            f"{prior.__name__} has no parameter {', '.join(unknown)}; there are {', '.join(names) or 'none'}"
+        )
+    own: Any = prior
+    terms: tuple[Term, ...] = getattr(own, "terms", ())
+    base: Any = getattr(own, "base", own)
+    chosen = tuple(replace(p, value=values.get(p.name, p.value)) for p in base.parameters)
+    made = type(
+        base.__name__, (base,), {"parameters": chosen, "__module__": base.__module__, "__doc__": base.__doc__}
+    )
+    return extended(made, *(_with_values(term, values) for term in terms))
+
+
+def _with_values(term: Term, values: Mapping[str, float]) -> Term:
+    """A term with other nominal parameters."""
+    chosen = tuple(replace(p, value=values.get(p.name, p.value)) for p in term.parameters)
+    made = None if term.made is None else replace(term.made, parameters=chosen)
+    return replace(term, parameters=chosen, made=made)
 
 
 @cache
@@ -168,7 +269,8 @@ def _expressions(
 
     def at(own: Any, term: Term, position: Any = None, driven: Any = 0.0, resting: Any = 0.0) -> At:
         x_named, u_named, w_named = (named(prior.names_of(k), ca.vertsplit(v)) for k, v in parts.items())
-        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term))
+        p_named = named(prior.names_of("p"), ca.vertsplit(of_base))
+        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term), p_named)
 
     def applied(term: Term, point: At) -> Any:
         value = term.law(point, given[term])
@@ -176,11 +278,16 @@ def _expressions(
             value, extra[term] = value
         return value
 
-    acting = dict(zip(prior.names_of("u"), ca.vertsplit(u), strict=True))
+    replaced = {
+        "input": dict(zip(prior.names_of("u"), ca.vertsplit(u), strict=True)),
+        "disturbance": dict(zip(prior.names_of("w"), ca.vertsplit(w), strict=True)),
+    }
     for term in terms:
-        if term.place == "input":
+        if term.place in replaced:
+            acting = replaced[term.place]
             acting[term.of] = applied(term, at(acting[term.of], term))
-    parts["u"] = u = ca.vertcat(*acting.values())
+    parts["u"] = u = ca.vertcat(*replaced["input"].values())
+    parts["w"] = w = ca.vertcat(*replaced["disturbance"].values())
     equations = prior.equations
     rates = equations.xdot(x_base, u, w, of_base)
     added, lost, stored = ca.SX.zeros(n_x), ca.SX.zeros(n_x), ca.SX(0)
@@ -274,16 +381,22 @@ def _operating_point(base: type[Prior], terms: tuple[Term, ...]) -> OperatingPoi
     if point is None or not any(term.state for term in terms):
         return point
     prior = base()
-    u = dict(zip((s.name for s in base.inputs), point.u, strict=True))
-    y = prior.equations.output(point.x, point.u, point.w, prior.p).full().ravel()
-    shown = {s.name: float(v) for s, v in zip(base.outputs, y, strict=True)}
-    more = [(u if term.place == "input" else shown)[term.of] for term in terms if term.state is not None]
+    y = prior.equations.output(point.x, point.u, point.w, prior.p).full().ravel().tolist()
+    at = {
+        place: dict(zip((s.name for s in signals), values, strict=True))
+        for place, signals, values in (
+            ("rate", base.states, point.x), ("input", base.inputs, point.u),
+            ("disturbance", base.disturbances, point.w or (0.0,) * len(base.disturbances)),
+            ("output", base.outputs, y),
+        )
+    }  # fmt: skip
+    more = [float(at[term.place][term.of]) for term in terms if term.state is not None]
     return OperatingPoint((*point.x, *more), point.u, point.w)
 
 
 def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
     problems, prior = [], base()
-    signals = {"input": base.inputs, "output": base.outputs}
+    signals = {"input": base.inputs, "disturbance": base.disturbances, "output": base.outputs}
     moving = {base.states[v].name for _, v in prior.kinematics}
     for term in terms:
         where = f"term {term.name!r} for {base.__name__}"
@@ -294,8 +407,10 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
             problems.append(f"{where}: a {term.place} needs a MechanicalPrior; take a rate.")
         elif term.place in ("force", "potential") and term.of not in moving:
             problems.append(f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}.")
-        if term.state is not None and term.place not in ("input", "output"):
-            problems.append(f"{where}: only inputs and outputs may have a state of their own.")
+        if term.state is not None and term.place in ("force", "potential"):
+            problems.append(f"{where}: a {term.place} cannot have a state of its own.")
+    if not problems:
+        problems = [problem for term in terms for problem in _misfits(base, prior, term)]
     for what, every in (
         ("parameter", [p.name for p in base.parameters] + [name for t in terms for name in t.names]),
         ("state", [s.name for s in base.states] + [t.state.name for t in terms if t.state is not None]),
@@ -308,27 +423,105 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
     refuse(problems)
 
 
+def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
+    """Why a term's law cannot stand where it is: its units, or a potential of more than its position."""
+    where = f"term {term.name!r} for {base.__name__}"
+    groups: dict[str, tuple[Signal | Parameter, ...]] = {
+        "x": base.states, "u": base.inputs, "w": base.disturbances, "p": base.parameters,
+    }  # fmt: skip
+    symbols: dict[str, list[Any]] = {
+        key: [ca.SX.sym(s.name) for s in signals] for key, signals in groups.items()
+    }
+    inputs: list[tuple[Any, str]] = [
+        (v, s.unit) for key in groups for v, s in zip(symbols[key], groups[key], strict=True)
+    ]
+    x, u, w, p = (named(prior.names_of(key), symbols[key]) for key in ("x", "u", "w", "p"))
+    kind: str = {"input": "u", "disturbance": "w"}.get(term.place, "x")
+    signals = base.outputs if term.place == "output" else groups[kind]
+    k = [s.name for s in signals].index(term.of)
+    unit, position = signals[k].unit, None
+    wanted, power = term_units.of(unit), None
+    if term.place == "output":
+        inputs.append((own := ca.SX.sym("y"), unit))
+    else:
+        own = symbols[kind][k]
+    for q, v in prior.kinematics:
+        if kind == "x" and v == k:
+            position = symbols["x"][q]
+            power = "N m" if term_units.of(base.states[q].unit) == term_units.NONE else "N"
+    if term.place == "rate":
+        wanted = term_units.per_second(wanted)
+    elif term.place in ("force", "potential"):
+        wanted = term_units.of("J" if term.place == "potential" else power or "N")
+    driven, resting = ca.SX.sym("driven"), ca.SX.sym("resting")
+    given = [ca.SX.sym(q.name) for q in term.parameters]
+    inputs += [(v, q.unit) for v, q in zip(given, term.parameters, strict=True)]
+    state = None if term.state is None else ca.SX.sym(term.state.name)
+    if term.state is not None:
+        inputs.append((state, term.state.unit))
+    point = At(x, u, w, own, position, driven, resting, state, p)
+    value = _uneven(term).law(point, named(term.names, given))
+    parts = [(value, wanted)]
+    if term.state is not None:
+        parts = [(value[0], wanted), (value[1], term_units.per_second(term_units.of(term.state.unit)))]
+    for one, needed in parts:
+        if said := term_units.clash(one, inputs, needed):
+            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law."
+    if term.place == "potential":
+        free = [
+            v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not position
+        ]
+        if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
+            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force."
+
+
+def _uneven(term: Term) -> Term:
+    """The same law with other numbers: a factor of 1 or 2, whatever its unit, leaves no trace in an expression."""
+    if term.made is None:
+        return term
+    options = {k: 1.2345 * v if type(v) is float else v for k, v in term.made.options.items()}
+    return again(replace(term.made, options=options))
+
+
 def _sign(v: Any, width: Any) -> Any:
     """Smooth sign of a speed: 96 % at two widths."""
     return ca.tanh(v / width)
 
 
-def _call(maker: str, of: str, *parameters: Parameter, **options: Any) -> str:
-    more = [f"{key}={value!r}" for key, value in options.items()]
-    return f"terms.{maker}({', '.join([repr(of), *map(_parameter_code, parameters), *more])})"
+def code_of(value: Option | Parameter) -> str:
+    """A parameter, signal or option as code.
 
-
-def _parameter_code(p: Parameter) -> str:
-    words = f", {p.description!r}" if p.description else ""
-    return f"Parameter({p.name!r}, {p.value!r}, {p.unit!r}, {p.lower!r}, {p.upper!r}{words})"
+    Example:
+        >>> code_of(Parameter("d", 0.0, "N s/m", 0.0, math.inf)), code_of(Signal("s", "N"))
+        ("Parameter('d', 0.0, 'N s/m', 0.0, float('inf'))", "Signal('s', 'N')")
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"float('{value}')"
+    if isinstance(value, tuple):
+        return f"({''.join(f'{code_of(one)}, ' for one in value).rstrip()})"
+    if isinstance(value, Parameter):
+        given: list[Option] = [value.name, value.value, value.unit, value.lower, value.upper]
+        given += [value.description] if value.description else []
+        return f"Parameter({', '.join(map(code_of, given))})"
+    if isinstance(value, Signal):
+        more = [
+            f", {f.name}={code_of(own)}"
+            for f in fields(value)[2:]
+            if (own := getattr(value, f.name)) != f.default
+        ]
+        return f"Signal({value.name!r}, {value.unit!r}{''.join(more)})"
+    return repr(value)
 
 
 def _added(
     maker: str, title: str, place: Place, of: str, parameters: tuple[Parameter, ...], law: Callable[[At, Any], Any],
     text: str, *, loss: bool = False, state: Signal | None = None, **options: Any,
 ) -> Term:  # fmt: skip
-    code = _call(maker, of, *parameters, **({"place": place} if place == "rate" else {}), **options)
-    return Term(f"{title} of {of}", place, of, parameters, law, text, loss, state, code)
+    by_rate = maker in BY_RATE and place == "rate"
+    if state is not None:
+        options["state"] = state
+    made = Made(maker, of, parameters, {**options, **({"place": place} if by_rate else {})})
+    return Term(f"{title} of {of}", place, of, parameters, law, text, loss, state, EXPLANATIONS[maker], made)
 
 
 # Friction: against the motion of one axis.
@@ -531,6 +724,15 @@ def radiation(of: str, k: Parameter, *, kelvin: float, surroundings: float) -> T
     )  # fmt: skip
 
 
+def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:
+    """A second capacity beside a state, as a wall's heat: ``k (s - x)`` with ``tau s' = x - s``."""
+    return _added(
+        "storage", "second capacity", "rate", of, (k, tau),
+        lambda at, p: (p[0] * (at.state - at.own), (at.own - at.state) / p[1]),
+        f"{k.name} (s - {of}), {tau.name} s' = {of} - s", state=state,
+    )  # fmt: skip
+
+
 def overflow(of: str, k: Parameter, *, edge: float, width: float) -> Term:
     """What runs over an edge: ``-k max(x - edge, 0)``, smooth over ``width``."""
     return _added(
@@ -605,6 +807,14 @@ def input_curve(of: str, c: Parameter, *, centre: float, span: float) -> Term:
     )  # fmt: skip
 
 
+def saturation(of: str, k: Parameter) -> Term:
+    """An input that does less the larger it is: ``u / sqrt(1 + k u^2)``; it never exceeds ``1 / sqrt(k)``."""
+    return _added(
+        "saturation", "saturation", "input", of, (k,),
+        lambda at, p: at.own / ca.sqrt(1.0 + p[0] * at.own * at.own), f"{of} / sqrt(1 + {k.name} {of}^2)",
+    )  # fmt: skip
+
+
 def dead_zone(of: str, d: Parameter, *, width: float) -> Term:
     """An input that must be this large before it acts: ``u - d tanh(u / width)``."""
     return _added(
@@ -618,6 +828,44 @@ def input_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
     return _added(
         "input_lag", "lag", "input", of, (tau,), lambda at, p: (at.state, (at.own - at.state) / p[0]),
         f"{tau.name} s' = {of} - s", state=state,
+    )  # fmt: skip
+
+
+def input_delay(of: str, tau: Parameter, *, state: Signal) -> Term:
+    """An input that acts later: ``2 s - u`` with ``tau s' = 2 (u - s)``, the Padé approximation of first order.
+
+    Source: K. Ogata, *Modern Control Engineering*, 5th edition (2010), section 5.5.
+    """
+    return _added(
+        "input_delay", "delay", "input", of, (tau,),
+        lambda at, p: (2.0 * at.state - at.own, 2.0 * (at.own - at.state) / p[0]), f"{of}(t - {tau.name})", state=state,
+    )  # fmt: skip
+
+
+# Measured disturbances.
+
+
+def disturbance_gain(of: str, g: Parameter, *, centre: float = 0.0) -> Term:
+    """A measured disturbance that does more, or less, than the prior has: ``w + g (w - centre)``."""
+    return _added(
+        "disturbance_gain", "gain of the disturbance", "disturbance", of, (g,),
+        lambda at, p: at.own + p[0] * (at.own - centre), f"{of} + {g.name} ({of} - {centre:.3g})", centre=centre,
+    )  # fmt: skip
+
+
+def disturbance_offset(of: str, value: Parameter) -> Term:
+    """A measured disturbance whose sensor has an offset: ``w + offset``."""
+    return _added(
+        "disturbance_offset", "offset of the disturbance", "disturbance", of, (value,), lambda at, p: at.own + p[0],
+        f"{of} + {value.name}",
+    )  # fmt: skip
+
+
+def disturbance_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
+    """A measured disturbance that acts through a lag: ``tau s' = w - s``, and ``s`` acts."""
+    return _added(
+        "disturbance_lag", "lag of the disturbance", "disturbance", of, (tau,),
+        lambda at, p: (at.state, (at.own - at.state) / p[0]), f"{tau.name} s' = {of} - s", state=state,
     )  # fmt: skip
 
 
@@ -665,3 +913,47 @@ def output_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
         "output_lag", "sensor lag", "output", of, (tau,), lambda at, p: (at.state, (at.own - at.state) / p[0]),
         f"{tau.name} s' = {of} - s", state=state,
     )  # fmt: skip
+
+
+BY_RATE = frozenset({
+    "coulomb", "asymmetric", "viscous", "viscous_by_direction", "quadratic", "stribeck", "loaded",
+    "coulomb_by_position", "offset",
+})  # fmt: skip
+"""Laws that take ``place="rate"``."""
+EXPLANATIONS: Mapping[str, str] = {
+    "coulomb": "Dry friction: constant, against the motion.",
+    "asymmetric": "Dry friction is larger in one direction than in the other.",
+    "viscous": "Friction proportional to the speed.",
+    "viscous_by_direction": "Friction proportional to the speed is larger in one direction than in the other.",
+    "quadratic": "Drag proportional to the square of the speed, as in air.",
+    "stribeck": "Dry friction is larger near rest than in motion.",
+    "loaded": "Dry friction grows with the load of a gear or bearing.",
+    "coulomb_by_position": "Dry friction changes along the way.",
+    "offset": "A constant force or rate acts all the time.",
+    "gravity_error": "The weight, its lever arm or its angle differs from the prior's.",
+    "cogging": "A torque periodic in the position: magnets on teeth, or a shaft that is not round.",
+    "spring": "A spring, such as a cable or hose, pulls towards one position.",
+    "elastic_end": "An elastic stop acts near the end of the way.",
+    "loss": "A loss to the surroundings or to another state.",
+    "radiation": "Heat is lost by radiation.",
+    "storage": "A second capacity, such as a wall, takes up and gives back with its own time constant.",
+    "overflow": "Above an edge, material runs off.",
+    "coupling": "Another signal acts on the state.",
+    "product": "Two signals act on the state by their product.",
+    "input_gain": "The input's gain differs from the prior's.",
+    "input_offset": "The input has an offset.",
+    "gain_by_direction": "The input's gain depends on its sign.",
+    "input_curve": "The input's characteristic is bent.",
+    "saturation": "The input's effect levels off at large values.",
+    "dead_zone": "Small inputs have no effect.",
+    "input_lag": "The actuator follows its command with a time constant.",
+    "input_delay": "The input acts after a delay.",
+    "disturbance_gain": "The measured disturbance has another gain than the prior's.",
+    "disturbance_offset": "The sensor of the measured disturbance has an offset.",
+    "disturbance_lag": "The measured disturbance acts with a time constant.",
+    "output_gain": "The sensor's gain is wrong.",
+    "output_offset": "The sensor has an offset.",
+    "output_curve": "The sensor's characteristic is bent.",
+    "output_lag": "The sensor, or its filter, follows with a time constant.",
+}
+"""What each law of this module is, in one sentence."""

@@ -15,12 +15,12 @@ from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import digest
+from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.folder import versions
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.parts import artifact_digest
 from hybrid_mpc.machine.specification import DataSpec, Role
-from hybrid_mpc.scenario import Budget, Scenario
+from hybrid_mpc.scenario import Budget, Scenario, load_scenario
 from hybrid_mpc.workflow.settings import RunSettings
 from hybrid_mpc.workflow.stage import Absent, Stage, Stored, read_stage, write_stage
 
@@ -34,18 +34,51 @@ R = TypeVar("R")
 class Context:
     """A run in its folder: what it computes, the machine, and where it reports to.
 
+    ``given`` is the user's scenario; :attr:`scenario` is the one that stages work with.
+
     ``pictures`` are those that this process has drawn, by part of the report: section, file, caption. On ``cluster``
     (address of a dask scheduler or a ``distributed.Client``) networks are trained and loops run; None: on this machine.
     """
 
     settings: RunSettings
-    scenario: Scenario
+    given: Scenario
     out: Path
     progress: Progress = field(default_factory=Progress)
     cluster: Any = field(default=None, repr=False, compare=False)
     pictures: dict[str, list[tuple[str, Path, str]]] = field(default_factory=dict, repr=False, compare=False)
     _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
     _kits: dict[str, Kit] = field(default_factory=dict, repr=False, compare=False)
+    _data: dict[object, Dataset] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _explained: dict[str, Scenario] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The machine: the user's scenario, or the one with the terms that stage ``explain`` found."""
+        file = self.explained
+        if file is None:
+            return self.given
+        if (content := sha256(file)) not in self._explained:
+            self._explained[content] = load_scenario(str(file))
+        return self._explained[content]
+
+    @property
+    def explained(self) -> Path | None:
+        """The scenario file of stage ``explain``; None where the stage found no term or is not asked for."""
+        if not self.settings.explain:
+            return None
+        from hybrid_mpc.workflow.stages.explain import EXPLAIN, FOLDER
+
+        found = self.find(EXPLAIN)
+        if isinstance(found, Absent) or not found.file:
+            return None
+        return self.out / FOLDER / found.file
+
+    @cached_property
+    def as_given(self) -> Context:
+        """The same run with the user's scenario, whatever terms were found."""
+        return (
+            replace(self, settings=replace(self.settings, explain=False)) if self.settings.explain else self
+        )
 
     @property
     def budget(self) -> Budget:
@@ -82,6 +115,8 @@ class Context:
     @property
     def scenario_path(self) -> str:
         """Name of the scenario, or the full path of its file, as processes elsewhere find it."""
+        if (file := self.explained) is not None:
+            return str(file.resolve())
         name = self.settings.scenario
         return str(Path(name).resolve()) if Path(name).is_file() else name
 
@@ -98,15 +133,18 @@ class Context:
 
     def forget_data(self) -> None:
         """Remove recordings that a simulated machine made before."""
-        self.__dict__.pop("dataset", None)
+        self._data.clear()
         if not self.settings.data:
             for path in self.files:
                 path.unlink()
 
-    @cached_property
+    @property
     def dataset(self) -> Dataset:
-        """All trajectories of the run's recordings."""
-        return load_trajectories(self.files, self.scenario.prior(), self.spec)
+        """All trajectories of the run's recordings, with the states of the prior."""
+        prior = self.scenario.prior()
+        if prior.states not in self._data:
+            self._data[prior.states] = load_trajectories(self.files, prior, self.spec)
+        return self._data[prior.states]
 
     @cached_property
     def time_unit(self) -> float:

@@ -22,6 +22,7 @@ from hybrid_mpc.workflow.stages.choose import CANDIDATES, CHOICE
 from hybrid_mpc.workflow.stages.compare import CONTROL
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, TASKS
 from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, check_data, models_of
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
@@ -31,16 +32,16 @@ from hybrid_mpc.workflow.stages.results import Results, read_results
 from hybrid_mpc.workflow.stages.watch import WATCH
 
 STAGES: tuple[Stage[Any], ...] = (
-    DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, TASKS, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES,
-    WATCH, ANALYSIS, REPORT,
+    DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, TASKS, CONTROL, LOOPS_ON_MODEL, ESTIMATION,
+    PROMISES, WATCH, ANALYSIS, REPORT,
 )  # fmt: skip
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
 ALWAYS = (TASKS.name, REPORT.name)
 """Stages that ``only`` does not leave out: they copy what the scenario and the other stages say."""
 SECONDS = {
-    "data": 2, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4, "tasks": 1,
-    "control": 42,
+    "data": 2, "explain": 20, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4,
+    "tasks": 1, "control": 42,
     "on_model": 14, "estimation": 1, "promises": 6, "watch": 36, "analysis": 1,
     "report": 9,
 }  # fmt: skip
@@ -90,24 +91,29 @@ def run(
     check_choice(only, skip)
     scenario = load_scenario(settings.scenario)
     context = Context(settings, scenario, out, progress or Progress(), cluster)
-    found = check_scenario(scenario, context.budget, (lambda: context.dataset) if settings.data else None)
+    found = check_scenario(
+        scenario, context.budget, (lambda: context.as_given.dataset) if settings.data else None
+    )
     for warning in found.warnings:
         context.progress.warn(warning)
-    check_data(context)
+    check_data(context.as_given)
     check_device(settings.device)
     if settings.deploy:
         there = models_of(scenario.prior())
         known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
     end = _end(context, only)
     took: dict[str, float] = {}
-    without = "on_model" if scenario.plant is not None else "control"
+    without = (
+        "on_model" if scenario.plant is not None else "control",
+        *(() if settings.explain else ("explain",)),
+    )
     with open_folder(out, run_note(settings), resume=resume):
         for i, stage in enumerate(STAGES):
             if stage is end:
                 report_so_far(context)
                 return None
             ahead = [
-                s.name for s in STAGES[i:] if s.name not in (*skip, without) and (not only or s.name in only)
+                s.name for s in STAGES[i:] if s.name not in (*skip, *without) and (not only or s.name in only)
             ]
             context.progress.start(stage.title + remaining(took, ahead))
             begun = time.monotonic()
@@ -117,7 +123,7 @@ def run(
                 said = bring_up_to_date(context, stage, stage.name in skip)
                 if not said and stage in (PRIOR, TRAINING, EVALUATION):
                     report_so_far(context)
-                if not said:
+                if not said and stage.name not in without:
                     took[stage.name] = time.monotonic() - begun
                 context.progress.finish(said)
     return read_results(read_object(out / "results.json"), str(out / "results.json"))

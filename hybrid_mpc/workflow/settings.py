@@ -38,6 +38,8 @@ class RunSettings:
         device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
         deploy: Model that is recommended whatever validation says: ``"phy"`` (the fitted prior), ``"pgrnn"`` or
             ``"mopgrnn"``. Default: what validation recommends.
+        explain: Whether terms that the prior lacks are searched first; the run goes on with the prior that has them.
+            Default: no.
     """
 
     scenario: str
@@ -50,6 +52,7 @@ class RunSettings:
     network_file: Path | None = None
     device: str = "cpu"
     deploy: str = ""
+    explain: bool = False
 
     def network(self) -> dict[str, Any]:
         """Settings of the networks that replace the budget's: what the file holds, checked."""

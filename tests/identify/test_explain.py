@@ -1,15 +1,31 @@
 """The search for missing terms: a term that was taken out is found, and none is added where none is missing."""
 
+import json
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Signal, Trajectory, fit_prior
-from hybrid_mpc.identify.explain import explain, library
+from hybrid_mpc import (
+    InputError,
+    MechanicalPrior,
+    OperatingPoint,
+    Parameter,
+    Prior,
+    Signal,
+    Trajectory,
+    fit_prior,
+)
+from hybrid_mpc.identify import term_table
+from hybrid_mpc.identify.explain import explain
+from hybrid_mpc.identify.explanation import Explanation
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import visited
+from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.machine import terms
-from hybrid_mpc.machine.terms import extended
+from hybrid_mpc.machine.terms import Term, extended
+from hybrid_mpc.records import plain, record
 
 DT = 0.02
 
@@ -72,17 +88,37 @@ def searched(plant):
 def test_dry_friction_that_is_missing_is_found():
     level = Parameter("F", 0.15, "N m", 0.0, 1.0)
     found = searched(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))())
-    assert found.steps[0].term.name == "Coulomb friction of phi_dot"
-    assert found.steps[0].ratio < 0.3
+    first = found.steps[0]
+    assert first.name == "Coulomb friction of phi_dot"
+    assert first.held_out.ratio < 0.3
+    assert first.held_out.lower < first.held_out.ratio < first.held_out.upper < 1.0
+    assert first.held_out.harm < 0.01
     assert found.values["F_c_phi_dot"] == pytest.approx(0.15, rel=0.1)
     assert found.values["mgl"] == pytest.approx(1.8, rel=0.02)
+    (friction,) = first.parameters
+    assert abs(friction.value - 0.15) < 4 * friction.standard_error
+    assert all(trial.outcome != "added" for trial in first.alternatives)
+    (picture,) = first.pictures
+    assert (picture.abscissa, picture.ordinate) == ("phi_dot [rad/s]", "Coulomb friction of phi_dot [N m]")
+    at, drawn, asked = (np.array(column) for column in (picture.at, picture.term, picture.data))
+    assert (np.diff(at) >= 0).all()
+    fast = np.abs(at) > 1.0
+    np.testing.assert_allclose(drawn[fast], -friction.value * np.sign(at[fast]), atol=1e-3)
+    assert np.abs(asked - drawn)[fast].mean() < 0.1
+    again = record(Explanation, json.loads(json.dumps(plain(found))), "explanation")
+    assert again == found
+    made = again.prior(Pendulum)(again.values)
+    x, u = [0.4, 2.0], [0.7]
+    wanted = extended(Pendulum, *found.terms())(found.values).equations.xdot(x, u, [], made.p)
+    np.testing.assert_array_equal(made.equations.xdot(x, u, [], made.p).full(), wanted.full())
 
 
 def test_no_term_is_added_where_none_is_missing():
     found = searched(Pendulum({"J": 0.14, "mgl": 2.1}))
     assert found.steps == ()
-    assert found.prior is Pendulum
+    assert found.prior(Pendulum) is Pendulum
     assert found.reason
+    assert found.after.ratio == 1.0
 
 
 def test_every_term_of_the_library_vanishes_where_the_search_begins():
@@ -101,3 +137,143 @@ def test_every_term_of_the_library_vanishes_where_the_search_begins():
         rtol=1e-12,
     )
     assert len(every) > 20
+
+
+def own(law, unit="N m", upper=1.0, name="own", **more):
+    return Term(name, "force", "phi_dot", (Parameter("k_own", 0.0, unit, 0.0, upper),), law, **more)
+
+
+def begun(*terms, runs=None, candidates=(), **more):
+    runs = recorded(Pendulum(), 4, 3.0) if runs is None else runs
+    known = smoothed(Pendulum, fit_prior(Pendulum, runs, [], dt=DT, length=1.0), runs, DT)
+    return explain(
+        Pendulum, Pendulum().values, known, dt=DT, length=1.0, candidates=candidates, own=terms, **more
+    )
+
+
+def test_own_terms_that_do_not_fit_are_refused():
+    refused = {
+        "units": (own(lambda at, p: -p.k_own * at.own),),
+        "one name": (own(lambda at, p: -p.k_own), own(lambda at, p: -p.k_own)),
+        "a loss that supplies": (own(lambda at, p: p.k_own * ca.tanh(at.own), loss=True),),
+        "a potential of the speed": (
+            Term("own", "potential", "phi_dot", (Parameter("k_own", 0.0, "N m", 0.0, 1.0),),
+                 lambda at, p: p.k_own * ca.tanh(at.own / 0.3)),
+        ),
+    }  # fmt: skip
+    for terms_of_one in refused.values():
+        with pytest.raises(InputError):
+            begun(*terms_of_one)
+
+
+def test_too_little_evidence_is_refused():
+    with pytest.raises(InputError):
+        begun(runs=recorded(Pendulum(), 1, 0.5))
+
+
+def test_a_candidate_whose_fit_diverges_is_reported_and_the_search_goes_on():
+    level = Parameter("F", 0.15, "N m", 0.0, 1.0)
+    runs = recorded(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))(), 4, 4.0)
+    wild = own(lambda at, p: -p.k_own * ca.tanh(at.own / 1e-6), name="wild")  # too stiff to be integrated
+    found = begun(
+        wild,
+        Term(
+            "dry", "force", "phi_dot", (Parameter("k_dry", 0.0, "N m", 0.0, 1.0),),
+            lambda at, p: -p.k_dry * ca.tanh(at.own / 0.05), loss=True,
+        ),
+        runs=runs,
+    )  # fmt: skip
+    assert [term.name for term in found.found] == ["dry"]
+    assert [trial.name for trial in found.diverged] == ["wild"]
+
+
+def test_an_own_term_may_have_parameters_that_are_not_zero():
+    level = Parameter("F", 0.15, "N m", 0.0, 1.0)
+    runs = recorded(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))(), 4, 4.0)
+    steep = Parameter("gamma", 10.0, "s/rad", 5.0, 40.0)
+    for first in (0.0, 0.1):
+        own_level = Parameter("F_own", first, "N m", 0.0, 1.0)
+        dry = Term(
+            "dry",
+            "force",
+            "phi_dot",
+            (own_level, steep),
+            lambda at, p: -p.F_own * ca.tanh(p.gamma * at.own),
+            loss=True,
+        )
+        found = begun(dry, runs=runs)
+        assert found.values["F_own"] == pytest.approx(0.15, rel=0.1)
+        assert found.prior(Pendulum, [dry]) is extended(Pendulum, dry)
+        with pytest.raises(InputError):  # its own code alone can make it
+            found.prior(Pendulum)
+
+
+def test_a_stopped_search_goes_on_where_it_was():
+    level = Parameter("F", 0.15, "N m", 0.0, 1.0)
+    runs = recorded(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))(), 4, 4.0)
+    dry = Candidate("dry", (terms.coulomb("phi_dot", Parameter("F_c", 0.0, "N m", 0.0, 1.0), width=0.05),))
+    steps, said = [], []
+    whole = begun(
+        runs=runs, candidates=(dry,), on_step=steps.append, on_progress=lambda *one: said.append(one)
+    )
+    assert [step.name for step in steps[0].steps] == ["Coulomb friction of phi_dot"]
+    assert said
+    again = begun(runs=runs, candidates=(dry,), begun=steps[0])
+    assert [step.name for step in again.steps] == [step.name for step in whole.steps]
+    assert again.values["F_c"] == pytest.approx(whole.values["F_c"], rel=1e-3)
+
+
+class Vessel(Prior):
+    states = (Signal("temperature", "degC", -100.0, 200.0),)
+    inputs = (Signal("power", "W", -10.0, 10.0),)
+    outputs = states
+    parameters = (Parameter("tau", 4.0, "s", 1.0, 10.0), Parameter("gain", 2.0, "K/W", 0.5, 5.0))
+    operating_point = OperatingPoint((0.0,), (0.0,))
+
+    def xdot(self, x, u, w, p):
+        return ((p.gain * u.power - x.temperature) / p.tau,)
+
+
+def warmed(prior, drift, count=6, n=300, dt=0.2, seed=0):
+    """Recordings of a vessel, each with a slow disturbance [K/s] of its own that nobody measures."""
+    rng, f, runs = np.random.default_rng(seed), prior.equations.xdot, []
+    for k in range(count):
+        power = np.repeat(rng.uniform(-5, 5, n // 20), 20)[:, None]
+        disturbance = drift * np.sin(2 * np.pi * np.arange(n) / n + rng.uniform(0, 6))
+        x = [np.zeros(len(prior.states))]
+        for u, d in zip(power[:-1], disturbance, strict=False):
+            for _ in range(4):
+                rate = f(x[-1], u, [], prior.p).full().ravel()
+                rate[0] += d
+                x.append(x[-1] + 0.25 * dt * rate)
+        y = np.array(x[::4])[:, :1] + 0.02 * rng.standard_normal((n, 1))
+        nothing = np.full((n, 1), np.nan)
+        runs.append(Trajectory(f"run{k}", "train", dt, dt * np.arange(n), power, y, nothing, nothing))
+    return runs
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.5])
+def test_a_slow_disturbance_is_not_taken_for_a_second_capacity(drift):
+    """Free first states of a slow state would explain it in every run."""
+    wall = terms.storage(
+        "temperature", Parameter("k_s", 0.0, "1/s", 0.0, 1.0), Parameter("tau_s", 12.0, "s", 0.2, 30.0),
+        state=Signal("wall", "degC", -100.0, 200.0),
+    )  # fmt: skip
+    plant = Vessel() if drift else extended(Vessel, wall)({"k_s": 0.3})
+    runs = warmed(plant, drift)
+    known = smoothed(Vessel, fit_prior(Vessel, runs, [], dt=0.2, length=15.0), runs, 0.2)
+    found = explain(
+        Vessel,
+        Vessel().values,
+        known,
+        dt=0.2,
+        length=15.0,
+        warm_up=2.0,
+        candidates=(Candidate("wall", (wall,)),),
+    )
+    assert [term.name for term in found.found] == ([] if drift else ["second capacity of temperature"])
+
+
+def test_the_page_of_terms_is_that_of_the_library():
+    assert {law for laws in term_table.GROUPS.values() for law in laws} == set(terms.EXPLANATIONS)
+    assert (Path(__file__).parents[2] / "docs/terms.md").read_text() == term_table.document()

@@ -11,18 +11,16 @@ from example_priors import PAIRS, Arm, Swing, Tanks, TorchArm, TorchSwing, Torch
 
 from hybrid_mpc import (
     Balance,
-    Coulomb,
     InputError,
-    LoadDependent,
     MechanicalPrior,
     Parameter,
     Prior,
     Signal,
-    Stribeck,
+    Term,
     TorchPrior,
-    Viscous,
-    with_friction,
+    extended,
 )
+from hybrid_mpc.machine import terms
 
 EVERY = [prior for pair in PAIRS for prior in pair]
 
@@ -430,25 +428,24 @@ def test_errors_of_ones_own_code_stay_what_they_are():
             wrong(base, xdot=broken)().equations  # noqa: B018
 
 
-# friction in both languages; their formulas are tested in test_friction.py
+# terms in both languages; their formulas are tested in test_terms.py
 
 
 TERMS = (
-    Viscous(Parameter("d_2", 0.3, "N m s/rad", 0.0, 2.0), axis=1),
-    Coulomb(Parameter("F_2", 0.5, "N m", 0.0, 2.0), Parameter("gamma_2", 20.0, "s/rad", 1.0, 50.0)),
-    Stribeck(
-        Parameter("F_3", 0.5, "N m", 0.0, 2.0), Parameter("F_s", 0.8, "N m", 0.5, 2.0),
-        Parameter("v_s", 0.2, "rad/s", 0.05, 1.0), Parameter("gamma_3", 30.0, "s/rad", 1.0, 50.0), axis=1,
-    ),
-    LoadDependent(
-        Parameter("rho", 0.02, "m", 0.0, 0.05), Parameter("gamma_4", 10.0, "s/rad", 1.0, 50.0),
-        lambda q, v, p: p.a * v.v_1 * v.v_1 + p.g_1 * (q.q_1 + 0.5 * q.q_2),
+    terms.viscous("v_2", Parameter("d_2", 0.3, "N m s/rad", 0.0, 2.0)),
+    terms.coulomb("v_1", Parameter("F_2", 0.5, "N m", 0.0, 2.0), width=0.05),
+    terms.stribeck("v_2", Parameter("F_s", 0.8, "N m", 0.5, 2.0), speed=0.2, width=0.05),
+    Term(
+        "bearing", "force", "v_1",
+        (Parameter("rho", 0.02, "-", 0.0, 0.05), Parameter("gamma", 10.0, "s/rad", 1.0, 50.0)),
+        lambda at, p: -p.rho * ca.tanh(p.gamma * at.own) * ca.fabs(at.p.a * at.x.v_1**2 + 2.0 * at.p.g_1 * at.x.q_1),
+        loss=True,
     ),
 )  # fmt: skip
 
 
-def test_friction_terms_are_the_same_in_both_languages():
-    ours, theirs = (with_friction(kind, *TERMS) for kind in (Arm, TorchArm))
+def test_terms_are_the_same_in_both_languages():
+    ours, theirs = (extended(kind, *TERMS) for kind in (Arm, TorchArm))
     assert ours.corrects == theirs.corrects == ("v_1", "v_2")
     for prior in (ours, theirs):
         check_balances(prior())

@@ -3,11 +3,15 @@
 import casadi as ca
 import numpy as np
 import pytest
+import torch
+from energy_checks import check_balances, random_points, rates
 
-from hybrid_mpc import InputError, MechanicalPrior, Parameter, Prior, Signal
+from hybrid_mpc import InputError, MechanicalPrior, Parameter, Prior, PriorStep, Signal, trace_model
 from hybrid_mpc.machine import terms
 from hybrid_mpc.machine.prior import Balance
 from hybrid_mpc.machine.terms import Term, extended
+from nn_export import build
+from scenarios.pendulum.prior import PendulumPrior
 
 
 class Arm(MechanicalPrior):
@@ -47,29 +51,34 @@ def p(name, value=0.0, unit="N m", low=-10.0, high=10.0):
 def arm_terms(value):
     """A term of each law of an axis, with this weight."""
     one, two = p("a", value), p("b", value)
+
+    def of(unit):
+        return p("a", value, unit)
+
     return {
         "coulomb": terms.coulomb("v1", one, width=0.2),
         "asymmetric": terms.asymmetric("v1", one, width=0.2),
-        "viscous": terms.viscous("v1", one),
-        "viscous by direction": terms.viscous_by_direction("v1", one),
-        "quadratic": terms.quadratic("v1", one),
+        "viscous": terms.viscous("v1", of("N m s/rad")),
+        "viscous by direction": terms.viscous_by_direction("v1", of("N m s/rad")),
+        "quadratic": terms.quadratic("v1", of("N m s^2/rad^2")),
         "stribeck": terms.stribeck("v2", one, speed=0.5, width=0.2),
-        "loaded by motor": terms.loaded("v1", one, load="driven", width=0.2),
-        "loaded by both": terms.loaded("v2", one, load="both", width=0.2),
+        "loaded by motor": terms.loaded("v1", of("-"), load="driven", width=0.2),
+        "loaded by both": terms.loaded("v2", of("-"), load="both", width=0.2),
         "by position": terms.coulomb_by_position("v1", one, two, width=0.2, turning=True),
         "offset": terms.offset("v1", one),
         "gravity": terms.gravity_error("v1", one, two),
         "cogging": terms.cogging("v2", one, two, periods=4.0),
-        "spring": terms.spring("v1", one, centre=0.1),
-        "end": terms.elastic_end("v1", one, edge=-0.2, upper=True),
-        "gain": terms.input_gain("t1", one),
+        "spring": terms.spring("v1", of("N m/rad"), centre=0.1),
+        "end": terms.elastic_end("v1", of("N m/rad"), edge=-0.2, upper=True),
+        "gain": terms.input_gain("t1", of("-")),
         "input offset": terms.input_offset("t1", one),
-        "by direction": terms.gain_by_direction("t2", one),
-        "input curve": terms.input_curve("t1", one, centre=0.0, span=2.0),
+        "by direction": terms.gain_by_direction("t2", of("-")),
+        "input curve": terms.input_curve("t1", of("-"), centre=0.0, span=1.0),
+        "saturation": terms.saturation("t1", of("1/N^2 m^2")),
         "dead zone": terms.dead_zone("t1", one, width=0.1),
-        "sensor gain": terms.output_gain("q1", one),
-        "sensor offset": terms.output_offset("q1", one),
-        "sensor curve": terms.output_curve("q2", one, lower=-1.0, upper=1.0),
+        "sensor gain": terms.output_gain("q1", of("-")),
+        "sensor offset": terms.output_offset("q1", of("rad")),
+        "sensor curve": terms.output_curve("q2", of("1/rad"), lower=-1.0, upper=1.0),
     }
 
 
@@ -159,3 +168,87 @@ def test_the_call_that_makes_a_term_makes_it_again():
     for term in arm_terms(0.25).values():
         again = eval(term.code, {"terms": terms, "Parameter": Parameter})
         assert (again, again.code) == (term, term.code)
+
+
+def test_friction_torques_are_the_hand_written_formulas_and_only_take_energy():
+    """On a prior in torch, whose own parameters a load is a function of."""
+    bearing = Term(
+        "bearing", "force", "phi_dot",
+        (Parameter("rho", 0.02, "m", 0.0, 0.05), Parameter("gamma", 20.0, "s/rad", 1.0, 50.0)),
+        lambda at, p: -p.rho * ca.tanh(p.gamma * at.own)
+        * ca.fabs(at.p.m * at.own**2 * at.p.l + at.p.m * at.p.g * ca.cos(at.x.phi)),
+        loss=True,
+    )  # fmt: skip
+    made = extended(
+        PendulumPrior, terms.viscous("phi_dot", p("d_2", 0.3, "N m s/rad")),
+        terms.stribeck("phi_dot", p("F_s", 0.3), speed=0.2, width=0.05), bearing,
+    )  # fmt: skip
+    prior, free = made(), PendulumPrior()
+    x, u, _ = random_points(prior, np.random.default_rng(0), 50)
+    x[:25, 1] *= 0.02  # near rest, where friction bends
+    phi, v = x.T
+    load = np.abs(50.0 * v * v * 0.05 + 50.0 * 9.81 * np.cos(phi))
+    wanted = 0.3 * v + 0.3 * np.exp(-((v / 0.2) ** 2)) * np.tanh(20 * v) + 0.02 * np.tanh(20 * v) * load
+    lost = (rates(free, x, u) - rates(prior, x, u))[:, 1] * 50.0 * 0.05**2
+    np.testing.assert_allclose(lost, wanted, rtol=0, atol=1e-11)
+    assert (lost * v > 0).all()
+    check_balances(prior)
+    step = PriorStep(prior, 0.01)
+    f = build(trace_model(step)["step"])
+    x, u, h = (torch.tensor(values, dtype=torch.float64) for values in ([0.4, -0.7], [3.0], []))
+    found = f(x.numpy(), [], u.numpy(), [], prior.p)[0].full().ravel()
+    np.testing.assert_allclose(found, step(x, h, u, h)[0], rtol=0, atol=1e-12)
+
+
+def test_terms_act_on_their_own_axis():
+    made = extended(Arm, terms.viscous("v2", p("d", 0.3, "N m s/rad")))()
+    x = np.concatenate([X[:2], [0.0, 2.0]])
+    change = (made.equations.xdot(x, U, [], made.p) - Arm().equations.xdot(x, U, [], Arm().p)).full().ravel()
+    mass = Arm().masses(X[:2], Arm().p).full()
+    np.testing.assert_allclose(mass @ change[2:], [0.0, -0.6], atol=1e-12)
+
+
+def test_a_prior_with_terms_takes_further_ones():
+    """Also forces: what it stands on is the mechanical prior."""
+    drag = terms.quadratic("v1", p("c", 0.1, "N m s^2/rad^2"))
+    dry = terms.coulomb("v1", p("F", 0.3), width=0.1)
+    assert extended(extended(Arm, drag), dry) is extended(Arm, drag, dry)
+
+
+def test_a_second_capacity_and_a_lag_of_a_disturbance_have_states():
+    made = extended(
+        Tank,
+        terms.storage("heat", p("k_s", 0.5, "1/s"), p("tau", 10.0, "s", 1.0, 100.0), state=Signal("wall", "degC")),
+        terms.disturbance_lag("room", p("late", 5.0, "s", 1.0, 10.0), state=Signal("room_acting", "degC")),
+    )()  # fmt: skip
+    rates_of = made.equations.xdot([1.0, 30.0, 25.0, 18.0], [0.1], [20.0], made.p).full().ravel()
+    np.testing.assert_allclose(rates_of, [0.0, 0.01 * (18.0 - 30.0) - 2.5, 0.5, 0.4], atol=1e-12)
+
+
+def test_a_delay_answers_with_its_mean_later():
+    """The integral of what a step of the input lacks is the delay."""
+    made = extended(
+        Tank, terms.input_delay("inflow", p("late", 2.0, "s", 0.1, 5.0), state=Signal("s", "m^3/s"))
+    )()
+    area, s, h = 0.0, 0.0, 1e-3
+    for _ in range(20000):
+        x = [1.0, 20.0, s]
+        acting = float(made.equations.xdot(x, [1.0], [20.0], made.p)[0]) + 0.1
+        area += (1.0 - acting) * h
+        s += h * float(made.equations.xdot(x, [1.0], [20.0], made.p)[2])
+    assert area == pytest.approx(2.0, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        terms.viscous("v1", p("d", 0.1, "N m")),
+        terms.coulomb("v1", p("F", 0.1, "N"), width=1.0),
+        terms.output_offset("q1", p("o", 0.1, "m")),
+        Term("own", "force", "v1", (p("k", 0.1, "N m"),), lambda at, q: -q.k * at.own),
+        Term("own", "potential", "v1", (p("k", 0.1, "J"),), lambda at, q: q.k * ca.cos(at.own / 0.3)),
+    ],
+)
+def test_units_that_do_not_fit_and_a_potential_of_a_speed_are_refused(term):
+    with pytest.raises(InputError):
+        extended(Arm, term)

@@ -19,20 +19,25 @@ HELD = (0.10, 0.07)
 """By how much less and more than its share of unseen measurements a band may hold: 80 to 97 % of one for 90 %."""
 FLOOR = 1.5
 """Error of a free run over the sensor's noise up to which the noise is what is left."""
+SEARCH = "hybrid-mpc explain looks for missing terms (docs/explain.md)."
 MOST = 4
 """Warnings of one kind that are told here; the sections have all."""
 
 
-def advice(results: Results) -> list[Hint]:
+def advice(results: Results, *, explained: bool = False) -> list[Hint]:
     """Hints about a finished run, what needs the user first; where nothing does, how to go on.
+
+    Args:
+        results: The run's results.
+        explained: Whether missing terms have been searched. Default: they have not, and a hint may name the command.
 
     Example:
         ``[hint.finding for hint in advice(read_results(read_object(path), str(path))) if hint.verdict == "bad"]``
     """
     own = results.identification
     found = [
-        *_doubt(own), *_recordings(results), *_prior(own), *_choice(own), *_linear(own), *_floor(own), *_bands(own),
-        *_promises(results), *_loops(results), *_watching(results),
+        *_doubt(own), *_recordings(results), *_prior(own, explained), *_choice(own, explained), *_linear(own),
+        *_floor(own), *_bands(own), *_promises(results), *_loops(results), *_watching(results),
     ]  # fmt: skip
     if not any(hint.verdict == "bad" for hint in found):
         found.append(
@@ -77,7 +82,7 @@ def _doubt(found: Identification) -> Iterator[Hint]:
         )  # fmt: skip
 
 
-def _prior(found: Identification) -> Iterator[Hint]:
+def _prior(found: Identification, explained: bool) -> Iterator[Hint]:
     for warning in found.details.prior_parameters.warnings[:MOST]:
         yield Hint("plain", f"Fit of the prior: {warning}", "docs/prior-fit.md says what to do.")
     windows = min(
@@ -96,14 +101,17 @@ def _prior(found: Identification) -> Iterator[Hint]:
         else:
             yield Hint(
                 "bad", f"{what}: it lacks much.",
-                "Look at signs, units, and a term that is missing, in the sensor too; a network is for what is small.",
+                "Look at signs, units, and a term that is missing, in the sensor too; a network is for what is small."
+                + ("" if explained else f" {SEARCH}"),
             )  # fmt: skip
 
 
-def _choice(found: Identification) -> Iterator[Hint]:
+def _choice(found: Identification, explained: bool) -> Iterator[Hint]:
     choice = found.details.choice
     own = choice.candidates[choice.hybrid]
     if choice.recommended != "phy":
+        if not explained:
+            yield Hint("plain", "A network was needed: the prior may lack a physical term.", SEARCH)
         return  # the page's first answer says why
     why = choice.reason
     if own.error is None or own.ratio is None:

@@ -17,16 +17,18 @@ from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.identify.evaluate import Scores, input_correlation
 from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.plots import analysis, animation, data, estimation, fit, loops, monitor
+from hybrid_mpc.plots import analysis, animation, data, estimation, explain, fit, loops, monitor
 from hybrid_mpc.plots.interactive import over_time, write_interactive
 from hybrid_mpc.plots.style import save
 from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.explain_page import bars_of
 from hybrid_mpc.workflow.stage import Absent, Stage
 from hybrid_mpc.workflow.stages.analyze import ANALYSIS
 from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.compare import CONTROL, REPORTED
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.identify import PRIOR, TRAINING, trained_models
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, by_controller
 from hybrid_mpc.workflow.stages.results import finite, step_times
@@ -46,7 +48,7 @@ LAGS, FEWEST_LAGS = 50, 5
 def draw_all(context: Context) -> Figures:
     """Draw every figure that the run's stages allow into ``figures/``."""
     parts = (
-        _data, _training, _free_runs, _overview, _loops, _on_model, _estimation, _timing, _watch,
+        _data, _explain, _training, _free_runs, _overview, _loops, _on_model, _estimation, _timing, _watch,
         _analysis,
     )  # fmt: skip
     figures = _draw(context, parts)
@@ -57,7 +59,7 @@ def draw_all(context: Context) -> Figures:
 def draw_first(context: Context) -> Figures:
     """Draw the figures of the stages up to the free runs, of those that have run."""
     there: dict[Callable[[Context], Any], Stage[Any]] = {
-        _data: PRIOR, _training: TRAINING, _free_runs: EVALUATION,
+        _data: PRIOR, _explain: EXPLAIN, _training: TRAINING, _free_runs: EVALUATION,
     }  # fmt: skip
     return _draw(
         context, [part for part, stage in there.items() if not isinstance(context.find(stage), Absent)]
@@ -87,6 +89,25 @@ def _saved(figure: Figure, path: Path) -> Path:
     if over_time(figure):
         write_interactive(figure, path)
     return path
+
+
+def _explain(context: Context) -> Any:
+    """What each found term removed of the error, and the terms over their data."""
+    found = context.find(EXPLAIN)
+    if isinstance(found, Absent):
+        return
+    labels, errors = bars_of(found.explanation)
+    figure = explain.error_steps(labels, errors, "held-out error, over the outputs' spreads [-]", found.floor)
+    yield "explain", "explain_steps", figure, "Held-out error of free runs: what each found term removed."
+    for number, step in enumerate(found.explanation.steps, 1):
+        for k, picture in enumerate(step.pictures, 1):
+            name = picture.ordinate.partition(" [")[0]
+            yield (
+                "explain",
+                f"explain_{number}_{k}",
+                explain.term_over_data(picture),
+                f"{name} over its data.",
+            )
 
 
 def _data(context: Context) -> Any:

@@ -188,6 +188,7 @@ def check_data(context: Context) -> None:
 
 def what_data_reads(context: Context) -> dict[str, object]:
     """What the recordings and their roles are made of."""
+    context = context.as_given
     prior, settings = context.scenario.prior(), context.settings
     read: dict[str, object] = {
         "data specification": context.spec,
@@ -201,6 +202,7 @@ def what_data_reads(context: Context) -> dict[str, object]:
 
 def data_stage(context: Context) -> DataResult:
     """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
+    context = context.as_given
     if not context.settings.data:
         assert context.scenario.make_data is not None
         context.progress.update("files", 0, 1, "recording the simulated machine")
@@ -221,6 +223,7 @@ def data_stage(context: Context) -> DataResult:
 
 def recordings_are_there(context: Context, found: DataResult) -> str:
     """Whether the recordings of a simulated machine lie where the run left them; a text if not."""
+    context = context.as_given
     if context.settings.data or (context.files and context.dataset.hash == found.hash):
         return ""
     return "the recordings are gone or were changed"

@@ -21,6 +21,7 @@ from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
 from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.advice import advice, doubt_of
 from hybrid_mpc.workflow.stages.analyze import ANALYSIS
@@ -29,6 +30,7 @@ from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.compare import CONTROL
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT
 from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
 from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, models_of, training_settings
@@ -56,6 +58,7 @@ from hybrid_mpc.workflow.stages.watching import watching_table
 TITLES: Mapping[str, str] = {
     "promises": "What this kit promises",
     "data": "Data",
+    "explain": "Missing terms",
     "models": "Prior and models",
     "training": "Training",
     "free_run": "Free runs: how well the models predict",
@@ -93,6 +96,7 @@ def report_so_far(context: Context) -> None:
     figures = draw_first(context)
     tables: dict[str, Sequence[Table]] = {
         "data": [_data_table(recordings(context))],
+        **({"explain": _explain_tables(context)} if _explained(context) else {}),
         "models": [_prior_table(context)],
     }
     if "free_run" in figures:
@@ -131,6 +135,7 @@ def command(context: Context, scenario: str = "") -> str:
     words = ["hybrid-mpc", "run", scenario or s.scenario, *s.options(lambda path: path.name)]
     words += ["--settings", s.network_file.name] if s.network_file else []
     words += ["--deploy", s.deploy] if s.deploy else []
+    words += ["--explain"] if s.explain else []
     return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
 
 
@@ -139,6 +144,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
     tables: dict[str, Sequence[Table | None]] = {
         "promises": [_promises_table(results.promises)],
         "data": [_data_table(results.data)],
+        "explain": _explain_tables(context),
         "models": [_prior_table(context)],
         "free_run": _free_run_tables(context, found),
         "export": [_export_table(results.export)],
@@ -169,7 +175,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
             after.get(key, ()),
         )
         for key in TITLES
-        if key != "on_model" or not results.on_model.reason
+        if (key != "on_model" or not results.on_model.reason) and (key != "explain" or _explained(context))
     )
     versions = ", ".join(f"{name} {v}" for name, v in results.versions.items())
     return Report(
@@ -180,7 +186,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         (),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
-        advice(results),
+        advice(results, explained=_explained(context)),
         doubt_of(found.details.prior_parameters.in_doubt),
         answer_all(results),
     )
@@ -298,6 +304,24 @@ def _data_table(data: Data) -> Table:
     ]
     caption = f"{len(data.files)} files; content hash {data.hash[:16]}."
     return Table(("part", "length [s]"), rows, caption)
+
+
+def _explained(context: Context) -> bool:
+    """Whether missing terms were searched."""
+    found = context.find(EXPLAIN)
+    return not isinstance(found, Absent)
+
+
+def _explain_tables(context: Context) -> list[Table]:
+    """Steps of the search for missing terms, and the errors over the test recordings."""
+    found = context.find(EXPLAIN)
+    if isinstance(found, Absent):
+        return []
+    told = found.explanation
+    tests = [tests_table(found)] if found.tests else []
+    return [
+        table for table in (steps_table(told), *tests, terms_table(told), trials_table(told)) if table.rows
+    ]
 
 
 def _prior_table(context: Context) -> Table:
@@ -596,7 +620,7 @@ def _pole_table(analysis: Analysis) -> Table | None:
 
 REPORT = Stage(
     "report", "writing the report", ReportResult, report_stage, what_report_reads,
-    (DATA, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES, WATCH,
+    (DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES, WATCH,
      ANALYSIS),
     restore=report_is_there,
 )  # fmt: skip

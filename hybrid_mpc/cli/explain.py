@@ -1,0 +1,109 @@
+"""``hybrid-mpc explain``: the physical terms that a prior lacks, found by held-out recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
+
+if TYPE_CHECKING:
+    from hybrid_mpc.workflow.explained import ExplainResult
+
+EXAMPLES = (
+    "Examples:\n\n"
+    "  hybrid-mpc explain my_machine.py --data monday.csv --data tuesday.csv --out explained\n\n"
+    "  hybrid-mpc explain my_machine.py --data monday.csv --terms coulomb --terms viscous --most 2\n\n"
+    "  hybrid-mpc check explained/my_machine_explained.py --data monday.csv --data tuesday.csv --fit"
+)
+
+
+def explain(
+    scenario: ScenarioName,
+    data: Recordings = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/explain-SCENARIO.")] = None,
+    terms: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Law to choose from, e.g. coulomb; may be repeated. Default: the scenario's, else all."
+        ),
+    ] = None,
+    most: Annotated[int, typer.Option(help="Most steps that add terms.", min=1)] = 8,
+    time_column: TimeColumn = "",
+    input_column: InputColumns = None,
+    output_column: OutputColumns = None,
+) -> None:
+    """Find the physical terms that the prior lacks: fit it, search a library of terms, judge by held-out recordings.
+
+    The folder then holds explain.html, explain.json and NAME_explained.py, a scenario whose prior has the found terms.
+    Nothing is trained. The same command goes on with a search that was stopped.
+    """
+    from hybrid_mpc.cli.progress import make_progress, print_summary
+    from hybrid_mpc.workflow.explain import explain as search
+    from hybrid_mpc.workflow.explain_page import PAGE
+    from hybrid_mpc.workflow.settings import RunSettings
+
+    folder = out or Path("runs") / f"explain-{Path(scenario).stem}"
+    settings = RunSettings(
+        scenario, tuple(data or ()), inputs=tuple(input_column or ()), outputs=tuple(output_column or ()),
+        time=time_column,
+    )  # fmt: skip
+    with make_progress() as progress:
+        found = search(settings, folder, terms=tuple(terms or ()), most=most, progress=progress)
+    console = Console(highlight=False)
+    console.print()
+    console.print(_steps(found))
+    if found.tests:
+        console.print(_tests(found))
+    print_summary(summary(found, folder), folder / PAGE, "page")
+
+
+def summary(found: ExplainResult, folder: Path) -> list[str]:
+    """What was found, in a few lines."""
+    told = found.explanation
+    lines = [f"judged by {told.evidence.text}, free runs of {told.evidence.length:.3g} s"]
+    if not told.found:
+        return [*lines, f"no term was added: {told.reason}"]
+    lines += [f"found: {term.name}: {term.formula}" for term in told.found]
+    return [*lines, f"the search ended: {told.reason}", f"scenario: {(folder / found.file).resolve()}"]
+
+
+def _steps(found: ExplainResult) -> Table:
+    """A row a step."""
+    from hybrid_mpc.workflow.explain_page import alternatives_of, interval, signed, values_of
+
+    told = found.explanation
+    table = _table(
+        "steps", "step", "held-out error [-]", "ratio to the step before", "fitted values", "alternatives"
+    )
+    table.add_row("prior, nominal", f"{told.nominal:.3g}", "", "", "")
+    table.add_row("prior, fitted", f"{told.before:.3g}", "", "", "")
+    for step in told.steps:
+        table.add_row(
+            signed(step), f"{step.held_out.error:.3g}", interval(step), values_of(step), alternatives_of(step)
+        )  # fmt: skip
+    return table
+
+
+def _tests(found: ExplainResult) -> Table:
+    """A row a model."""
+    from hybrid_mpc.workflow.explain_page import MODELS
+
+    labels = list(next(iter(found.tests.values())).rmse)
+    table = _table(
+        "free runs over the test recordings", "model", "error [-]", *(f"RMSE {one}" for one in labels)
+    )
+    for name, one in found.tests.items():
+        table.add_row(MODELS[name], f"{one.error:.3g}", *(f"{one.rmse[label]:.4g}" for label in labels))
+    return table
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table

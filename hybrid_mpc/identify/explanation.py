@@ -1,0 +1,295 @@
+"""What a search for missing terms found, as plain data: for tables, pictures and files. No torch in here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.terms import Made, Term, again, extended
+
+Outcome: TypeAlias = Literal["added", "alternative", "unsure", "worse", "diverged"]
+Action: TypeAlias = Literal["added", "removed"]
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A parameter with its fitted value.
+
+    Args:
+        name: Its name.
+        value: Fitted value [unit].
+        unit: Its unit.
+        standard_error: Standard error of the value [unit]; 0 for a fixed parameter.
+        lower: Lower bound of the fit [unit].
+        upper: Upper bound of the fit [unit].
+        description: A few words.
+
+    Example:
+        >>> print(FittedParameter("F", 0.1523, "N m", 0.0041, 0.0, 1.0))
+        F = 0.152 +- 0.0041 N m
+    """
+
+    name: str
+    value: float
+    unit: str
+    standard_error: float
+    lower: float
+    upper: float
+    description: str = ""
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether a fitted value lies at one of its bounds."""
+        width = self.upper - self.lower
+        near = min(self.value - self.lower, self.upper - self.value)
+        return width > 0.0 and near <= 1e-3 * width and self.value != 0.0
+
+    def __str__(self) -> str:
+        return f"{self.name} = {self.value:.3g} +- {self.standard_error:.2g} {self.unit}"
+
+
+@dataclass(frozen=True)
+class HeldOutError:
+    """Error of free runs over held-out data: root mean square over the outputs' spreads, first states fitted.
+
+    Args:
+        error: With the change [-].
+        ratio: That over the error without the change [-]: the geometric mean over the pieces of evidence.
+        lower: Lower end of its interval [-]: the probability of an error beyond it is 10 %, shared by the candidates
+            that were fitted in the step.
+        upper: Upper end of its interval [-], likewise; infinite where there are too few pieces of evidence.
+        harm: Probability that the expected error is more than 5 % larger with the change, times the number of
+            candidates that were fitted in the step, at most 1.
+    """
+
+    error: float
+    ratio: float
+    lower: float
+    upper: float
+    harm: float
+
+
+@dataclass(frozen=True)
+class FoundTerm:
+    """A term, as text.
+
+    Args:
+        name: Its name, e.g. ``"Coulomb friction of phi_dot"``.
+        formula: What it adds, or puts in place of its signal.
+        explanation: What it is, in a sentence.
+        place: Where it stands: ``"force"``, ``"potential"``, ``"rate"``, ``"input"``, ``"disturbance"``, ``"output"``.
+        of: The speed, state, input, disturbance or output.
+        code: The call that makes it, for a file; empty for a user's own term without one.
+        made: The call as data, for :meth:`Explanation.prior`; None for a user's own term.
+    """
+
+    name: str
+    formula: str
+    explanation: str
+    place: str
+    of: str
+    code: str
+    made: Made | None = None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate that was fitted in a step, and what came of it.
+
+    Args:
+        terms: The candidate's terms: one, or a pair.
+        outcome: ``"added"``; ``"alternative"``: the data do not tell it from what was added; ``"unsure"``: it may
+            lower the error, but not surely; ``"worse"``: it does not lower it; ``"diverged"``: its fit failed.
+        held_out: Its error over held-out data; None where the fit failed.
+        reason: Why it was not added; empty where it was.
+    """
+
+    terms: tuple[FoundTerm, ...]
+    outcome: Outcome
+    held_out: HeldOutError | None
+    reason: str = ""
+
+    @property
+    def name(self) -> str:
+        """Names of its terms."""
+        return _named(self.terms)
+
+
+@dataclass(frozen=True)
+class TermPicture:
+    """A term over its data, for a picture.
+
+    Args:
+        abscissa: Label of what it is drawn over, with unit, e.g. ``"phi_dot [rad/s]"``.
+        ordinate: Label of what it adds, with unit.
+        at: Where the recordings were, increasing ``(n,)``.
+        term: What the term adds there.
+        low: That less two standard errors of its parameters.
+        high: That and two standard errors.
+        data: What the recordings ask for there: the term and what the model with all terms leaves of the rates; empty
+            where no rate or output shows it.
+    """
+
+    abscissa: str
+    ordinate: str
+    at: tuple[float, ...]
+    term: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    data: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class ExplainStep:
+    """A step of the search: a term or a pair that was added, or a term that a later one made needless.
+
+    Args:
+        action: ``"added"`` or ``"removed"``.
+        terms: One term, or a pair.
+        held_out: Error with the step's change, over that before the step.
+        parameters: Fitted values of the terms' parameters: of the last fit, or of the step for removed terms.
+        scored: Candidates that were scored in the step by one Gauss-Newton step.
+        trials: Candidates that were fitted in every fold, the best first; the alternatives are among them.
+        pictures: Of each term; empty for terms that were removed later.
+    """
+
+    action: Action
+    terms: tuple[FoundTerm, ...]
+    held_out: HeldOutError
+    parameters: tuple[FittedParameter, ...]
+    scored: int
+    trials: tuple[Trial, ...] = ()
+    pictures: tuple[TermPicture, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Names of its terms."""
+        return _named(self.terms)
+
+    @property
+    def alternatives(self) -> tuple[Trial, ...]:
+        """Candidates that the data do not tell from what was added."""
+        return tuple(trial for trial in self.trials if trial.outcome == "alternative")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the search was judged by.
+
+    Args:
+        recordings: Recordings.
+        pieces: Pieces of evidence: recordings, or blocks of them where they are few.
+        folds: Groups of these that were left out in turn.
+        length: Length [s] of the free runs.
+        text: The same in words.
+    """
+
+    recordings: int
+    pieces: int
+    folds: int
+    length: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The terms that recordings ask for beside a prior, and all that a table and a page show of the search.
+
+    It is plain data: :func:`hybrid_mpc.records.plain` writes it, :func:`hybrid_mpc.records.record` reads it.
+
+    Args:
+        base: Name of the prior's class.
+        nominal: Error of the nominal parameters over the same data [-].
+        before: Held-out error of the fitted prior without terms [-].
+        after: Held-out error with all terms, over that without any.
+        steps: Steps of the search in order.
+        last: Candidates that were fitted in the last step, in which nothing was added.
+        parameters: Fitted values of all parameters, the prior's first.
+        evidence: What the search was judged by.
+        candidates: Candidates of the library.
+        reason: Why the search ended.
+    """
+
+    base: str
+    nominal: float
+    before: float
+    after: HeldOutError
+    steps: tuple[ExplainStep, ...]
+    last: tuple[Trial, ...]
+    parameters: tuple[FittedParameter, ...]
+    evidence: Evidence
+    candidates: int
+    reason: str
+
+    @property
+    def found(self) -> tuple[FoundTerm, ...]:
+        """The terms that remain, in the order in which they were added."""
+        there: dict[str, FoundTerm] = {}
+        for step in self.steps:
+            for term in step.terms:
+                if step.action == "added":
+                    there[term.name] = term
+                else:
+                    there.pop(term.name)
+        return tuple(there.values())
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Fitted values [their units] of all parameters by name."""
+        return {p.name: p.value for p in self.parameters}
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Their standard errors."""
+        return {p.name: p.standard_error for p in self.parameters}
+
+    @property
+    def diverged(self) -> tuple[Trial, ...]:
+        """Candidates whose fit failed."""
+        trials = [trial for step in self.steps for trial in step.trials] + list(self.last)
+        return tuple(trial for trial in trials if trial.outcome == "diverged")
+
+    def terms(self, own: Sequence[Term] = ()) -> tuple[Term, ...]:
+        """The terms that remain, made again.
+
+        Args:
+            own: A user's own terms, which only their own code can make.
+
+        Raises:
+            InputError: If a term without a call is not among ``own``.
+        """
+        given, made = {term.name: term for term in own}, []
+        for term in self.found:
+            if term.made is None and term.name not in given:
+                raise InputError(
+                    f"term {term.name!r} was made by own code; give it: explanation.terms([term])"
+                )
+            made.append(given[term.name] if term.made is None else again(term.made))
+        return tuple(made)
+
+    def prior(self, base: type[Prior], own: Sequence[Term] = ()) -> type[Prior]:
+        """The prior's class with the terms; ``prior(base)(explanation.values)`` has the fitted values.
+
+        Args:
+            base: The prior's class, that the search began with.
+            own: A user's own terms, which only their own code can make.
+        """
+        return extended(base, *self.terms(own))
+
+
+def _named(terms: Sequence[FoundTerm]) -> str:
+    return " and ".join(term.name for term in terms)
+
+
+def bound(upper: float) -> str:
+    """An upper bound in words.
+
+    Example:
+        >>> bound(0.912), bound(math.inf)
+        ('at most 0.91', 'without a bound')
+    """
+    return f"at most {upper:.2f}" if math.isfinite(upper) and upper < 1e6 else "without a bound"

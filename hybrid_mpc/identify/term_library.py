@@ -1,0 +1,422 @@
+"""The library of physical terms that a prior may lack, with bounds and scales from its recordings. No torch in here.
+
+Which terms can apply follows from a prior's structure and units, never from names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.identify.simulation import Points
+from hybrid_mpc.machine import terms as laws
+from hybrid_mpc.machine.mechanical import MechanicalPrior
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Parameter, Signal
+from hybrid_mpc.machine.terms import Place, Term
+from hybrid_mpc.machine.units import parsed
+
+Array = NDArray[np.float64]
+REACH = 3.0
+"""Bound of a term's weight: what it does at most, over what the state's rate is in the recordings."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term in one or several forms (of an exponent, an edge), of which the best is taken.
+
+    Args:
+        name: Name of the candidate.
+        forms: Its forms; names of their parameters are distinct.
+    """
+
+    name: str
+    forms: tuple[Term, ...]
+
+
+def library(prior: Prior, points: Points, dt: float, length: float) -> tuple[Candidate, ...]:
+    """Terms that a prior may lack, with bounds and scales from where its machine was.
+
+    Which can apply follows from its structure and units:
+
+    - a state whose rate is another state is an axis' position, and friction acts on axes alone;
+    - terms that touch forces need a :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior`;
+    - radiation and free convection are of temperatures;
+    - an overflow is of a level: a state that cannot be negative, and no temperature;
+    - an angle that turns has no loss, and acts on no other state by its size.
+
+    Args:
+        prior: The prior with fitted values.
+        points: States ``(n, n_x)``, inputs ``(n, n_u)`` and disturbances ``(n, n_w)`` of the recordings.
+        dt: Model period [s].
+        length: Length [s] of the free runs that models are judged by: no lag is longer than a quarter.
+    """
+    return tuple(_Library(prior, points, dt, length).candidates())
+
+
+class _Library:
+    """Scales of the signals, and the terms that are made with them."""
+
+    def __init__(self, prior: Prior, points: Points, dt: float, length: float) -> None:
+        self.prior, self.dt, self.length = prior, dt, length
+        self.x, self.u, self.w = points
+        rates = prior.equations.xdot(self.x.T, self.u.T, self.w.T, prior.p).full().T
+        self.rates = np.sqrt(np.mean(np.square(rates), axis=0))
+        self.positions = {v: q for q, v in prior.kinematics}
+        self.mechanical = isinstance(prior, MechanicalPrior)
+        if isinstance(prior, MechanicalPrior):
+            half = self.x.shape[1] // 2
+            mass = prior.masses.map(len(self.x))(
+                self.x[:, :half].T, np.tile(prior.p, (len(self.x), 1)).T
+            ).full()
+            mass = mass.reshape(half, len(self.x), half).swapaxes(0, 1)
+            forces = np.einsum("nij,nj->ni", mass, rates[:, half:])
+            self.rates = np.concatenate([self.rates[:half], np.sqrt(np.mean(np.square(forces), axis=0))])
+
+    def candidates(self) -> Iterator[Candidate]:
+        """All of them."""
+        exact = set(self.positions.values())
+        for i, state in enumerate(self.prior.states):
+            if i in self.positions:
+                yield from self._axis(i, state)
+            elif i not in exact and i in self.prior.corrected:
+                yield from self._process(i, state)
+        for i, signal in enumerate(self.prior.inputs):
+            yield from self._input(i, signal)
+        for i, signal in enumerate(self.prior.disturbances):
+            yield from self._disturbance(i, signal)
+        for i, signal in enumerate(self.prior.outputs):
+            yield from self._output(i, signal)
+
+    def _weight(
+        self, name: str, i: int, size: float, unit: str, *, positive: bool = False, words: str = ""
+    ) -> Parameter:
+        """A weight of what has this size on the rate of state ``i``."""
+        most = REACH * self.rates[i] / max(size, 1e-12)
+        return Parameter(name, 0.0, unit, 0.0 if positive else -most, most, words)
+
+    def _axis(self, i: int, state: Signal) -> Iterator[Candidate]:
+        own, q = state.name, self.positions[i]
+        v, position = self.x[:, i], self.x[:, q]
+        speed, turning = float(np.sqrt(np.mean(v**2))), self.prior.states[q].unit == "rad"
+        if not speed > 0:
+            return
+        place: Place = "force" if self.mechanical else "rate"
+        unit = _force_unit(state.unit) if self.mechanical else f"{state.unit}/s"
+        width = 0.05 * speed
+
+        def weight(
+            key: str, size: float, per: Sequence[str] = (), positive: bool = False, words: str = ""
+        ) -> Parameter:
+            return self._weight(f"{key}_{own}", i, size, over(unit, *per), positive=positive, words=words)
+
+        v_unit, q_unit = state.unit, _base(state.unit)
+        at: dict[str, Any] = {"width": width, "place": place}
+        yield _one(laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at))
+        yield _one(
+            laws.asymmetric(own, weight("F_a", 1.0, words="dry friction forwards more than backwards"), **at)
+        )
+        yield _one(laws.viscous(own, weight("d", speed, (v_unit,), True, "viscous friction"), place=place))
+        yield _one(
+            laws.viscous_by_direction(
+                own, weight("d_a", speed, (v_unit,), words="viscous friction by direction"), place=place
+            )
+        )
+        yield _one(laws.quadratic(own, weight("c", speed**2, (v_unit, v_unit), True, "drag"), place=place))
+        yield Candidate(
+            f"Stribeck friction of {own}",
+            tuple(
+                laws.stribeck(
+                    own,
+                    weight(f"F_s{k}", 0.3, positive=True, words="friction near rest"),
+                    speed=share * speed,
+                    **at,
+                )
+                for k, share in enumerate((0.1, 0.3, 1.0), 1)
+            ),
+        )
+        for k, load in enumerate(("driven", "resting", "both"), 1):
+            mu = Parameter(f"mu_{k}_{own}", 0.0, "-", 0.0, 2.0, f"friction by {load} load")
+            yield _one(laws.loaded(own, mu, load=load, **at))
+        centre, span = float(np.mean(position)), float(np.std(position)) or 1.0
+        sizes: tuple[float, float] = (0.7, 0.7) if turning else (span, span**2)
+        per: tuple[tuple[str, ...], ...] = ((), ()) if turning else ((q_unit,), (q_unit, q_unit))
+        names = [
+            weight(f"F_{k}", size, p, words="dry friction along the way")
+            for k, size, p in zip((1, 2), sizes, per, strict=True)
+        ]
+        yield _one(
+            laws.coulomb_by_position(own, *names, turning=turning, centre=0.0 if turning else centre, **at)
+        )
+        yield _one(laws.offset(own, weight("F_0", 1.0, words="offset"), place=place))
+        if not self.mechanical:
+            return
+        if turning:
+            yield _one(
+                laws.gravity_error(
+                    own, weight("G_s", 0.7, words="gravity by sin q"), weight("G_c", 0.7, words="by cos q")
+                )
+            )
+            yield Candidate(
+                f"cogging of {own}",
+                tuple(
+                    laws.cogging(
+                        own, weight(f"C_{n}s", 0.7, words="cogging by sin"), weight(f"C_{n}c", 0.7, words="by cos"),
+                        periods=float(n),
+                    )
+                    for n in (2, 3, 4, 6, 8, 12)
+                ),
+            )  # fmt: skip
+        if self.prior.states[q].periodic:
+            return
+        stiff = (q_unit,)
+        yield _one(laws.spring(own, weight("k", span, stiff, words="stiffness"), centre=centre))
+        low, high = np.quantile(position, (0.02, 0.98))
+        reach = 0.1 * (high - low)
+        yield _one(
+            laws.elastic_end(
+                own, weight("k_u", reach, stiff, True, "upper end"), edge=float(high - reach), upper=True
+            )
+        )
+        yield _one(
+            laws.elastic_end(
+                own, weight("k_l", reach, stiff, True, "lower end"), edge=float(low + reach), upper=False
+            )
+        )
+
+    def _process(self, i: int, state: Signal) -> Iterator[Candidate]:
+        own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
+        temperature = (parsed(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
+
+        def weight(key: str, size: float, per: Sequence[str] = (), words: str = "") -> Parameter:
+            return self._weight(f"{key}_{own}", i, size, over(unit, *per), words=words)
+
+        yield _one(laws.offset(own, weight("r_0", 1.0, words="offset of the rate"), place="rate"))
+        if not state.periodic:
+            yield from self._losses(i, state, temperature)
+            yield self._storage(i, state)
+        signals = [(s, c) for s, c in self._signals() if s.name != own and not s.periodic]
+        for s, c in signals:
+            scale, centre = float(np.std(c)), float(np.mean(c))
+            if scale > 0:
+                k = weight(f"k_{_short(s.name)}", scale, (s.unit,), words=f"of {s.name}")
+                yield _one(laws.coupling(own, k, source=s.name, centre=centre))
+        everything = signals if state.periodic else [(state, values), *signals]
+        for a, (one, c) in enumerate(everything):
+            for two, d in everything[a:]:
+                size = float(np.std(c) * np.std(d))
+                if size > 0:
+                    key = f"k_{_short(one.name)}_{_short(two.name)}"
+                    k = weight(
+                        key,
+                        size,
+                        (one.unit, two.unit),
+                        words=f"of {one.name} and {two.name}",
+                    )
+                    centres = float(np.mean(c)), float(np.mean(d))
+                    yield _one(laws.product(own, k, one=one.name, two=two.name, centres=centres))
+
+    def _losses(self, i: int, state: Signal, temperature: bool) -> Iterator[Candidate]:
+        """What a state loses: to its surroundings, by radiation, over an edge."""
+        own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
+        low, high = float(values.min()), float(values.max())
+
+        def weight(key: str, size: float, by: str, words: str) -> Parameter:
+            return self._weight(f"{key}_{own}", i, size, by, positive=True, words=words)
+
+        forms = []
+        references: list[tuple[str | float, Array]] = (
+            [(0.0, np.zeros(len(values)))]
+            if low >= 0 and not temperature
+            else [(low, np.full(len(values), low))]
+        )
+        references += [(s.name, c) for s, c in self._alike(i, state.unit)]
+        for number, (reference, other) in enumerate(references, 1):
+            far = float(np.sqrt(np.mean((values - other) ** 2))) or 1.0
+            for exponent, key in ((1.0, "a"), (1.25, "b"), (0.5, "c"), (2.0, "d")):
+                if (temperature and exponent == 0.5) or (exponent == 1.25 and not temperature):
+                    continue
+                whole = over(unit, *[state.unit] * int(exponent))
+                by = whole if exponent in (1.0, 2.0) else f"{unit}/{state.unit}^{exponent:g}"
+                k = weight(f"k_{number}{key}", far**exponent, by, "loss")
+                forms.append(laws.loss(own, k, exponent=exponent, reference=reference))
+        yield Candidate(f"loss of {own}", tuple(forms))
+        if temperature:
+            kelvin = 0.0 if state.unit == "K" else 273.15
+            size = abs((np.mean(values) + kelvin) ** 4 - (low + kelvin) ** 4) / 1e8 or 1.0
+            yield _one(
+                laws.radiation(
+                    own,
+                    weight("e", float(size), f"{unit} 1e8/K^4", "radiation"),
+                    kelvin=kelvin,
+                    surroundings=low,
+                )
+            )
+        width = 0.02 * (high - low) or 1.0
+        if state.lower < 0 or temperature:
+            return
+        edges = [low + share * (high - low) for share in (0.6, 0.75, 0.9)]
+        yield Candidate(
+            f"overflow of {own}",
+            tuple(
+                laws.overflow(
+                    own,
+                    weight(f"s_{n}", high - edge, over(unit, state.unit), "overflow"),
+                    edge=edge,
+                    width=width,
+                )
+                for n, edge in enumerate(edges, 1)
+            ),
+        )
+
+    def _storage(self, i: int, state: Signal) -> Candidate:
+        forms = []
+        for number, share in enumerate((0.05, 0.3), 1):
+            k = Parameter(
+                f"k_s{number}_{state.name}",
+                0.0,
+                "1/s",
+                0.0,
+                1.0 / (4 * self.dt),
+                "exchange with a second capacity",
+            )
+            tau = Parameter(
+                f"tau_s{number}_{state.name}", max(share * self.length, 2 * self.dt), "s", self.dt, self.length,
+                "time constant of the second capacity",
+            )  # fmt: skip
+            inner = Signal(f"{state.name}_{number}", state.unit, state.lower, state.upper)
+            forms.append(laws.storage(state.name, k, tau, state=inner))
+        return Candidate(f"second capacity of {state.name}", tuple(forms))
+
+    def _disturbance(self, i: int, signal: Signal) -> Iterator[Candidate]:
+        own, values = signal.name, self.w[:, i]
+        spread, centre = float(np.std(values)), float(np.mean(values))
+        most = Parameter(
+            f"o_{own}", 0.0, signal.unit, -2 * spread or -1.0, 2 * spread or 1.0, "offset of the disturbance"
+        )
+        yield _one(laws.disturbance_offset(own, most))
+        if not spread > 1e-9 * max(abs(centre), 1e-300):
+            return
+        gain = Parameter(f"g_{own}", 0.0, "-", -2.0, 2.0, "relative error of the disturbance's gain")
+        yield _one(laws.disturbance_gain(own, gain, centre=centre))
+        acting = replace(signal, name=f"{own}_acting", saturation=None)
+        yield _one(
+            laws.disturbance_lag(own, self._time(f"tau_{own}", "lag of the disturbance"), state=acting)
+        )
+
+    def _time(self, name: str, words: str) -> Parameter:
+        return Parameter(name, 2 * self.dt, "s", self.dt, max(0.25 * self.length, 4 * self.dt), words)
+
+    def _signals(self) -> Iterator[tuple[Signal, Array]]:
+        for group, values in (
+            (self.prior.states, self.x),
+            (self.prior.inputs, self.u),
+            (self.prior.disturbances, self.w),
+        ):
+            yield from zip(group, values.T, strict=True)
+
+    def _alike(self, i: int, unit: str) -> Iterator[tuple[Signal, Array]]:
+        """States and disturbances of the same unit."""
+        for k, (s, c) in enumerate(self._signals()):
+            if s.unit == unit and k != i and s.name not in {one.name for one in self.prior.inputs}:
+                yield s, c
+
+    def _input(self, i: int, signal: Signal) -> Iterator[Candidate]:
+        own, values = signal.name, self.u[:, i]
+        spread, centre = float(np.std(values)), float(np.mean(values))
+        if not spread > 1e-9 * max(abs(centre), 1e-300):
+            return
+
+        def of(key: str, most: float, unit: str = "-", words: str = "", positive: bool = False) -> Parameter:
+            return Parameter(f"{key}_{own}", 0.0, unit, 0.0 if positive else -most, most, words)
+
+        tau = self._time(f"tau_{own}", "lag of the input")
+        yield _one(laws.input_lag(own, tau, state=replace(signal, name=f"{own}_acting")))
+        late = self._time(f"late_{own}", "delay of the input")
+        yield _one(laws.input_delay(own, late, state=replace(signal, name=f"{own}_late")))
+        yield _one(laws.input_gain(own, of("g", 0.9, words="relative error of the gain")))
+        yield _one(laws.input_offset(own, of("o", 2 * spread, signal.unit, "offset of the input")))
+        if (values < 0).any() and (values > 0).any():
+            yield _one(laws.gain_by_direction(own, of("g_a", 0.9, words="gain forwards more than backwards")))
+            yield _one(
+                laws.dead_zone(own, of("z", spread, signal.unit, "dead zone", True), width=0.05 * spread)
+            )
+        size = float(np.abs(values).max())
+        k = Parameter(
+            f"sat_{own}",
+            0.0,
+            over("1", signal.unit, signal.unit),
+            0.0,
+            9.0 / size**2,
+            "saturation of the input",
+        )
+        yield _one(laws.saturation(own, k))
+        yield _one(
+            laws.input_curve(
+                own,
+                of("g_c", 0.5, words="bend of the input"),
+                centre=centre if centre > 2 * spread else 0.0,
+                span=2 * spread,
+            )
+        )
+
+    def _output(self, i: int, signal: Signal) -> Iterator[Candidate]:
+        y = self.prior.equations.output(self.x.T, self.u.T, self.w.T, self.prior.p).full()[i]
+        own, spread = signal.name, float(np.std(y))
+        if not spread > 0:
+            return
+        unit = signal.unit
+
+        def of(key: str, most: float, own_unit: str = "-", words: str = "") -> Parameter:
+            return Parameter(f"{key}_{own}", 0.0, own_unit, -most, most, words)
+
+        tau = self._time(f"tau_{own}", "lag of the sensor")
+        shown = Signal(f"{own}_shown", unit, signal.lower, signal.upper)
+        yield _one(laws.output_lag(own, tau, state=shown))
+        yield _one(laws.output_gain(own, of("s_g", 0.5, words="relative error of the sensor's gain")))
+        yield _one(laws.output_offset(own, of("s_o", 2 * spread, unit, "offset of the sensor")))
+        low, high = (float(v) for v in np.quantile(y, (0.0, 1.0)))
+        bend = of("s_b", 0.9 / (high - low), over("1", unit), "bend of the sensor")
+        yield _one(laws.output_curve(own, bend, lower=low, upper=high))
+
+
+def _one(term: Term) -> Candidate:
+    return Candidate(term.name, (term,))
+
+
+def _short(name: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in name)
+
+
+def over(unit: str, *by: str) -> str:
+    """A unit over others.
+
+    Example:
+        >>> over("N m", "rad/s"), over("m/s", "m/s"), over("1", "V", "V"), over("m/s", "m", "m")
+        ('N m s/rad', '1', '1/V/V', '1/s/m')
+    """
+    up, *down = unit.split("/")
+    ups = [up]
+    for one in by:
+        first, *rest = one.split("/")
+        ups += rest
+        down.append(first)
+    for word in list(down):
+        if word in ups:
+            ups.remove(word)
+            down.remove(word)
+    words = [word for word in ups if word not in ("-", "1", "")]
+    return " ".join(words or ["1"]) + "".join(f"/{word}" for word in down if word not in ("-", "1", ""))
+
+
+def _base(unit: str) -> str:
+    """The unit of a position, of that of its speed."""
+    return unit.removesuffix("/s")
+
+
+def _force_unit(unit: str) -> str:
+    return "N" if unit.startswith("m") else "N m"

@@ -1,0 +1,141 @@
+"""Figures of a search for missing terms: what each step removed of the error, and each term over its data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.plots.style import FAINT, GOOD, INK, colour, new_figure, number, plain, shared_legend
+
+WORDS = 38
+"""Characters of a label at most before it is broken."""
+WAVES = 6.0
+"""Ways up and down of a term along its abscissa up to which it is drawn as a line; beyond, another signal acts too."""
+
+
+class Picture(Protocol):
+    """A term over its data (``identify.explanation.TermPicture``)."""
+
+    @property
+    def abscissa(self) -> str:
+        """Label of what it is drawn over."""
+
+    @property
+    def ordinate(self) -> str:
+        """Label of what it adds."""
+
+    @property
+    def at(self) -> Sequence[float]:
+        """Where the recordings were, increasing."""
+
+    @property
+    def term(self) -> Sequence[float]:
+        """What it adds there."""
+
+    @property
+    def low(self) -> Sequence[float]:
+        """That less two standard errors."""
+
+    @property
+    def high(self) -> Sequence[float]:
+        """That and two standard errors."""
+
+    @property
+    def data(self) -> Sequence[float]:
+        """What the recordings ask for there; empty where nothing shows it."""
+
+
+def error_steps(
+    labels: Sequence[str], errors: Sequence[float], what: str, floor: float | None = None
+) -> Figure:
+    """A bar a model, from the nominal prior on: how much of the error each step removed.
+
+    Args:
+        labels: Of the bars: ``"nominal"``, ``"fitted"``, then what was added or removed.
+        errors: Errors, not negative; what is not finite has no bar.
+        what: What the errors are, with unit.
+        floor: Error that the sensors' noise alone makes. Default: it is not drawn.
+
+    Raises:
+        InputError: If no error is finite.
+
+    Example:
+        >>> figure = error_steps(["nominal", "fitted", "+ drag"], [0.5, 0.3, 0.1], "error [-]")
+        >>> len(figure.axes)
+        1
+    """
+    finite = [v for v in errors if math.isfinite(v)]
+    if not finite:
+        raise InputError("plot of the steps: there is no finite error")
+    figure, axes = new_figure(1, 1, size=(10.0, 1.3 + 0.42 * len(labels)))
+    ax, top = axes[0, 0], max(finite)
+    for k, (value, before) in enumerate(zip(errors, [math.inf, *errors], strict=False)):
+        if not math.isfinite(value):
+            ax.text(0.0, k, "  diverged", va="center", fontsize=9, color=INK)
+            continue
+        ink = colour("phy_nominal") if k == 0 else colour("phy") if k == 1 else GOOD
+        ax.barh(k, value, color=ink, height=0.62)
+        if math.isfinite(before) and before > value:  # what the step removed
+            ax.barh(k, before - value, left=value, color=ink, alpha=0.18, height=0.62)
+        share = (
+            f" ({100 * value / before:.0f} % of the bar above)"
+            if k and math.isfinite(before) and before > 0
+            else ""
+        )
+        ax.text(max(value, before if math.isfinite(before) else 0.0) + 0.01 * top, k, f"{number(value)}{share}",
+                va="center", fontsize=9, color=INK)  # fmt: skip
+    ax.set_yticks(range(len(labels)), [_broken(plain(label)) for label in labels])
+    ax.invert_yaxis()
+    ax.set_xlim(0.0, 1.32 * top)
+    ax.set_xlabel(plain(what))
+    ax.grid(visible=False, axis="y")
+    if floor is not None:
+        ax.axvline(floor, color=INK, linestyle="--", linewidth=1.0, label="sensor noise")
+        shared_legend(figure)
+    return figure
+
+
+def term_over_data(picture: Picture) -> Figure:
+    """A term over its data: the fitted law with two standard errors, and what the recordings ask for.
+
+    Args:
+        picture: The term over its data.
+
+    Example:
+        ``term_over_data(explanation.steps[0].pictures[0])``
+    """
+    figure, axes = new_figure(1, 1, size=(8.0, 3.6))
+    ax, at = axes[0, 0], np.array(picture.at)
+    low, high, term = (np.array(v) for v in (picture.low, picture.high, picture.term))
+    if len(picture.data):
+        data = np.array(picture.data)
+        ax.plot(at, data, ".", color=FAINT, markersize=4, alpha=0.7, label="what the recordings ask for")
+        reach = np.concatenate([low, high, np.quantile(data, [0.02, 0.98])])
+        margin = 0.15 * (reach.max() - reach.min()) or 1.0
+        ax.set_ylim(reach.min() - margin, reach.max() + margin)
+    ax.fill_between(at, low, high, color=colour("phy"), alpha=0.25, linewidth=0, label="two standard errors")
+    line = np.abs(np.diff(term)).sum() <= WAVES * (term.max() - term.min())
+    ax.plot(
+        at, term, "-" if line else ".", color=colour("phy"), linewidth=1.8, markersize=5, label="the term"
+    )
+    ax.set_xlabel(plain(picture.abscissa))
+    ax.set_ylabel(_broken(plain(picture.ordinate)))
+    shared_legend(figure)
+    return figure
+
+
+def _broken(text: str) -> str:
+    """A label in two lines where it is long."""
+    if len(text) <= WORDS:
+        return text
+    words, lines = text.split(), [""]
+    for word in words:
+        if len(lines[-1]) + len(word) >= WORDS and lines[-1]:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return "\n".join(lines)

@@ -1,0 +1,128 @@
+"""``hybrid-mpc explain``: fit the prior, search for the terms that it lacks, and write a scenario that has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.data.trajectories import Dataset, load_trajectories
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.errors import InputError, named_extra, no_exit
+from hybrid_mpc.files import read_json, write_json, write_text
+from hybrid_mpc.folder import JobNote, open_folder, versions
+from hybrid_mpc.identify.explain import STEPS
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.specification import Role
+from hybrid_mpc.records import record
+from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.explain_page import write_page
+from hybrid_mpc.workflow.explain_search import Search, chosen_terms, prior_class
+from hybrid_mpc.workflow.explained import ExplainResult, scenario_code
+from hybrid_mpc.workflow.settings import RunSettings
+
+SCHEMA, SCHEMA_VERSION = "hybrid-mpc explain", 1
+RESULT = "explain.json"
+NEEDED: tuple[Role, ...] = ("train", "valid")
+"""Roles whose recordings the search is made of; those for tests are left for a judgement of its end."""
+
+
+@no_exit()
+@named_extra("the search")
+def explain(
+    settings: RunSettings,
+    out: Path,
+    *,
+    terms: Sequence[str] = (),
+    most: int = STEPS,
+    progress: Progress | None = None,
+) -> ExplainResult:
+    """Fit the prior, search for the physical terms that it lacks, and write what was found into ``out``.
+
+    ``explain.json`` holds the result, ``explain.html`` shows it, ``NAME_explained.py`` is a scenario whose prior has
+    the found terms, with the fitted values as nominal ones. A search that was stopped goes on where the same arguments
+    are given again. Nothing is trained.
+
+    Args:
+        settings: Scenario, recordings and columns, as of a run.
+        out: Folder to make.
+        terms: Names of laws (:mod:`hybrid_mpc.machine.terms`) that the search is limited to. Default: those of the
+            scenario's ``terms``, else all.
+        most: Steps that add terms, at most.
+        progress: Where to report. Default: nowhere.
+
+    Raises:
+        InputError: For any bad input: no recordings, too few to judge terms by, an unknown law, a term that does not
+            fit to the prior.
+
+    Example:
+        >>> found = explain(RunSettings("my_machine.py", data=(Path("swing.csv"),)), Path("out"))  # doctest: +SKIP
+        >>> [term.name for term in found.explanation.found]  # doctest: +SKIP
+        ['Coulomb friction of phi_dot']
+    """
+    if most < 1:
+        raise InputError(f"most: a search of at least one step is needed, got {most}")
+    scenario = load_scenario(settings.scenario)
+    chosen = chosen_terms(scenario, terms)
+    context = Context(settings, scenario, out, progress or Progress())
+    check_scenario(replace(scenario, plant=None, oracle=None, control=None, tasks=()))
+    if not settings.data and scenario.make_data is None:
+        raise InputError(
+            f"scenario {scenario.name} is a real machine: give its recordings with --data FILE.csv (once for each file)"
+        )
+    make = prior_class(scenario)
+    # bad recordings leave no folder behind
+    data = _recordings(context, make) if settings.data else None
+    note = JobNote("search", {**settings.identity(), "terms": tuple(terms), "most": most})
+    with open_folder(out, note, resume=None):
+        if data is None:
+            data = _simulated(context, make)
+        found = Search(context, make, data, chosen, out, most).result()
+        write(context, found, out, ["explain", settings.scenario, *settings.options(str), "--out", str(out)])
+        return found
+
+
+def read_result(out: Path) -> ExplainResult:
+    """What :func:`explain` left in a folder.
+
+    Raises:
+        InputError: If it is missing or damaged.
+    """
+    held = read_json(out / RESULT)
+    return record(ExplainResult, held.get("result") if isinstance(held, dict) else held, str(out / RESULT))
+
+
+def _recordings(context: Context, make: type[Prior]) -> Dataset:
+    """Recordings, of which none need be left for tests."""
+    data = load_trajectories(context.files, make(), context.spec, needed=NEEDED)
+    for finding in data.findings:
+        context.progress.warn(str(finding))
+    return data
+
+
+def _simulated(context: Context, make: type[Prior]) -> Dataset:
+    """Recordings that a simulated machine makes; those that are there already are taken."""
+    scenario, folder = context.scenario, context.out / "data"
+    assert scenario.make_data is not None
+    done = folder / "made.json"
+    if not done.is_file():
+        for path in context.files:
+            path.unlink()
+        scenario.make_data(folder, context.settings.seed, context.settings.budget)
+        write_json(done, {"seed": context.settings.seed})
+    return _recordings(context, make)
+
+
+def write(context: Context, found: ExplainResult, out: Path, command: Sequence[str]) -> None:
+    """Write page, scenario file and, last, ``explain.json``; ``command`` is what made them."""
+    if found.file:
+        write_text(
+            out / found.file, scenario_code(context.scenario, context.scenario_path, found.explanation)
+        )
+    write_page(out, context.scenario, found, command)
+    write_json(
+        out / RESULT,
+        {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "versions": versions(), "result": found},
+    )

@@ -1,0 +1,261 @@
+"""The search of ``hybrid-mpc explain`` and of a run's stage, kept in a folder: fit, missing terms, free runs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.data.trajectories import Dataset
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.files import digest, read_document, write_document
+from hybrid_mpc.folder import versions
+from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.explain import STEPS
+from hybrid_mpc.identify.explain import explain as search
+from hybrid_mpc.identify.explanation import Explanation
+from hybrid_mpc.identify.fit import fit_prior, smoothed
+from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.simulation import Points, required_substeps, visited
+from hybrid_mpc.identify.smooth import fit_smoother
+from hybrid_mpc.identify.term_library import Candidate, library
+from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.terms import EXPLANATIONS, Term, extended
+from hybrid_mpc.records import known, plain, record
+from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.explained import ExplainResult, FreeRuns, explained_name
+from hybrid_mpc.workflow.stage import sources
+from nn_export.program import to_json
+
+SHOWN_LEFT = 5.0
+"""Time left [s] from which on it is told."""
+
+
+def prior_class(scenario: Scenario) -> type[Prior]:
+    """The class of a scenario's prior, to which terms are added.
+
+    Raises:
+        InputError: If the class needs more than parameter values.
+    """
+    made = type(scenario.prior())
+    try:
+        made()
+    except TypeError as error:
+        raise InputError(
+            f"scenario {scenario.name}: {made.__name__}() raised TypeError: {error}. Terms are added to a prior that "
+            "is made of parameter values alone; make the other arguments class attributes"
+        ) from error
+    return made
+
+
+@dataclass(frozen=True)
+class ChosenTerms:
+    """What a search chooses from: laws by name (none: all), and own terms."""
+
+    laws: tuple[str, ...]
+    own: tuple[Term, ...]
+
+    def candidates(self, prior: Prior, points: Points, dt: float, length: float) -> tuple[Candidate, ...]:
+        """Candidates of the library; those whose names the prior has already are left out.
+
+        Raises:
+            InputError: If none of the laws can apply.
+        """
+        there = {p.name for p in prior.parameters} | {s.name for s in prior.states}
+        every = [one for one in library(prior, points, dt, length) if not _names(one) & there]
+        found = tuple(one for one in every if not self.laws or _law(one) in self.laws)
+        if not found and not self.own:
+            apply = ", ".join(dict.fromkeys(_law(one) for one in every)) or "none"
+            raise InputError(
+                f"terms: {', '.join(self.laws) or 'no law'} cannot apply to {type(prior).__name__}; "
+                f"laws that can: {apply}"
+            )
+        return found
+
+
+def chosen_terms(scenario: Scenario, names: Sequence[str] = ()) -> ChosenTerms:
+    """Laws and own terms that a search chooses from: ``names`` replace those of the scenario.
+
+    Raises:
+        InputError: If a name is no law, or the scenario's ``terms`` hold something else.
+
+    Example:
+        >>> from hybrid_mpc.scenario import load_scenario
+        >>> chosen_terms(load_scenario("emps"), ["coulomb"]).laws
+        ('coulomb',)
+    """
+    own = tuple(term for term in scenario.terms if isinstance(term, Term))
+    laws = tuple(names) or tuple(term for term in scenario.terms if not isinstance(term, Term))
+    for law in laws:
+        known(law, EXPLANATIONS, "law of a term")
+    there = {term.name for term in getattr(scenario.prior(), "terms", ())}
+    return ChosenTerms(laws, tuple(term for term in own if term.name not in there))
+
+
+def _law(candidate: Candidate) -> str:
+    made = candidate.forms[0].made
+    return "" if made is None else made.maker
+
+
+def _names(candidate: Candidate) -> set[str]:
+    """Names of its parameters and states."""
+    names = {name for form in candidate.forms for name in form.names}
+    return names | {form.state.name for form in candidate.forms if form.state is not None}
+
+
+class Search:
+    """Fit and search of one machine, each kept in the folder."""
+
+    def __init__(
+        self,
+        context: Context,
+        make: type[Prior],
+        data: Dataset,
+        chosen: ChosenTerms,
+        out: Path,
+        most: int = STEPS,
+    ) -> None:
+        self.context, self.make, self.data, self.chosen = context, make, data, chosen
+        self.out, self.most = out, most
+        self.dt = context.spec.dt
+        self.train, self.valid, self.test = (list(data.by_role(role)) for role in ("train", "valid", "test"))
+        self.length = context.spec.free_run or max(
+            (len(t.t) - context.warm) * self.dt for t in (*self.valid, *self.test)
+        )
+        programs = prior_programs(extended(make, *chosen.own)(), self.dt)
+        self.key = digest({
+            "prior": {name: to_json(program) for name, program in programs.items()},
+            "parameters": extended(make, *chosen.own).parameters, "recordings": data.hash, "data": context.spec,
+            "chosen": chosen.laws, "versions": versions(), "program": sources("hybrid_mpc.identify.explain"),
+        })  # fmt: skip
+
+    def result(self) -> ExplainResult:
+        """What was found."""
+        progress = self.context.progress
+        progress.start("fitting the prior")
+        fit = self.fit()
+        for warning in fit.warnings:
+            progress.warn(f"fit of the prior: {warning}")
+        progress.finish("")
+        told = self.searched(fit)
+        tests: dict[str, FreeRuns] = {}
+        if self.test:
+            progress.start("free runs over the test recordings")
+            tests = self.tests(fit, told)
+            progress.finish("")
+        name = self.context.scenario.name
+        own = fit.smoother(self.make(fit.values), self.dt)
+        floor = math.sqrt(
+            sum((s / size) ** 2 for s, size in zip(own.sigma, own.sizes.y, strict=True)) / len(own.sigma)
+        )
+        return ExplainResult(
+            name, told, fit.delay, floor, tests, f"{explained_name(name)}.py" if told.found else ""
+        )
+
+    def fit(self) -> PriorFit:
+        """The fitted prior."""
+        held = self._held("fit")
+        if held is not None:
+            return record(PriorFit, held, "the fit")
+        fit = fit_prior(
+            self.make, self.train, self.valid, dt=self.dt, length=self.length,
+            largest_delay=self.context.spec.largest_delay, time_unit=time_unit(self.train, self.dt),
+            on_progress=self._progress("free runs"),
+        )  # fmt: skip
+        self._keep("fit", fit)
+        return fit
+
+    def searched(self, fit: PriorFit) -> Explanation:
+        """The search, from where it was stopped."""
+        known_ = smoothed(self.make, fit, [*self.train, *self.valid], self.dt)
+        candidates = self.chosen.candidates(self.make(fit.values), visited(known_), self.dt, self.length)
+        done = self._held("search")
+        if done is not None:
+            return record(Explanation, done, "the search")
+        held = self._held("steps")
+        begun = None if held is None else record(Explanation, held, "the steps of the search")
+        progress, count = self.context.progress, len(candidates) + len(self.chosen.own)
+        number = 1 + _added(begun)
+        progress.start(f"search, step {number}: {count} candidates")
+
+        def keep(told: Explanation) -> None:
+            self._keep("steps", told)
+            last = next(step for step in reversed(told.steps) if step.action == "added")
+            progress.finish(f"{last.name}: the held-out error is {last.held_out.ratio:.2f} of that before")
+            if _added(told) < self.most:
+                progress.start(f"search, step {1 + _added(told)}")
+
+        found = search(
+            self.make, fit.values, known_, dt=self.dt, length=self.length, warm_up=self.context.spec.warm_up,
+            candidates=candidates, own=self.chosen.own, begun=begun, most=self.most,
+            on_progress=self._progress("candidates"), on_step=keep,
+        )  # fmt: skip
+        progress.finish(found.reason)
+        self._keep("search", found)
+        return found
+
+    def tests(self, fit: PriorFit, told: Explanation) -> dict[str, FreeRuns]:
+        """Errors over the test recordings, each model from states that its own equations smooth."""
+        from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
+        from hybrid_mpc.identify.step import PriorStep
+
+        warm, spec = self.context.warm, self.context.spec
+        fitted, acting = self.make(fit.values), shifted([*self.train, *self.valid], fit.delay)
+        own = fit.smoother(fitted, self.dt)
+        models = {"fitted": (fitted, own)}
+        if told.found:
+            better = told.prior(self.make, self.chosen.own)(told.values)
+            substeps = required_substeps(better, self.dt)
+            unit = time_unit(self.train, self.dt)
+            models["explained"] = (
+                better,
+                fit_smoother(better, acting, self.dt, time_unit=unit, substeps=substeps),
+            )
+        test, found = shifted(self.test, fit.delay), {}
+        steps = {"nominal": (PriorStep(self.make(), self.dt), fitted, own)}
+        steps |= {name: (PriorStep(p, self.dt, s.substeps), p, s) for name, (p, s) in models.items()}
+        for name, (step, prior, smoother) in steps.items():
+            runs = evaluation_trajectories(smoother.smooth(test), smoother, warm, spec.free_run)
+            errors = score(free_runs(step, prior, runs, warm), prior, own.sizes.y)
+            found[name] = FreeRuns(errors.error, errors.rmse)
+        return found
+
+    def _progress(self, part: str) -> Callable[[int, int, str], None]:
+        """Passes progress on, with the time that is left of a step."""
+        begun, last = time.monotonic(), 0
+
+        def passed(done: int, total: int, text: str) -> None:
+            nonlocal begun, last
+            now = time.monotonic()
+            if done <= 0 or done < last:
+                begun = now
+            last = done
+            left = (now - begun) / done * (total - done) if done > 0 else 0.0
+            more = f", about {left:.0f} s left of this step" if left > SHOWN_LEFT else ""
+            self.context.progress.update(part, done, total, f"{text}{more}")
+
+        return passed
+
+    def _path(self, name: str) -> Path:
+        return self.out / "checkpoints" / f"{name}.json"
+
+    def _held(self, name: str) -> Any:
+        """What the folder holds of a part; None where it holds nothing, or of something else."""
+        path = self._path(name)
+        if not path.is_file():
+            return None
+        held = read_document(path, f"delete {path}, and the same command computes it anew")
+        return held["value"] if held["key"] == self.key else None
+
+    def _keep(self, name: str, value: object) -> None:
+        write_document(self._path(name), {"key": self.key, "value": plain(value)})
+
+
+def _added(told: Explanation | None) -> int:
+    return 0 if told is None else sum(step.action == "added" for step in told.steps)

@@ -1,0 +1,154 @@
+"""What ``hybrid-mpc explain`` found, and the scenario file that has it. No torch in here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+from hybrid_mpc.identify.explanation import Explanation, FittedParameter, FoundTerm
+from hybrid_mpc.machine.terms import Made, code_of
+from hybrid_mpc.scenario import Scenario
+
+DIGITS = 6
+"""Significant digits of fitted values in a file that a user edits."""
+ENDING = "_explained"
+
+
+@dataclass(frozen=True)
+class FreeRuns:
+    """Errors of free runs over the test recordings, which the search has not seen, of one prior.
+
+    Args:
+        error: Root mean square over the outputs of the error over the output's spread [-].
+        rmse: Root mean square error by output, ``"phi [rad]"``.
+    """
+
+    error: float
+    rmse: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class ExplainResult:
+    """What a search for missing terms leaves, beside its page.
+
+    Args:
+        scenario: Name of the scenario.
+        explanation: Steps, terms, values and what they were judged by.
+        delay: Delay of the inputs [s] that was fitted with the prior.
+        floor: Error that the sensors' noise alone makes [-], of the fitted prior's smoother.
+        tests: Errors over the test recordings by model: ``"nominal"``, ``"fitted"``, ``"explained"``. Empty where there
+            are no test recordings.
+        file: Name of the scenario file with the found terms; empty where none was found.
+    """
+
+    scenario: str
+    explanation: Explanation
+    delay: float
+    floor: float
+    tests: Mapping[str, FreeRuns] = field(default_factory=dict)
+    file: str = ""
+
+
+def explained_name(scenario: str) -> str:
+    """Name of a scenario whose prior has the found terms.
+
+    Example:
+        >>> explained_name("emps"), explained_name("emps_explained")
+        ('emps_explained', 'emps_explained')
+    """
+    return scenario.removesuffix(ENDING) + ENDING
+
+
+def scenario_code(scenario: Scenario, where: str, found: Explanation) -> str:
+    """A scenario file: the machine of another one, whose prior has the found terms, with fitted values as nominal ones.
+
+    Args:
+        scenario: The scenario that was explained.
+        where: Its registered name or the path of its file.
+        found: What was found.
+    """
+    values = {p.name: p for p in found.parameters}
+    own = [term for term in found.found if term.made is None]
+    made = [term for term in found.found if term.made is not None]
+    of_made = {p.name for term in made if term.made for p in term.made.parameters}
+    signals = any(state_of(term) for term in made)
+    names = [
+        "Parameter",
+        *(["Signal"] if signals else []),
+        "extended",
+        "load_scenario",
+        "terms",
+        "with_nominal",
+    ]
+    lines = [
+        f'"""{_plain(scenario.title)}: the prior with the terms that its recordings ask for.',
+        "",
+        f"Written by hybrid-mpc explain. Judged by {found.evidence.text}: the held-out error is",
+        f"{found.after.ratio:.2f} of the fitted prior's. Edit the file as you like.",
+        '"""',
+        "",
+        "from dataclasses import replace",
+        "",
+        f"from hybrid_mpc import {', '.join(names)}",
+        "",
+        f"machine = load_scenario({where!r})",
+    ]
+    if own:
+        lines.append("own = {term.name: term for term in machine.terms if not isinstance(term, str)}")
+    lines += ["", "TERMS = ("]
+    for term in found.found:
+        lines.append(f"    # {_plain(term.explanation)} {_plain(term.formula)}")
+        lines += [f"    own[{term.name!r}],"] if term.made is None else _call(term.made, values)
+    lines += [")", '"""The terms that were found, with their fitted values."""', "", "FITTED = {"]
+    lines += [
+        f"    {p.name!r}: {_rounded(p.value)!r},  # {_error(p)}"
+        for p in found.parameters
+        if p.name not in of_made
+    ]
+    lines += [
+        "}", '"""Fitted values of the other parameters."""', "",
+        "scenario = replace(", "    machine,", f"    name={explained_name(scenario.name)!r},",
+        f"    title={scenario.title + ', with found terms'!r},",
+        "    prior=with_nominal(extended(type(machine.prior()), *TERMS), FITTED),",
+    ]  # fmt: skip
+    if scenario.control is not None and any(state_of(term) for term in found.found):
+        lines += [
+            "    # A found term has a state: add its weight to the control problem and its initial value to the tasks,",
+            "    # then remove these lines.",
+            "    control=None,", "    tasks=(),", "    plant=None,", "    oracle=None,",
+        ]  # fmt: skip
+    return "\n".join([*lines, ")", ""])
+
+
+def state_of(term: FoundTerm) -> bool:
+    """Whether a found term has a state of its own."""
+    return term.made is not None and "state" in term.made.options
+
+
+def _call(made: Made, values: Mapping[str, FittedParameter]) -> Iterator[str]:
+    """Lines of the call that makes a term, with fitted values."""
+    yield f"    terms.{made.maker}("
+    yield f"        {made.of!r},"
+    for p in made.parameters:
+        fitted = values[p.name]
+        own = replace(p, value=_rounded(fitted.value), lower=_rounded(p.lower), upper=_rounded(p.upper))
+        yield f"        {code_of(own)},  # {_error(fitted)}"
+    for key, value in made.options.items():
+        yield f"        {key}={code_of(_rounded(value) if isinstance(value, float) else value)},"
+    yield "    ),"
+
+
+def _rounded(value: float) -> float:
+    """A number as a user writes it; rounding keeps the order of numbers, so values stay within bounds."""
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _error(p: FittedParameter) -> str:
+    if p.standard_error == 0.0:
+        return f"{p.unit}, fixed"
+    return f"{p.unit}, standard error {p.standard_error:.2g}" + (", at its bound" if p.at_bound else "")
+
+
+def _plain(text: str) -> str:
+    """A text that can stand in a comment or docstring."""
+    return " ".join(text.replace("\\", "/").replace('"""', "'''").split())
