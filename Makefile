@@ -41,7 +41,7 @@ test-full: lint types
 
 # The site, in build/site; broken links and references stop it.
 docs: $(INSTALLED)
-	$(BIN)/mkdocs build
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 clean:
 	rm -rf .venv build runs/demo

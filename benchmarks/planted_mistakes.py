@@ -38,11 +38,14 @@ from hybrid_mpc import InputError, Prior, fit_prior
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.delay import shifted
-from hybrid_mpc.identify.fit import OutputFit, Shooting, cut_outputs, with_states
+from hybrid_mpc.identify.fit import with_states
+from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import visited
 from hybrid_mpc.identify.smooth import rough_smoother
 from hybrid_mpc.identify.structure import Cause, causes, causes_of_refusal
+from hybrid_mpc.identify.windows import cut_outputs
 
 
 @dataclass(frozen=True)

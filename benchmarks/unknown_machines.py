@@ -98,10 +98,16 @@ def said(make: type[Prior], found: PriorFit, parts: Parts, dt: float, longest: f
 
 
 def compared(
-    name: str, make: type[Prior], parts: Parts, dt: float, length: float, truth: Mapping[str, float]
+    name: str,
+    make: type[Prior],
+    parts: Parts,
+    dt: float,
+    length: float,
+    truth: Mapping[str, float],
+    windows: int,
 ) -> dict[str, Any]:
-    """A row: the fit of the library against the better of two independent ones, from the nominal values and the
-    plant's; where these are not known, from what the library found.
+    """A row: the fit of the library against the better of two independent ones to so many ``windows`` at most, from the
+    nominal values and the plant's; where these are not known, from what the library found.
     """
     began = time.process_time()
     try:
@@ -117,7 +123,7 @@ def compared(
     runs = Runs(prior, dt, spread, steps)
     periods = min(round(length / dt), max(len(t.t) for t in (*parts[0], *held)) - 1)
     independent = [
-        fit(runs, parts[0], periods, start)
+        fit(runs, parts[0], periods, start, windows)
         for start in (prior.values, {**prior.values, **(truth or found.values)})
     ]
     nominal, ours, *theirs = judged(make, parts, dt, length, [found.values, *independent], steps)
@@ -159,7 +165,7 @@ def machines(given: argparse.Namespace) -> list[dict[str, Any]]:
             else:
                 make, spec, files = one.scenario.prior, one.scenario.data, list(one.files)
             parts = read(files, make, spec)
-            rows.append(compared(one.name, make, parts, spec.dt, one.length, one.truth))
+            rows.append(compared(one.name, make, parts, spec.dt, one.length, one.truth, given.windows))
             print(rows[-1], flush=True)
     return rows
 
@@ -246,16 +252,25 @@ def invariance(
     of = np.array([factors[s.name] for s in make.outputs])
     moved = [[replace(t, y=t.y * of) for t in part] for part in (train, valid)]
     scaled = fit_prior(in_other_units(make, factors), *moved, dt=dt)
-    halves = [t.part(keep) for t in train for keep in (slice(0, len(t.t) // 2), slice(len(t.t) // 2, None))]
-    pieces = fit_prior(make, halves, valid, dt=dt)
+    later = [replace(t, t=t.t + 2 * k * t.dt * len(t.t)) for k, t in enumerate(train)]
+    halves = [
+        t.part(keep, f"{k} {i}")
+        for k, t in enumerate(later)
+        for i, keep in enumerate((slice(0, len(t.t) // 2), slice(len(t.t) // 2, None)))
+    ]
+    apart = [replace(t, t=t.t - t.t[0]) for t in halves]
+    pieces, strangers = (fit_prior(make, some, valid, dt=dt) for some in (halves, apart))
 
     def change(other: PriorFit) -> float:
         return max(abs(other.values[k] - v) / max(abs(v), 1e-9) for k, v in found.values.items())
 
-    cut_in_two = max(abs(pieces.values[k] - found.values[k]) / e for k, e in found.standard_errors.items())
+    cut_in_two, without_time = (
+        max(abs(other.values[k] - found.values[k]) / e for k, e in found.standard_errors.items())
+        for other in (pieces, strangers)
+    )
     return {
         "machine": name, "order": f"{change(turned):.1e}", "units": f"{change(scaled):.1e}",
-        "cut in two [standard errors]": f"{cut_in_two:.2f}",
+        "cut in two [standard errors]": f"{cut_in_two:.2f}", "both from zero on": f"{without_time:.2f}",
     }  # fmt: skip
 
 
@@ -328,6 +343,9 @@ def main() -> None:
     parser.add_argument("--cases", type=Path, default=Path("../shared/cases"), help="folder of the cases")
     parser.add_argument(
         "--data", type=Path, default=Path("../shared/data"), help="folder of measured recordings"
+    )
+    parser.add_argument(
+        "--windows", type=int, default=24, help="windows of the independent fit at most (machines)"
     )
     parser.add_argument("--draws", type=int, default=20, help="recordings drawn of each machine (coverage)")
     parser.add_argument("--priors", type=int, default=None, help="random priors (random: 50, order: 5)")

@@ -77,7 +77,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         evaluation_trajectories as evaluation_trajectories, free_runs as free_runs, score as score,
     )
     from hybrid_mpc.identify.export import check_parity as check_parity, trace_model as trace_model
-    from hybrid_mpc.identify.fit import FirstStates as FirstStates, fit_prior as fit_prior
+    from hybrid_mpc.identify.fit import fit_prior as fit_prior
     from hybrid_mpc.identify.linear import (
         LinearModel as LinearModel, fit_arx as fit_arx, fit_subspace as fit_subspace,
     )
@@ -91,6 +91,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     )
     from hybrid_mpc.identify.train import train as train
     from hybrid_mpc.identify.tune import SearchSpace as SearchSpace, tune as tune
+    from hybrid_mpc.identify.windows import FirstStates as FirstStates
     from hybrid_mpc.check.preflight import check_scenario as check_scenario
     from hybrid_mpc.workflow.check_fit import check_fit as check_fit
     from hybrid_mpc.compare.controllers import find_noise as find_noise
@@ -208,7 +209,7 @@ _ROOMS = {
     "files": ("write_arrays",),
     "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),
     "identify.export": ("check_parity", "trace_model"),
-    "identify.fit": ("FirstStates", "fit_prior"),
+    "identify.fit": ("fit_prior",),
     "identify.linear": ("LinearModel", "fit_arx", "fit_subspace"),
     "identify.networks": ("GRUNetwork",),
     "identify.predict": ("Prediction", "predict"),
@@ -218,6 +219,7 @@ _ROOMS = {
     "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
     "identify.train": ("train",),
     "identify.tune": ("SearchSpace", "tune"),
+    "identify.windows": ("FirstStates",),
     "kit.artifact": ("Kit", "load", "save_artifact"),
     "kit.assembly": (
         "make_adaptive_guard", "make_controller", "make_estimator", "make_ocp",

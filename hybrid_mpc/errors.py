@@ -36,8 +36,8 @@ class MissingPackage(InputError, ImportError):
 
 
 EXTRAS = {
-    **dict.fromkeys(("torch", "optuna", "filelock"), "train"),
-    **dict.fromkeys(("typer", "rich"), "cli"),
+    **dict.fromkeys(("torch", "optuna"), "train"),
+    **dict.fromkeys(("typer", "rich", "filelock"), "cli"),
     **dict.fromkeys(("matplotlib", "PIL", "bokeh", "jinja2", "markupsafe"), "report"),
     **dict.fromkeys(("pandas", "openpyxl", "pyarrow", "h5py"), "tables"),
     **dict.fromkeys(

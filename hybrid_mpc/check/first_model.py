@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from hybrid_mpc.identify.fit import feedback
+from hybrid_mpc.identify.closed_loop import feedback
 
 Array = NDArray[np.float64]
 FEWEST = 20
@@ -32,8 +32,8 @@ LAGS = 4
 ROWS = 10_000
 """Most samples of a recording from which these predictions are fitted."""
 CLOSED = 2.0
-"""Feedback, in what chance makes of it (:func:`~hybrid_mpc.identify.fit.feedback`), from which on a loop was closed. In
-open loop it was 1.3 at most in eight recordings of machines, in closed loop 2.2 to 34 where it is seen."""
+"""Feedback, in what chance makes of it (:func:`~hybrid_mpc.identify.closed_loop.feedback`), from which on a loop was
+closed. In open loop it was 1.3 at most in eight recordings of machines, in closed loop 2.2 to 34 where it is seen."""
 GROWS = 3.0
 """Growth over the length of a recording, as an exponent, from which on it is no drift."""
 PACE = 0.3

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.check.columns import clock_of, columns_of, near, read_all
 from hybrid_mpc.data.files import opened
+from hybrid_mpc.data.findings import missing_code, outliers
 from hybrid_mpc.data.names import FIELD, said_by, unit_behind
-from hybrid_mpc.data.recording import missing_code, outliers
 from hybrid_mpc.data.source import Source, name_and_unit, restarts
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.records import shown

@@ -21,36 +21,33 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Count = NDArray[np.int64]
 BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---")
 """Cells that say that there is no value, in small letters."""
-PAIRS = (
+PAIRS = (  # words for the two positions of a switch, 0 and 1, in small letters
     ("off", "on"), ("false", "true"), ("no", "yes"), ("closed", "open"), ("low", "high"), ("aus", "ein"), ("aus", "an"),
     ("zu", "auf"), ("nein", "ja"), ("falsch", "wahr"), ("arrêt", "marche"), ("non", "oui"),
 )  # fmt: skip
-"""Words for the two positions of a switch, 0 and 1, in small letters."""
 SWITCH = frozenset(word for pair in PAIRS for word in pair)
 DAY = 86400.0
 FAR = 20.0
 """Usual steps of dates by which none is away from the next one, where the order of day and month must be told."""
-SEEN = 100
-"""Cells that are looked at before all are read as dates of ISO 8601."""
+SEEN = 100  # cells that are looked at before all are read as dates of ISO 8601
 ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}(:\d{2}([.,]\d{1,9})?)?(Z|[+-]\d{2}:?\d{2})?")
 TIMES = "times of day read as seconds"
-MONTHS = (
+MONTHS = (  # how the names of months begin, in small letters
     ("jan",), ("feb", "fév", "fev"), ("mar", "mär", "mrz"), ("apr", "avr"), ("may", "mai"), ("jun", "juin"),
     ("jul", "juil"), ("aug", "aoû", "aou"), ("sep",), ("oct", "okt"), ("nov",), ("dec", "dez", "déc"),
 )  # fmt: skip
-"""How the names of months begin, in small letters."""
 _CLOCK = r"(?P<H>\d{1,3}):(?P<M>\d{2})(?::(?P<S>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?\s*(?P<ap>[AaPp]\.?[Mm]\.?)?"
 _ZONE = r"\s*(?P<z>Z|[A-Z]{2,5}|[+-]\d{2}:?\d{2})?"
-_DAYS = (
+_DAYS = (  # a day: year first, year last, with the month's name, in eight digits (before a time of day)
     r"(?P<Y>\d{4})(?P<sep>[-/.])(?P<m>\d{1,2})(?P=sep)(?P<d>\d{1,2})",
     r"(?P<a>\d{1,2})(?P<sep>[-/.])(?P<b>\d{1,2})(?P=sep)(?P<Y>\d{4}|\d{2})",
     r"(?P<d>\d{1,2})[-/. ]\s?(?P<name>[^\W\d_]{3,9})\.?[-/. ,]\s?(?P<Y>\d{4})",
     r"(?P<name>[^\W\d_]{3,9})\.?\s(?P<d>\d{1,2}),?\s(?P<Y>\d{4})",
     r"(?P<Y>\d{4})(?P<m>\d{2})(?P<d>\d{2})",
 )
-"""A day: year first, year last, with the month's name, in eight digits (before a time of day)."""
 DATES = tuple(re.compile(rf"{day}(?:[T _,-]\s*{_CLOCK}{_ZONE})?") for day in _DAYS)
 TIME_OF_DAY = re.compile(_CLOCK)
 MINUTES = re.compile(r"(?P<M>\d{1,3}):(?P<S>\d{2})[.,](?P<f>\d{1,9})")
@@ -70,22 +67,17 @@ class Cells(NamedTuple):
     """
 
     values: Array
-    blank: Mask
+    blank: Mask = np.zeros(0, bool)
     unit: str = ""
     done: str = ""
     fault: str = ""
 
 
 def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
-    """The numbers in a column.
-
-    Args:
-        column: As pandas has it: numbers, dates, or texts.
-        decimal: The file's decimal mark, in cells that pandas left as texts.
-    """
+    """The numbers in a column as pandas has it: numbers, dates, or texts with the file's decimal mark."""
     import pandas as pd
 
-    kind = column.dtype.kind
+    kind, none = column.dtype.kind, np.zeros(len(column), bool)
     if kind in "iuf" or (kind == "b" and not column.isna().any()):
         values = column.to_numpy(np.float64, na_value=np.nan)
         return Cells(values, np.isnan(values), done="true and false read as 1 and 0" if kind == "b" else "")
@@ -97,33 +89,26 @@ def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
         values = np.where(blank, np.nan, since / 1e9)
         return Cells(values, blank, "s", f"dates read as seconds since {begin}" if kind == "M" else "")
     if kind == "c":
-        return Cells(
-            np.full(len(column), np.nan), np.zeros(len(column), bool), fault="it holds complex numbers"
-        )
-    if len(column) and all(isinstance(c, str) and ISO.fullmatch(c) for c in column.iloc[:SEEN]):
+        return Cells(np.full(len(column), np.nan), none, fault="it holds complex numbers")
+    first = [one for one in column.iloc[:SEEN] if isinstance(one, str)]
+    texts = len(first) == min(SEEN, len(column)) > 0
+    if texts and all(map(ISO.fullmatch, first)):
         dates = pd.to_datetime(column, format="ISO8601", utc=True, errors="coerce")
         if not dates.isna().any():
             return cells_of(dates)
-    found = _of_stamps(column)
-    if found is None:
+    found, words = None, column.tolist() if texts and all(map(is_stamp, first)) else list[Any]([None])
+    if all(isinstance(one, str) for one in words):
+        found = _stamps(words, np.zeros(0), ".")  # all are dates that are written in one way
+    if found is None or found.fault:
         codes, uniques = pd.factorize(column, use_na_sentinel=False)
         found = _of_objects(list(uniques), decimal)
         found = found._replace(values=found.values[codes], blank=found.blank[codes])
+    else:
+        found = found._replace(blank=none)
     values, done = found.values, found.done
     if done == TIMES and (turned := np.cumsum(np.r_[0, np.diff(values) < -DAY / 2])).any():
         values, done = values + DAY * turned, f"{done}, past midnight {turned[-1]} times"
     return found._replace(values=values, done=done)
-
-
-def _of_stamps(column: pd.Series) -> Cells | None:
-    """The same where all cells are dates that are written in one way; None elsewhere."""
-    words = column.tolist()
-    if not words or not all(isinstance(one, str) and is_stamp(one) for one in words[:SEEN]):
-        return None
-    if any(not isinstance(one, str) for one in words):
-        return None
-    found = _stamps(words, np.zeros(0), ".")
-    return None if found is None or found.fault else found._replace(blank=np.zeros(len(words), bool))
 
 
 def number(cell: str) -> float:
@@ -197,31 +182,24 @@ def _of_objects(cells: Sequence[Any], decimal: str) -> Cells:
     """The same for different cells of any kind: texts, and what a spreadsheet holds."""
     import pandas as pd
 
-    stamps = [
-        isinstance(c, datetime.datetime | datetime.date | pd.Timestamp) and c is not pd.NaT for c in cells
-    ]
-    times = [isinstance(c, datetime.time | datetime.timedelta) for c in cells]
+    dates = (datetime.datetime, datetime.date, pd.Timestamp)
+    stamps = [isinstance(c, dates) and c is not pd.NaT for c in cells]
     texts = [_text(cell) for cell in cells]
     blank = np.array([text.casefold() in BLANK for text in texts], dtype=bool)
     values = np.array([number(_pointed(text, decimal)) for text in texts])
-    if any(stamps) and all(a or b for a, b in zip(stamps, blank, strict=True)):
-        dates = pd.Series([None if b else c for b, c in zip(blank, cells, strict=True)], dtype=object)
-        made = pd.to_datetime(dates)
-        return cells_of(made)._replace(blank=blank)
-    if any(times) or any(stamps):
-        texts = [
-            c.isoformat(" ") if isinstance(c, datetime.datetime) else t
-            for c, t in zip(cells, texts, strict=True)
-        ]
+    if any(stamps) and (np.array(stamps) | blank).all():
+        made = pd.Series([None if b else c for b, c in zip(blank, cells, strict=True)], dtype=object)
+        return cells_of(pd.to_datetime(made))._replace(blank=blank)
+    texts = [
+        c.isoformat(" ") if isinstance(c, datetime.datetime) else t for c, t in zip(cells, texts, strict=True)
+    ]
     odd = ~np.isfinite(values) & ~blank
-    if not odd.any():
-        return Cells(values, blank)
-    words = [texts[k] for k in np.flatnonzero(odd)]
-    others = values[~odd & ~blank]
-    for make in (_switch, _stamps, _with_units, _thousands):
-        if found := make(words, others, decimal):
-            values[odd] = found.values
-            return found._replace(values=values, blank=blank)
+    if odd.any():
+        words, others = [texts[k] for k in np.flatnonzero(odd)], values[~odd & ~blank]
+        for make in (_switch, _stamps, _with_units, _thousands):
+            if found := make(words, others, decimal):
+                values[odd] = found.values
+                return found._replace(values=values, blank=blank)
     return Cells(values, blank)
 
 
@@ -240,7 +218,7 @@ def _switch(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     if pair is None or not np.isin(others, (0.0, 1.0)).all():
         return None
     values = np.array([float(word.casefold() == pair[1]) for word in words])
-    return Cells(values, np.zeros(0, bool), done=f"{pair[0]!r} and {pair[1]!r} read as 0 and 1")
+    return Cells(values, done=f"{pair[0]!r} and {pair[1]!r} read as 0 and 1")
 
 
 def _with_units(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
@@ -250,24 +228,20 @@ def _with_units(words: Sequence[str], others: Array, decimal: str) -> Cells | No
         return None
     values = np.array([number(_pointed(match["number"], decimal)) for match in found if match])
     unit = units.pop()
-    return Cells(values, np.zeros(0, bool), unit, f"cells are numbers with the unit {unit!r}")
+    return Cells(values, unit=unit, done=f"cells are numbers with the unit {unit!r}")
 
 
 def _thousands(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     """Numbers between whose thousands is a mark that cannot be a decimal one."""
     mark = "." if decimal == "," else ","
     sure = re.compile(rf"[+-]?\d{{1,3}}(?:([{mark}'’ \u00a0\u202f])\d{{3}})(?:\1\d{{3}})*(?:[{decimal}]\d*)?")
-    if not all(map(sure.fullmatch, words)) or not _told(words, mark):
+    # that it stands between thousands is shown twice in a cell, or beside the decimal mark
+    told = any(mark not in word or word.count(mark) > 1 or decimal in word for word in words)
+    if not told or not all(map(sure.fullmatch, words)):
         return None
     bare = [re.sub(rf"[{mark}'’ \u00a0\u202f]", "", word) for word in words]
     values = np.array([number(_pointed(one, decimal)) for one in bare])
-    return Cells(values, np.zeros(0, bool), done="marks between thousands left out")
-
-
-def _told(words: Sequence[str], mark: str) -> bool:
-    """Whether cells show that a mark stands between thousands: twice in a cell, or beside the decimal mark."""
-    other = "," if mark == "." else "."
-    return any(mark not in word or word.count(mark) > 1 or other in word for word in words)
+    return Cells(values, done="marks between thousands left out")
 
 
 # Dates
@@ -279,9 +253,8 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
 
     if len(others):
         return None
-    patterns = [p for p in (*DATES, MINUTES, TIME_OF_DAY) if p.fullmatch(words[0])]
-    parts = None
-    for pattern in patterns:
+    parts, pattern = None, TIME_OF_DAY
+    for pattern in (p for p in (*DATES, MINUTES, TIME_OF_DAY) if p.fullmatch(words[0])):
         parts = _fixed(words, pattern)
         if parts is None and all(map(pattern.fullmatch, words)):
             parts = pd.Series(words).str.extract(rf"^(?:{pattern.pattern})$")
@@ -289,8 +262,8 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
             break
     if parts is None:
         return None
-    count = {key: pd.to_numeric(parts[key]).fillna(0).to_numpy(np.int64) for key in "HMS" if key in parts}
     none = np.zeros(len(words), np.int64)
+    count = {key: pd.to_numeric(parts[key]).fillna(0).to_numpy(np.int64) for key in "HMS" if key in parts}
     hours = count.get("H", none)
     if "ap" in parts and parts["ap"].notna().any():
         if parts["ap"].isna().any() or (hours > 12).any() or (hours < 1).any():
@@ -301,27 +274,26 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
         written = parts["f"].dtype.kind != "i"
         fraction = (parts["f"].fillna("0").str.ljust(9, "0") if written else parts["f"]).to_numpy(np.int64)
     within = ((hours * 60 + count.get("M", none)) * 60 + count.get("S", none)) * 10**9 + fraction
-    if pattern is TIME_OF_DAY:
-        if parts["S"].isna().all():
-            return _no_stamps(
-                words, "hours and minutes, or minutes and seconds? Write hours, minutes and seconds"
-            )
-        return Cells(within / 1e9, none > 0, "s", TIMES)
     if pattern is MINUTES:
         return Cells(within / 1e9, none > 0, "s", "minutes and seconds read as seconds")
-    zone = _zone(parts)
-    if zone is None:
-        return _no_stamps(words, "the names of their time zones differ. Write the offset, e.g. +02:00")
-    ways = [days * 86400 * 10**9 + within - zone for days in _days(parts)]
-    if not ways:
-        return _no_stamps(words, "there is no such day. Correct that row")
+    zone, fault, ways = none, "", list[Count]()
+    if pattern is TIME_OF_DAY:
+        if parts["S"].notna().any():
+            return Cells(within / 1e9, none > 0, "s", TIMES)
+        fault = "hours and minutes, or minutes and seconds? Write hours, minutes and seconds"
+    elif (offsets := _zone(parts)) is None:
+        fault = "the names of their time zones differ. Write the offset, e.g. +02:00"
+    else:
+        zone, ways = offsets, _days(parts)
+        fault = "one of these days does not exist. Correct that row" if not ways else ""
+    ways = [days * 86400 * 10**9 + within - zone for days in ways]
     if any((np.diff(way) != np.diff(ways[0])).any() for way in ways[1:]):
         ways = [way for way in ways if _goes_on(way)]
         if len(ways) != 1:
-            return _no_stamps(words, "day or month first? Write year, month and day, e.g. 2024-01-31")
-    total = ways[0]
-    done = f"dates read as seconds since {words[0]}"
-    return Cells((total - total[0]) / 1e9, none > 0, "s", done)
+            fault = "day or month first? Write year, month and day, e.g. 2024-01-31"
+    if fault:
+        return Cells(np.full(len(words), np.nan), fault=f"its dates, as {words[0]!r}: {fault}")
+    return Cells((ways[0] - ways[0][0]) / 1e9, none > 0, "s", f"dates read as seconds since {words[0]}")
 
 
 def _fixed(words: Sequence[str], pattern: re.Pattern[str]) -> pd.DataFrame | None:
@@ -340,33 +312,26 @@ def _fixed(words: Sequence[str], pattern: re.Pattern[str]) -> pd.DataFrame | Non
         return None
     parts = {}
     for key, text in first.groupdict().items():
+        begin, end = first.span(key)
         if text is not None and text.isdigit():
-            begin, end = first.span(key)
             width = 9 if key == "f" else end - begin
             powers = 10 ** np.arange(width - 1, width - 1 - (end - begin), -1)
             parts[key] = (codes[:, begin:end].astype(np.int64) - 48) @ powers
-        elif (
-            text is not None
-            and (codes[:, slice(*first.span(key))] != codes[0, slice(*first.span(key))]).any()
-        ):
+        elif text is not None and (codes[:, begin:end] != codes[0, begin:end]).any():
             return None
         else:
             parts[key] = np.full(len(words), text, dtype=object)
     return pd.DataFrame(parts)
 
 
-def _no_stamps(words: Sequence[str], fault: str) -> Cells:
-    return Cells(np.full(len(words), np.nan), np.zeros(0, bool), fault=f"its dates, as {words[0]!r}: {fault}")
-
-
-def _goes_on(stamps: NDArray[np.int64]) -> bool:
+def _goes_on(stamps: Count) -> bool:
     """Whether stamps of different rows increase, and none by far more than usual."""
     steps = np.diff(stamps)
     steps = steps[steps != 0]
     return bool(len(steps) and (steps > 0).all() and steps.max() <= FAR * np.median(steps))
 
 
-def _days(parts: pd.DataFrame) -> list[NDArray[np.int64]]:
+def _days(parts: pd.DataFrame) -> list[Count]:
     """Days since 1970, by every way to read the dates: none where there are no such days."""
     year = parts["Y"].to_numpy(np.int64)
     if "name" in parts:
@@ -384,9 +349,7 @@ def _days(parts: pd.DataFrame) -> list[NDArray[np.int64]]:
     return ways + (_since_1970(first, second, year) if (year < 100).all() else [])
 
 
-def _since_1970(
-    year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int64]
-) -> list[NDArray[np.int64]]:
+def _since_1970(year: Count, month: Count, day: Count) -> list[Count]:
     if (month < 1).any() or (month > 12).any() or (day < 1).any():
         return []
     year = np.where(year < 100, year + 2000, year)
@@ -395,16 +358,12 @@ def _since_1970(
     return [days.astype(np.int64)] if (days.astype("datetime64[M]") == months).all() else []
 
 
-def _zone(parts: pd.DataFrame) -> NDArray[np.int64] | None:
+def _zone(parts: pd.DataFrame) -> Count | None:
     """Offsets of the time zones [ns]; None where they are names that differ."""
     codes, zones = parts["z"].fillna("").factorize()
     found = [re.fullmatch(r"([+-])(\d{2}):?(\d{2})", zone) for zone in zones]
     names = {zone for zone, match in zip(zones, found, strict=True) if not match} - {"Z", "UTC", "GMT"}
     if len(names) > 1 or (names and any(found)):
         return None
-    sizes = [
-        (-1 if match[1] == "-" else 1) * (int(match[2]) * 3600 + int(match[3]) * 60) if match else 0
-        for match in found
-    ]
-    offsets: NDArray[np.int64] = np.array(sizes, np.int64)[codes] * 10**9
-    return offsets
+    sizes = [int(f"{m[1]}1") * (int(m[2]) * 3600 + int(m[3]) * 60) if m else 0 for m in found]
+    return np.asarray(np.array(sizes, np.int64)[codes] * 10**9)

@@ -17,12 +17,9 @@ from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
 HALF_POWER = math.sqrt(0.5)
-ROOM = math.sqrt(2.0) - 1.0
-"""``1 / (1 + ROOM)`` is a gain of -3 dB."""
-POINTS = 2**15
-"""Points of the transform in which a bandwidth is looked for: steps of 3 mHz at 100 Hz."""
-DECAYS = 28.0
-"""Time constants after which a kernel is below 1e-12 of its peak: rounding."""
+ROOM = math.sqrt(2.0) - 1.0  # ``1 / (1 + ROOM)`` is a gain of -3 dB
+POINTS = 2**15  # points of the transform in which a bandwidth is looked for: steps of 3 mHz at 100 Hz
+DECAYS = 28.0  # time constants after which a kernel is below 1e-12 of its peak: rounding
 SLOWEST = 2e-4
 """Lowest cutoff of a smoothing spline over the sampling rate: below it the spline's equations lose four digits."""
 

@@ -18,19 +18,12 @@ Array = NDArray[np.float64]
 ROUNDING = 1e-12
 """Span of a signal over its largest value at or below which it is constant: what is left of equal numbers after they
 are converted and interpolated. Any larger span is a motion, however small beside the level or the range."""
-WEAKEST = 0.1
-"""Amplitude of a spectral line over that of the strongest, from which on it counts."""
-LOBE = 2
-"""Bins to either side of a line that its Hann window fills above ``WEAKEST``."""
+WEAKEST = 0.1  # amplitude of a spectral line over that of the strongest, from which on it counts
+LOBE = 2  # bins to either side of a line that its Hann window fills above WEAKEST
 
 
 def sinusoid(
-    t: Array,
-    amplitude: float,
-    frequency: float,
-    *,
-    phase: float = 0.0,
-    offset: float = 0.0,
+    t: Array, amplitude: float, frequency: float, *, phase: float = 0.0, offset: float = 0.0
 ) -> Array:
     """``offset + amplitude sin(2 pi frequency t + phase)``.
 
@@ -49,12 +42,7 @@ def sinusoid(
 
 
 def chirp(
-    t: Array,
-    amplitude: float,
-    start_frequency: float,
-    end_frequency: float,
-    *,
-    offset: float = 0.0,
+    t: Array, amplitude: float, start_frequency: float, end_frequency: float, *, offset: float = 0.0
 ) -> Array:
     """Sine whose frequency moves linearly from the first to the last time; it starts at the offset.
 
@@ -119,15 +107,9 @@ def random_steps(
 
 
 def multisine(
-    t: Array,
-    amplitude: float,
-    lower_frequency: float,
-    upper_frequency: float,
-    *,
-    period: float | None = None,
-    odd: bool = False,
-    offset: float = 0.0,
-) -> Array:
+    t: Array, amplitude: float, lower_frequency: float, upper_frequency: float, *, period: float | None = None,
+    odd: bool = False, offset: float = 0.0,
+) -> Array:  # fmt: skip
     """Sum of cosines of one size at all multiples of ``1 / period`` in a band, with Schroeder's phases.
 
     Power lies at these lines alone, evenly. Between them an FFT over whole periods shows noise and what the machine's
@@ -319,7 +301,7 @@ def check_excitation(
         if is_constant(np.concatenate([piece.u[:, j] for piece in trajectories])):
             level = trajectories[0].u[0, j]
             problems.append(
-                f"{names}: the input {one.name} is {level:.10g} throughout; what it does cannot be learned. Add a "
+                f"{names}: the input {one.name} is {level:.10g} throughout; its effect cannot be identified. Add a "
                 "recording in which it moves, or check that the DataSpec names the right column."
             )
     for j in range(trajectories[0].y.shape[1]):

@@ -18,27 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 import nn_export.files
-from hybrid_mpc.data.source import LISTED, Source, megabytes
+from hybrid_mpc.data.source import EMPTY, LARGEST, LISTED, Source, megabytes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_text
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-ENDINGS = (
+ENDINGS = (  # endings that a message lists of a folder's files
     ".csv", ".txt", ".npz", ".mat", ".xlsx", ".parquet", ".feather", ".h5", ".mf4", ".tdms", ".mcap", ".bag", ".ulg"
 )  # fmt: skip
-"""Endings that a message lists of a folder's files."""
-LARGEST = 2**31
-"""Largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day."""
-CHUNK = 2**20
-"""Bytes of a file that are checked at a time [byte]."""
-LONGEST_ROW = 2**20
-"""Longest row of a text file [byte]: ten thousand columns of a hundred characters."""
+CHUNK = 2**20  # bytes of a file that are checked at a time [byte]
+LONGEST_ROW = 2**20  # longest row of a text file [byte]: ten thousand columns of a hundred characters
 
 
-BEGINS = (
+BEGINS = (  # how files of a format begin, and what reads them
     (re.compile(rb"PAR1|ARROW1"), ("sheets", "arrow_source")),
-    (re.compile(rb"\x89HDF\r\n\x1a\n"), ("sheets", "hdf5_source")),
+    (re.compile(rb"\x89HDF\r\n\x1a\n"), ("hdf5", "hdf5_source")),
     (re.compile(rb"MATLAB (5.0|7.3) MAT-file"), ("matlab", "mat_source")),
     (
         re.compile(
@@ -48,19 +43,16 @@ BEGINS = (
         ("loggers", "logger_source"),
     ),
 )
-"""How files of a format begin, and what reads them."""
-ENDS = {
+ENDS = {  # the same by their ending, for formats that do not say what they are
     ".npz": ("vectors", "npz_source"),
     ".mat": ("matlab", "mat_source"),
     ".xlsx": ("sheets", "excel_source"),
     ".xlsm": ("sheets", "excel_source"),
 }
-"""The same by their ending, for formats that do not say what they are."""
-OTHERS = (
+OTHERS = (  # formats that are not read
     (re.compile(rb"\xd0\xcf\x11\xe0"), "an old Excel workbook"),
     (re.compile(rb"PK\x03\x04.{26}mimetypeapplication/vnd\.oasis", re.DOTALL), "an OpenDocument file"),
 )
-"""Formats that are not read."""
 
 
 def opened(path: Path) -> Source:
@@ -77,7 +69,7 @@ def opened(path: Path) -> Source:
     ==================  ==================================================================================
     """
     reader = ENDS.get(path.suffix.lower())
-    content = _content(path, None if reader else _Rows(path))
+    content = _content(path, reader is None)
     if reader is None:
         reader = next((found for begin, found in BEGINS if begin.match(content)), ("text", "text_source"))
     if other := next((what for begin, what in OTHERS if begin.match(content)), ""):
@@ -87,40 +79,24 @@ def opened(path: Path) -> Source:
     return source
 
 
-class _Rows:
-    """Checks piece by piece that rows of text have a bearable length, before any is kept."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._length, self._first, self._text = path, 0, True, True
-
-    def check(self, piece: bytes) -> None:
-        """See the next piece; what is no text has no rows."""
-        if self._first and any(begin.match(piece) for begin, _ in BEGINS):
-            self._text = False
-        self._first = False
-        if not self._text:
-            return
-        parts = piece.replace(b"\r", b"\n").split(b"\n")
-        longest = max(self._length + len(parts[0]), *map(len, parts))
-        self._length = len(parts[-1]) if len(parts) > 1 else longest
-        if longest > LONGEST_ROW:
-            raise InputError(
-                f"{self._path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with the "
-                "columns that are needed."
-            )
-
-
-def _content(path: Path, rows: _Rows | None) -> bytes:
-    """The bytes of a regular file; ``rows`` sees them piece by piece before any is kept.
+def _content(path: Path, is_text: bool) -> bytes:
+    """The bytes of a regular file; rows of text have a bearable length, which is seen before any is kept.
 
     Pipes and devices are refused: nothing says how long they are, and they may never end.
     """
     try:
         with nn_export.files.opened(path, LARGEST) as (file, size):
-            left = size
+            left, longest = size if is_text else 0, 0
             while left > 0 and (piece := file.read(min(CHUNK, left))):
-                if rows is not None:
-                    rows.check(piece)
+                if left == size and any(begin.match(piece) for begin, _ in BEGINS):
+                    break  # what is no text has no rows
+                first, *others = map(len, piece.replace(b"\r", b"\n").split(b"\n"))
+                if max(longest + first, *others, 0) > LONGEST_ROW:
+                    raise InputError(
+                        f"{path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with the "
+                        "columns that are needed."
+                    )
+                longest = others[-1] if others else longest + first
                 left -= len(piece)
             file.seek(0)
             content = file.read(size)
@@ -129,14 +105,15 @@ def _content(path: Path, rows: _Rows | None) -> bytes:
             f"{path}: there is no such file{_beside(path)}. Check the path given with --data."
         ) from None
     except OSError as error:
+        large = error.errno == errno.EFBIG
         remedy = (
             "Split the recording, or leave out columns that are not needed."
-            if error.errno == errno.EFBIG
+            if large
             else "Give a readable file."
         )
         raise InputError(f"{path}: cannot be read ({error.strerror}). {remedy}") from error
     if not content or content.isspace():
-        raise InputError(f"{path}: the file is empty. It needs a header line and rows of numbers.")
+        raise InputError(f"{path}: {EMPTY}")
     return content
 
 
@@ -149,8 +126,7 @@ def _beside(path: Path) -> str:
     return f"; that folder has: {', '.join(near[:LISTED])}" if near else ""
 
 
-MOST_DECIMALS = 17
-"""Most digits after the point that are written: a float has no more."""
+MOST_DECIMALS = 17  # most digits after the point that are written: a float has no more
 
 
 def real_numbers(values: object, name: str) -> Array:
@@ -195,10 +171,7 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
             f"write_csv: decimals from 0 to {MOST_DECIMALS} are needed, got {type(decimals).__name__}"
         )
     path = Path(path)
-    arrays = {
-        name: real_numbers(column, f"write_csv: column {shown(str(name))}")
-        for name, column in columns.items()
-    }
+    arrays = {n: real_numbers(column, f"write_csv: column {shown(str(n))}") for n, column in columns.items()}
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
         raise InputError(f"{path}: columns must be one-dimensional and of one length, got {shapes}")

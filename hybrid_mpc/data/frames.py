@@ -12,17 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.cells import BLANK, Cells, cause, cells_of, is_number, is_stamp
-from hybrid_mpc.data.names import said_by, words_of
-from hybrid_mpc.data.series import Series, clocked
-from hybrid_mpc.data.source import Columns, Source, name_and_unit
+from hybrid_mpc.data.names import name_and_unit, said_by, words_of
+from hybrid_mpc.data.source import Columns, Series, Source, clocked
 from hybrid_mpc.records import shown
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-HEAD = 200
-"""Rows of a column that show what it holds."""
+HEAD = 200  # rows of a column that show what it holds
 TAGS = words_of(
     "tag tagname name variable signal channel sensor sensorid sensorname parameter point pointname kanal messstelle "
     "metric item measurement quantity node device attribute series messgroesse"
@@ -33,14 +31,16 @@ VALUES = words_of("value val values wert messwert reading data valeur valor resu
 MOST_TAGS = 500
 
 
-@dataclass(frozen=True)
+@dataclass
 class Frame:
     """A table: names, how its columns are read, and the numbers of its rows.
 
     ``columns(places)`` gives pandas' columns; ``head`` is the beginning of each, as text. ``text(k, place)`` is a cell
-    as the file has it. ``fault(place, values)`` says what else is wrong with a column.
+    as the file has it. ``fault(place, values)`` says what else is wrong with a column. ``places`` are those of the
+    columns of its source by name, two of a date and a time of day; each is read once.
     """
 
+    path: Path
     names: tuple[str, ...]
     columns: Callable[[Sequence[int]], list[pd.Series]]
     head: Sequence[pd.Series]
@@ -50,60 +50,112 @@ class Frame:
     decimal: str = "."
     notes: tuple[str, ...] = ()
     clock: tuple[float, float] | None = None
-
-
-@dataclass
-class _Reader:
-    """Columns of a frame by their names as :class:`Source` gives them; each is read once."""
-
-    path: Path
-    frame: Frame
     places: dict[str, tuple[int, ...]] = field(default_factory=dict)
     done: dict[str, Cells] = field(default_factory=dict)
 
-    def cells(self, names: Sequence[str]) -> list[Cells]:
-        """The columns of these names."""
-        missing = [name for name in dict.fromkeys(names) if name not in self.done]
-        places = list(dict.fromkeys(place for name in missing for place in self.places[name]))
-        read = dict(zip(places, self.frame.columns(places), strict=True)) if places else {}
-        for name in missing:
-            columns = [read[place] for place in self.places[name]]
-            cells = cells_of(_joined(columns), self.frame.decimal)
-            if self.frame.clock is not None and self.places[name] == (0,):
-                start, step = self.frame.clock
-                cells = cells._replace(values=start + step * cells.values)
-            self.done[name] = cells
-        return [self.done[name] for name in names]
+    def source(self, sha256: str) -> Source:
+        """The table as a source: dates are seconds, in long form every tag is a column."""
+        notes, header = list(self.notes), list[str]()
+        heads = [cells_of(head, self.decimal) if len(head) else None for head in self.head]
+        dates, clocks = ([_holds(head, date) for head in self.head] for date in (True, False))
+        taken: set[int] = set()
+        for j, name in enumerate(self.names):
+            near = [k for k in (j - 1, j + 1) if 0 <= k < len(dates) and dates[k] and k not in taken]
+            date = near[0] if clocks[j] and near else None
+            if date is not None:
+                taken.add(date)
+                notes.append(f"columns {shown(self.names[date])} and {shown(name)} are one time")
+                if (gone := _in_seconds(self.names[date])) in header:
+                    header.remove(gone)
+            elif j in taken:
+                continue
+            head = heads[j]
+            full = _in_seconds(name) if dates[j] or clocks[j] else name
+            if head is not None and head.unit not in ("", "s") and not name_and_unit(name)[1]:
+                full = f"{name} [{head.unit}]"
+            header.append(full)
+            self.places[full] = (j,) if date is None else (date, j)
+            if head is not None and head.done:
+                notes.append(f"column {shown(full)}: {head.done}")
+        source = Source(self.path, sha256, tuple(header), self.read, notes=tuple(notes))
+        return self.in_long_form(source) or source
 
     def read(self, time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
         """As :class:`Source` says."""
-        names = [*([] if time is None else [time]), *wanted]
-        cells = self.cells(names)
-        faults = {}
-        for name, one in zip(names, cells, strict=True):
-            if fault := self._fault(name, one, name in blanks):
+        names, faults = [*([] if time is None else [time]), *wanted], {}
+        missing = [name for name in dict.fromkeys(names) if name not in self.done]
+        places = list(dict.fromkeys(place for name in missing for place in self.places[name]))
+        read = dict(zip(places, self.columns(places), strict=True)) if places else {}
+        for name in missing:
+            cells = cells_of(_joined([read[place] for place in self.places[name]]), self.decimal)
+            if self.clock is not None and self.places[name] == (0,):
+                cells = cells._replace(values=self.clock[0] + self.clock[1] * cells.values)
+            self.done[name] = cells
+        for name in names:
+            if fault := self.fault_of(name, self.done[name], name in blanks):
                 faults[name] = fault
-        values = (
-            np.column_stack([one.values for one in cells])
-            if cells
-            else np.zeros((len(self.frame.numbers), 0))
-        )
-        return Columns(np.where(np.isfinite(values), values, np.nan), "row", self.frame.numbers, faults)
+        values = [self.done[name].values for name in names]
+        table = np.column_stack([np.zeros((len(self.numbers), 0)), *values])
+        return Columns(np.where(np.isfinite(table), table, np.nan), "row", self.numbers, faults)
 
-    def _fault(self, name: str, one: Cells, may_be_blank: bool) -> str:
+    def fault_of(self, name: str, one: Cells, may_be_blank: bool) -> str:
+        """What is wrong with a column's cells; empty if nothing is."""
         if one.fault:
             return f"column {shown(name)}: {one.fault}."
         bad = np.flatnonzero(~np.isfinite(one.values) & ~(one.blank & may_be_blank))
         place = self.places[name][-1]
         if not len(bad):
-            found = self.frame.fault(place, one.values)
-            return found and f"{found.replace('COLUMN', f'column {shown(name)}')}"
-        cell = self.frame.text(int(bad[0]), place)
+            return self.fault(place, one.values).replace("COLUMN", f"column {shown(name)}")
+        cell = self.text(int(bad[0]), place)
         such = f" ({len(bad)} such rows)" if len(bad) > 1 else ""
         what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
         why = cause(cell)
         remedy = f": {why}." if why else ". Delete the row (longer gaps are cut out) or repair the value."
-        return f"row {self.frame.numbers[int(bad[0])]}, column {shown(name)} {what}{such}{remedy}"
+        return f"row {self.numbers[int(bad[0])]}, column {shown(name)} {what}{such}{remedy}"
+
+    def in_long_form(self, source: Source) -> Source | None:
+        """The source where each row names what it measured; None where rows do not."""
+        header = source.header
+        small = {name: re.sub(r"[\W_]", "", name_and_unit(name)[0].casefold()) for name in header}
+        tags = [name for name in header if small[name] in TAGS]
+        times = [name for name in header if said_by(name).kind == "time" and name not in tags]
+        if len(tags) != 1 or not times or len(self.numbers) == 0:
+            return None
+
+        def texts(name: str) -> pd.Series:
+            return self.columns([self.places[name][0]])[0].astype(str).str.strip()
+
+        said = texts(tags[0])
+        several = list(dict.fromkeys(said))
+        if all(map(is_number, several)) and not small[tags[0]].endswith("id"):
+            return None
+        others = [name for name in header if name not in (tags[0], *times) and self.is_measured(name)]
+        values = [name for name in header if small[name] in VALUES] or others
+        if not 1 < len(several) <= min(MOST_TAGS, len(said) // 2) or not values:
+            return None
+        time = self.read(None, [times[0]], ())
+        if time.faults:
+            return None
+        units = [name for name in header if small[name] in ("unit", "units", "einheit")]
+        written = texts(units[0]) if units and len(values) == 1 else None
+        found = []
+        for tag in several:
+            rows = np.flatnonzero(said == tag)
+            for value in values:
+                one = self.read(None, [value], [value])
+                name = tag if len(values) == 1 else f"{tag}.{value}"
+                if written is not None and written.iloc[rows[0]] not in ("", "-"):
+                    name = f"{tag} [{written.iloc[rows[0]]}]"
+                at, x = time.values[rows, 0], one.values[rows, 0]
+                order = np.argsort(at, kind="stable")
+                found.append(Series(name, at[order], x[order], one.faults.get(value, "")))
+        note = f"long form: {len(several)} signals by column {shown(tags[0])}"
+        return replace(clocked(source.path, source.sha256, found, times[0]), notes=(*source.notes, note))
+
+    def is_measured(self, name: str) -> bool:
+        """Whether a column begins with a number."""
+        head = self.head[self.places[name][0]]
+        return len(head) > 0 and bool(np.isfinite(cells_of(head).values).any())
 
 
 def _joined(columns: Sequence[pd.Series]) -> pd.Series:
@@ -114,40 +166,9 @@ def _joined(columns: Sequence[pd.Series]) -> pd.Series:
     return date.str.replace(r" 00:00:00$", "", regex=True) + " " + time
 
 
-def frame_source(path: Path, sha256: str, frame: Frame) -> Source:
-    """A table as a source: dates are seconds, in long form every tag is a column."""
-    reader, header, notes = _Reader(path, frame), list[str](), list(frame.notes)
-    heads = [cells_of(head, frame.decimal) if len(head) else None for head in frame.head]
-    dates = [_holds(head, date=True) for head in frame.head]
-    clocks = [_holds(head, date=False) for head in frame.head]
-    taken: set[int] = set()
-    for j, name in enumerate(frame.names):
-        places: tuple[int, ...] = (j,)
-        near = [k for k in (j - 1, j + 1) if 0 <= k < len(dates) and dates[k] and k not in taken]
-        date = near[0] if clocks[j] and near else None
-        if date is not None:
-            places = (date, j)
-            taken.add(date)
-            notes.append(f"columns {shown(frame.names[date])} and {shown(name)} are one time")
-            if (gone := _renamed(frame.names[date], "s")) in header:
-                header.remove(gone)
-        elif j in taken:
-            continue
-        head = heads[j]
-        full = _renamed(name, "s") if dates[j] or clocks[j] else name
-        if head is not None and head.unit not in ("", "s") and not name_and_unit(name)[1]:
-            full = f"{name} [{head.unit}]"
-        header.append(full)
-        reader.places[full] = places
-        if head is not None and head.done:
-            notes.append(f"column {shown(full)}: {head.done}")
-    source = Source(path, sha256, tuple(header), reader.read, notes=tuple(notes))
-    return _in_long_form(source, frame, reader) or source
-
-
-def _renamed(name: str, unit: str) -> str:
-    """A column's name with this unit in place of its own."""
-    return f"{name_and_unit(name)[0]} [{unit}]"
+def _in_seconds(name: str) -> str:
+    """A column's name with seconds in place of its own unit."""
+    return f"{name_and_unit(name)[0]} [s]"
 
 
 def _holds(head: pd.Series, date: bool) -> bool:
@@ -163,48 +184,3 @@ def _holds(head: pd.Series, date: bool) -> bool:
 def is_blank(cell: object) -> bool:
     """Whether a cell of any kind says that there is no value."""
     return cell is None or str(cell).strip().casefold() in (*BLANK, "nat", "<na>")
-
-
-def _in_long_form(source: Source, frame: Frame, reader: _Reader) -> Source | None:
-    """The same where each row names what it measured; None where rows do not."""
-    small = {name: re.sub(r"[\W_]", "", name_and_unit(name)[0].casefold()) for name in source.header}
-    tags = [name for name in source.header if small[name] in TAGS]
-    times = [name for name in source.header if said_by(name).kind == "time" and name not in tags]
-    if len(tags) != 1 or not times or len(frame.numbers) == 0:
-        return None
-    (place,) = reader.places[tags[0]]
-    said = frame.columns([place])[0].astype(str).str.strip()
-    units = next(
-        (reader.places[n][0] for n in source.header if small[n] in ("unit", "units", "einheit")), None
-    )
-    several = list(dict.fromkeys(said))
-    if all(map(is_number, several)) and not small[tags[0]].endswith("id"):
-        return None
-    values = [n for n in source.header if small[n] in VALUES] or [
-        n
-        for n in source.header
-        if n not in (tags[0], *times) and _is_measured(frame.head[reader.places[n][0]])
-    ]
-    if not 1 < len(several) <= min(MOST_TAGS, len(said) // 2) or not values:
-        return None
-    time = reader.read(None, [times[0]], ())
-    if time.faults:
-        return None
-    written = frame.columns([units])[0].astype(str).str.strip() if units is not None else None
-    found = []
-    for tag in several:
-        rows = np.flatnonzero(said == tag)
-        for value in values:
-            one = reader.read(None, [value], [value])
-            name = tag if len(values) == 1 else f"{tag}.{value}"
-            if written is not None and len(values) == 1 and written.iloc[rows[0]] not in ("", "-"):
-                name = f"{tag} [{written.iloc[rows[0]]}]"
-            at, x = time.values[rows, 0], one.values[rows, 0]
-            order = np.argsort(at, kind="stable")
-            found.append(Series(name, at[order], x[order], one.faults.get(value, "")))
-    note = f"long form: {len(several)} signals by column {shown(tags[0])}"
-    return replace(clocked(source.path, source.sha256, found, times[0]), notes=(*source.notes, note))
-
-
-def _is_measured(head: pd.Series) -> bool:
-    return bool(len(head)) and bool(np.isfinite(cells_of(head).values).any())

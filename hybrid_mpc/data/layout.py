@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from hybrid_mpc.data.cells import BLANK, is_number, is_stamp, is_unit, is_value
-from hybrid_mpc.data.names import said_by
-from hybrid_mpc.data.source import name_and_unit
+from hybrid_mpc.data.names import name_and_unit, said_by
 from hybrid_mpc.machine.units import Conversion, conversion
 from hybrid_mpc.records import shown
 
-MOST_SEEN = 1000
-"""Rows at the beginning of a file that show where its table begins."""
-STEADY = 3
-"""Fewest rows that show a table."""
+MOST_SEEN = 1000  # rows at the beginning of a file that show where its table begins
+STEADY = 3  # fewest rows that show a table
 COMMENTS = ("#", "%", "//", ";;")
 """How comments begin."""
 
@@ -238,9 +235,6 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | str:
     for name, cell in zip(names, [*units, *[""] * (len(names) - len(units))], strict=True):
         unit, said = cell.strip("[]()").strip(), name_and_unit(name)[1]
         if said and unit and conversion(said, unit) != Conversion(1.0):
-            return (
-                f"column {shown(name)} is {shown(unit)}, and the header has {shown(said)}. Delete one of the two; "
-                "which is right, nobody here knows."
-            )
+            return f"column {shown(name)} is {shown(unit)}, and the header has {shown(said)}. Delete the wrong one."
         found.append(f"{name} [{unit}]" if unit not in ("", "-") and not said and name else name)
     return found

@@ -9,7 +9,7 @@ import io
 import json
 import sqlite3
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -19,19 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.names import said_by
-from hybrid_mpc.data.series import Series, clocked
-from hybrid_mpc.data.source import LISTED, Source, line_of
-from hybrid_mpc.data.vectors import LARGEST, vector_source
+from hybrid_mpc.data.source import LARGEST, LISTED, Series, Source, clocked, line_of
+from hybrid_mpc.data.vectors import vector_source
 from hybrid_mpc.errors import InputError, MissingPackage, named_extra
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-MOST_FIELDS = 64
-"""Longest array in a message whose elements are signals."""
+MOST_FIELDS = 64  # longest array in a message whose elements are signals
 NUMBERS = {"2": (0, 1, 2, 6, 7, 8, 9, 65535), "3": (0, 1, 2, 6, 7, 8, 9, 65535), "4": (0, 1, 2, 4, 5, 6)}
 """Conversions of a channel's raw numbers into numbers, by the version of an MDF file; tables of texts are not used."""
-FORMULAS = {"2": 10, "3": 10, "4": 3}
-"""The conversion that is a formula as text."""
+FORMULAS = {"2": 10, "3": 10, "4": 3}  # the conversion that is a formula as text
 
 
 def logger_source(path: Path, content: bytes, sha256: str) -> Source:
@@ -156,34 +153,40 @@ def _seconds(stamps: NDArray[Any], name: str) -> Array:
 # Messages: ROS, MCAP, PX4, CAN
 
 
-class _Topics:
-    """Numbers of messages, by topic and field, with the stamps [ns] of the messages."""
+def _of_messages(path: Path, sha256: str, messages: Iterable[tuple[str, str, Any, int, bytes]]) -> Source:
+    """Numbers of messages by topic and field; of each message its topic, encoding, schema, stamp [ns] and bytes."""
+    from mcap_ros1.decoder import DecoderFactory as First
+    from mcap_ros2.decoder import DecoderFactory as Second
 
-    def __init__(self) -> None:
-        self._fields: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-        self._stamps: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
-        self._left = LARGEST // 64
-
-    def add(self, topic: str, stamp: int, message: Any) -> None:
-        """See a message."""
-        for field, value in _fields_of(message, ""):
-            self._left -= 1
-            if self._left < 0:
+    factories, unread, left = (First(), Second()), set[str](), LARGEST // 64
+    decoders: dict[tuple[str, str], Callable[[bytes], Any] | None] = {}
+    numbers: dict[str, dict[str, tuple[list[int], list[float]]]] = {}
+    for topic, encoding, schema, stamp, data in messages:
+        key = encoding, schema.name if schema else ""
+        if key not in decoders:
+            made = [factory.decoder_for(encoding, schema) for factory in factories] if schema else []
+            found = next((one for one in made if one is not None), None)
+            decoders[key] = json.loads if encoding == "json" else found
+        decode = decoders[key]
+        if decode is None:
+            unread.add(topic)
+            continue
+        fields = numbers.setdefault(topic, {})
+        for field, value in _fields_of(decode(data), ""):
+            left -= 1
+            if left < 0:
                 raise InputError("it holds more numbers than are read. Split the recording")
-            self._fields[topic][field].append(value)
-            self._stamps[topic][field].append(stamp)
-
-    def source(self, path: Path, sha256: str, unread: Sequence[str]) -> Source:
-        """What was seen."""
-        stamps = [s for fields in self._stamps.values() for one in fields.values() for s in one[:1]]
-        begin = min(stamps, default=0)
-        found = []
-        for topic, fields in self._fields.items():
-            for field, values in fields.items():
-                t = (np.array(self._stamps[topic][field], dtype=np.int64) - begin) / 1e9
-                order = np.argsort(t, kind="stable")
-                found.append((topic, f"{topic}.{field}", "", t[order], np.array(values)[order]))
-        return _source(path, sha256, found, sorted(set(unread)), "times as recorded, since the first message")
+            stamps, values = fields.setdefault(field, ([], []))
+            stamps.append(stamp)
+            values.append(value)
+    begin = min((stamps[0] for fields in numbers.values() for stamps, _ in fields.values()), default=0)
+    signals = []
+    for topic, fields in numbers.items():
+        for field, (stamps, values) in fields.items():
+            t = (np.array(stamps, dtype=np.int64) - begin) / 1e9
+            order = np.argsort(t, kind="stable")
+            signals.append((topic, f"{topic}.{field}", "", t[order], np.array(values)[order]))
+    return _source(path, sha256, signals, sorted(unread), "times as recorded, since the first message")
 
 
 def _fields_of(value: Any, name: str) -> Iterator[tuple[str, float]]:
@@ -206,52 +209,23 @@ def _fields_of(value: Any, name: str) -> Iterator[tuple[str, float]]:
 def _mcap(path: Path, content: bytes, sha256: str) -> Source:
     from mcap.reader import make_reader
 
-    topics, decoders, unread = _Topics(), _Decoders(), list[str]()
-    for schema, channel, message in make_reader(io.BytesIO(content), validate_crcs=True).iter_messages():
-        if channel.message_encoding == "json":
-            topics.add(channel.topic, message.log_time, json.loads(message.data))
-        elif schema is not None and (decode := decoders.of(channel.message_encoding, schema)):
-            topics.add(channel.topic, message.log_time, decode(message.data))
-        else:
-            unread.append(channel.topic)
-    return topics.source(path, sha256, unread)
-
-
-class _Decoders:
-    """What decodes messages of a type; made once a type."""
-
-    def __init__(self) -> None:
-        from mcap_ros1.decoder import DecoderFactory as First
-        from mcap_ros2.decoder import DecoderFactory as Second
-
-        self._factories, self._known = (First(), Second()), dict[tuple[str, str], Any]()
-
-    def of(self, encoding: str, schema: Any) -> Any:
-        """A function of a message's bytes; None where there is none."""
-        key = encoding, schema.name
-        if key not in self._known:
-            made = (factory.decoder_for(encoding, schema) for factory in self._factories)
-            self._known[key] = next((one for one in made if one is not None), None)
-        return self._known[key]
+    read = make_reader(io.BytesIO(content), validate_crcs=True).iter_messages()
+    return _of_messages(
+        path, sha256, ((c.topic, c.message_encoding, schema, m.log_time, m.data) for schema, c, m in read)
+    )
 
 
 def _bag(path: Path, content: bytes, sha256: str) -> Source:
     from mcap.records import Schema
     from rosbags.rosbag1 import Reader
 
-    topics, decoders, unread = _Topics(), _Decoders(), list[str]()
     with Reader(path) as reader:
         schemas = {
             one.id: Schema(one.id, one.msgdef.data.encode(), "ros1msg", one.msgtype.replace("/msg/", "/"))
             for one in reader.connections
         }
-        for connection, stamp, data in reader.messages():
-            decode = decoders.of("ros1", schemas[connection.id])
-            if decode is None:
-                unread.append(connection.topic)
-            else:
-                topics.add(connection.topic, stamp, decode(data))
-    return topics.source(path, sha256, unread)
+        messages = ((c.topic, "ros1", schemas[c.id], stamp, data) for c, stamp, data in reader.messages())
+        return _of_messages(path, sha256, messages)
 
 
 def _db3(path: Path, content: bytes, sha256: str) -> Source:
@@ -259,29 +233,18 @@ def _db3(path: Path, content: bytes, sha256: str) -> Source:
     from mcap.records import Schema
     from rosbags.typesys import Stores, get_typestore
 
-    topics, decoders, unread = _Topics(), _Decoders(), list[str]()
     with closing(sqlite3.connect(":memory:")) as base:
         base.deserialize(content)
         tables = {name for (name,) in base.execute("select name from sqlite_master where type = 'table'")}
-        own = (
-            dict(base.execute("select topic_type, encoded_message_definition from message_definitions"))
-            if ("message_definitions" in tables)
-            else {}
-        )
-        store, schemas = get_typestore(Stores.LATEST), {}
+        own, store, topics = dict[str, str](), get_typestore(Stores.LATEST), dict[int, tuple[str, Any]]()
+        if "message_definitions" in tables:
+            own = dict(base.execute("select topic_type, encoded_message_definition from message_definitions"))
         for key, name, kind in base.execute("select id, name, type from topics"):
             text = own.get(kind) or (store.generate_msgdef(kind)[0] if kind in store.types else "")
-            schemas[key] = name, text and Schema(id=key, name=kind, encoding="ros2msg", data=text.encode())
-        for key, stamp, data in base.execute(
-            "select topic_id, timestamp, data from messages order by timestamp"
-        ):
-            name, schema = schemas[key]
-            decode = decoders.of("cdr", schema) if schema else None
-            if decode is None:
-                unread.append(name)
-            else:
-                topics.add(name, stamp, decode(data))
-    return topics.source(path, sha256, unread)
+            topics[key] = name, text and Schema(id=key, name=kind, encoding="ros2msg", data=text.encode())
+        rows = base.execute("select topic_id, timestamp, data from messages order by timestamp")
+        messages = ((topics[key][0], "cdr", topics[key][1], stamp, data) for key, stamp, data in rows)
+        return _of_messages(path, sha256, messages)
 
 
 def _ulog(path: Path, content: bytes, sha256: str) -> Source:
@@ -312,8 +275,8 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     if len(own) != 1:
         there = f"; that folder has {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
         raise InputError(
-            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Without it nobody "
-            "knows what its bytes mean."
+            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Its bytes "
+            "have no meaning without it."
         )
     base = cantools.database.load_string(own[0].read_text(encoding="cp1252"), "dbc", strict=False)
     known = {message.frame_id: message for message in base.messages}
@@ -322,25 +285,24 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     )  # fmt: skip
     kind = next(one for begin, one in kinds if content.startswith(begin))
     file = io.BytesIO(content) if kind is can.BLFReader else io.StringIO(content.decode("cp1252"))
-    stamps: dict[tuple[str, str], list[float]] = defaultdict(list)
-    values: dict[tuple[str, str], list[float]] = defaultdict(list)
-    unread: Counter[str] = Counter()
+    numbers: dict[tuple[str, str], tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
+    unread = dict[str, None]()
     for frame in kind(file):
         message = known.get(frame.arbitration_id)
         if message is None or frame.is_error_frame or frame.is_remote_frame:
-            unread[f"0x{frame.arbitration_id:x}"] += 1
+            unread[f"0x{frame.arbitration_id:x}"] = None
             continue
         for name, value in message.decode(bytes(frame.data), decode_choices=False).items():
-            stamps[message.name, name].append(frame.timestamp)
-            values[message.name, name].append(float(value))
-    begin = min((one[0] for one in stamps.values()), default=0.0)
+            stamps, values = numbers[message.name, name]
+            stamps.append(frame.timestamp)
+            values.append(float(value))
+    begin = min((stamps[0] for stamps, _ in numbers.values()), default=0.0)
     units = {(m.name, s.name): s.unit or "" for m in base.messages for s in m.signals}
-    found = [(m, s, units[m, s], np.array(stamps[m, s]) - begin, np.array(values[m, s])) for m, s in stamps]
+    found = [(*key, units[key], np.array(one) - begin, np.array(two)) for key, (one, two) in numbers.items()]
     return _source(path, sha256, found, list(unread), f"messages decoded by {own[0].name}")
 
 
-_READERS = (
+_READERS = (  # how files begin, what reads them, and what they are; all others are CAN logs
     (b"MDF     ", _mdf, "MDF file"), (b"TDSm", _tdms, "TDMS file"), (b"\x89MCAP0", _mcap, "MCAP file"),
     (b"#ROSBAG", _bag, "ROS bag"), (b"SQLite", _db3, "ROS 2 bag"), (b"ULog", _ulog, "PX4 log"),
 )  # fmt: skip
-"""How files begin, what reads them, and what they are; all others are CAN logs."""

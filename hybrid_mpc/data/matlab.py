@@ -1,11 +1,20 @@
-"""MATLAB's files, v4 to v7.3, as named vectors: fields of structs, columns of matrices."""
+"""MATLAB's files, v4 to v7, as named vectors: fields of structs, columns of matrices; v7.3 is :mod:`.hdf5`.
+
+They are read here, every length checked, since ``scipy.io.loadmat`` trusts what a file declares and crashes the process
+where that is wrong.
+
+Source: MathWorks, *MAT-File Format*, chapter 1 (level 5): an element is a tag of 8 bytes (type, number of bytes) and
+its data, padded to 8 bytes; up to 4 bytes of data stand in the tag itself. Chapter 2 (level 4): a variable is a header
+of 20 bytes, its name and its numbers.
+"""
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
-from collections.abc import Callable, Iterator
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,202 +22,248 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.mat_structure import check_structure, version
-from hybrid_mpc.data.source import LISTED, Source, line_of
-from hybrid_mpc.data.vectors import budget_of, vector_source
-from hybrid_mpc.errors import InputError, named_extra
-from hybrid_mpc.records import shown
+from hybrid_mpc.data.source import Source, line_of
+from hybrid_mpc.data.vectors import MOST_STRUCTS, OBJECTS, Leaf, budget_of, leaf_source
+from hybrid_mpc.errors import InputError
 
-MOST_WIDE = 64
-"""Most columns of a matrix that are read as columns."""
-MOST_STRUCTS = 100
-"""Most elements of an array of structs that are read."""
-DEEPEST = 8
-"""Deepest structs in structs that are read."""
-OBJECTS = "objects"
-CONVERT = {
-    "timeseries": "t = {0}.Time; y = {0}.Data; save('{1}', 't', 'y', '-v7')",
-    "timetable": "t = seconds({0}.Properties.RowTimes - {0}.Properties.RowTimes(1)); "
-    "s = table2struct(timetable2table({0}, 'ConvertRowTimes', false), 'ToScalar', true); save('{1}', 't', 's', '-v7')",
-    "table": "s = table2struct({0}, 'ToScalar', true); save('{1}', 's', '-v7')",
-    "iddata": "t = {0}.SamplingInstants; u = {0}.InputData; y = {0}.OutputData; save('{1}', 't', 'u', 'y', '-v7')",
-    "Simulink.SimulationData.Dataset": "x = {0}.getElement(1).Values; t = x.Time; y = x.Data; "
-    "save('{1}', 't', 'y', '-v7')",
-    "datetime": "t = seconds({0} - {0}(1)); save('{1}', 't', '-v7', '-append')",
-    "duration": "t = seconds({0}); save('{1}', 't', '-v7', '-append')",
-}
-"""The line of MATLAB that makes vectors of an object, by its class."""
-
-
-class Leaf(NamedTuple):
-    """A variable or a field: its shape, and how its numbers are read; ``what`` it is where it is not read."""
-
-    name: str
-    shape: tuple[int, ...] = ()
-    read: Callable[[], NDArray[Any]] = lambda: np.zeros(0)
-    what: str = ""
-    kind: str = ""
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+"""Types of elements that hold numbers, as numpy names them."""
+TEXT = (16, 17, 18)
+MATRIX, COMPRESSED = 14, 15
+CELL, STRUCT, OBJECT, CHAR, SPARSE, FUNCTION, OPAQUE = 1, 2, 3, 4, 5, 16, 17
+NUMERIC = range(6, 16)  # classes of arrays: double, single, int8 to uint64
+COMPLEX = 0x08
+DEEPEST = 32  # deepest structs and cells in each other; a recording has a few
+ELEMENTS = 200_000  # most elements of a file, four and more a variable, cell or field: some seconds of work
+LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
 
 
 def mat_source(path: Path, content: bytes, sha256: str) -> Source:
     """A ``.mat`` file as a source."""
-    leaves = _leaves_73(path, content) if version(content) == "7.3" else _leaves(path, content)
-    vectors: dict[str, Callable[[], NDArray[Any]]] = {}
-    unread: dict[str, list[str]] = {}
-    lines: list[str] = []
-    for leaf in leaves:
-        if leaf.what:
-            unread.setdefault(leaf.what, []).append(leaf.name)
-            if leaf.kind in CONVERT:
-                lines.append(CONVERT[leaf.kind].format(leaf.name, f"{path.stem}_vectors.mat"))
-        else:
-            vectors |= dict(columns_of_leaf(leaf))
-    told = [f"{what} ({', '.join(map(shown, names[:LISTED]))})" for what, names in sorted(unread.items())]
-    note = f" Not read are {' and '.join(told)}." if told else ""
-    note += f" In MATLAB: {lines[0]}" if lines else " Save their vectors as variables." if told else ""
-    lost = tuple(name for names in unread.values() for name in names)
-    return vector_source(
-        path,
-        sha256,
-        budget_of(len(content)),
-        tuple(vectors),
-        lambda name: vectors[name](),
-        "row",
-        1,
-        note,
-        lost,
-    )
+    if version(content) == "7.3":
+        from hybrid_mpc.data.hdf5 import hdf5_source
 
-
-def columns_of_leaf(leaf: Leaf) -> Iterator[tuple[str, Callable[[], NDArray[Any]]]]:
-    """A vector; or the columns of a matrix, rows where these are longer."""
-    long = [size for size in leaf.shape if size != 1]
-    if len(leaf.shape) != 2 or len(long) < 2 or min(long) > MOST_WIDE or 0 in long:
-        yield leaf.name, leaf.read
-        return
-    upright = leaf.shape[0] >= leaf.shape[1]
-    for k in range(min(long)):
-        where = f"(:,{k + 1})" if upright else f"({k + 1},:)"
-        yield f"{leaf.name}{where}", partial(_taken, leaf.read, k, int(upright))
-
-
-def _taken(read: Callable[[], NDArray[Any]], k: int, axis: int) -> NDArray[Any]:
-    return read().take(k, axis)
-
-
-# v4 to v7
-
-
-def _leaves(path: Path, content: bytes) -> list[Leaf]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatlabOpaque, MatReadWarning
-
+        return hdf5_source(path, content, sha256)
     try:
-        objects = check_structure(content, budget_of(len(content)))
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", MatReadWarning)  # two variables of one name, for one
-            # scipy gives all objects this name; they are named by the file's structure
-            warnings.filterwarnings("ignore", 'Duplicate variable name "None"', MatReadWarning)
-            variables = loadmat(io.BytesIO(content), struct_as_record=True)
-    except Exception as error:  # a damaged file raises nearly anything
+        leaves = leaves_of(content, budget_of(len(content)))
+    except ValueError as error:
         raise InputError(
             f"{path}: is no .mat file, damaged or too large ({line_of(error)}). Save it again in MATLAB with "
             f"save('{path.name}', ..., '-v7'), large vectors with '-v6'."
         ) from error
-    found = [Leaf(name, what=f"{OBJECTS} of class {kind or 'unknown'}", kind=kind) for name, kind in objects]
-    for name, value in variables.items():
-        if not name.startswith("__") and not isinstance(value, MatlabOpaque):
-            found += _walked(name, value, 0)
+    return leaf_source(path, content, sha256, leaves)
+
+
+def version(content: bytes) -> str:
+    """``"7.3"`` (HDF5), ``"5"`` (what -v6 and -v7 write) or ``"4"`` (anything else)."""
+    if content[:8] == b"\x89HDF\r\n\x1a\n" or content[512:520] == b"\x89HDF\r\n\x1a\n":
+        return "7.3"
+    mark = content[126:128]
+    if len(content) < 128 or mark not in (b"IM", b"MI") or not all(content[:4]):
+        return "4"
+    return "7.3" if content[125 if mark == b"IM" else 124] == 2 else "5"
+
+
+def leaves_of(content: bytes, budget: int) -> list[Leaf]:
+    """Vectors, matrices and what is not read of a file of level 4 or 5.
+
+    ``budget`` is the most bytes of numbers that the file may hold, each counted as 8 of them.
+
+    Raises:
+        ValueError: If there are more, or an element is damaged.
+    """
+    file = _File(content, budget)
+    found = list(file.level_4() if version(content) == "4" else file.level_5())
+    if twice := next((name for name, count in Counter(file.names).items() if count > 1), None):
+        raise ValueError(f"two variables have the name {twice!r}")
     return found
 
 
-def _walked(name: str, value: Any, depth: int) -> Iterator[Leaf]:
-    from scipy.io.matlab import MatlabObject, MatlabOpaque
+class _Element(NamedTuple):
+    """Type, and where its data begin and end."""
 
-    if isinstance(value, MatlabOpaque) or (isinstance(value, MatlabObject) and value.dtype.names is None):
-        kind = getattr(value, "classname", "unknown")
-        yield Leaf(name, what=f"{OBJECTS} of class {kind}", kind=kind)
-    elif not isinstance(value, np.ndarray):
-        yield Leaf(name, what="sparse matrices")
-    elif value.size > MOST_STRUCTS and value.dtype.kind in "VO":
-        yield Leaf(name, what="arrays of structs" if value.dtype.names else "cells")
-    elif depth > DEEPEST:
-        yield Leaf(name, what="structs in structs")
-    elif value.dtype.kind == "O":
-        for k, one in enumerate(value.ravel(), 1):
-            yield from _walked(f"{name}{{{k}}}" if value.size > 1 else name, one, depth + 1)
-    elif value.dtype.names is None:
-        yield Leaf(name, value.shape, lambda: value)
-    else:
-        for k, one in enumerate(value.ravel(), 1):
-            where = f"{name}({k})" if value.size > 1 else name
-            for field in value.dtype.names:
-                yield from _walked(f"{where}.{field}", one[field], depth + 1)
+    kind: int
+    begin: int
+    end: int
+
+    @property
+    def size(self) -> int:
+        return self.end - self.begin
 
 
-# v7.3
+class _File:
+    """A file, what it may still hold, ``size`` bytes of numbers and ``count`` elements, and its variables' names."""
 
+    def __init__(self, content: bytes, budget: int) -> None:
+        self.content, self.budget = content, budget
+        self.size, self.count, self.order, self.names = budget, ELEMENTS, "<", list[str]()
 
-def _leaves_73(path: Path, content: bytes) -> list[Leaf]:
-    with named_extra("reading .mat files of version 7.3"):
-        import h5py
-    try:
-        file = h5py.File(io.BytesIO(content), "r")
-        return [
-            leaf
-            for name in file
-            if not name.startswith("#")
-            for leaf in _walked_73(file, name, file[name], 0)
-        ]
-    except Exception as error:  # a damaged file raises nearly anything
-        raise InputError(
-            f"{path}: is no .mat file or damaged ({line_of(error)}). Save it again in MATLAB with "
-            f"save('{path.name}', ..., '-v7')."
-        ) from error
+    def take(self, size: int = 0, count: int = 0) -> None:
+        """Use some of it up."""
+        self.size, self.count = self.size - size, self.count - count
+        if self.count < 0:
+            raise ValueError(f"it has more than {ELEMENTS} elements")
+        if self.size < 0:
+            raise ValueError(f"it declares more than {self.budget / 1e6:.4g} MB of numbers")
 
-
-def _walked_73(file: Any, name: str, item: Any, depth: int) -> Iterator[Leaf]:
-    import h5py
-
-    kind = _class(item)
-    if item.attrs.get("MATLAB_object_decode", 0) or kind in CONVERT:
-        yield Leaf(name, what=f"{OBJECTS} of class {kind}", kind=kind)
-    elif isinstance(item, h5py.Group):
-        if "MATLAB_sparse" in item.attrs or depth > DEEPEST:
-            yield Leaf(name, what="sparse matrices" if depth <= DEEPEST else "structs in structs")
-            return
-        for field in item:
-            inner = item[field]
-            if isinstance(inner, h5py.Dataset) and inner.dtype == h5py.ref_dtype and not _class(inner):
-                if inner.size > MOST_STRUCTS:
-                    yield Leaf(f"{name}.{field}", what="arrays of structs")
-                    continue
-                for k, one in enumerate(inner[()].ravel(), 1):
-                    yield from _walked_73(file, f"{name}({k}).{field}", file[one], depth + 1)
+    def level_4(self) -> Iterator[Leaf]:
+        """All variables."""
+        content, begin = self.content, 0
+        order = "<" if len(content) < 4 or 0 <= struct.unpack_from("<i", content)[0] <= 5000 else ">"
+        while begin < len(content):
+            if len(content) - begin < 20:
+                raise ValueError("a variable is cut off")
+            kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", content, begin)
+            number, matrix = kind // 10 % 10, kind % 10
+            if not 0 <= kind <= 5000 or kind // 100 % 10 or number >= len(LEVEL_4) or matrix > 2:
+                raise ValueError("a variable of an unknown type")
+            if min(rows, columns) < 0 or length < 1:
+                raise ValueError("a variable without its dimensions or its name")
+            self.take(8 * rows * columns, 4)
+            pair = 1 + (imaginary == 1 and matrix != 2)
+            dtype, start = np.dtype(order + LEVEL_4[number]), begin + 20 + length
+            name = content[begin + 20 : start].split(b"\0")[0].decode("latin-1")
+            begin = start + rows * columns * dtype.itemsize * pair
+            if begin > len(content):
+                raise ValueError("a variable is longer than the file")
+            self.names.append(name)
+            if matrix:
+                yield Leaf(name, (), _text) if matrix == 1 else Leaf(name, what="sparse matrices")
             else:
-                yield from _walked_73(file, f"{name}.{field}", inner, depth + 1)
-    elif item.attrs.get("MATLAB_empty", 0):
-        yield Leaf(name, (0, 0), lambda: np.zeros(0))
-    elif kind == "cell" and item.dtype == h5py.ref_dtype and item.size <= MOST_STRUCTS and depth <= DEEPEST:
-        for k, one in enumerate(item[()].ravel(), 1):
-            yield from _walked_73(file, f"{name}{{{k}}}" if item.size > 1 else name, file[one], depth + 1)
-    elif kind in ("cell", "function_handle") or item.dtype.kind not in "biufc":
-        yield Leaf(name, what="cells")
-    elif kind == "char":
-        yield Leaf(name, item.shape, lambda: np.array("text"))
-    else:
-        yield Leaf(name, item.shape[::-1], lambda: _numbers(item))
+                yield _leaf(name, content, dtype, (rows, columns), start, pair)
+
+    def level_5(self) -> Iterator[Leaf]:
+        """All variables; a compressed one is decompressed as far as the budget allows."""
+        content = self.content
+        self.order = "<" if content[126:128] == b"IM" else ">"
+        for element in self.elements(content, 128, len(content)):
+            if element.kind != COMPRESSED:
+                yield from self.leaves(content, element)
+                continue
+            before, inner = self.size, self.unpacked(memoryview(content)[element.begin : element.end])
+            for matrix in self.elements(inner, 0, len(inner)):
+                yield from self.leaves(inner, matrix)
+            self.take(max(0, len(inner) - (before - self.size)))
+
+    def unpacked(self, data: memoryview) -> bytes:
+        """The content of a compressed variable."""
+        stream = zlib.decompressobj()
+        try:
+            inner = stream.decompress(data, self.size + 1)
+        except zlib.error as error:
+            raise ValueError("a compressed variable does not match its checksum") from error
+        if len(inner) > self.size:
+            self.take(len(inner))
+        if not stream.eof:
+            raise ValueError("a compressed variable is cut off")
+        return inner
+
+    def elements(self, data: bytes, begin: int, end: int) -> Iterator[_Element]:
+        """Elements in a row from ``begin`` to ``end``."""
+        while begin < end:
+            self.take(count=1)
+            if end - begin < 8:
+                raise ValueError("an element is cut off")
+            kind, size = struct.unpack_from(f"{self.order}II", data, begin)
+            start, after = begin + 8, begin + 8 + size
+            if kind >> 16:
+                kind, size, start, after = kind & 0xFFFF, kind >> 16, begin + 4, begin + 8
+            elif kind != COMPRESSED:
+                after += -size % 8
+            if start + size > end or start + size > after:
+                raise ValueError("an element is longer than the file")
+            yield _Element(kind, start, start + size)
+            begin = after
+
+    def leaves(
+        self, data: bytes, matrix: _Element, named: str | None = None, depth: int = 0
+    ) -> Iterator[Leaf]:
+        """What an array holds, at any depth; a variable has its own name."""
+        if matrix.kind != MATRIX:
+            raise ValueError(f"an element of type {matrix.kind} where a variable is expected")
+        if depth > DEEPEST:
+            raise ValueError("structs lie too deep in each other")
+        parts = list(self.elements(data, matrix.begin, matrix.end))
+        if not parts and named is not None:
+            yield Leaf(named, (0, 0))
+            return
+        if not parts or parts[0].kind != 6 or parts[0].size != 8:
+            raise ValueError("a variable without its flags")
+        flags = struct.unpack_from(f"{self.order}I", data, parts[0].begin)[0]
+        kind, pair = flags & 0xFF, 1 + bool(flags >> 8 & COMPLEX)
+        own = parts[1 if kind == OPAQUE else 2 :][:1]
+        if not own or own[0].kind not in (1, *TEXT):
+            raise ValueError("a variable without its name")
+        name = data[own[0].begin : own[0].end].decode("latin-1") if named is None else named
+        if named is None:
+            self.names.append(name)
+        if not name:  # MATLAB's own
+            return
+        if kind in (OPAQUE, FUNCTION):
+            made_of = data[parts[3].begin : parts[3].end] if len(parts) > 3 else b""
+            told = made_of.decode("ascii", errors="replace") if kind == OPAQUE else "function_handle"
+            yield Leaf(name, what=f"{OBJECTS} of class {told or 'unknown'}", kind=told)
+            return
+        if parts[1].kind not in (5, 6) or parts[1].size < 8 or parts[1].size % 4:
+            raise ValueError("a variable without its dimensions")
+        shape = struct.unpack_from(f"{self.order}{parts[1].size // 4}i", data, parts[1].begin)
+        if min(shape) < 0:
+            raise ValueError("a variable with a negative dimension")
+        count, rest = math.prod(shape), parts[3:]
+        if kind != SPARSE:  # whose dimensions are not what is stored
+            self.take(8 * count * pair)
+        fits = all(part.kind in NUMBERS for part in rest)
+        if kind in NUMERIC and fits and len(rest) == pair:
+            dtypes = [np.dtype(self.order + NUMBERS[part.kind]) for part in rest]
+            fits = all(one.size == count * dtype.itemsize for one, dtype in zip(rest, dtypes, strict=True))
+            leaf = _leaf(name, data, dtypes[0], shape, rest[0].begin, pair) if fits else None
+        elif kind == CHAR:
+            leaf = Leaf(name, (), _text) if [p.kind in (*NUMBERS, *TEXT) for p in rest] == [True] else None
+        elif kind in (CELL, STRUCT, OBJECT):
+            yield from self.inner(data, rest[kind == OBJECT :], name, depth, count, kind == CELL)
+            return
+        else:
+            sparse = kind == SPARSE and fits and len(rest) == 2 + pair
+            leaf = Leaf(name, what="sparse matrices") if sparse else None
+        if leaf is None:
+            raise ValueError("a variable without its contents")
+        yield leaf
+
+    def inner(
+        self, data: bytes, rest: list[_Element], name: str, depth: int, count: int, cell: bool
+    ) -> Iterator[Leaf]:
+        """What stands in cells, or in the fields of structs."""
+        fields = [""]
+        if not cell:
+            length, names = rest[:2] if len(rest) > 1 else 2 * [_Element(0, 0, 0)]
+            size = struct.unpack_from(f"{self.order}i", data, length.begin)[0] if length.size == 4 else 0
+            if size < 1 or length.kind not in (5, 6) or names.kind != 1 or names.size % size:
+                raise ValueError("a struct without the names of its fields")
+            begins = range(names.begin, names.end, size)
+            fields = ["." + data[k : k + size].split(b"\0")[0].decode("latin-1") for k in begins]
+            self.take(8 * count * max(0, len(fields) - 1))
+            rest = rest[2:]
+        if len(rest) != count * len(fields):
+            raise ValueError("a variable without its contents")
+        if count > MOST_STRUCTS:
+            yield Leaf(name, what="cells" if cell else "arrays of structs")
+            return
+        for k, one in enumerate(rest):
+            number = k // len(fields) + 1
+            place = (f"{{{number}}}" if cell else f"({number})") if count > 1 else ""
+            yield from self.leaves(data, one, f"{name}{place}{fields[k % len(fields)]}", depth + 1)
 
 
-def _class(item: Any) -> str:
-    kind = item.attrs.get("MATLAB_class", b"")
-    return kind.decode(errors="replace") if isinstance(kind, bytes) else str(kind)
+def _text() -> NDArray[Any]:
+    return np.array("text")
 
 
-def _numbers(item: Any) -> NDArray[Any]:
-    """A dataset's numbers as MATLAB has them; what it declares is looked at first."""
-    if 8 * math.prod(item.shape) > budget_of(item.file.id.get_filesize()):
-        raise InputError(
-            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file"
-        )
-    return np.asarray(item[()]).T
+def _leaf(
+    name: str, data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], begin: int, pair: int
+) -> Leaf:
+    """Numbers in columns; of a ``pair`` of real and imaginary parts nothing is read but that it is one."""
+    if pair == 2:
+        return Leaf(name, shape, partial(np.zeros, shape, complex))
+    return Leaf(
+        name, shape, lambda: np.frombuffer(data, dtype, math.prod(shape), begin).reshape(shape, order="F")
+    )

@@ -1,7 +1,7 @@
 """What a column's name says of it: that it is the time, that it counts samples, its unit and its role.
 
-Names are compared in small letters, without accents, word by word; ``camelCase``, ``snake_case`` and blanks separate
-words. Names that may say it and may say something else (``T``, ``n``, ``valve_time``) are decided by their numbers.
+Names are compared word by word, in small letters, without accents. What may say something else as well (``T``, ``n``,
+``valve_time``) is decided by the numbers.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import unicodedata
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-from hybrid_mpc.data.source import name_and_unit
 from hybrid_mpc.machine.units import time_factor
 
 Kind = Literal["time", "step", "count", ""]
@@ -28,7 +27,7 @@ def words_of(text: str) -> frozenset[str]:
     return frozenset(_plain(text).split())
 
 
-TIME = words_of(
+TIME = words_of(  # words for time; a name of these, of units and of ``AROUND`` says time
     "time times timestamp timestamps stamp tout datetime date dates clock elapsed runtime uptime walltime simtime "
     "rostime systime daytime epoch t zeit zeiten zeitstempel zeitpunkt zeitachse uhrzeit datum messzeit laufzeit "
     "systemzeit versuchszeit temps heure horodatage horodate tiempo tempo hora fecha instante orario tijd "
@@ -36,45 +35,55 @@ TIME = words_of(
     "waktu laikas laiks время дата час χρονος χρόνος الوقت الزمن זמן समय 시간 sekunden sekunde secondes segundos "
     "secondi"
 )
-"""Words for time; a name of these, of units and of ``AROUND`` says time."""
 STAMPS = words_of("timestamp timestamps datetime zeitstempel horodatage tijdstempel tidsstempel")
 """Words that say time whatever stands beside them."""
 WITHIN = tuple(_plain(text) for text in ("时间", "時間", "时刻", "時刻", "시간"))
 """The same where a language does not separate words."""
-DATES = words_of("datetime date dates datum fecha дата")
-"""Words for dates: their numbers may count days."""
-AROUND = words_of(
+DATES = words_of("datetime date dates datum fecha дата")  # words for dates: their numbers may count days
+AROUND = words_of(  # what may stand beside them
     "elapsed relative rel absolute abs sim simulation simulated ros unix posix utc gmt local system sys since "
     "start from begin recording recorded record log logger logging measurement measured meas test run real wall "
     "host pc plc device header stamp field total global master base axis vector in the of at and day"
 )
-"""What may stand beside them."""
-PERHAPS = words_of("T ts s ms us ns min h d data")
-"""Single words that may say time: decided by their numbers."""
-COUNT = words_of(
+PERHAPS = words_of("T ts s ms us ns min h d data")  # single words that may say time: decided by their numbers
+COUNT = words_of(  # words for a count of samples
     "index indices idx sample samples row rows record records seq sequence unnamed datapoint datapoints messpunkt "
     "zeile"
 )
-"""Words for a count of samples."""
 PAIRS = ({"data", "point"}, {"data", "points"}, {"lfd", "nr"}, {"step", "number"}, {"line", "number"})
 """Pairs of words for the same."""
-STEP = (
+STEP = (  # words for the sampling time
     {"dt"}, {"ts"}, {"timestep"}, {"delta", "t"}, {"time", "step"}, {"delta", "time"}, {"step", "size"},
     {"sampling", "time"}, {"sample", "time"}, {"sampling", "period"}, {"sample", "period"}, {"sampling", "interval"},
 )  # fmt: skip
-"""Words for the sampling time."""
-BESIDE = words_of("number no nr num nummer id count counter of the s ms")
-"""What may stand beside them."""
-COUNT_PERHAPS = words_of(
+BESIDE = words_of("number no nr num nummer id count counter of the s ms")  # what may stand beside them
+COUNT_PERHAPS = words_of(  # single words that may be a count: decided by their numbers
     "n i j k no nr num number nummer count counter id step steps point points frame scan cycle line x"
 )
-"""Single words that may be a count: decided by their numbers."""
 ALONE = ("s", "ms", "us", "ns", "min", "mins", "h", "d", "day", "days")
 """Units of time that as a whole name, or behind a ``t``, may be something else (a minimum, a height)."""
 
 
-FIELD = re.compile(r"(?:[^\W\d]\w*\.)+([^\W\d]\w*)")
-"""A field of a struct, ``run.phi``, and its own name."""
+FIELD = re.compile(r"(?:[^\W\d]\w*\.)+([^\W\d]\w*)")  # a field of a struct, ``run.phi``, and its own name
+
+
+def name_and_unit(column: str) -> tuple[str, str]:
+    """A column's name and the unit that stands behind it in brackets; ``""`` if there is none.
+
+    A whole number in brackets is an index, as in ``state[0]`` and ``y(1)``; ``[1]`` behind a blank is the unit 1.
+
+    Example:
+        >>> name_and_unit("level [mm]"), name_and_unit("time (s)"), name_and_unit("phi")
+        (('level', 'mm'), ('time', 's'), ('phi', ''))
+        >>> name_and_unit("state[0]"), name_and_unit("slip [1]")
+        (('state[0]', ''), ('slip', '1'))
+    """
+    for opening, closing in ("[]", "()"):
+        name, bracket, unit = column.removesuffix(closing).rpartition(opening)
+        if column.endswith(closing) and bracket and name.strip():
+            index = re.fullmatch(r"[\d\s,;:]*", unit) and not (unit.strip() == "1" and name[-1].isspace())
+            return (column, "") if index else (name.strip(), unit.strip())
+    return column, ""
 
 
 class Said(NamedTuple):
@@ -154,60 +163,50 @@ Role = Literal[
 """What a column is by its name: ``command`` is an input for certain, ``actuator`` probably; ``answer`` is what an
 actuator's sensor shows, ``label`` an entry about the recording (a fault, a correction), ``measured`` what a sensor
 shows, ``quantity`` something that machines reach and surroundings have, too."""
-SET_POINT = words_of(
+SET_POINT = words_of(  # words for what a machine is asked to reach
     "ref refs reference references referencia referencias referenz set setpoint setpoints setpt setvalue sp target "
     "targets desired des goal goals wanted soll sollwert fuhrungsgrosse consigne consigna riferimento demand planned "
 )
-"""Words for what a machine is asked to reach."""
-FLAG = words_of(
+FLAG = words_of(  # words for switches of the recording or the controller
     "flag enable enabled enabling status alarm valid invalid active mode trigger event marker bool boolean ok ready "
     "fehler freigabe moving running busy"
 )
-"""Words for switches of the recording or the controller."""
-LABEL = words_of(
+LABEL = words_of(  # words for what somebody computed, noted down, or adds to a command
     "feedforward ff offset fault faults label anomaly correction bias calibration error err residual residuum deviation"
 )
-"""Words for what somebody computed, noted down, or adds to a command."""
-COMMAND = words_of(
+COMMAND = words_of(  # words for what somebody commands
     "u command commands cmd commanded control controle controller ctrl input inputs eingang stellgrosse stellwert "
     "steuerung manipulated mv op actuation actuator excitation entrada entree commande comando mando pwm duty dac"
 )
-"""Words for what somebody commands."""
-ACTUATOR = words_of(
+ACTUATOR = words_of(  # words for what moves a machine
     "pump valve heater heating cooler cooling coolant voltage volt volts torque tau force thrust throttle "
     "steering steer brake fan pumpe ventil heizung spannung drehmoment moment kraft bomba valvula tensao "
     "tension chauffage pompe vanne power burner damper rudder elevator aileron propeller rotor"
 )
-"""Words for what moves a machine."""
-DISTURBANCE = words_of(
+DISTURBANCE = words_of(  # words for what acts on a machine and is not commanded
     "ambient outside outdoor environment umgebung aussen weather wind disturbance disturbances disturb supply battery "
     "mains reservoir storung sun solar radiation irradiance push kick"
 )
-"""Words for what acts on a machine and is not commanded."""
-MEASURED = words_of(
+MEASURED = words_of(  # words for what a sensor shows, whatever it measures
     "output outputs ausgang saida sortie salida measured measure measurement meas mes actual ist istwert sensor pv "
     "feedback fb encoder enc tacho gyro imu"
 )
-"""Words for what a sensor shows, whatever it measures."""
-QUANTITY = words_of(
+QUANTITY = words_of(  # words for what machines reach
     "temperature temp temperatur temperatura level fullstand niveau nivel position pos angle ang winkel angulo "
     "speed vel velocity geschwindigkeit drehzahl velocidade rate pressure druck concentration height altitude "
     "heading yaw pitch roll theta phi psi alpha beta gamma q dq qd x z omega distance displacement "
     "acceleration acc accel hohe weg pendulum cart"
 )
-"""Words for what machines reach."""
 ANGLES = ("rad", "mrad", "deg", "°", "rev", "turn")
 """Units in which a column may be an angle that jumps by full turns."""
-DRIVING_UNITS = frozenset(
+DRIVING_UNITS = frozenset(  # units in which machines are mostly driven
     ("V", "mV", "kV", "%", "N m", "Nm", "mNm", "Ncm", "kNm", "N", "kN", "mN", "W", "kW")
 )
-"""Units in which machines are mostly driven."""
-REACHED_UNITS = frozenset((
+REACHED_UNITS = frozenset((  # units in which machines are mostly measured
     "rad", "deg", "°", "mrad", "rev", "turn", "m", "mm", "cm", "km", "K", "degC", "°C", "degF", "rad/s", "deg/s",
     "m/s", "mm/s", "cm/s", "km/h", "rpm", "rad/s^2", "deg/s^2", "m/s^2", "mol/l",
 ))  # fmt: skip
-"""Units in which machines are mostly measured."""
-ENDINGS = {
+ENDINGS = {  # units by the last words of a name, in small letters
     "deg": "deg", "rad": "rad", "mrad": "mrad", "rpm": "rpm", "degc": "degC", "celsius": "degC", "degf": "degF",
     "kelvin": "K", "pct": "%", "percent": "%", "mm": "mm", "cm": "cm", "km": "km", "mps": "m/s", "kmh": "km/h",
     "kph": "km/h", "hz": "Hz", "khz": "kHz", "nm": "N m", "mnm": "mNm", "ncm": "Ncm", "bar": "bar",
@@ -219,7 +218,6 @@ ENDINGS = {
     "m3 h": "m^3/h", "m3 s": "m^3/s", "kg h": "kg/h", "kg s": "kg/s", "kg min": "kg/min", "g s": "g/s",
     "mol l": "mol/l", "w m2": "W/m^2",
 }  # fmt: skip
-"""Units by the last words of a name, in small letters."""
 LETTERS = {"K": "K", "V": "V", "A": "A", "N": "N", "W": "W", "m": "m"}
 """Units of a single letter, which may be an index as well: the letter as it is written."""
 
@@ -267,6 +265,19 @@ def _parted(name: str) -> tuple[list[str], Ending]:
         if len(words) > 1 and words[-1] in LETTERS:
             return _written(" ".join(words[:-1]), camel=True), Ending(LETTERS[words[-1]], True)
     return words, Ending()
+
+
+def is_named(column: str, name: str) -> bool:
+    """Whether a column has this name but for the unit behind it.
+
+    Example:
+        >>> is_named("level_m", "level"), is_named("clock_ms", "clock"), is_named("temp_min", "temp")
+        (True, True, False)
+    """
+    words, ending = _parted(column)
+    if (said := said_by(column)).kind == "time" and said.unit == _plain(words[-1]):
+        words, ending = words[:-1], Ending(said.unit)
+    return bool(ending.unit) and words == _written(name, camel=True)
 
 
 def role_said_by(column: str, unit: str = "", switches: bool = False) -> Role:

@@ -17,8 +17,7 @@ a fit, windows of the monitor, blocks of false alarms) were tried on machines of
 left to either side."""
 COARSEST = 10
 """Fewest periods in a machine's second: the shortest length, a tenth of a second, is then one of them."""
-SHORTEST = 5
-"""Half the samples of the first window in which accelerations are looked for: ten periods."""
+SHORTEST = 5  # half the samples of the first window in which accelerations are looked for: ten periods
 NOISY = 0.02
 """Share of noise in the power of the acceleration from which on the window is too short: the steps of a coarse sensor
 are no white noise, and up to half of what they make would pass for motion."""

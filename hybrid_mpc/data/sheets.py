@@ -1,33 +1,25 @@
-"""Excel workbooks, Parquet, Feather and HDF5 files as sources."""
+"""Excel workbooks, Parquet and Feather files as sources."""
 
 from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from hybrid_mpc.data.frames import HEAD, Frame, frame_source
+from hybrid_mpc.data.frames import HEAD, Frame
 from hybrid_mpc.data.layout import MOST_SEEN, STEADY, Layout, Look, layout_of
-from hybrid_mpc.data.matlab import Leaf, columns_of_leaf
-from hybrid_mpc.data.source import LISTED, Source, line_of, megabytes
-from hybrid_mpc.data.vectors import LARGEST, budget_of, vector_source
+from hybrid_mpc.data.source import LARGEST, LISTED, Source, line_of, megabytes
 from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.records import shown
 
 if TYPE_CHECKING:
     import pandas as pd
 
-UNPACKED = 50
-"""Most bytes of a workbook's sheets for one byte of the file."""
-MOST_CELLS = 20_000_000
-"""Most cells of a sheet: each takes a hundred bytes of memory."""
-LONGER = 10
-"""Times as many rows as any other sheet that the one which is read has."""
+UNPACKED = 50  # most bytes of a workbook's sheets for one byte of the file
+MOST_CELLS = 20_000_000  # most cells of a sheet: each takes a hundred bytes of memory
+LONGER = 10  # times as many rows as any other sheet that the one which is read has
 
 
 def excel_source(path: Path, content: bytes, sha256: str) -> Source:
@@ -69,7 +61,7 @@ def excel_source(path: Path, content: bytes, sha256: str) -> Source:
     if isinstance(layout, str):
         raise InputError(f"{path}: sheet {shown(order[0])}: {layout}")
     note = [f"sheet {shown(order[0])}"] if len(sheets) > 1 else []
-    return frame_source(path, sha256, _frame_of(sheets[order[0]], layout, note))
+    return _frame_of(path, sheets[order[0]], layout, note).source(sha256)
 
 
 def _cells_of(sheet: Any) -> list[tuple[Any, ...]]:
@@ -86,21 +78,18 @@ def _written(cell: Any) -> str:
     return "" if cell is None else str(cell).strip()
 
 
-def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[str]) -> Frame:
+def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[str]) -> Frame:
     """The rows of a sheet below its header, without those that are blank and those behind the table."""
     import pandas as pd
 
     numbers = [k for k in range(layout.first, len(rows)) if any(_written(cell) for cell in rows[k])]
+    words = [isinstance(next((c for c in rows[k] if c is not None), None), str) for k in numbers]
     closing: list[int] = []
-    while (
-        len(numbers) > 2
-        and isinstance(_first(rows[numbers[-1]]), str)
-        and not isinstance(_first(rows[numbers[0]]), str)
-    ):
+    while len(numbers) > 2 and words[len(numbers) - 1] and not words[0]:
         closing.append(numbers.pop() + 1)
     notes = [*notes, *layout.notes]
     if closing:
-        notes.append(f"rows from {closing[-1]} on are no rows of the table: left out")
+        notes.append(f"rows from {closing[-1]} on do not belong to the table: left out")
     seen = [j for j, name in enumerate(layout.names) if name]
 
     def cell(k: int, j: int) -> Any:
@@ -110,18 +99,9 @@ def _frame_of(rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[s
     def columns(places: Sequence[int], most: int | None = None) -> list[pd.Series]:
         return [pd.Series([cell(k, j) for k in range(len(numbers[:most]))]) for j in places]
 
-    return Frame(
-        tuple(layout.names[j] for j in seen),
-        columns,
-        columns(range(len(seen)), HEAD),
-        [k + 1 for k in numbers],
-        lambda k, j: _written(cell(k, j)),
-        notes=tuple(notes),
-    )
-
-
-def _first(row: Sequence[Any]) -> Any:
-    return next((cell for cell in row if cell is not None), None)
+    names, heads = tuple(layout.names[j] for j in seen), columns(range(len(seen)), HEAD)
+    count = [k + 1 for k in numbers]
+    return Frame(path, names, columns, heads, count, lambda k, j: _written(cell(k, j)), notes=tuple(notes))
 
 
 # Columns of Arrow
@@ -132,109 +112,42 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
     with named_extra("reading Parquet and Feather files"):
         import pandas as pd
         import pyarrow
+    kinds, ipc = pyarrow.types, pyarrow.ipc
     try:
         if content.startswith(b"PAR1"):
             from pyarrow.parquet import ParquetFile
 
             file = ParquetFile(io.BytesIO(content))
             schema, rows = file.schema_arrow, file.metadata.num_rows
-
-            def read(name: str) -> Any:
-                return file.read([name]).column(0)
         else:
-            whole = pyarrow.ipc.open_file(io.BytesIO(content))
-            schema = whole.schema
-            none = pyarrow.ipc.IpcReadOptions(included_fields=[])
-            rows = pyarrow.ipc.open_file(io.BytesIO(content), options=none).read_all().num_rows
-
-            def read(name: str) -> Any:
-                one = pyarrow.ipc.IpcReadOptions(included_fields=[schema.get_field_index(name)])
-                return pyarrow.ipc.open_file(io.BytesIO(content), options=one).read_all().column(0)
+            none = ipc.open_file(io.BytesIO(content), options=ipc.IpcReadOptions(included_fields=[]))
+            file, schema, rows = None, ipc.open_file(io.BytesIO(content)).schema, none.read_all().num_rows
+        names = tuple(
+            field.name
+            for field in schema
+            if not (kinds.is_nested(field.type) or kinds.is_binary(field.type))
+            and schema.names.count(field.name) == 1
+        )
+        if 8 * rows * max(1, len(names)) > LARGEST:
+            raise InputError(f"{path}: has {rows} rows, more than are read. Split the recording.")
+        if file is None:
+            own = ipc.IpcReadOptions(included_fields=[schema.get_field_index(name) for name in names])
+            table = ipc.open_file(io.BytesIO(content), options=own).read_all()
+        else:
+            table = file.read(list(names))
+        whole = [pd.Series(table.column(name).to_pandas()) for name in names]
+    except InputError:
+        raise
     except Exception as error:  # a damaged file raises nearly anything
         raise InputError(
             f"{path}: is no Parquet or Feather file, or damaged ({line_of(error)}). Write it again, e.g. with pandas."
         ) from error
-    if 8 * rows > LARGEST:
-        raise InputError(f"{path}: has {rows} rows, more than are read. Split the recording.")
-    kinds = pyarrow.types
-    names = tuple(
-        field.name
-        for field in schema
-        if not kinds.is_nested(field.type)
-        and schema.names.count(field.name) == 1
-        and not kinds.is_binary(field.type)
-    )
-
-    def columns(places: Sequence[int]) -> list[pd.Series]:
-        try:
-            return [pd.Series(read(names[j]).to_pandas()) for j in places]
-        except Exception as error:
-            raise InputError(
-                f"{path}: cannot be read ({line_of(error)}). Write it again, e.g. with pandas."
-            ) from error
-
-    whole_columns = columns(range(len(names)))
-    return frame_source(
+    frame = Frame(
         path,
-        sha256,
-        Frame(
-            names,
-            lambda places: [whole_columns[j] for j in places],
-            [column.iloc[:HEAD] for column in whole_columns],
-            range(1, rows + 1),
-            lambda k, j: _written(whole_columns[j].iloc[k]),
-        ),
+        names,
+        lambda places: [whole[j] for j in places],
+        [column.iloc[:HEAD] for column in whole],
+        range(1, rows + 1),
+        lambda k, j: _written(whole[j].iloc[k]),
     )
-
-
-# HDF5
-
-
-def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
-    """Datasets of an HDF5 file: vectors, columns of matrices, fields of tables; links to other files are left alone."""
-    with named_extra("reading HDF5 files"):
-        import h5py
-    try:
-        leaves = list(_walked(h5py.File(io.BytesIO(content), "r"), "", 0))
-    except Exception as error:  # a damaged file raises nearly anything
-        raise InputError(f"{path}: is no HDF5 file or damaged ({line_of(error)}). Write it again.") from error
-    vectors: dict[str, Callable[[], Any]] = {}
-    for leaf in leaves:
-        vectors |= dict(columns_of_leaf(leaf))
-    return vector_source(
-        path, sha256, budget_of(len(content)), tuple(vectors), lambda name: vectors[name](), "index", 0
-    )
-
-
-def _walked(group: Any, prefix: str, depth: int) -> Iterator[Leaf]:
-    import h5py
-
-    for name in group:
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            continue
-        item, full = group[name], f"{prefix}{name}"
-        if isinstance(item, h5py.Group):
-            if depth < 8:
-                yield from _walked(item, f"{full}.", depth + 1)
-            continue
-        if not isinstance(item, h5py.Dataset) or item.shape is None:
-            continue
-        unit = next(
-            (str(item.attrs[key]) for key in ("units", "unit") if isinstance(item.attrs.get(key), str)), ""
-        )
-        named = f"{full} [{unit}]" if unit else full
-        if item.dtype.names:
-            for field in item.dtype.names:
-                if item.dtype[field].kind in "biuf":
-                    yield Leaf(f"{full}.{field}", item.shape, partial(_numbers, item, field))
-        elif item.dtype.kind in "biufc":
-            yield Leaf(named, item.shape, partial(_numbers, item))
-
-
-def _numbers(item: Any, field: str = "") -> np.ndarray[Any, Any]:
-    """A dataset's numbers, or those of a field of its records; what it declares is looked at first."""
-    if max(8, item.dtype.itemsize) * item.size > budget_of(item.file.id.get_filesize()):
-        raise InputError(
-            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file"
-        )
-    return np.asarray(item[()][field] if field else item[()])
+    return frame.source(sha256)

@@ -3,45 +3,28 @@
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.data.names import is_named, name_and_unit
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.records import LONGEST, shown
 
 Array = NDArray[np.float64]
 ALIKE = 0.7
 """How alike a column's name must be to be proposed: ``inflow_degC`` is by 0.6 like ``tank_degC``, by its unit alone."""
-LISTED = 30
-"""Most names that a message lists."""
-FEWEST = 10
-"""Fewest samples before and behind the place where time begins anew."""
-COMPARED = 1000
-"""Most names among which a message looks for one that is nearly right."""
-
-
-def name_and_unit(column: str) -> tuple[str, str]:
-    """A column's name and the unit that stands behind it in brackets; ``""`` if there is none.
-
-    A whole number in brackets is an index, as in ``state[0]`` and ``y(1)``; ``[1]`` behind a blank is the unit 1.
-
-    Example:
-        >>> name_and_unit("level [mm]"), name_and_unit("time (s)"), name_and_unit("phi")
-        (('level', 'mm'), ('time', 's'), ('phi', ''))
-        >>> name_and_unit("state[0]"), name_and_unit("slip [1]")
-        (('state[0]', ''), ('slip', '1'))
-    """
-    for opening, closing in ("[]", "()"):
-        name, bracket, unit = column.removesuffix(closing).rpartition(opening)
-        if column.endswith(closing) and bracket and name.strip():
-            index = re.fullmatch(r"[\d\s,;:]*", unit) and not (unit.strip() == "1" and name[-1].isspace())
-            return (column, "") if index else (name.strip(), unit.strip())
-    return column, ""
+LISTED = 30  # most names that a message lists
+FEWEST = 10  # fewest samples before and behind the place where time begins anew
+COMPARED = 1000  # most names among which a message looks for one that is nearly right
+EMPTY = "the file is empty. It needs a header line and rows of numbers."
+LARGEST = 2**31  # largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day
+ROUNDING, SHARE = 5e-7, 1e-3
+"""Stamps of two clocks are one where they differ by less: in their unit, and in steps of the fastest clock."""
+TIME = "time [s]"  # name of the time of files whose signals have clocks of their own
 
 
 class MissingColumn(InputError):
@@ -125,9 +108,8 @@ class Source:
     notes: tuple[str, ...] = ()
 
     def find(self, name: str) -> str:
-        """Full name of a column: its own, ``struct.field`` where just one struct has it, or with its unit in brackets.
-
-        Fields of structs in structs come after those of structs.
+        """Full name of a column: its own, with its unit in brackets or behind (``level [m]``, ``level_m``), or
+        ``struct.field`` where just one struct has it; fields of structs in structs come last.
 
         Raises:
             MissingColumn: If there is none.
@@ -142,16 +124,13 @@ class Source:
             raise InputError(
                 f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
             )
-        inner = f".{name}"
-        fields = [
-            column
-            for column in self.header
-            if column.endswith(inner) or name_and_unit(column)[0].endswith(inner)
-        ] or [
-            column
-            for column in self.header
-            if name_and_unit(column)[0] == name or column == f"{name_and_unit(name)[0]} [s]"
+        own, inner = name_and_unit(name)[0], f".{name}"
+        ways: list[Callable[[str], bool]] = [
+            lambda c: name_and_unit(c)[0] == name or c == f"{own} [s]",
+            lambda c: c.startswith(name) and is_named(c, name),
+            lambda c: c.endswith(inner) or name_and_unit(c)[0].endswith(inner),
         ]
+        fields = next((found for way in ways if (found := [c for c in self.header if way(c)])), [])
         fields = [column for column in fields if column.count(".") == min(one.count(".") for one in fields)]
         if len(fields) == 1:
             return fields[0]
@@ -178,3 +157,85 @@ def megabytes(size: int) -> str:
 def line_of(error: BaseException) -> str:
     """The first line of an error's message, or its kind."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+
+
+# Signals of one file that have clocks of their own
+
+
+@dataclass(frozen=True)
+class Series:
+    """A signal of a file: its time stamps ``t`` ``(m,)`` [s] and numbers ``(m,)``; ``fault`` is what is wrong."""
+
+    name: str
+    t: Array
+    values: Array
+    fault: str = ""
+
+
+def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME, note: str = "") -> Source:
+    """A source of signals with clocks of their own.
+
+    The rows are all stamps of the signals that are asked for. A column that may have blank cells (an output, a
+    disturbance) has a number where it was sampled, and none between; all others (inputs) hold their last number, and
+    rows before their first one are left out.
+    """
+    series = [_once(one) for one in series]
+    by_name = {one.name: one for one in series}
+    found = {one.name: fault for one in series if (fault := one.fault or _disorder(one))}
+
+    def read(asked: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
+        names = [*([] if asked is None else [asked]), *wanted]
+        faults = {name: found[name] for name in names if name in found}
+        sound = [by_name[name] for name in names if name != time and name not in found]
+        t = _joined([one.t for one in sound or series if one.name not in found])
+        if 8 * len(t) * len(names) > LARGEST:
+            raise InputError(
+                f"{path}: {len(names)} signals at {len(t)} stamps are more numbers than are read. Name fewer of them."
+            )
+        values, first = np.full((len(t), len(names)), np.nan), t[0] if len(t) else 0.0
+        for j, name in enumerate(names):
+            if name == time:
+                values[:, j] = t
+            elif name not in faults and len(by_name[name].t):
+                one = by_name[name]
+                known = np.isfinite(one.values) | (name in blanks)
+                stamps = t[
+                    np.searchsorted(t, one.t[known], side="right") - 1
+                ]  # as they stand among those of all
+                if name in blanks:
+                    values[np.searchsorted(t, stamps), j] = one.values
+                elif known.any():
+                    at = np.searchsorted(stamps, t, side="right") - 1
+                    values[:, j] = np.where(at >= 0, one.values[known][np.maximum(at, 0)], np.nan)
+                    first = max(first, float(t[np.argmax(at >= 0)]))
+        rows = t >= first
+        return Columns(values[rows], "sample", range(1, int(rows.sum()) + 1), faults)
+
+    if len(by_name) < len(series):
+        raise InputError(f"{path}: two signals have the same name and the same clock. Rename one.")
+    return Source(path, sha256, (time, *by_name), read, note)
+
+
+def _once(one: Series) -> Series:
+    """A signal without samples that stand twice."""
+    again = (one.t[1:] == one.t[:-1]) & (one.values[1:] == one.values[:-1])
+    keep = np.r_[np.ones(min(1, len(one.t)), bool), ~again]
+    return one if keep.all() else replace(one, t=one.t[keep], values=one.values[keep])
+
+
+def _joined(stamps: Sequence[Array]) -> Array:
+    """All stamps of several clocks; those that differ by rounding alone are one."""
+    t = np.unique(np.concatenate([np.zeros(0), *stamps]))
+    steps = [float(np.median(np.diff(one))) for one in stamps if len(one) > 1]
+    least = min([ROUNDING, *(SHARE * step for step in steps if step > 0)])
+    return t[np.r_[True, np.diff(t) > least]] if len(t) else t
+
+
+def _disorder(one: Series) -> str:
+    """Where the stamps of a signal do not increase; empty where all do."""
+    k = int(np.argmax(np.r_[np.diff(one.t) <= 0, True]))
+    if k >= len(one.t) - 1:
+        return ""
+    stamps = f"sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at {one.t[k]:.10g} s"
+    remedy = "Time stamps must increase: delete the repeated samples, or split the file."
+    return f"column {shown(one.name)}: {stamps}. {remedy}"

@@ -14,40 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
-from hybrid_mpc.data.findings import findings_of
-from hybrid_mpc.data.recording import (
-    MIN_SCORED,
-    Finding,
-    Flags,
-    Recording,
-    Signals,
-    complete,
-    empty,
-    gaps,
-    misspelt,
-    no_flags,
-    read_recordings,
-)
+from hybrid_mpc.data.findings import MIN_SCORED, Finding, findings_of, gaps
+from hybrid_mpc.data.recording import Flags, Recording, Samples, Signals, misspelt, read_recordings
 from hybrid_mpc.errors import SHOWN, InputError, refuse
-from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
 
 Array = NDArray[np.float64]
 ROLES: tuple[Role, ...] = ("train", "valid", "test")
-TINY = 1e-6
-"""Tolerance [periods] where periods are counted: above rounding."""
-NEAR = 5e-5
-"""Tolerance [periods] of comparisons between time stamps, which files round: 1 us at 20 ms."""
-FINEST = 1000
-"""Most samples of the model's grid for one of the recording: beyond it a period is given in a wrong unit."""
-UNEVEN = 20.0
-"""Largest ratio of mean to median sampling interval: smoothing works on the median."""
-WORK = 2e10
-"""Most products of smoothing, samples times those in a window: half a minute."""
+TINY = 1e-6  # tolerance [periods] where periods are counted: above rounding
+NEAR = 5e-5  # tolerance [periods] of comparisons between time stamps, which files round: 1 us at 20 ms
+FINEST = 1000  # most samples of the model's grid for one of the recording: beyond it a unit is wrong
+UNEVEN = 20.0  # largest ratio of mean to median sampling interval: smoothing works on the median
+WORK = 2e10  # most products of smoothing, samples times those in a window: half a minute
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(Samples):
     """One contiguous piece of a recording on the uniform grid ``dt``.
 
     Args:
@@ -74,11 +56,8 @@ class Trajectory:
     y: Array
     x: Array
     xdot: Array
-    w: Array = field(default_factory=empty)
-    censored: Flags = field(default_factory=no_flags)
-
-    def __post_init__(self) -> None:
-        complete(self)
+    w: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    censored: Flags = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int8))
 
     @property
     def file(self) -> str:
@@ -88,16 +67,10 @@ class Trajectory:
     def part(
         self, keep: NDArray[np.bool_] | slice, name: str | None = None, role: str | None = None
     ) -> Trajectory:
-        """The samples of ``keep``, a slice or a mask ``(n,)`` of one contiguous run.
-
-        Args:
-            keep: Which samples.
-            name: New name. Default: as before.
-            role: New role. Default: as before.
-        """
+        """The samples of ``keep``, a slice or a mask ``(n,)`` of one contiguous run; a name or a role may be new."""
         arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot", "w", "censored")}
-        own = (self.name if name is None else name), (self.role if role is None else role)
-        return replace(self, name=own[0], role=own[1], **arrays)
+        name, role = self.name if name is None else name, self.role if role is None else role
+        return replace(self, name=name, role=role, **arrays)
 
 
 class Cut(NamedTuple):
@@ -143,12 +116,11 @@ def load_trajectories(
 ) -> Dataset:
     """Read recordings, cut them at gaps, shift known delays out, smooth, resample to ``spec.dt``, give roles.
 
-    Where the outputs are the positions ``q`` of states ``[q, v]`` (as many, of the same names), velocities and
-    accelerations are their derivatives. Smoothing comes before resampling and the split, never across a gap, and never
-    across samples of that output that are missing or censored for longer than ``spec.max_gap``: there ``x`` and
-    ``xdot`` are NaN. A sample's ``x`` and ``xdot`` know half of ``spec.smoothing`` of the time before and after it.
-    Where the outputs are anything else, ``x`` and ``xdot`` are NaN throughout: states then come from the prior's own
-    equations. Parts by ``fractions`` keep ``spec.smoothing`` apart; ``windows`` should, too.
+    Where the outputs are the positions ``q`` of states ``[q, v]`` (as many, of the same names), ``x`` and ``xdot`` are
+    smoothed before resampling and the split. They depend on half of ``spec.smoothing`` before and after a sample, and
+    are NaN over gaps, and where samples of that output are missing or censored for longer than ``spec.max_gap``. For
+    other outputs they are NaN: states then come from the prior's equations. Parts by ``fractions`` keep
+    ``spec.smoothing`` apart; ``windows`` should, too.
 
     Args:
         paths: Files with different stems, of any formats and lengths.
@@ -158,9 +130,9 @@ def load_trajectories(
         needed: Roles that must not be empty. Default: all three.
 
     Raises:
-        InputError: If recordings are bad (see :func:`~hybrid_mpc.data.recording.read_recording`), columns differ
-            between them, windows overlap, a role gets no trajectory, the sampling is too coarse or too uneven for
-            ``smoothing``, or the speeds are beyond all that is plausible. It names all that is wrong with all files.
+        InputError: With all that is wrong with all files: bad recordings
+            (:func:`~hybrid_mpc.data.recording.read_recording`), columns that differ between them, windows that overlap,
+            a role without a trajectory, sampling too coarse or uneven for ``smoothing``, implausible speeds.
 
     Example:
         >>> import tempfile
@@ -183,7 +155,8 @@ def load_trajectories(
     _check_windows(spec)
     recordings, problems = read_recordings(paths, prior, spec)
     outputs, states = prior.outputs, prior.states
-    n_x = None if _are_positions(outputs, states) else len(states)
+    names = [[s.name for s in signals] for signals in (outputs, states)]
+    positions = len(states) == 2 * len(outputs) and names[0] == names[1][: len(outputs)]
     trajectories: list[Trajectory] = []
     whole: list[Trajectory] = []
     motions: list[tuple[Array, Array]] = []
@@ -191,39 +164,29 @@ def load_trajectories(
     for recording in recordings:
         own: list[Trajectory] = []
         try:
-            own = list(_segments(recording, spec, n_x, cuts))
+            own = list(_segments(recording, spec, None if positions else len(states), cuts))
             trajectories += _pieces(recording, own, spec, cuts)
         except InputError as error:
             problems.append(f"{recording.path}: {error}")
         whole += own
         t, x = [piece.t for piece in own], [piece.x for piece in own]
         motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
-    speeds = states if n_x is None else ()
-    findings = findings_of(recordings, motions, spec, outputs=outputs, states=speeds)
+    findings = findings_of(recordings, motions, spec, outputs=outputs, states=states if positions else ())
     findings = (*findings, *misspelt(spec, [recording.path for recording in recordings]))
     paths_of = {recording.path.name: recording.path for recording in recordings}
-    problems += [f"{paths_of[finding.file]}: {finding.message}" for finding in findings if finding.refused]
-    refuse(problems)
+    refuse(problems + [f"{paths_of[one.file]}: {one.message}" for one in findings if one.refused])
     _check_roles(trajectories, cuts, spec, needed)
+    contents = "".join(sorted(f"{one.name} {one.sha256}\n" for one in recordings))
     return Dataset(
-        trajectories=tuple(trajectories),
-        whole=tuple(whole),
-        cuts=tuple(cuts),
-        files=tuple(recording.path.name for recording in recordings),
-        sha256=tuple(recording.sha256 for recording in recordings),
-        hash=hashlib.sha256(
-            "".join(sorted(f"{t.name} {t.sha256}\n" for t in recordings)).encode()
-        ).hexdigest(),
+        tuple(trajectories),
+        tuple(whole),
+        tuple(cuts),
+        files=tuple(one.path.name for one in recordings),
+        sha256=tuple(one.sha256 for one in recordings),
+        hash=hashlib.sha256(contents.encode()).hexdigest(),
         findings=findings,
-        sampling=tuple(recording.dt for recording in recordings),
+        sampling=tuple(one.dt for one in recordings),
     )
-
-
-def _are_positions(outputs: Sequence[Signal], states: Sequence[Signal]) -> bool:
-    """Whether the outputs are the positions of states ``[q, v]``."""
-    return len(states) == 2 * len(outputs) and [s.name for s in states[: len(outputs)]] == [
-        s.name for s in outputs
-    ]
 
 
 def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[Cut]) -> Iterator[Trajectory]:
@@ -231,42 +194,85 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
 
     They are smoothed if ``n_x`` is None; else their ``n_x`` states are NaN.
     """
-    ends = np.flatnonzero(gaps(recording.t, spec.max_gap))
+    times, period, number, file = recording.t, recording.dt, 0, recording.path.name
+    ends = np.flatnonzero(gaps(times, spec.max_gap))
     for first in recording.cuts:
         why = "the number of turns that an angle made while its samples were missing is not known"
-        cuts.append(Cut(recording.path.name, float(recording.t[first - 1]), float(recording.t[first]), why))
+        cuts.append(Cut(file, float(times[first - 1]), float(times[first]), why))
     for k in ends:
-        why = f"gap of {recording.t[k + 1] - recording.t[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
-        cuts.append(Cut(recording.path.name, float(recording.t[k]), float(recording.t[k + 1]), why))
+        why = f"gap of {times[k + 1] - times[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
+        cuts.append(Cut(file, float(times[k]), float(times[k + 1]), why))
     ends = np.union1d(ends, np.array(recording.cuts, dtype=np.intp) - 1)
     shortest = _fewest(spec) * spec.dt
-    if n_x is None:
-        samples = window_samples(spec.smoothing, recording.dt)
-        _check_sampling(recording, samples, spec)
-        shortest = max((samples - 1) * recording.dt + spec.dt, shortest)
-    _check_period(recording, spec)
-    number = 0
-    for rows in np.split(np.arange(len(recording.t)), ends + 1):
-        part = _Part.of(recording, rows, spec)
-        whole, covered = part.span, part.covered()
-        if covered[1] - covered[0] < shortest - NEAR * spec.dt:
+    samples = window_samples(spec.smoothing, period) if n_x is None else 0
+    _check_sampling(recording, samples, spec)
+    shortest = max((samples - 1) * period + spec.dt, shortest) if samples else shortest
+    # an input acts later than it is recorded; what a sensor shows was earlier
+    delays = spec.delays_in(recording.name)
+    late_u, late_w, late_y = (
+        [sign * delays.get(name, 0.0) for name in names]
+        for sign, names in ((1, spec.inputs_in(recording.name)), (-1, spec.disturbances), (-1, spec.outputs))
+    )
+    for rows in np.split(np.arange(len(times)), ends + 1):
+        origin, t = float(times[rows[0]]), times[rows] - times[rows[0]]
+        # what every channel covers; blank outputs count as if they had samples
+        spans = [(late, t[-1] + late) for late in (*late_u, *late_y)]
+        for late, column in zip(late_w, recording.w[rows].T, strict=True):
+            known = t[np.isfinite(column)]
+            spans.append((known[0] + late, known[-1] + late) if len(known) else (0.0, 0.0))
+        start, end = float(max(begin for begin, _ in spans)), float(min(end for _, end in spans))
+        if end - start < shortest - NEAR * spec.dt:
             why = _too_short(shortest, spec)
-            if whole[1] - whole[0] >= shortest - NEAR * spec.dt:
+            if t[-1] >= shortest - NEAR * spec.dt:
                 why = f"what all columns cover, known delays taken off, is {why}"
-            cuts.append(Cut(recording.path.name, part.origin + whole[0], part.origin + whole[1], why))
+            cuts.append(Cut(file, origin, origin + float(t[-1]), why))
             continue
-        for start, end in ((whole[0], covered[0]), (covered[1], whole[1])):
-            if end - start > NEAR * spec.dt:
+        for one, two in ((0.0, start), (end, float(t[-1]))):
+            if two - one > NEAR * spec.dt:
                 why = "not covered by all columns once known delays are taken off"
-                cuts.append(Cut(recording.path.name, part.origin + start, part.origin + end, why))
+                cuts.append(Cut(file, origin + one, origin + two, why))
         number += 1
-        yield _resampled(part, covered, recording.dt, spec, n_x, _numbered(recording.name, number))
+        grid: Array = start + spec.dt * np.arange(
+            int(np.floor((end - start) / spec.dt + TINY)), dtype=np.float64
+        )
+        n, y, censored = len(grid), recording.y[rows], recording.censored[rows]
+        u = [
+            hold_mean(t + a, z[:, None], grid, spec.dt)
+            for a, z in zip(late_u, recording.u[rows].T, strict=True)
+        ]
+        w = [
+            line_mean(t + a, z, grid, spec.dt)[:, None]
+            for a, z in zip(late_w, recording.w[rows].T, strict=True)
+        ]
+        outputs = list(zip(late_y, y.T, censored.T, strict=True))
+        measured = [to_grid(t + a, z, flags, grid, spec.dt, spec.max_gap) for a, z, flags in outputs]
+        x = xdot = np.full((n, n_x or 0), np.nan)
+        if n_x is None:
+            motions = [
+                _smoothed(t + a, np.where(flags == 0, z, np.nan), grid, period, spec)
+                for a, z, flags in outputs
+            ]
+            q, v, a = (np.column_stack(columns) for columns in zip(*motions, strict=True))
+            x, xdot = np.hstack([q, v]), np.hstack([v, a])
+        yield Trajectory(
+            _numbered(recording.name, number),
+            "",
+            spec.dt,
+            origin + grid,
+            u=np.hstack([np.zeros((n, 0)), *u]),
+            y=np.column_stack([y for y, _ in measured]),
+            x=x,
+            xdot=xdot,
+            w=np.hstack([np.zeros((n, 0)), *w]),
+            censored=np.column_stack([flags for _, flags in measured]),
+        )
 
 
 def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
-    """Refuse sampling that smoothing would take gigabytes or minutes for."""
-    mean = _mean_step(recording, spec)
-    if mean > UNEVEN * recording.dt:
+    """Refuse sampling that smoothing over ``samples`` would take gigabytes or minutes for, or too fine a period."""
+    steps = np.diff(recording.t)
+    mean = float(steps[~gaps(recording.t, spec.max_gap)].mean())  # gaps left out
+    if samples and mean > UNEVEN * recording.dt:
         raise InputError(
             f"sampling is uneven: the time stamps are {recording.dt:.3g} s apart in the median and {mean:.3g} s in "
             "the mean. Record at one rate, or check the time stamps."
@@ -276,110 +282,11 @@ def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
             f"smoothing of {spec.smoothing:g} s holds {samples} of {len(recording.t)} samples, too many to work "
             f"with. The model's period is {spec.dt:g} s: give every tenth or hundredth row, or split the recording."
         )
-
-
-def _check_period(recording: Recording, spec: DataSpec) -> None:
-    """Refuse a period so fine that the grid would take gigabytes."""
-    mean = _mean_step(recording, spec)
     if mean > FINEST * spec.dt:
         raise InputError(
             f"the model's period of {spec.dt:g} s is more than {FINEST} times finer than the sampling, {mean:.3g} s in "
             "the mean. Raise dt in the DataSpec, or check that time is in seconds."
         )
-
-
-def _mean_step(recording: Recording, spec: DataSpec) -> float:
-    """Mean distance [s] of the time stamps, gaps left out."""
-    steps = np.diff(recording.t)
-    return float(steps[~gaps(recording.t, spec.max_gap)].mean())
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Rows of a recording between two gaps, with times ``t`` ``(m,)`` [s] from ``origin`` on.
-
-    Known delays [s] by input, disturbance and output say how much later a channel acts than it was recorded; those of
-    sensors are negative.
-    """
-
-    origin: float
-    t: Array
-    u: Array
-    w: Array
-    y: Array
-    censored: Flags
-    late_u: tuple[float, ...]
-    late_w: tuple[float, ...]
-    late_y: tuple[float, ...]
-
-    @classmethod
-    def of(cls, recording: Recording, rows: NDArray[np.intp], spec: DataSpec) -> _Part:
-        t, late = recording.t[rows], spec.delays_in(recording.name)
-        return cls(
-            origin=float(t[0]),
-            t=t - t[0],
-            u=recording.u[rows],
-            w=recording.w[rows],
-            y=recording.y[rows],
-            censored=recording.censored[rows],
-            late_u=tuple(late.get(name, 0.0) for name in spec.inputs_in(recording.name)),
-            late_w=tuple(-late.get(name, 0.0) for name in spec.disturbances),
-            late_y=tuple(-late.get(name, 0.0) for name in spec.outputs),
-        )
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """First and last time."""
-        return 0.0, float(self.t[-1])
-
-    def covered(self) -> tuple[float, float]:
-        """First and last time between which every channel has samples; blank outputs count as if they had some."""
-        spans = [(late, self.t[-1] + late) for late in (*self.late_u, *self.late_y)]
-        for late, column in zip(self.late_w, self.w.T, strict=True):
-            known = self.t[np.isfinite(column)]
-            spans.append((known[0] + late, known[-1] + late) if len(known) else (0.0, 0.0))
-        return float(max(start for start, _ in spans)), float(min(end for _, end in spans))
-
-
-def _resampled(
-    part: _Part, covered: tuple[float, float], period: float, spec: DataSpec, n_x: int | None, name: str
-) -> Trajectory:
-    """A part on the model's grid; ``period`` is that of the recording."""
-    n = int(np.floor((covered[1] - covered[0]) / spec.dt + TINY))
-    grid: Array = covered[0] + spec.dt * np.arange(n, dtype=np.float64)
-    u = [
-        hold_mean(part.t + late, column[:, None], grid, spec.dt)
-        for late, column in zip(part.late_u, part.u.T, strict=True)
-    ]
-    w = [
-        line_mean(part.t + late, column, grid, spec.dt)[:, None]
-        for late, column in zip(part.late_w, part.w.T, strict=True)
-    ]
-    outputs = list(zip(part.late_y, part.y.T, part.censored.T, strict=True))
-    measured = [
-        to_grid(part.t + late, column, flags, grid, spec.dt, spec.max_gap) for late, column, flags in outputs
-    ]
-    if n_x is None:
-        motions = [
-            _smoothed(part.t + late, np.where(flags == 0, column, np.nan), grid, period, spec)
-            for late, column, flags in outputs
-        ]
-        q, v, a = (np.column_stack(columns) for columns in zip(*motions, strict=True))
-        x, xdot = np.hstack([q, v]), np.hstack([v, a])
-    else:
-        x, xdot = np.full((n, n_x), np.nan), np.full((n, n_x), np.nan)
-    return Trajectory(
-        name=name,
-        role="",
-        dt=spec.dt,
-        t=part.origin + grid,
-        u=np.hstack([np.zeros((n, 0)), *u]),
-        y=np.column_stack([y for y, _ in measured]),
-        x=x,
-        xdot=xdot,
-        w=np.hstack([np.zeros((n, 0)), *w]),
-        censored=np.column_stack([flags for _, flags in measured]),
-    )
 
 
 def _smoothed(t: Array, y: Array, grid: Array, period: float, spec: DataSpec) -> tuple[Array, Array, Array]:
@@ -408,23 +315,18 @@ def to_grid(
 ) -> tuple[Array, Flags]:
     """One output's samples on a grid of period ``dt`` [s], without inventing any; what is censored.
 
-    - Between two samples of this output that are at most ``max_gap`` [s] apart the grid has the straight line.
-    - Elsewhere, as between the samples of a slow analyser or in a hole, a sample counts for the one grid point that is
-      nearest to it, with its value as it was measured, at most half a period away. All other points are NaN.
-
-    A straight line to a censored sample is a bound as well, of the same side; it is NaN between the two ends of a
-    sensor.
+    Between two samples that are at most ``max_gap`` [s] apart the grid has the straight line. Elsewhere, as between the
+    samples of a slow analyser, a sample counts for the grid point nearest to it, as it was measured, at most half a
+    period away; all other points are NaN. A straight line to a censored sample is a bound of the same side; it is NaN
+    between the two ends of a sensor.
 
     Args:
         t: Times ``(m,)`` [s] of the rows, increasing.
         y: Samples ``(m,)``; NaN is none.
         censored: -1, 0 or +1 ``(m,)`` for each.
-        grid: Times ``(n,)`` [s], ``dt`` apart.
+        grid: Times ``(n,)`` [s], ``dt`` apart; returned are values ``(n,)`` and -1, 0 or +1 for each.
         dt: Period [s].
         max_gap: Longest distance [s] that a straight line bridges.
-
-    Returns:
-        Values ``(n,)`` and -1, 0 or +1 for each.
 
     Example:
         >>> t = 0.1 * np.arange(9)
@@ -451,9 +353,8 @@ def to_grid(
     nearest = np.floor((t - grid[0]) / dt + 0.5 - TINY).astype(np.int64)
     alone = np.flatnonzero((nearest >= 0) & (nearest < len(grid)))
     alone = alone[~between[nearest[alone]]]
-    alone = alone[
-        np.argsort(-np.abs(t[alone] - grid[nearest[alone]]), kind="stable")
-    ]  # the nearest one stays
+    away = np.abs(t[alone] - grid[nearest[alone]])
+    alone = alone[np.argsort(-away, kind="stable")]  # the nearest one stays
     values[nearest[alone]], flags[nearest[alone]] = y[alone], censored[alone]
     flags[np.isnan(values)] = 0
     return values, flags
@@ -465,7 +366,8 @@ def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
     Each input is held until the next time stamp; it is zero outside the recording.
     """
     integral = np.vstack([np.zeros((1, u.shape[1])), np.cumsum(u[:-1] * np.diff(t)[:, None], axis=0)])
-    return (_interpolate(t, integral, grid + dt) - _interpolate(t, integral, grid)) / dt
+    means = [(np.interp(grid + dt, t, z) - np.interp(grid, t, z)) / dt for z in integral.T]
+    return np.column_stack(means)
 
 
 def line_mean(t: Array, w: Array, grid: Array, dt: float) -> Array:
@@ -488,11 +390,6 @@ def line_mean(t: Array, w: Array, grid: Array, dt: float) -> Array:
     return (integral(grid + dt) - integral(grid)) / dt
 
 
-def _interpolate(t: Array, z: Array, grid: Array) -> Array:
-    """Linear interpolation of each column of ``z`` ``(m, n_z)``."""
-    return np.column_stack([np.interp(grid, t, column) for column in z.T])
-
-
 def _pieces(
     recording: Recording, segments: list[Trajectory], spec: DataSpec, cuts: list[Cut]
 ) -> list[Trajectory]:
@@ -505,15 +402,13 @@ def _pieces(
             if not keep.any():
                 continue
             piece = segment.part(keep, _numbered(recording.name, len(pieces) + 1), window.role)
-            if len(piece.t) >= _fewest(spec) and np.isfinite(piece.y).any():
+            why = "" if np.isfinite(piece.y).any() else "no sample of any output"
+            why = _too_short(_fewest(spec) * spec.dt, spec) if len(piece.t) < _fewest(spec) else why
+            if not why:
                 pieces.append(piece)
-            else:
-                why = f"{window.role}: " + (
-                    _too_short(_fewest(spec) * spec.dt, spec)
-                    if len(piece.t) < _fewest(spec)
-                    else "no sample of any output"
-                )
-                cuts.append(Cut(recording.path.name, float(piece.t[0]), float(piece.t[-1]), why))
+                continue
+            first, last = float(piece.t[0]), float(piece.t[-1])
+            cuts.append(Cut(recording.path.name, first, last, f"{window.role}: {why}"))
     return pieces
 
 
@@ -537,14 +432,7 @@ def _windows(recording: Recording, spec: DataSpec) -> tuple[Window, ...]:
 
 def _check_windows(spec: DataSpec) -> None:
     for stem, windows in spec.windows.items():
-        ordered = sorted(windows, key=lambda window: window.start)
-        for window in ordered:
-            if not window.start < window.end or window.role not in (*ROLES, "nominal"):
-                raise InputError(
-                    f"data specification: window {window} of {stem} needs start < end and one of "
-                    f"{(*ROLES, 'nominal')}"
-                )
-        for one, two in pairwise(ordered):
+        for one, two in pairwise(sorted(windows, key=lambda window: window.start)):
             if two.start < one.end:
                 raise InputError(
                     f"windows overlap in {stem}: {one.role} {one.start:g} to {one.end:g} s, "

@@ -1,24 +1,26 @@
-"""Files of named vectors, as ``.npz`` and ``.mat`` hold them."""
+"""Files of named vectors, as ``.npz``, ``.mat`` and HDF5 files hold them."""
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.source import Columns, Source, line_of, megabytes
+from hybrid_mpc.data.names import said_by
+from hybrid_mpc.data.source import LARGEST, LISTED, TIME, Columns, Series, Source, clocked, line_of, megabytes
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import check_npz
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-LARGEST = 2**31
-"""Most bytes of numbers in a file [byte]."""
 SMALL = 2**26
 """Bytes of numbers that any file may hold [byte], however well they are compressed: 8 million numbers."""
 PACKED = 20
@@ -141,3 +143,127 @@ def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
             "Give that, or a vector of time stamps."
         )
     return dt * np.arange(m, dtype=np.float64)
+
+
+# Variables, fields and datasets
+
+
+MOST_WIDE = 64  # most columns of a matrix that are read as columns
+MOST_STRUCTS = 100  # most elements of an array of structs, or of cells, that are read
+OBJECTS = "objects"
+CONVERT = {  # the line of MATLAB that makes vectors of an object, by its class
+    "timeseries": "t = {0}.Time; y = {0}.Data; save('{1}', 't', 'y', '-v7')",
+    "timetable": "t = seconds({0}.Properties.RowTimes - {0}.Properties.RowTimes(1)); "
+    "s = table2struct(timetable2table({0}, 'ConvertRowTimes', false), 'ToScalar', true); save('{1}', 't', 's', '-v7')",
+    "table": "s = table2struct({0}, 'ToScalar', true); save('{1}', 's', '-v7')",
+    "iddata": "t = {0}.SamplingInstants; u = {0}.InputData; y = {0}.OutputData; save('{1}', 't', 'u', 'y', '-v7')",
+    "Simulink.SimulationData.Dataset": "x = {0}.getElement(1).Values; t = x.Time; y = x.Data; "
+    "save('{1}', 't', 'y', '-v7')",
+    "datetime": "t = seconds({0} - {0}(1)); save('{1}', 't', '-v7', '-append')",
+    "duration": "t = seconds({0}); save('{1}', 't', '-v7', '-append')",
+}
+
+
+class Leaf(NamedTuple):
+    """A variable or a field: its shape, and how its numbers are read; ``what`` it is where it is not read."""
+
+    name: str
+    shape: tuple[int, ...] = ()
+    read: Callable[[], NDArray[Any]] = lambda: np.zeros(0)
+    what: str = ""
+    kind: str = ""
+
+
+def leaf_source(
+    path: Path, content: bytes, sha256: str, leaves: Sequence[Leaf], matlab: bool = True
+) -> Source:
+    """A source of vectors and columns of matrices; in MATLAB's files what is not read is named."""
+    vectors: dict[str, Callable[[], NDArray[Any]]] = {}
+    lengths: dict[str, int] = {}
+    unread: dict[str, list[str]] = {}
+    lines: list[str] = []
+    for leaf in leaves:
+        if not leaf.what:
+            columns = _columns_of(leaf)
+            vectors |= columns
+            lengths |= dict.fromkeys(columns, max(leaf.shape, default=1))
+        elif matlab:
+            unread.setdefault(leaf.what, []).append(leaf.name)
+            if leaf.kind in CONVERT:
+                lines.append(CONVERT[leaf.kind].format(leaf.name, f"{path.stem}_vectors.mat"))
+    told = [f"{what} ({', '.join(map(shown, names[:LISTED]))})" for what, names in sorted(unread.items())]
+    note = f" Not read are {' and '.join(told)}." if told else ""
+    note += f" In MATLAB: {lines[0]}" if lines else " Save their vectors as variables." if told else ""
+    lost = tuple(name for names in unread.values() for name in names)
+    row, first = ("row", 1) if matlab else ("index", 0)
+    budget = budget_of(len(content))
+    plain = vector_source(
+        path, sha256, budget, tuple(vectors), lambda name: vectors[name](), row, first, note, lost
+    )
+    return _with_clocks(plain, lengths, budget) or plain
+
+
+def _columns_of(leaf: Leaf) -> dict[str, Callable[[], NDArray[Any]]]:
+    """A vector; or the columns of a matrix, rows where these are longer."""
+    long = [size for size in leaf.shape if size != 1]
+    if len(leaf.shape) != 2 or len(long) < 2 or min(long) > MOST_WIDE or 0 in long:
+        return {leaf.name: leaf.read}
+    upright = leaf.shape[0] >= leaf.shape[1]
+    form = "(:,{})" if upright else "({},:)"
+    return {
+        leaf.name + form.format(k + 1): partial(_taken, leaf.read, k, int(upright)) for k in range(min(long))
+    }
+
+
+def _taken(read: Callable[[], NDArray[Any]], k: int, axis: int) -> NDArray[Any]:
+    return read().take(k, axis)
+
+
+# Vectors of several clocks
+
+
+def _with_clocks(source: Source, lengths: dict[str, int], budget: int) -> Source | None:
+    """The same where vectors of different lengths have times of their own: in one struct, or alone of that length.
+
+    None where all have one length, or only one of them is a time.
+    """
+    times = [name for name, length in lengths.items() if length > 1 and _is_time(name)]
+    if len({lengths[name] for name in times}) < 2:
+        return None
+    clocks: dict[str, str] = {}
+    for name, length in lengths.items():
+        scope = name
+        while name not in times and scope and length > 1:
+            scope = scope.rpartition(".")[0]
+            near = [one for one in times if one.rpartition(".")[0] == scope and lengths[one] == length]
+            if near:
+                clocks |= {name: near[0]} if len(near) == 1 else {}
+                break
+    if len(set(clocks.values())) < 2 or 16 * sum(lengths[name] for name in clocks) > budget:
+        return None
+    clocks |= {clock: clock for clock in clocks.values()}  # times are signals of their own clocks, too
+    read = {name: source.read(None, [name], [name]) for name in clocks}
+    series = [
+        Series(
+            name,
+            (said_by(clock).seconds or 1.0) * read[clock].values[:, 0],
+            read[name].values[:, 0],
+            read[clock].faults.get(clock, "") or read[name].faults.get(name, ""),
+        )
+        for name, clock in clocks.items()
+    ]
+    own = {clock.rpartition(".")[2] for clock in clocks.values()}
+    time = f"{own.pop()} [s]" if len(own) == 1 else TIME
+    used = ", ".join(map(shown, list(dict.fromkeys(clocks.values()))[:LISTED]))
+    lost = [name for name in lengths if name not in clocks]
+    note = f" Without a time of their own are {', '.join(map(shown, lost[:LISTED]))}." if lost else ""
+    return replace(
+        clocked(source.path, source.sha256, series, time, source.note + note),
+        unread=(*source.unread, *lost),
+        notes=(f"vectors have times of their own: {used}",),
+    )
+
+
+def _is_time(name: str) -> bool:
+    """Whether a vector's name says time, ``t`` beside other words included: ``t_pos``, ``t2``."""
+    return said_by(name).kind == "time" or "t" in re.split(r"[\W_\d]+", name.rpartition(".")[2])

@@ -30,6 +30,8 @@ USUALLY = 0.98
 of an empty tank's level, is integrated as well as can be."""
 VISITED = 200
 """Samples of the recordings that are asked how stiff the prior is there, beside the outermost ones."""
+CHAINED = 20
+"""Periods of a recursion that one call evaluates: calls from Python take as long as some hundred operations."""
 Points: TypeAlias = tuple[Array, Array, Array]
 """States ``(n, n_x)``, inputs ``(n, n_u)`` and disturbances ``(n, n_w)``."""
 
@@ -130,21 +132,25 @@ def over_time(
         ``z`` ``(T + 1, size, n)``, and each of the others ``(T, size, n)``.
     """
     steps, n = len(signals[0]), first.shape[-1]
-    buffer: Any
-    buffer, evaluate = _side_by_side(period, len(signals), n).buffer()
     held = np.concatenate([np.zeros((0, n)), *(v.reshape(-1, n) for v in constants)])
     moving, fixed = (np.ascontiguousarray(v, np.float64) for v in (np.concatenate(signals, axis=1), held))
     sizes = [period.numel_out(i) for i in range(1, period.n_out())]
     z, others = np.empty((steps + 1, period.numel_in(0), n)), np.empty((steps, sum(sizes), n))
     z[0] = first.reshape(-1, n)
-    given = [(buffer.set_arg, 0, z), (buffer.set_arg, 1, moving), (buffer.set_res, 0, z[1:])]
-    given += [(buffer.set_res, 1, others)] if sizes else []
-    if fixed.size:
-        buffer.set_arg(2, memoryview(fixed.data))
-    for k in range(steps):
-        for place, i, v in given:
-            place(i, memoryview(v[k].data))
-        evaluate()
+    one, done = _side_by_side(period, len(signals), n), 0
+    for function, length in ((_chained(one), CHAINED), (one, 1)) if steps >= CHAINED else ((one, 1),):
+        buffer: Any
+        buffer, evaluate = function.buffer()
+        if fixed.size:
+            buffer.set_arg(2, memoryview(fixed.data))
+        for k in range(done, steps - length + 1, length):
+            buffer.set_arg(0, memoryview(z[k].data))
+            buffer.set_arg(1, memoryview(moving[k : k + length].data))
+            buffer.set_res(0, memoryview(z[k + 1 : k + 1 + length].data))
+            if sizes:
+                buffer.set_res(1, memoryview(others[k : k + length].data))
+            evaluate()
+            done = k + length
     return z, np.split(others, np.cumsum(sizes)[:-1], axis=1) if sizes else []
 
 
@@ -162,6 +168,19 @@ def _side_by_side(period: ca.Function, signals: int, n: int) -> ca.Function:
     z, *others = period.call([ca.reshape(v, *period.size_in(i)) for i, v in enumerate(parts)])
     found = [ca.vec(z), ca.vertcat(*(ca.vec(v) for v in others))]
     return vectorised(ca.Function(period.name(), given, found), n)
+
+
+@lru_cache(maxsize=128)
+def _chained(one: ca.Function) -> ca.Function:
+    """``CHAINED`` periods as one function, what each of them gives side by side: few calls from Python."""
+    z, constants = ca.MX.sym("z", *one.size_in(0)), ca.MX.sym("c", *one.size_in(2))
+    signals = ca.MX.sym("s", one.size1_in(1), CHAINED * one.size2_in(1))
+    found, after = [], z
+    for now in ca.horzsplit(signals, one.size2_in(1)) if one.size2_in(1) else [signals] * CHAINED:
+        found.append(one.call([after, now, constants]))
+        after = found[-1][0]
+    results = [ca.horzcat(*values) for values in zip(*found, strict=True)]
+    return ca.Function(one.name(), [z, signals, constants], results)
 
 
 def stepped(xdot: ca.Function, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int) -> ca.SX:

@@ -12,19 +12,15 @@ from numpy.typing import NDArray
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.fit import (
-    AT_BOUND,
-    GROWN,
-    LENGTHS,
-    POOR,
-    WINDOWS,
-    OutputFit,
-    Shooting,
-    cut_outputs,
-)
+from hybrid_mpc.identify.fit import LENGTHS
+from hybrid_mpc.identify.fit_warnings import AT_BOUND
+from hybrid_mpc.identify.output_fit import GROWN, OutputFit
 from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import visited
 from hybrid_mpc.identify.smooth import Smoother
+from hybrid_mpc.identify.starts import POOR
+from hybrid_mpc.identify.windows import FEW, cut_outputs
 from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
@@ -201,7 +197,7 @@ def bound_costs(
 
 
 def shooting(
-    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = WINDOWS // 2
+    fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = FEW
 ) -> Shooting:
     """At most so many windows of ``length`` [s], or as long as the recordings hold."""
     longest = max(len(t.t) for t in known) - 1

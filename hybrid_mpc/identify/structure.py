@@ -19,20 +19,13 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.identify.fit import (
-    GROWN,
-    LENGTHS,
-    POOR,
-    QUIET,
-    OutputFit,
-    Shooting,
-    Trial,
-    check_observable,
-    with_states,
-)
+from hybrid_mpc.identify.fit import LENGTHS, QUIET, check_observable, with_states
+from hybrid_mpc.identify.output_fit import GROWN, OutputFit
+from hybrid_mpc.identify.shooting import Shooting, Trial
 from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, Points, required_substeps, visited
 from hybrid_mpc.identify.smooth import rough_smoother
 from hybrid_mpc.identify.sound import shooting
+from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.excitation import check_excitation
+from hybrid_mpc.data.names import name_and_unit
 from hybrid_mpc.data.recording import censored_of, read_recording
 from hybrid_mpc.data.scales import noise_of, time_scale
-from hybrid_mpc.data.source import name_and_unit
 from hybrid_mpc.data.trajectories import ROLES, Trajectory, line_mean, to_grid
 
 SPEC = DataSpec("t", ("u",), ("y",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
@@ -83,7 +83,7 @@ def test_a_slow_sensor_of_a_disturbance_is_bridged_and_what_it_does_not_cover_is
     told = finding.kind, finding.channel, finding.count, finding.start
     assert told == ("missing", "wind", 594, 0.0)
     assert "594 of 600 rows (99 %)" in str(finding)
-    assert "none for 1 s at most" in str(finding)
+    assert "the longest time without one is 1 s" in str(finding)
 
 
 def test_trajectories_are_made_without_disturbances():

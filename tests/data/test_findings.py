@@ -8,8 +8,8 @@ import pytest
 from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
-from hybrid_mpc.data.findings import still_stretches
-from hybrid_mpc.data.recording import read_recording, unwrapped
+from hybrid_mpc.data.findings import still_stretches, unwrapped
+from hybrid_mpc.data.recording import read_recording
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)

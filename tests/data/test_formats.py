@@ -135,6 +135,18 @@ def test_hdf5(tmp_path):
     same(read(path, "bench.t", ["u"], ["xy(:,2)", "level"]), T, U, Y, Y)
 
 
+def test_links_that_lead_to_one_group_again_and_again(tmp_path):
+    """A hundred links at each of eight depths are 1e16 ways."""
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    path = tmp_path / "run.h5"
+    with h5py.File(path, "w") as file:
+        group = file.create_group("a")
+        for k in range(100):
+            group[f"again{k}"] = group
+    with pytest.raises(InputError, match=r"run.h5: .*more than 10000 groups"):
+        opened(path)
+
+
 # MATLAB
 
 
@@ -149,6 +161,21 @@ def test_matrices_structs_in_structs_and_vectors_of_other_lengths(tmp_path):
     same(read(path, "dt", ["runs(1).v"]), T, U)
     with pytest.raises(InputError, match="differ in length"):
         read(path, "log.t", ["short"])
+
+
+def test_vectors_of_different_lengths_with_times_of_their_own(tmp_path):
+    """A time in each struct, or one of each length: inputs are held, outputs have their own samples."""
+    path, slow = tmp_path / "run.mat", T[::4] + 0.002
+    named = {"t_fast": T, "u": U, "t_slow": slow, "y": Y[::4]}
+    structs = {"a": {"t": T, "log": {"u": U}}, "b": {"t": slow, "y": Y[::4]}}
+    for content, time in ((named, "time"), (structs, "t")):
+        savemat(path, {**content, "k": 3.0})
+        rules(path, time, "u", "y")
+        assert opened(path).unread == ("k",)
+    same(read(path, "a.t", ["a.log.u"]), T, U)  # one clock by its own name
+    savemat(path, {"t": T, "u": U, "y": Y[::4]})  # which samples have which time?
+    with pytest.raises(InputError, match="differ in length"):
+        read(path, "t", ["u"], ["y"])
 
 
 def test_version_7_3(tmp_path):
@@ -167,12 +194,16 @@ def test_version_7_3(tmp_path):
         put("note", np.array([[97, 98]], dtype=np.uint16), b"char")
         put("#refs#/a", U[None])
         file["runs/v"] = np.array([[file["#refs#/a"].ref]], dtype=h5py.ref_dtype)
+        put("#refs#/b", Y[None])
+        file["#refs#/s/w"] = np.array([[file["#refs#/a"].ref, file["#refs#/b"].ref]], dtype=h5py.ref_dtype)
+        put("c", np.array([[file["#refs#/b"].ref, file["#refs#/s"].ref]], dtype=h5py.ref_dtype), b"cell")
         put("run", np.array([[1, 2]], dtype=np.uint32), b"timetable")
         file["run"].attrs["MATLAB_object_decode"] = np.int32(3)
     content = bytearray(path.read_bytes())
     content[:128] = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
     path.write_bytes(bytes(content))
     same(read(path, "t", ["xy(:,1)", "runs(1).v"], ["xy(:,2)", "log.deep.y"]), T, U, U, Y, Y)
+    same(read(path, "t", ["c{2}(1).w"], ["c{1}", "c{2}(2).w"]), T, U, Y, Y)
     source = opened(path)
     assert source.unread == ("run",)
     assert "timetable2table(run" in source.note

@@ -126,6 +126,11 @@ def test_damaged_files(name):
     assert "refused" in outcomes
 
 
+def test_a_text_that_holds_nothing_but_its_mark():
+    for mark in ("\ufeff", "\ufeff\n", "\ufeff  \t\n"):
+        assert tried("csv", mark.encode()) == tried("csv", mark.encode("utf-16")) == "refused"
+
+
 @pytest.mark.parametrize("name", ["csv", "npz", "mat"])
 def test_strange_tables(name):
     ending, make = MAKERS[name]

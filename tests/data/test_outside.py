@@ -8,7 +8,8 @@ from machine_signals import machine
 from recording_bombs import GOOD, SPEC, T
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
-from hybrid_mpc.data.recording import even, folded, read_recording
+from hybrid_mpc.data.findings import folded
+from hybrid_mpc.data.recording import even, read_recording
 
 FREE = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
 PLAIN = machine((Signal("n", "rpm"),), (Signal("u", "V"),))

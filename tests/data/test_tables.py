@@ -278,7 +278,7 @@ AMBIGUOUS = {
         "day or month first",
     ),
     "hours or minutes": (text(with_cells(lambda k, c: f"10:{k:02d}", 0)), "hours and minutes"),
-    "no such day": (text(with_cells(lambda k, c: f"30.02.2024 10:00:{k:02d}", 0), ";"), "no such day"),
+    "no such day": (text(with_cells(lambda k, c: f"30.02.2024 10:00:{k:02d}", 0), ";"), "does not exist"),
     "two zones by name": (
         text(with_cells(lambda k, c: f"2024-03-31 10:00:{k:02d} {'CET' if k < 9 else 'CEST'}", 0)),
         "time zones",

@@ -8,7 +8,7 @@ from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.excitation import short_runs
-from hybrid_mpc.data.recording import check_unit
+from hybrid_mpc.data.recording import check_unit, read_recording
 from hybrid_mpc.data.trajectories import Trajectory, hold_mean
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
@@ -187,6 +187,35 @@ def test_units_of_the_specification_are_those_of_a_header():
     check_unit(spec, "flow", Signal("flow", "l/min"))
     with pytest.raises(InputError, match="'heater' is in 'W'"):
         check_unit(spec, "heater", Signal("heater", "K"))
+
+
+@pytest.mark.parametrize("column", ["level [m]", "level (m)", "level_m"])
+def test_a_unit_in_or_behind_a_name_counts_whatever_part_of_the_name_is_given(tmp_path, column):
+    t = 0.01 * np.arange(200)
+    spec = replace(SPEC, time="clock", inputs=("pump",), outputs=("level",))
+    path = write_csv(
+        tmp_path / "run.csv", {"clock_ms": 1000 * t, "pump_pct": 100 * (t > 1), column: 0.5 + 0.1 * t}
+    )
+    tank = machine((Signal("level", "mm"),), (Signal("pump", "-", 0, 1),))
+    for one in (spec, replace(spec, time="clock_ms", inputs=("pump_pct",), outputs=(column,))):
+        found = read_recording(path, tank, one)
+        np.testing.assert_allclose(found.y[:, 0], 500 + 100 * t, rtol=1e-9)
+        np.testing.assert_allclose(found.t, t, atol=1e-9)
+        np.testing.assert_array_equal(found.u[:, 0], t > 1)
+    given = replace(spec, units={"level": "cm", "clock": 0.002, "pump": 1.0})  # has the last word
+    found = read_recording(path, machine(tank.outputs, (Signal("pump", "-", 0, 100),)), given)
+    np.testing.assert_allclose(found.y[:, 0], 5 + t, rtol=1e-9)
+    np.testing.assert_allclose(found.t, 2 * t, atol=1e-9)
+
+
+def test_a_letter_behind_a_name_that_is_given_whole_may_be_an_index(tmp_path):
+    t = 0.01 * np.arange(200)
+    path = write_csv(tmp_path / "run.csv", {"t": t, "u_A": t, "T_m": 20 + t})
+    two = machine((Signal("oil", "degC"),), (Signal("voltage", "V"),))
+    found = read_recording(path, two, replace(SPEC, inputs=("u_A",), outputs=("T_m",)))
+    np.testing.assert_array_equal(found.u[:, 0], found.t)
+    with pytest.raises(InputError, match="column 'u_A' is in 'A'"):
+        read_recording(path, two, replace(SPEC, inputs=("u",), outputs=("T_m",)))
 
 
 def test_free_runs_longer_than_any_test_piece_are_told():

@@ -65,7 +65,7 @@ def test_a_delay_that_nobody_would_act_on_is_not_told(monkeypatch):
     """Half of a hundredth of a period explains all that is left of exact recordings, and matters to nobody."""
     runs = [late_recording(seed, 0.005) for seed in range(3)]
     assert not late_told(runs[:2], runs[2:])
-    monkeypatch.setattr("hybrid_mpc.identify.fit.SHORTEST", 0.0)
+    monkeypatch.setattr("hybrid_mpc.identify.fit_warnings.SHORTEST", 0.0)
     assert late_told(runs[:2], runs[2:])
 
 

@@ -8,8 +8,10 @@ from scipy.optimize import least_squares
 from simulated_pendulum import DT, TRUTH, Pendulum
 
 from hybrid_mpc import FirstStates, InputError, Trajectory, fit_prior
-from hybrid_mpc.identify.fit import OUTLIERS, OutputFit, Shooting, cut_outputs
+from hybrid_mpc.identify.output_fit import OutputFit
+from hybrid_mpc.identify.shooting import OUTLIERS, Shooting
 from hybrid_mpc.identify.simulation import Simulation
+from hybrid_mpc.identify.windows import cut_outputs
 
 NOISE, N, RUNS, SUBSTEPS = 5e-3, 80, 4, 2
 START = (0.4, 0.0)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import Parameter, Prior, Signal, Trajectory
-from hybrid_mpc.identify.fit import OutputFit, PredictionFit, cut_outputs, feedback, fit_by_prediction
+from hybrid_mpc.identify.closed_loop import PredictionFit, feedback, fit_by_prediction
+from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.smooth import fit_smoother
+from hybrid_mpc.identify.windows import cut_outputs
 
 DT, N = 0.1, 400
 TRUTH = {"a": -0.5, "b": 1.5}

@@ -9,9 +9,12 @@ from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, Parameter, Prior, Signal, Trajectory, fit_prior
-from hybrid_mpc.identify.fit import OutputFit, Shooting, beyond_ranges, cut_outputs, refit, smoothed
+from hybrid_mpc.identify.fit import beyond_ranges, refit, smoothed
+from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import Simulation, rest_of
+from hybrid_mpc.identify.windows import continued, cut_outputs
 
 NOISE = 2e-3
 
@@ -555,3 +558,19 @@ def test_a_fit_that_hardly_improves_says_so(noisy_runs, fit):
         line.startswith(("no fit improved on", "the fit hardly improves on")) for line in again.warnings
     )
     assert not any("improve" in line for line in fit.warnings)  # from wrong nominal values
+
+
+def test_recordings_that_follow_each_other_count_as_one() -> None:
+    """A recording cut in two, files in any order, is the same recording; one that begins elsewhere stays apart."""
+    runs = [record(k, seconds=3.0) for k in range(2)]
+    moved = [replace(t, t=t.t + 100.0 * k) for k, t in enumerate(runs)]
+    keeps = {"b": slice(70, None), "a": slice(0, 70)}
+    halves = [t.part(keep, f"{k}{name}") for k, t in enumerate(moved) for name, keep in keeps.items()]
+    for one, other in zip(continued(halves), moved, strict=True):
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.y, other.y)
+    late = replace(halves[0], t=halves[0].t + 0.5 * halves[0].dt)
+    assert len(continued([late, halves[1]])) == 2
+    assert len(continued([t.part(keep) for t in moved for keep in keeps.values()])) == 4  # cut from one file
+    jumped = replace(halves[0], y=halves[0].y + 10.0 * np.ptp(halves[0].y))
+    assert len(continued([jumped, halves[1]])) == 2

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from hybrid_mpc.compare.sequential import hardest
-from hybrid_mpc.identify.fit import POOR
+from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
 from hybrid_mpc.workflow.stages.compare import REPORTED

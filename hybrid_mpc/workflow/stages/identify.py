@@ -29,7 +29,7 @@ from hybrid_mpc.identify.evaluate import (
     score,
     stacked_free_runs,
 )
-from hybrid_mpc.identify.fit import POOR, beyond_ranges, fit_prior, smoothed
+from hybrid_mpc.identify.fit import beyond_ranges, fit_prior, smoothed
 from hybrid_mpc.identify.linear import BASELINES, LinearModel
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
@@ -48,6 +48,7 @@ from hybrid_mpc.identify.sound import (
     structure_doubt,
     trial_length,
 )
+from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.structure import causes, causes_of_refusal, named
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train

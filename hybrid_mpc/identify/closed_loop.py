@@ -1,0 +1,228 @@
+"""Recordings under feedback: a test for feedback, and a fit to the errors of predictions one period ahead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.identifiable import Fitted
+from hybrid_mpc.identify.output_fit import OutputFit, delayed
+from hybrid_mpc.identify.shooting import OUTLIERS, Shooting
+from hybrid_mpc.identify.simulation import (
+    Simulation,
+    flow_slope,
+    rest_of,
+    with_unknown_rates,
+)
+from hybrid_mpc.identify.smooth import Smoother, output_slope
+from hybrid_mpc.identify.windows import OutputWindows
+from hybrid_mpc.machine.prior import Equations
+from hybrid_mpc.model.riccati import dare
+
+Array = NDArray[np.float64]
+PREDICTION_STEPS = 12
+"""Gauss-Newton steps of a fit of predictions at most; it starts near its end."""
+GAIN = 1e3
+"""Largest element of an observer's gain [sizes of a state a spread of an output]."""
+QUIETLY = 0.01
+"""Least noise of sensors and states that an observer's first gain counts with, over their spread and their size."""
+PAST, ANSWERS = 10, 3
+"""Samples of an input's own past, and of prediction errors, that are asked for feedback."""
+MEMORY = 200
+"""Lags up to which series are asked how far they hang together."""
+CHANCE = 4.0
+"""Standard deviations of a correlation by chance that count as 1: of some dozen, one in a thousand is larger."""
+
+
+class PredictionFit(OutputFit):
+    """The same parameters beside the gain of an observer: predictions one period ahead instead of free runs.
+
+    ``z+ = f(z + K (y - g(x, u)), u)`` with ``z = (x, d)``, of which ``d`` are the unknown rates of the states that the
+    prior has corrected; ``theta`` has ``K`` ``(n_z, n_y)`` behind the parameters. The delay stays: inputs are those
+    that act.
+
+    Args:
+        fit: The fit of free runs.
+        smoother: Of a fitted prior. Its filter at rest has the first ``K``.
+    """
+
+    def __init__(self, fit: OutputFit, smoother: Smoother) -> None:
+        super().__init__(fit.make, fit.dt)
+        self.points, self.least, self.n = fit.points, fit.least, len(self.unit)
+        self._corrected = smoother.prior.corrected
+        self.sizes = np.concatenate([smoother.sizes.x, np.array(smoother.sizes.rate)[list(self._corrected)]])
+        unit = np.outer(self.sizes, 1.0 / np.array(smoother.sizes.y)).ravel()
+        self._gains = [f"gain {i}" for i in range(len(unit))]
+        self.unit = np.concatenate([self.unit, unit])
+        first = np.clip(_gain_at_rest(smoother, self.sizes).ravel() / unit, -GAIN, GAIN)
+        self.nominal = np.concatenate([self.nominal, first])
+        self.lower, self.upper = (
+            np.concatenate([own, np.full(len(unit), limit)])
+            for own, limit in ((self.lower, -GAIN), (self.upper, GAIN))
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Names of what is fitted."""
+        return [*super().names, *self._gains]
+
+    def of(self, windows: OutputWindows) -> OutputWindows:
+        """Windows with first states ``z``, of which ``d`` begins at zero."""
+        more = np.zeros((len(windows.x), len(self._corrected)))
+        known = np.concatenate([windows.known, more > 0], axis=1)
+        return replace(windows, x=np.concatenate([windows.x, more], axis=1), known=known)
+
+    def _constants(self, theta: Array) -> list[float]:
+        return [*super()._constants(theta), *(theta * self.unit)[self.n :].tolist()]
+
+    @cached_property
+    def _free(self) -> list[int]:
+        every = [*(p.name for p in self.prior.parameters), "delay", *self._gains]
+        return [every.index(name) for name in self.names]
+
+    def _simulation(self, free: tuple[int, ...]) -> Simulation:
+        if free not in self._simulations:
+            xdot, output, correct = _observed(self.prior.equations, self._corrected)
+            self._simulations[free] = Simulation(xdot, self.dt, free, output, correct)
+        return self._simulations[free]
+
+    def _acting(self, theta: Array, commanded: Array, windows: OutputWindows) -> Array:
+        there = np.isfinite(windows.y)
+        acting = super()._acting(theta, commanded, windows)
+        return np.concatenate([acting, np.where(there, windows.y, 0.0), there], axis=-1)
+
+
+@lru_cache(maxsize=32)
+def _observed(
+    equations: Equations, corrected: tuple[int, ...]
+) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Rates and outputs of ``z``, and ``z`` corrected by a measurement, as functions ``(z, u, w, p)``.
+
+    Inputs are ``[u, slope by the delay, y, whether it is there]``, parameters ``[p, change of the delay, K]``.
+    """
+    rates, late = delayed(with_unknown_rates(equations.xdot, corrected)), delayed(equations.output)
+    n_y, n_z, n_x = late.size1_out(0), rates.size1_in(0), late.size1_in(0)
+    z, u, w, p = (ca.SX.sym(rates.name_in(i), rates.size1_in(i)) for i in range(4))
+    y, there, gain = ca.SX.sym("y", n_y), ca.SX.sym("there", n_y), ca.SX.sym("K", n_z * n_y)
+    given = [z, ca.vertcat(u, y, there), w, ca.vertcat(p, gain)]
+    shown = late(z[:n_x], u, w, p)
+    corrected_z = z + ca.reshape(gain, n_y, n_z).T @ (there * (y - shown))
+    values = {"rates": rates(z, u, w, p), "shown": shown, "corrected": corrected_z}
+    found = [ca.Function(name, given, [value]) for name, value in values.items()]
+    return found[0], found[1], found[2]
+
+
+def _gain_at_rest(smoother: Smoother, sizes: Array) -> Array:
+    """Gain ``(n_z, n_y)`` of a smoother's filter at rest; none where the outputs do not tell of all states there."""
+    prior, n_x = smoother.prior, len(smoother.prior.states)
+    x, u, w = rest_of(prior)
+    z = np.concatenate([x, np.zeros(len(prior.corrected))])
+    a = expm(
+        flow_slope(with_unknown_rates(prior.equations.xdot, prior.corrected))(z, u, w, prior.p).full()
+        * smoother.dt
+    )
+    c = np.zeros((len(smoother.sigma), len(z)))
+    c[:, :n_x] = output_slope(prior.equations)(x, u, w, prior.p)[1].full()
+    walk = np.concatenate([QUIETLY * sizes[:n_x], smoother.walk]) / sizes
+    spread = np.array(smoother.sizes.y)
+    c, a = c * sizes / spread[:, None], a * sizes / sizes[:, None]
+    noise = np.diag(np.square(np.maximum(smoother.sigma / spread, QUIETLY)))
+    try:
+        p, _ = dare(a.T, c.T, np.diag(np.square(np.maximum(walk, QUIETLY * smoother.dt))), noise)
+    except InputError:  # the fit finds one by itself
+        return np.zeros((len(z), len(spread)))
+    return np.asarray(np.linalg.solve(c @ p @ c.T + noise, c @ p).T * np.outer(sizes, 1.0 / spread))
+
+
+def fit_by_prediction(fit: OutputFit, theta: Array, windows: OutputWindows, smoother: Smoother) -> Fitted:
+    """Fit ``theta`` to the errors of predictions one period ahead, with the gain of their observer; the delay stays.
+
+    A machine that is unstable, or that was recorded under feedback with disturbances of its own, biases free runs:
+    inputs then answer to what free runs take for their error. Predictions know the measured past.
+
+    Args:
+        fit: The fit of free runs.
+        theta: What it found.
+        windows: Windows of the recordings with inputs that act.
+        smoother: That of the prior with ``theta``.
+
+    Source: Ljung, *System Identification: Theory for the User*, 1999, sections 4.3 and 7.3.
+    """
+    n, own = len(fit.free), PredictionFit(fit, smoother)
+    first = np.concatenate([theta[:n], own.nominal[n:]])
+    found = Shooting(own, own.of(windows), own.sizes).solve(first, PREDICTION_STEPS)
+    covariance = np.zeros((len(theta), len(theta)))
+    covariance[:n, :n] = found.covariance[:n, :n]
+    known = tuple(one for one in found.unidentified if set(one.parameters) <= set(fit.names))
+    return Fitted(np.concatenate([found.theta[:n], theta[n:]]), covariance, known)
+
+
+class Driven(Protocol):
+    """A recording with its inputs ``(n, n_u)``."""
+
+    @property
+    def u(self) -> Array:
+        """Inputs."""
+
+
+def feedback(trajectories: Sequence[Driven], errors: Sequence[Array]) -> float:
+    """How far inputs answer to earlier prediction errors: the largest correlation, over what chance makes of it.
+
+    What an input's own past does not tell of it is compared with the prediction errors of the same sample and of those
+    before; it is zero, but for chance, if the recordings were made in open loop. Several times 1 is feedback.
+
+    Args:
+        trajectories: Recordings.
+        errors: Prediction errors ``(n, n_y)`` of each, NaN where nothing was measured.
+    """
+    largest = 0.0
+    for j in range(trajectories[0].u.shape[1]):
+        rows, answers = [], []
+        for t, e in zip(trajectories, errors, strict=True):
+            u = t.u[:, j]
+            if len(u) <= 2 * PAST or not np.ptp(u) > 0:
+                continue
+            past = np.stack([u[PAST - k - 1 : len(u) - k - 1] for k in range(PAST)], axis=1)
+            before = np.stack([np.nan_to_num(e[PAST - k : len(u) - k]) for k in range(ANSWERS)], axis=1)
+            rows.append(np.column_stack([past, np.ones(len(past)), before.reshape(len(past), -1)]))
+            answers.append(u[PAST:])
+        if not rows:
+            continue
+        x, y = np.concatenate(rows), np.concatenate(answers)
+        own = x[:, : PAST + 1]
+        left = _without_jumps(y - own @ np.linalg.lstsq(own, y, rcond=None)[0])
+        for column in x[:, PAST + 1 :].T:
+            rest = _without_jumps(column - own @ np.linalg.lstsq(own, column, rcond=None)[0])
+            size = float(np.linalg.norm(left) * np.linalg.norm(rest))
+            if np.linalg.norm(left) > 1e-9 * np.linalg.norm(y) and size > 0:
+                chance = math.sqrt(max(float(_memory(left) @ _memory(rest)), 1.0) / len(y))
+                largest = max(largest, abs(float(left @ rest)) / size / chance)
+    return largest / CHANCE
+
+
+def _memory(values: Array) -> Array:
+    """Correlations of a series with itself, at lags of up to ``MEMORY`` to either side.
+
+    The correlation of two independent series has the variance of the sum of the products of theirs, over their length
+    (Bartlett, *On the theoretical specification and sampling properties of autocorrelated time-series*, 1946).
+    """
+    n = len(values)
+    power = np.square(np.abs(np.fft.rfft(values, 2 * n)))
+    own = np.fft.irfft(power)[: min(MEMORY, n - 1) + 1]
+    own = own / max(float(own[0]), 1e-300)
+    return np.concatenate([own, own[1:]])
+
+
+def _without_jumps(values: Array) -> Array:
+    """Values within three robust standard deviations: the jumps of a reference hide the rest of an input."""
+    limit = OUTLIERS * 1.4826 * float(np.median(np.abs(values)))
+    return np.clip(values, -limit, limit)

@@ -1,0 +1,142 @@
+"""Covariance of fitted parameters, and the combinations of parameters that the recordings do not identify."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.identify.output_fit import LOOSE, OutputFit
+from hybrid_mpc.identify.prior_result import Combination
+
+Array = NDArray[np.float64]
+UNTOLD = 1.0
+"""Standard error, in half ranges, from which on a combination of parameters counts as not told by the data."""
+CLUSTERS = 48
+"""Parts of the windows at least whose scatter tells the standard errors."""
+ROUNDED = 1e-11
+"""Ratio of singular values of the slopes below which they are rounding errors."""
+ALIKE_WEIGHTS = 0.8
+"""Ratio of the weights from which on parameters of one unit are taken to add up, instead of to multiply."""
+INVOLVED = 0.2
+"""Share of the largest from which on a parameter counts as a part of a combination."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What a fit to windows found: ``theta`` with its covariance, and what the windows do not tell."""
+
+    theta: Array
+    covariance: Array
+    unidentified: tuple[Combination, ...]
+
+
+def covariance(
+    fit: OutputFit,
+    theta: Array,
+    slopes: Array,
+    error: Array,
+    falling: Array,
+    counted: float,
+    taken: float,
+    outputs: int,
+) -> tuple[Array, tuple[Combination, ...]]:
+    """Covariance ``(k, k)`` of ``theta``, and the combinations of parameters that the windows do not identify.
+
+    It follows from the scatter of the slopes of ``CLUSTERS`` parts of the windows at least, since errors within a
+    window are no white noise, and from what holds ``theta`` at the nominal values. It is at least that of white noise,
+    since so few parts estimate their scatter roughly, and at most that of a half range.
+
+    Args:
+        fit: Names, units and bounds of the parameters.
+        theta: The fitted parameters ``(k,)``.
+        slopes: Slopes ``(n, m, k)`` of the errors by ``theta``, first states eliminated, over their scales, by the root
+            of their robust weights.
+        error: The errors ``(n, m)``, in the same way.
+        falling: Derivative of the robust influence function over its weight ``(n, m)``.
+        counted: Number of errors that count.
+        taken: Degrees of freedom that the first states take.
+        outputs: Number of outputs; ``m`` is a multiple of it.
+
+    Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters; Huber
+    and Ronchetti, *Robust Statistics* (2009), section 7.6, of the robust loss.
+    """
+    n, k = len(slopes), slopes.shape[-1]
+    if not k:
+        return np.zeros((0, 0)), ()
+    half = fit.half
+    rows = (slopes * np.sqrt(falling)[..., None]).reshape(-1, k) * half
+    _, values, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
+    told = np.zeros(k)
+    told[: len(values)] = np.where(values > ROUNDED * values[0], values, 0.0)
+    back = directions.T * half[:, None]  # theta from coordinates in which the information is diag(told^2)
+    scores = (slopes * error[..., None]).reshape(n, -1, outputs, k).sum(axis=2)
+    parts = min(math.ceil(CLUSTERS / n), scores.shape[1])
+    begins = np.arange(parts) * scores.shape[1] // parts
+    scores = np.add.reduceat(scores, begins, axis=1).reshape(-1, k)
+    left = max(counted - k - taken, 0.5 * counted)  # degrees of freedom
+    scores = scores @ back * (told > 0)
+    middle = scores.T @ scores * (counted / max(left, 1.0)) * len(scores) / max(len(scores) - 1, 1)
+    inverse = 1.0 / (np.square(told) + LOOSE**-2)
+    found = back @ ((middle + LOOSE**-2 * np.eye(k)) * np.outer(inverse, inverse)) @ back.T
+    found = 0.5 * (found + found.T)
+    white = float(np.square(error).sum()) / max(left, 1.0)  # variance of errors that are white, weighed
+    least = np.square(back) @ (inverse * inverse * (white * np.square(told) + LOOSE**-2))
+    short = np.sqrt(np.maximum(least / np.maximum(np.diag(found), 1e-300), 1.0))
+    found = found * np.outer(short, short)
+    values, directions = np.linalg.eigh(found / np.outer(half, half))
+    untold = directions[:, values >= UNTOLD**2].T
+    unknown = tuple(_combination(fit, theta, found, one) for one in untold)
+    bounded = directions * np.minimum(values, 1.0) @ directions.T * np.outer(half, half)
+    return bounded, tuple({one.parameters: one for one in unknown}.values())
+
+
+def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Array) -> Combination:
+    """What the data do not tell along a direction [half ranges], and the best known combination of the same."""
+    among = np.flatnonzero(np.abs(direction) > INVOLVED * np.abs(direction).max())
+    names = tuple(fit.names[i] for i in among)
+    if len(among) == 1:
+        return Combination(names)
+    sizes = fit.unit[among]
+
+    def known(size: Array) -> tuple[Array, float]:
+        """Weights of the parameters, each over its size, and what they add up to is known to."""
+        own = covariance[np.ix_(among, among)] * np.outer(sizes, sizes) / np.outer(size, size)
+        values, directions = np.linalg.eigh(own)
+        weights = directions[:, 0] / size
+        return weights, math.sqrt(max(float(values[0]), 0.0))
+
+    weights, error = known(fit.half[among] * sizes)
+    ratio = np.abs(weights / np.abs(weights).max())
+    units = {fit.free[i].unit if i < len(fit.free) else "s" for i in among}
+    value = theta[among] * sizes
+    sign = np.sign(theta[among])
+    one_sign = (sign * np.where(sign > 0, fit.lower[among], fit.upper[among]) >= 0).all() and sign.all()
+    product = bool(one_sign) and not (len(units) == 1 and ratio.min() > ALIKE_WEIGHTS)
+    if product:
+        weights, error = known(value)
+        weights = weights * value
+    largest = float(weights[np.abs(weights).argmax()])
+    return Combination(names, tuple((weights / largest).tolist()), product, error / abs(largest))
+
+
+def standard_errors(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
+    """Standard errors of the parameters that the data tell of."""
+    if not len(chosen.covariance):
+        return {}
+    sizes = np.sqrt(np.maximum(np.diag(chosen.covariance), 0.0)) * fit.unit
+    return {p.name: float(e) for p, e in zip(fit.free, sizes, strict=False) if math.isfinite(e)}
+
+
+def correlations(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
+    """Correlation of the errors of every two parameters that the data tell of, by ``"a, b"``."""
+    c = chosen.covariance
+    sigma = np.sqrt(np.maximum(np.diag(c), 1e-300)) if len(c) else np.zeros(0)
+    told = [i for i in range(min(len(c), len(fit.free))) if math.isfinite(sigma[i])]
+    return {
+        f"{fit.names[i]}, {fit.names[j]}": float(c[i, j] / (sigma[i] * sigma[j]))
+        for k, i in enumerate(told)
+        for j in told[k + 1 :]
+    }

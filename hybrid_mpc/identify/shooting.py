@@ -1,0 +1,553 @@
+"""Multiple shooting: parameters and the first states of windows as one robust least-squares problem.
+
+First states are eliminated from every step of Levenberg and Marquardt. Parameters stay within their bounds.
+
+Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.scales import robust_spread, within
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.identifiable import Fitted, covariance
+from hybrid_mpc.identify.output_fit import OutputFit, Slopes
+from hybrid_mpc.identify.prior_result import Combination
+from hybrid_mpc.identify.windows import OutputWindows
+
+Array = NDArray[np.float64]
+ITERATIONS = 25
+"""Gauss-Newton steps of a length at most."""
+FIRST = 4
+"""Steps at most before outputs and outliers are weighed by their residuals."""
+LOOSELY = 1e-2
+"""Weight of a first state's distance from its guess, over its size, beside errors that are counted in spreads: a guess
+by the nominal prior is far off where that is, and errors are a small share of the spread once first states fit."""
+ROUNDING = 1e-12
+"""Share that is added to the diagonal of the normal equations: first states that act alike stay solvable."""
+STEEP = 1e8
+"""Slopes beyond this many spreads of an output per size of a first state or parameter do not count: a run diverges."""
+OUTLIERS = 3.0
+"""Residuals beyond this many robust standard deviations count by their size, not by its square."""
+COMMON = 0.7
+"""Least robust standard deviation of an output's errors, over their root mean square without gross outliers: where a
+prior is far off for a part of the time, that part is no outlier."""
+GROSS = 10.0
+"""Residuals beyond this many robust standard deviations are left out at the end of a fit: any weight would bias it."""
+SCALINGS = 4
+"""Times at most that outputs are weighed by their residuals: outliers hide how small those are."""
+SETTLED = 0.8
+"""Share to which the scales must fall for another time."""
+FAR = 3.0
+"""Errors beyond this many spreads of the data are as bad as this one where candidates are compared."""
+LARGEST = 1e3
+"""Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
+COMPARED = 10
+"""Steps at most of the first states alone, where candidates are compared."""
+FOLLOWING = 4
+"""Steps at most of the first states after ``theta``, where it would be rejected without."""
+ALIKE = 1e-3
+"""These steps end when none lowers a candidate's cost by more than this share."""
+DAMPING, WORST = 1e-3, 1e9
+"""First damping of a step, and the one with which steps are given up."""
+CONVERGED = 0.01
+"""A step that lowers the cost by less than this share of a window's mean cost is the last of a fit: further steps are
+far smaller than a standard error."""
+CLOSELY = 1e-4
+"""The same share at the end of a fit: steps along a narrow valley are short."""
+SETTLING, DIGITS, SAME = 12, 1e-9, 1e-9
+"""Steps at most at the end of a fit, which end where none moves a parameter by more than this share of its half range;
+and the share by which rounding may raise the cost there."""
+SHARES = 1.0, 0.5, 0.2, 0.05
+"""Shares of such a step, of which the first that does not raise the cost is taken."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Result of a short fit: the number of its start, ``theta``, and the error of the windows over the spread."""
+
+    start: int
+    theta: Array
+    error: float
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Errors of the outputs at ``theta`` and first states ``x`` ``(n, n_x)``, and their Jacobians.
+
+    ``error`` ``(n, (T + 1) n_y)`` is zero where nothing was measured. ``slopes`` ``(n, (T + 1) n_y, columns)`` are the
+    derivatives by ``theta`` (where asked for) and by ``x`` over its sizes. ``scale`` ``(n_y,)`` is the unit of each
+    output's errors. Errors beyond ``far`` scales cost a constant. ``held`` is the weight of a first state's distance
+    from its guess, in sizes, beside errors in scales.
+    """
+
+    theta: Array
+    x: Array
+    substeps: int
+    scale: Array
+    error: Array
+    slopes: Array
+    held: float
+    far: float = math.inf
+
+    @property
+    def scales(self) -> Array:
+        """Scale of each error of a window."""
+        return np.tile(self.scale, self.error.shape[1] // len(self.scale))
+
+    def where(self, better: NDArray[np.bool_], other: _Point) -> _Point:
+        """Windows of the other one where it is better."""
+        own, new = ((p.x, p.error, p.slopes) for p in (self, other))
+        x, error, slopes = (
+            np.where(better.reshape(-1, *(1 for _ in v.shape[1:])), n, v)
+            for v, n in zip(own, new, strict=True)
+        )
+        return replace(self, x=x, error=error, slopes=slopes)
+
+
+class Shooting:
+    """Windows of outputs as a least-squares problem over ``theta`` and the first states.
+
+    ``sizes`` ``(n_x,)`` are those of the states: first states keep to their guess as if it were known to that.
+    """
+
+    def __init__(
+        self, fit: OutputFit, windows: OutputWindows, sizes: Array, spread: Array | None = None
+    ) -> None:
+        self.own, self.windows, self.sizes = fit, windows, sizes
+        y = windows.y
+        self.seen = np.isfinite(y)
+        own = [robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T]
+        self.spread = np.array(own) if spread is None else spread
+        warm = np.repeat(np.arange(y.shape[1]) < windows.warm, y.shape[2]).astype(float)
+        self.tell: Array = warm if windows.warm else 1.0 - warm
+        self.count: Array = 1.0 - warm
+        members = np.bincount(windows.group)
+        self.members, self.alone = members[windows.group].astype(float), bool((members == 1).all())
+        self._known: dict[bytes, tuple[float, Array]] = {}
+
+    def explained(self, thetas: Sequence[Array]) -> list[float]:
+        """Root mean square error of each ``theta`` over the windows, from the first states that are best for it.
+
+        Errors are in spreads of the outputs, each at most ``FAR``. Infinite where the prior is too stiff.
+        """
+        unknown: dict[int, list[Array]] = {}
+        for theta in {one.tobytes(): one for one in thetas if one.tobytes() not in self._known}.values():
+            try:
+                unknown.setdefault(self.own.substeps(theta), []).append(theta)
+            except InputError:
+                self._known[theta.tobytes()] = math.inf, self.windows.x
+        n = len(self.windows.x)
+        share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
+        for some in unknown.values():  # all at once: windows do not know of each other
+            problem = Shooting(self.own, self.windows.times(len(some)), self.sizes, self.spread)
+            x = problem.windows.x
+            for periods in self._growing(some):
+                begun = Shooting(self.own, problem.windows.beginning(periods), self.sizes, self.spread)
+                x = begun._states(begun.start(np.stack(some), x, "x")).x
+            point = problem._states(problem.start(np.stack(some), x, "x"))
+            over = (
+                np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
+                * self.count
+            )
+            for i, theta in enumerate(some):
+                part = slice(i * n, (i + 1) * n)
+                error = float(np.sqrt(np.square(over[part]).sum() / share))
+                self._known[theta.tobytes()] = error, point.x[part]
+        return [self._known[theta.tobytes()][0] for theta in thetas]
+
+    def _growing(self, thetas: Sequence[Array]) -> list[int]:
+        """Lengths [periods] over which first states are estimated before the whole windows, where small errors grow
+        more than a hundredfold: each estimate is the start of the next.
+        """
+        periods, dt = self.windows.y.shape[1] - 1, self.own.dt
+        reach = min(self.own.reach(theta) for theta in thetas) / dt
+        if self.windows.warm or 0.8 * periods <= reach:
+            return []
+        return [int(own) for own in np.arange(max(reach, 4.0), periods, max(0.5 * reach, 2.0))]
+
+    def first_states(self, theta: Array) -> Array:
+        """First states ``(n, n_x)`` that are best for ``theta``."""
+        self.explained([theta])
+        return self._known[theta.tobytes()][1]
+
+    def solve(self, theta: Array, iterations: int = ITERATIONS) -> Fitted:
+        """Fit ``theta`` with the first states: errors are weighed by the spreads first, then by the residuals."""
+        theta = np.clip(theta, self.own.lower, self.own.upper)
+        point = self.start(theta, self.first_states(theta), "all")
+        if len(theta):
+            point = self._descend(point, min(iterations, FIRST))
+            for k in range(SCALINGS):
+                rescaled = replace(point, scale=self._left(point.error), held=1.0)
+                if k and (rescaled.scale > SETTLED * point.scale).all():
+                    break
+                point = self._descend(rescaled, iterations)
+            if (np.abs(point.error) > GROSS * point.scales).any():
+                point = self._descend(replace(point, far=GROSS), iterations)
+        return Fitted(point.theta, *self._covariance(point))
+
+    def several(
+        self,
+        thetas: Array,
+        each: Callable[[Sequence[int]], OutputFit],
+        keep: Sequence[int],
+        free: int | None = None,
+    ) -> list[Trial]:
+        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs; the worst end early.
+
+        Args:
+            thetas: Starts.
+            each: Fit for the starts of these numbers, whose windows lie one behind the other.
+            keep: How many go on after each two steps.
+            free: How many parameters are fitted, the first ones. Default: all.
+        """
+        alive, n = list(range(len(thetas))), len(self.windows.x)
+        damping = np.full(len(thetas), DAMPING)
+        share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
+
+        def many(numbers: Sequence[int]) -> Shooting:
+            return Shooting(each(numbers), self.windows.times(len(numbers)), self.sizes, self.spread)
+
+        def parts(point: _Point) -> list[_Point]:
+            rows = [slice(i * n, (i + 1) * n) for i in range(len(point.theta))]
+            return [
+                replace(point, theta=theta, x=point.x[r], error=point.error[r], slopes=point.slopes[r])
+                for theta, r in zip(point.theta, rows, strict=True)
+            ]
+
+        problem = many(alive)
+        begun = problem._states(problem.start(thetas, problem.windows.x, "x"))
+        point = problem._at(begun, thetas, begun.x, "all") if keep else begun
+        found = dict(zip(alive, parts(point), strict=True))
+        for left in keep:
+            for _ in range(2):
+                steps = []
+                for k in alive:
+                    xx, xt, tt, gx, gt = self._normal(found[k])
+                    normal = xx, xt[..., :free], tt[:free, :free], gx, gt[:free]
+                    step, moved, _ = self._step(normal, damping[k], found[k].theta[:free])
+                    steps.append((np.pad(step, (0, thetas.shape[1] - len(step))), moved))
+                theta = np.stack([
+                    np.clip(found[k].theta + step, self.own.lower, self.own.upper)
+                    for k, (step, _) in zip(alive, steps, strict=True)
+                ])  # fmt: skip
+                x = np.concatenate([
+                    found[k].x + moved[self.windows.group] * self.sizes
+                    for k, (_, moved) in zip(alive, steps, strict=True)
+                ])  # fmt: skip
+                trials = parts(many(alive)._at(begun, theta, x, "all"))
+                for k, trial in zip(alive, trials, strict=True):
+                    better = self._cost(trial) < self._cost(found[k])
+                    found[k] = trial if better else found[k]
+                    damping[k] *= 0.2 if better else 5.0
+            alive = sorted(alive, key=lambda k: self._cost(found[k]))[:left]
+        over = {
+            k: np.clip(found[k].error / np.tile(self.spread, self.windows.y.shape[1]), -FAR, FAR)
+            for k in alive
+        }
+        return [
+            Trial(k, found[k].theta, math.sqrt(float(np.square(over[k] * self.count).sum()) / share))
+            for k in alive
+        ]
+
+    def settled(self, theta: Array) -> Fitted:
+        """The fit continued to the last digits, so that it depends on neither the start nor rounding."""
+        point = self.start(theta, self.first_states(theta), "all")
+        for _ in range(2):
+            rescaled = replace(point, scale=self._left(point.error), held=1.0)
+            point = self._descend(rescaled, ITERATIONS, CLOSELY)
+        if (np.abs(point.error) > GROSS * point.scales).any():
+            point = replace(point, far=GROSS)
+        for _ in range(SETTLING):
+            point = replace(point, scale=self._left(point.error))
+            normal = self._behind(point) if self.windows.warm else self._normal(point)
+            step, moved, _ = self._step(normal, 0.0, point.theta)
+            for share in SHARES:
+                trial = self._along(point, share * step, share * moved)
+                if better := self._cost(trial) <= self._cost(point) * (1 + SAME):
+                    break
+            if not better:
+                break
+            far, point = np.abs(trial.theta - point.theta), trial
+            if (far <= DIGITS * self.own.half).all():
+                break
+        return Fitted(point.theta, *self._covariance(point))
+
+    def _along(self, point: _Point, step: Array, moved: Array) -> _Point:
+        """The point after a step; its first states are estimated anew where the cost would rise."""
+        theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
+        x = point.x + moved[self.windows.group] * self.sizes
+        if self.windows.warm:
+            x = self._states(self._at(point, theta, x, "x")).x
+        trial, cost = self._at(point, theta, x, "all"), self._cost(point)
+        if self._cost(trial) <= cost * (1 + SAME) or self.windows.warm:
+            return trial
+        own = self._followed(point, trial)
+        return self._at(point, theta, own.x, "all") if self._cost(own) <= cost * (1 + SAME) else trial
+
+    def forget(self) -> None:
+        """Forget the first states that were found with other integration steps."""
+        self._known.clear()
+
+    def shift(self, theta: Array, substeps: int) -> Array:
+        """How far a Gauss-Newton step moves ``theta`` where the outputs are those of so many sub-steps a period."""
+        point = self.start(theta, self.first_states(theta), "all")
+        point = replace(point, scale=self._left(point.error), held=1.0)
+        finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
+        moved = [
+            self._step(self._behind(p) if self.windows.warm else self._normal(p), 0.0, theta)[0]
+            for p in (point, replace(point, error=finer.error))
+        ]
+        return np.abs(moved[1] - moved[0])
+
+    def start(self, theta: Array, x: Array, slopes: Slopes) -> _Point:
+        """Errors at ``theta`` from ``x``, each output's over its spread."""
+        nothing = np.zeros(0)
+        substeps = self.own.most_substeps(np.atleast_2d(theta))
+        empty = _Point(theta, x, substeps, self.spread, nothing, nothing, LOOSELY**2)
+        return self._at(empty, theta, x, slopes)
+
+    def linear(self, theta: Array, x: Array) -> tuple[Array, Array]:
+        """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` and first states ``x``, these
+        eliminated, over their scales, by the root of their robust weights.
+        """
+        point = self.start(theta, x, "all")
+        return self._eliminated(replace(point, scale=self._left(point.error), held=1.0))[:2]
+
+    def _at(self, before: _Point, theta: Array, x: Array, slopes: Slopes) -> _Point:
+        """Another point."""
+        windows, seen, n, limit = self.windows, self.seen, len(x), LARGEST * self.spread
+        y, by = self.own.outputs(theta, x, windows, before.substeps, slopes)
+        error = np.nan_to_num(y, nan=np.inf) - np.where(seen, windows.y, 0.0)
+        beyond = np.where(windows.censored > 0, error > 0, error < 0)
+        counts = seen & ~((windows.censored != 0) & beyond)
+        inside = counts & (np.abs(error) < limit)
+        error = np.where(counts, np.clip(error, -limit, limit), 0.0).reshape(n, -1)
+        if slopes:
+            with np.errstate(over="ignore", invalid="ignore"):
+                by[..., -x.shape[1] :] *= np.where(self.windows.known, 0.0, self.sizes)[:, None, None]
+                inside &= np.abs(by).max(axis=-1) < STEEP * self.spread  # not where it is NaN
+            by[~inside] = 0.0
+            by = by.reshape(n, error.shape[1], by.shape[-1])
+        return replace(before, theta=theta, x=x, error=error, slopes=by)
+
+    def _costs(self, point: _Point) -> Array:
+        """Robust cost of each group of windows for its first state, the pull towards the guess included."""
+        c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
+        over = np.minimum(np.abs(point.error / point.scales), point.far)
+        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
+        return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
+
+    def _cost(self, point: _Point) -> float:
+        """Cost of ``theta``: the sum over all windows; with a warm-up, of the samples after it."""
+        if not self.windows.warm:
+            return float(self._costs(point).sum()) + self._pulled(point)
+        c2 = OUTLIERS**2
+        over = np.minimum(np.abs(point.error / point.scales), point.far)
+        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
+        return float((own * self.count).sum()) + self._pulled(point)
+
+    def _pulled(self, point: _Point) -> float:
+        """Cost of the parameters' distance from their nominal values."""
+        return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
+
+    def _moved(self, point: _Point) -> Array:
+        """Distance of the first states from their guess, in sizes, times the root of its weight."""
+        return np.asarray(math.sqrt(point.held) * (point.x - self.windows.x) / self.sizes)
+
+    def _grouped(self, values: Array) -> Array:
+        """Sums over the windows of each group."""
+        if self.alone:
+            return values
+        total = np.zeros((int(self.windows.group.max()) + 1, *values.shape[1:]))
+        np.add.at(total, self.windows.group, values)
+        return total
+
+    def _left(self, error: Array) -> Array:
+        """Robust scale ``(n_y,)`` of each output's residuals."""
+        own = error.reshape(self.windows.y.shape)
+        left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
+        robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
+        whole = np.array([float(np.sqrt(np.mean(within(v) ** 2))) if len(v) else 0.0 for v in left])
+        robust = np.maximum(robust, COMMON * whole)  # errors that are common are the prior's, and no outliers
+        return np.maximum(robust, 1e-9 * self.spread)
+
+    def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
+        """First states for a given ``theta``: Levenberg and Marquardt in each group of windows, until all converge."""
+        cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
+        damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
+        for _ in range(steps):
+            xx, _, _, gx, _ = self._normal(point)
+            moved = -np.linalg.solve(xx * (1 + damping * eye), gx[..., None])[..., 0]
+            trial = self._at(point, point.theta, point.x + moved[group] * self.sizes, "x")
+            new = self._costs(trial)
+            better, promised = new < cost, -2.0 * np.sum(gx * moved, axis=1)
+            gain = np.where(better, cost - new, np.where(damping[:, 0, 0] < WORST, promised, 0.0))
+            point = point.where(better[group], trial)
+            cost = np.minimum(cost, new)
+            damping = damping * np.where(better, 0.2, 5.0)[:, None, None]
+            gains, costs = (v.reshape(candidates, -1).sum(axis=1) for v in (gain, cost))
+            if (gains <= ALIKE * costs).all():
+                break
+        return point
+
+    def _followed(self, point: _Point, trial: _Point) -> _Point:
+        """The trial with first states estimated anew, in each window from the trial's or the point's."""
+        moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
+        still = self._at(point, trial.theta, point.x, "x")
+        better = self._costs(still) < self._costs(moved)
+        return self._states(moved.where(better[self.windows.group], still), FOLLOWING)
+
+    def _descend(self, point: _Point, iterations: int, enough: float = CONVERGED) -> _Point:
+        """Steps of Levenberg and Marquardt of ``theta`` and first states, until one lowers the cost by less than
+        ``enough`` times a window's mean cost.
+        """
+        damping, cost, n = DAMPING, self._cost(point), len(point.x)
+        for _ in range(iterations):
+            better = followed = False
+            normal = self._behind(point) if self.windows.warm else self._normal(point)
+            while not better and damping < WORST:
+                step, moved, promised = self._step(normal, damping, point.theta)
+                last = promised < enough * cost / n
+                theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
+                x = point.x + moved[self.windows.group] * self.sizes
+                if self.windows.warm:  # the warm-up tells the first states of every theta
+                    x = self._states(self._at(point, theta, x, "x")).x
+                trial = self._at(point, theta, x, "all")
+                new = self._cost(trial)
+                if not (
+                    new < cost or last or followed or self.windows.warm
+                ):  # first states may not have followed
+                    followed = True
+                    own = self._followed(point, trial)
+                    if self._cost(own) < cost:
+                        trial = self._at(point, theta, own.x, "all")
+                        new = self._cost(trial)
+                better = new < cost
+                damping *= 0.2 if better else 5.0
+                if last:
+                    break
+            if not better:
+                break
+            gain, point, cost = cost - new, trial, new
+            if last or gain < enough * cost / n:
+                break
+        return point
+
+    def _weighted(self, point: _Point) -> Array:
+        """Jacobian and, as the last column, errors: over their scale and times the root of their robust weight."""
+        error = point.error / point.scales
+        root = np.where(np.abs(error) < point.far, (1 + np.square(error / OUTLIERS)) ** -0.25, 0.0)
+        slopes = point.slopes * (root / point.scales)[..., None]
+        return np.concatenate([slopes, (root * error)[..., None]], axis=-1)
+
+    def _normal(self, point: _Point) -> tuple[Array, ...]:
+        """Blocks of the normal equations: of ``x`` and of both by groups, of ``theta``, and the gradients."""
+        rows, n_x = self._weighted(point) * np.sqrt(self.tell)[:, None], point.x.shape[1]
+        every = rows.swapaxes(1, 2) @ rows
+        t, x = slice(0, -1 - n_x), slice(-1 - n_x, -1)
+        moved, n = self._moved(point) / self.members[:, None], rows.shape[-1] - 1 - n_x
+        moved = math.sqrt(point.held) * moved
+        pull, from_nominal = self._pull(point, n)
+        return (
+            _regular(self._grouped(every[:, x, x]), point.held), self._grouped(every[:, x, t]),
+            every[:, t, t].sum(axis=0) + pull, self._grouped(every[:, x, -1] + moved),
+            every[:, t, -1].sum(axis=0) + from_nominal,
+        )  # fmt: skip
+
+    def _pull(self, point: _Point, n: int) -> tuple[Array, Array]:
+        """The pull towards the nominal values: its part of the normal matrix and of the gradient."""
+        if not n:  # of the first states alone
+            return np.zeros((0, 0)), np.zeros(0)
+        weights = np.square(self.own.pull)
+        return np.diag(weights), weights * (point.theta - self.own.nominal)
+
+    def _eliminated(self, point: _Point) -> tuple[Array, Array, Array, float]:
+        """Jacobian by ``theta`` and errors that count, first states eliminated; how first states follow ``theta``, and
+        the degrees of freedom that they take.
+        """
+        rows, n_x = self._weighted(point), point.x.shape[1]
+        b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
+        at = (a * self.tell[:, None]).swapaxes(1, 2)
+        xx = _regular(self._grouped(at @ a), point.held)
+        follow = np.linalg.solve(xx, self._grouped(at @ np.concatenate([b, error], axis=-1)))
+        left = np.concatenate([b, error], axis=-1) - a @ follow[self.windows.group]
+        left *= self.count[:, None]
+        taken = (
+            0.0
+            if self.windows.warm
+            else float(np.trace(np.eye(n_x) - point.held * np.linalg.inv(xx), axis1=1, axis2=2).sum())
+        )
+        return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64), taken
+
+    def _behind(self, point: _Point) -> tuple[Array, ...]:
+        """As :meth:`_normal`, for the samples after the warm-up; the warm-up alone determines the first states."""
+        b, error, follow, _ = self._eliminated(point)
+        n_x = point.x.shape[1]
+        pull, from_nominal = self._pull(point, b.shape[-1])
+        return (
+            np.broadcast_to(np.eye(n_x), (len(follow), n_x, n_x)), follow[..., :-1],
+            (b.swapaxes(1, 2) @ b).sum(axis=0) + pull, follow[..., -1],
+            (b.swapaxes(1, 2) @ error[..., None])[..., 0].sum(axis=0) + from_nominal,
+        )  # fmt: skip
+
+    def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
+        """Step of ``theta`` within its bounds, step of the first states by groups, and the decrease of the cost to
+        first order.
+        """
+        xx, xt, tt, gx, gt = normal
+        reduced, slope = tt, gt
+        if not self.windows.warm:
+            xx = xx * (1 + damping * np.eye(xx.shape[-1]))
+        solved = np.linalg.solve(xx, np.concatenate([xt, gx[..., None]], axis=-1))
+        by_theta, own = solved[..., :-1], solved[..., -1]
+        if not self.windows.warm:
+            reduced = tt - (xt.swapaxes(1, 2) @ by_theta).sum(axis=0)
+            slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
+        step = _bounded(
+            reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30)), slope,
+            self.own.lower[: len(theta)] - theta, self.own.upper[: len(theta)] - theta,
+        )  # fmt: skip
+        moved = -own - (by_theta @ step[:, None])[..., 0]
+        of_states = 0.0 if self.windows.warm else float(np.sum(gx * moved))
+        return step, moved, -2.0 * (float(gt @ step) + of_states)
+
+    def _covariance(self, point: _Point) -> tuple[Array, tuple[Combination, ...]]:
+        """Covariance of ``theta``, and what the windows do not identify."""
+        slopes, error, _, taken = self._eliminated(point)
+        falling = 1.0 / (1.0 + np.square(point.error / point.scales / OUTLIERS))  # psi'(r) over psi(r) / r
+        counted = float((self.seen.reshape(len(slopes), -1) * self.count).sum())
+        return covariance(self.own, point.theta, slopes, error, falling, counted, taken, len(self.spread))
+
+
+def _bounded(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
+    """Step ``(n,)`` to the least of ``s' matrix s / 2 + slope' s`` between ``low <= 0`` and ``high >= 0``.
+
+    Of the components that would go beyond, the first one to meet its bound is held there, and the others are solved for
+    anew: held together, two that lie along a valley would both rest in a corner. None is let go of again.
+    """
+    step, free = np.zeros(len(slope)), np.arange(len(slope))
+    held = np.zeros(len(slope), dtype=bool)
+    for _ in range(len(slope)):
+        free = np.flatnonzero(~held)
+        right = slope[free] + matrix[np.ix_(free, np.flatnonzero(held))] @ step[held]
+        step[free] = -np.linalg.lstsq(matrix[np.ix_(free, free)], right, rcond=1e-14)[0]
+        ends = np.clip(step, low, high)
+        beyond = free[ends[free] != step[free]]
+        if not len(beyond):
+            break
+        first = beyond[np.lexsort((-np.abs(step - ends)[beyond], (ends[beyond] / step[beyond])))[0]]
+        held[first], step[first] = True, ends[first]
+    return step
+
+
+def _regular(xx: Array, held: float) -> Array:
+    """Normal matrices of first states ``(n, n_x, n_x)`` with what holds these at their guess."""
+    eye = np.eye(xx.shape[-1])
+    return np.asarray(xx * (1.0 + ROUNDING * eye) + held * eye)
