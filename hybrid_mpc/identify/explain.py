@@ -21,7 +21,6 @@ from scipy.stats import t as student
 from hybrid_mpc.data.scales import evenly, robust_spread
 from hybrid_mpc.data.scales import periods as periods_of
 from hybrid_mpc.data.trajectories import Trajectory
-<<<<<<< HEAD
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.identify.explanation import (
     Evidence,
@@ -35,18 +34,12 @@ from hybrid_mpc.identify.explanation import (
     Trial,
     bound,
 )
-from hybrid_mpc.identify.fit import Fitted, OutputFit, OutputWindows, Shooting, cut_outputs
-from hybrid_mpc.identify.simulation import Points, visited
-from hybrid_mpc.identify.term_library import Candidate, library
-=======
-from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import Points, visited
+from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.identify.windows import OutputWindows, cut_outputs
-from hybrid_mpc.machine import terms as laws
->>>>>>> main
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior, named
 from hybrid_mpc.machine.signals import Signal
