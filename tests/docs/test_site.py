@@ -1,5 +1,6 @@
 """The site builds, its links lead somewhere, and every page of docs/ is in it."""
 
+import itertools
 import re
 import shutil
 import subprocess
@@ -43,6 +44,22 @@ def searched(site, words):
     return re.findall(r'<a href="([^"]*)" class="md-search-result__link"', done.stdout)
 
 
+MEASURED = """<script>addEventListener("load", () => {
+document.documentElement.setAttribute("data-wide", document.documentElement.scrollWidth) })</script></body>"""
+
+
+def widest(page, width):
+    """Width [px] that a page needs in a window of a width; more than the window's is scrolled sideways."""
+    copy = page.with_name(f"measured-{page.name}")
+    copy.write_text(page.read_text().replace("</body>", MEASURED))
+    done = subprocess.run(
+        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},800", "--dump-dom",
+         "--virtual-time-budget=4000", copy.as_uri()],
+        capture_output=True, text=True, timeout=HANGS,
+    )  # fmt: skip
+    return int(re.search(r'data-wide="(\d+)"', done.stdout)[1])
+
+
 PICTURE = re.compile(r"!\[([^\]]*)\]\(([^)\s]+)\)")
 
 
@@ -71,6 +88,8 @@ def test_the_site_builds_and_a_broken_link_stops_it(tmp_path):
         found = searched(tmp_path / "site", "offset disturbance")
         assert any("mpc.html" in link for link in found)
         assert not searched(tmp_path / "site", "xyzzyplugh")
+        for name, width in itertools.product(("machines", "mpc", "data", "results/explain"), (1280, 500)):
+            assert widest(tmp_path / "site" / f"{name}.html", width) <= width, name
     settings = (ROOT / "mkdocs.yml").read_text().replace("docs_dir: docs", f"docs_dir: {tmp_path}/docs")
     (tmp_path / "docs").mkdir()
     (tmp_path / "docs" / "index.md").write_text("[nowhere](none.md)\n")
