@@ -70,6 +70,17 @@ class Table:
                     f"its {len(self.columns)} columns need one each"
                 )
 
+    def filled(self) -> Table:
+        """The table without columns that have nothing but dashes.
+
+        Example:
+            >>> Table(("task", "rise [s]", "offset"), (("step", None, 0.1), ("hold", "–", None))).filled().columns
+            ('task', 'offset')
+        """
+        kept = [i for i in range(len(self.columns)) if any(row[i] not in (None, "–") for row in self.rows)]
+        rows = [tuple(row[i] for i in kept) for row in self.rows]
+        return Table(tuple(self.columns[i] for i in kept), rows, self.caption)
+
     def csv(self) -> str:
         r"""The table as CSV: a header, numbers with all their digits, nothing for None.
 

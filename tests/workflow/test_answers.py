@@ -9,6 +9,7 @@ from hybrid_mpc import Promise
 from hybrid_mpc.files import read_object
 from hybrid_mpc.report.page import Report, render
 from hybrid_mpc.workflow.stages.answers import answer_all, controller_answer, model_answer, monitor_answer
+from hybrid_mpc.workflow.stages.report import oracle_words
 from hybrid_mpc.workflow.stages.results import Results, read_results
 from hybrid_mpc.workflow.stages.watch import CleanAlarms
 
@@ -91,3 +92,15 @@ def test_the_answers_come_first_on_the_page_and_hints_after_them(results):
     assert (
         text.index("Is the model good?") < text.index("Is the controller safe?") < text.index("the machine")
     )
+
+
+def test_an_oracle_that_is_beaten_is_explained(results):
+    control = results.control
+    task, cells = next(iter(control.details.tasks.items()))
+    dear = replace(cells["oracle"], cost=replace(cells["oracle"].cost, mean=1e9))
+    tasks = {**control.details.tasks, task: {**cells, "oracle": dear}}
+    (said,) = oracle_words(replace(control, details=replace(control.details, tasks=tasks)))
+    assert task in said
+    cheap = replace(cells["oracle"], cost=replace(cells["oracle"].cost, mean=0.0))
+    all_cheap = {name: {**own, "oracle": cheap} for name, own in control.details.tasks.items()}
+    assert oracle_words(replace(control, details=replace(control.details, tasks=all_cheap))) == ()

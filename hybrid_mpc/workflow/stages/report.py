@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -151,7 +151,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "control": [
             _control_table(results.control),
             _comparison_table(results.control),
-            _tracking_table(results.control),
+            _tracking_table(results.control, untracked(context)),
             _response_table(context),
         ],
         "on_model": _on_model_tables(results.on_model),
@@ -171,7 +171,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
             TITLES[key],
             instead.get(key, texts[key]),
             figures.get(key, ()),
-            [t for t in tables.get(key, ()) if t is not None and t.rows],
+            [t.filled() for t in tables.get(key, ()) if t is not None and t.rows],
             after.get(key, ()),
         )
         for key in TITLES
@@ -214,6 +214,7 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
             instead["control"] = (f"There is no closed loop here: {reason}.{timed}",)
         else:
             after["control"] = (f"The gap closed is not defined: {reason}.",)
+    after["control"] = (*after.get("control", ()), *oracle_words(control))
     on_model = results.on_model
     after["on_model"] = tuple(f"{name}: {why}." for name, why in on_model.left_out.items())
     if DRAWN_PRIOR in on_model.plants.values():
@@ -248,6 +249,22 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
             f"{name}: {m.fixed_point_reason}" for name, m in models.items() if m.fixed_point_reason
         )
     return instead, after
+
+
+def oracle_words(control: Control) -> tuple[str, ...]:
+    """A sentence about the tasks in which another controller costs less than the oracle; nothing without any."""
+    tasks = control.details.tasks if control.details is not None else {}
+    beaten = []
+    for task, cells in tasks.items():
+        costs = {name: cell.cost.mean for name, cell in cells.items() if cell.cost.mean is not None}
+        if "oracle" in costs and min(costs, key=lambda name: costs[name]) != "oracle":
+            beaten.append(task)
+    if not beaten:
+        return ()
+    return (
+        f"In {', '.join(beaten)} the oracle does not cost least. It knows the machine's equations, but it estimates "
+        "state and load from the same measurements as the others, so its cost is no lower bound there.",
+    )
 
 
 def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
@@ -477,7 +494,12 @@ def _comparison_table(control: Control) -> Table | None:
     return Table(("task", "baseline", "ratio of costs", "seeds", "finding"), rows, caption)
 
 
-def _tracking_table(control: Control) -> Table | None:
+def untracked(context: Context) -> set[str]:
+    """Names of the tasks whose references are not to be followed throughout: their weights change over time."""
+    return {task.name for task in context.scenario.tasks if task.weight is not None}
+
+
+def _tracking_table(control: Control, untracked: Collection[str]) -> Table | None:
     """Tracking errors of every signal that has a reference, in its unit."""
     if control.details is None:
         return None
@@ -485,7 +507,7 @@ def _tracking_table(control: Control) -> Table | None:
         (task, name, own[name])
         for task, own in control.details.tasks.items()
         for name in CONTROLLERS
-        if name in own
+        if name in own and task not in untracked
     ]
     signals, errors = _tracking([cell for *_, cell in cells])
     rows = [(task, name.replace("_", ", "), *own) for (task, name, _), own in zip(cells, errors, strict=True)]
@@ -510,7 +532,7 @@ def _response_table(context: Context) -> Table | None:
         )
         for task in tasks_of(scenario, context.budget.tasks)
         for row in drawn
-        if row.task == task.name and row.controller in names
+        if row.task == task.name and row.controller in names and task.weight is None
         for signal, answer in step_responses(task.control or scenario.control, prior, row.arrays).items()
     ]  # fmt: skip
     caption = (
