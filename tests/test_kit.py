@@ -180,7 +180,7 @@ def test_the_lines_of_the_readme(run, monkeypatch):
     monkeypatch.chdir(run.parent)
     names = {
         "read": lambda: plant.measure(machine["state"], rng), "write": lambda u: machine.update(u=u), "wait": wait,
-        "running": running,
+        "running": running, "goal": [0.5, 0.0],
     }  # fmt: skip
     exec(lines.replace('"runs/mine"', repr(run.name)), names)
     assert names["loop"].state.k == 150

@@ -121,12 +121,17 @@ def _fitted_parameters(prior: Prior, found: PriorResult) -> Table:
         if not one.fixed:
             table.add_row(
                 one.name, f"{one.value:.4g}", f"{found.fit.values[one.name]:.4g}",
-                f"{found.fit.standard_errors[one.name]:.2g}", one.unit, f"{one.lower:g} to {one.upper:g}",
+                _error(found.fit.standard_errors.get(one.name)), one.unit, f"{one.lower:g} to {one.upper:g}",
                 ends.get(one.name, ""),
             )  # fmt: skip
     if found.fit.delay:
         table.add_row("delay of the inputs", "", f"{found.fit.delay:.4g}", "", "s", "", "")
     return table
+
+
+def _error(value: float | None) -> str:
+    """A standard error; a fit that keeps the nominal values has none."""
+    return "–" if value is None else f"{value:.2g}"
 
 
 def _free_runs(prior: Prior, found: PriorResult) -> Table:

@@ -623,7 +623,7 @@ class _Explain:
         if begun is not None:
             self._resume(begun)
         last: tuple[Trial, ...] = ()
-        reason = f"{most} steps were asked for at most"
+        reason = f"{most} step{'s' * (most > 1)} at most were asked for"
         while sum(step.action == "added" for step in self.steps) < most:
             trials, scored, chosen = self._step()
             if chosen is None:
@@ -737,7 +737,20 @@ class _Explain:
                 reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
         elif untold:
             reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
+        elif ends := self._at_bounds(forms, theta):
+            reason = f"{', '.join(ends)} would end at a bound"
         return _Fitted(forms, found, theta, squares, reason, not reason)
+
+    def _at_bounds(self, forms: Terms, theta: Array) -> list[str]:
+        """Parameters of new terms that end at a bound: the law then stands for something else."""
+        fit = self.search.fit((*self.now.terms, *forms))
+        own, values = {name for form in forms for name in form.names}, fit.values(theta)
+        fitted = [
+            FittedParameter(p.name, values[p.name], p.unit, 0.0, p.lower, p.upper)
+            for p in fit.prior.parameters
+            if p.name in own
+        ]
+        return [p.name for p in fitted if p.at_bound]
 
     def _both_needed(self, pair: _Fitted) -> bool:
         """Whether each term of a pair lowers the error beside the other."""

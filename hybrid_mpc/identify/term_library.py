@@ -43,7 +43,8 @@ def library(prior: Prior, points: Points, dt: float, length: float) -> tuple[Can
 
     Which can apply follows from its structure and units:
 
-    - a state whose rate is another state is an axis' position, and friction acts on axes alone;
+    - a state whose rate is another state is an axis' position, and most friction acts on axes alone;
+    - dry friction and losses act on other states of both signs, such as the speed of a fan;
     - terms that touch forces need a :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior`;
     - radiation and free convection are of temperatures;
     - an overflow is of a level: a state that cannot be negative, and no temperature;
@@ -196,6 +197,10 @@ class _Library:
             return self._weight(f"{key}_{own}", i, size, over(unit, *per), words=words)
 
         yield _one(laws.offset(own, weight("r_0", 1.0, words="offset of the rate"), place="rate"))
+        if state.lower < 0 and not (state.periodic or temperature):  # a speed without a position, a current
+            size = float(np.sqrt(np.mean(values**2)))
+            dry = self._weight(f"F_c_{own}", i, 1.0, unit, positive=True, words="dry friction")
+            yield _one(laws.coulomb(own, dry, width=0.05 * size or 1.0, place="rate"))
         if not state.periodic:
             yield from self._losses(i, state, temperature)
             yield self._storage(i, state)
@@ -231,7 +236,7 @@ class _Library:
         forms = []
         references: list[tuple[str | float, Array]] = (
             [(0.0, np.zeros(len(values)))]
-            if low >= 0 and not temperature
+            if not temperature and (low >= 0 or state.lower < 0)
             else [(low, np.full(len(values), low))]
         )
         references += [(s.name, c) for s, c in self._alike(i, state.unit)]

@@ -39,7 +39,8 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
         *_doubt(own), *_recordings(results), *_prior(own, explained), *_choice(own, explained), *_linear(own),
         *_floor(own), *_bands(own), *_promises(results), *_loops(results), *_watching(results),
     ]  # fmt: skip
-    if not any(hint.verdict == "bad" for hint in found):
+    tried = results.control.details is not None
+    if tried and not any(hint.verdict == "bad" for hint in found):
         found.append(
             Hint(
                 "good",

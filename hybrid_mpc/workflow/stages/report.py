@@ -345,7 +345,7 @@ def _prior_table(context: Context) -> Table:
     prior = context.prior
     rows = [
         (p.label, p.description, prior.nominal[p.name], prior.fit.values[p.name],
-         prior.fit.standard_errors.get(p.name, "fixed"))
+         "fixed" if p.fixed else prior.fit.standard_errors.get(p.name))
         for p in context.scenario.prior().parameters
     ]  # fmt: skip
     colours = ", ".join(f"{label} {value:.2f}" for label, value in prior.error_correlation.items())

@@ -551,7 +551,8 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     baseline = min((costs[n] for n in BASELINES if n in costs), key=lambda c: float(c.mean()))
     hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
     if min(len(baseline), len(oracle)) < 2:
-        return None, "one seed has no standard error: more seeds and oracle_seeds are needed (budget full)"
+        single = "the oracle ran" if len(oracle) < 2 else "the prior ran"
+        return None, f"{single} with one seed, which has no standard error; budget full has more"
     if not all(np.all(np.isfinite(c)) for c in (baseline, hybrid, oracle)):
         return None, "a loop diverged"
     gap = float(baseline.mean() - oracle.mean())
