@@ -691,6 +691,29 @@ def elastic_end(of: str, stiffness: Parameter, *, edge: float, upper: bool) -> T
 # Rates of processes.
 
 
+def _from(of: str, centre: str) -> str:
+    """A signal's distance from a centre, in words; the signal alone where that is zero.
+
+    Example:
+        >>> _from("speed", "0"), _from("water", "21")
+        ('speed', '(water - 21)')
+    """
+    return of if centre in ("0", "-0") else f"({of} - {centre})"
+
+
+def _power(x: str, exponent: float) -> str:
+    """An odd power, which keeps the sign.
+
+    Example:
+        >>> _power("speed", 1.0), _power("speed", 2.0), _power("(T - 21)", 1.25)
+        ('speed', 'speed |speed|', '(T - 21) |T - 21|^0.25')
+    """
+    if exponent == 1.0:
+        return x
+    more = "" if exponent == 2.0 else f"^{exponent - 1.0:g}"
+    return f"{x} |{x.removeprefix('(').removesuffix(')')}|{more}"
+
+
 def loss(of: str, k: Parameter, *, exponent: float, reference: str | float = 0.0) -> Term:
     """A loss to what surrounds it: ``-k sign(x - r) |x - r|^exponent``.
 
@@ -710,7 +733,7 @@ def loss(of: str, k: Parameter, *, exponent: float, reference: str | float = 0.0
 
     to = reference if isinstance(reference, str) else f"{reference:.3g}"
     return _added(
-        "loss", f"loss to {to} by {exponent:g}", "rate", of, (k,), law, f"-{k.name} ({of} - {to})^{exponent:g}",
+        "loss", f"loss to {to} by {exponent:g}", "rate", of, (k,), law, f"-{k.name} {_power(_from(of, to), exponent)}",
         exponent=exponent, reference=reference,
     )  # fmt: skip
 
@@ -803,7 +826,7 @@ def input_curve(of: str, c: Parameter, *, centre: float, span: float) -> Term:
     return _added(
         "input_curve", "input curve", "input", of, (c,),
         lambda at, p: at.own + p[0] * (at.own - centre) * ca.fabs(at.own - centre) / span,
-        f"{of} + {c.name} ({of} - {centre:.3g})^2", centre=centre, span=span,
+        f"{of} + {c.name} {_power(_from(of, f'{centre:.3g}'), 2.0)} / {span:.3g}", centre=centre, span=span,
     )  # fmt: skip
 
 
