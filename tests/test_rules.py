@@ -152,7 +152,9 @@ def leaves(value):
 @pytest.mark.parametrize("record", RECORDS, ids=lambda r: type(r).__name__)
 def test_no_field_takes_what_it_is_not(record):
     """Every strange value in every field: refused as InputError, or of a kind that the annotation names."""
-    unseen = dict.fromkeys(("Prior", "Plant", "HybridModel", "Figure", "ClosedLoopResult", "OCP"), typing.Any)
+    unseen = dict.fromkeys(
+        ("Prior", "Plant", "HybridModel", "Figure", "ClosedLoopResult", "OCP", "Term"), typing.Any
+    )
     hints = typing.get_type_hints(type(record), localns=unseen, include_extras=True)
     for f in dataclasses.fields(record):
         kinds = kinds_of(hints[f.name])

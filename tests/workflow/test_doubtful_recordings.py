@@ -57,7 +57,7 @@ def doubtful(machine, tmp_path):
 
 
 def test_the_terminal_hears_of_doubts_and_of_the_fit_s_warnings(call, doubtful, tmp_path, monkeypatch):
-    monkeypatch.setattr(job, "STAGES", (*job.STAGES[:2], replace(job.STAGES[2], compute=stopped)))
+    monkeypatch.setattr(job, "STAGES", (*job.STAGES[:3], replace(job.STAGES[3], compute=stopped)))
     code, told, message = call("run", *doubtful)
     assert (code, "stopped here" in message) == (2, True)
     reading, fitting = told.index("reading the measurements"), told.index("fitting the prior")
