@@ -119,7 +119,7 @@ def write(context: Context, found: ExplainResult, out: Path, command: Sequence[s
     """Write page, scenario file and, last, ``explain.json``; ``command`` is what made them."""
     if found.file:
         write_text(
-            out / found.file, scenario_code(context.scenario, context.scenario_path, found.explanation)
+            out / found.file, scenario_code(context.scenario, context.scenario_path, found.explanation, out)
         )
     write_page(out, context.scenario, found, command)
     write_json(

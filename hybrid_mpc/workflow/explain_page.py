@@ -201,7 +201,7 @@ def _hints(found: ExplainResult) -> Sequence[Hint]:
     if found.file:
         hints.append(
             Hint("good", f"{found.file} is the scenario with the found terms.",
-                 f"Read it, then run it: hybrid-mpc check {found.file} --data FILE --fit, then hybrid-mpc run.")
+                 "Read it, then give it and your recordings to hybrid-mpc check --fit, then to hybrid-mpc run.")
         )  # fmt: skip
     else:
         hints.append(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from hybrid_mpc.identify.explanation import Explanation, FittedParameter, FoundTerm
 from hybrid_mpc.machine.terms import Made, code_of
@@ -59,13 +61,14 @@ def explained_name(scenario: str) -> str:
     return scenario.removesuffix(ENDING) + ENDING
 
 
-def scenario_code(scenario: Scenario, where: str, found: Explanation) -> str:
+def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Path) -> str:
     """A scenario file: the machine of another one, whose prior has the found terms, with fitted values as nominal ones.
 
     Args:
         scenario: The scenario that was explained.
-        where: Its registered name or the path of its file.
+        where: Its registered name, or the path of its file.
         found: What was found.
+        folder: Where the new file will lie; it names a file by the way from there.
     """
     values = {p.name: p for p in found.parameters}
     own = [term for term in found.found if term.made is None]
@@ -80,6 +83,9 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation) -> str:
         "terms",
         "with_nominal",
     ]
+    found_from = (
+        f"str(Path(__file__).parent / {_way(folder, where)!r})" if where.endswith(".py") else repr(where)
+    )
     lines = [
         f'"""{_plain(scenario.title)}: the prior with the terms that its recordings ask for.',
         "",
@@ -88,10 +94,11 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation) -> str:
         '"""',
         "",
         "from dataclasses import replace",
+        *(["from pathlib import Path"] if where.endswith(".py") else []),
         "",
         f"from hybrid_mpc import {', '.join(names)}",
         "",
-        f"machine = load_scenario({where!r})",
+        f"machine = load_scenario({found_from})",
     ]
     if own:
         lines.append("own = {term.name: term for term in machine.terms if not isinstance(term, str)}")
@@ -118,6 +125,14 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation) -> str:
             "    control=None,", "    tasks=(),", "    plant=None,", "    oracle=None,",
         ]  # fmt: skip
     return "\n".join([*lines, ")", ""])
+
+
+def _way(folder: Path, file: str) -> str:
+    """The way from a folder to a file; the whole path where there is none, as between drives."""
+    try:
+        return Path(os.path.relpath(file, folder)).as_posix()
+    except ValueError:
+        return str(Path(file).resolve())
 
 
 def state_of(term: FoundTerm) -> bool:

@@ -192,7 +192,7 @@ def test_a_prior_with_terms_can_be_explained_again(explained, machine, files, tm
         hm.explain(RunSettings(str(out / found.file), files), tmp_path / "again", terms=("coulomb",))
 
 
-def test_a_found_state_leaves_the_control_problem_to_the_user(machine, explained):
+def test_a_found_state_leaves_the_control_problem_to_the_user(machine, explained, tmp_path):
     _, found = explained
     told, base = found.explanation, load_scenario(str(machine / "my_machine.py"))
     lag = terms.input_lag("tau", hm.Parameter("t_tau", 0.1, "s", 0.01, 1.0), state=hm.Signal("s_tau", "N m"))
@@ -201,10 +201,10 @@ def test_a_found_state_leaves_the_control_problem_to_the_user(machine, explained
     changed = replace(
         told, steps=(replace(told.steps[0], terms=(term,)),), parameters=(*told.parameters[:-1], value)
     )
-    code = scenario_code(base, str(machine / "my_machine.py"), changed)
-    space: dict[str, object] = {}
-    exec(code, space)
-    scenario = space["scenario"]
+    file = tmp_path / "lagged.py"
+    file.write_text(scenario_code(base, str(machine / "my_machine.py"), changed, tmp_path))
+    assert str(machine) not in file.read_text()  # the way to it, so that both may move
+    scenario = load_scenario(str(file))
     assert scenario.control is None
     assert [s.name for s in scenario.prior().states][-1] == "s_tau"
     assert scenario.prior().values["t_tau"] == 0.2

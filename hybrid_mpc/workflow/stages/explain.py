@@ -44,7 +44,7 @@ def explain_stage(context: Context) -> ExplainResult | Absent:
     own, out = context.as_given, context.out / FOLDER
     found = Search(own, prior_class(own.scenario), own.dataset, chosen_terms(own.scenario), out).result()
     if found.file:
-        write_text(out / found.file, scenario_code(own.scenario, own.scenario_path, found.explanation))
+        write_text(out / found.file, scenario_code(own.scenario, own.scenario_path, found.explanation, out))
     return found
 
 

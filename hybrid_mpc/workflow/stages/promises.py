@@ -69,7 +69,7 @@ def structure(prior: PriorResult) -> Promise:
     figures = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
     evidence = f"error of free runs on unseen recordings over the outputs' spread: {figures}"
     if not prior.in_doubt:
-        return Promise(STRUCTURE, "shown", f"no term, signal or bound is in doubt; {evidence}")
+        return Promise(STRUCTURE, "shown", f"no term or signal is in doubt; {evidence}")
     return Promise(STRUCTURE, "doubted", f"{'; '.join(prior.in_doubt)}; {evidence}", MEND)
 
 
