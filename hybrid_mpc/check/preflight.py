@@ -30,8 +30,10 @@ from hybrid_mpc.loop.plant import Plant
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
+from hybrid_mpc.machine.terms import EXPLANATIONS
 from hybrid_mpc.model.equilibrium import Range, RateEquations, rate_search
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.records import known
 from hybrid_mpc.scenario import Budget, Scenario, Task
 
 if TYPE_CHECKING:
@@ -132,6 +134,9 @@ def preflight(
     prior, asked = check_prior(report, scenario.prior)
     if prior is not None:
         _check_columns(report, scenario, prior)
+    for law in (term for term in scenario.terms if isinstance(term, str)):
+        with report.part("terms"):
+            known(law, EXPLANATIONS, "law of a term")
     before = len(report.problems)
     rest = model = None
     if prior is not None and asked:

@@ -29,7 +29,7 @@ from hybrid_mpc import (
     TorchPrior,
     load_scenario,
 )
-from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.check.preflight import check_scenario, preflight
 from hybrid_mpc.scenario import registered_scenarios
 
 
@@ -567,3 +567,10 @@ def test_a_set_point_of_outputs_that_no_input_holds_is_told():
     (told,) = [w for w in found.warnings if "comes to rest" in w]
     assert "its reference comes to rest at y = [1.9], which no input within its limits holds" in told
     assert "under u = [0.2]" in told
+
+
+def test_a_term_that_is_no_law_is_named():
+    found = preflight(dataclasses.replace(GOOD, terms=("coulomb", "coulombic")))
+    (problem,) = found.problems
+    assert "coulombic" in problem
+    assert "'coulomb'" in problem  # the nearest one
