@@ -70,11 +70,11 @@ def trace(
     outputs = list(output_names) if output_names is not None else _output_names(exported)
     nodes, sources, weights, inputs = convert(exported, names, len(outputs))
     if len(set(names)) < len(names) or len(set(outputs)) < len(outputs):
-        raise SignatureError(f"names must differ: inputs {names}, outputs {outputs}")
+        raise SignatureError(f"names must differ: inputs {names}, outputs {outputs} [NN-106]")
     for name in (*names, *outputs):
         if not valid_name(name):
             raise SignatureError(
-                f"{name!r} is no name for CasADi: use letters, digits and single underscores"
+                f"{name!r} is no name for CasADi: use letters, digits and single underscores [NN-107]"
             )
     metadata = {"module": type(module).__name__, "torch": version("torch"), "casadi": version("casadi")}
     metadata["nn_export"] = _version()
@@ -119,15 +119,15 @@ def float64_copy(module: torch.nn.Module) -> torch.nn.Module:
 
 def _examples(module: Any, example_inputs: Any) -> tuple[Any, ...]:
     if not isinstance(module, torch.nn.Module):
-        raise SignatureError(f"expected a torch.nn.Module, got {type(module).__name__}")
+        raise SignatureError(f"expected a torch.nn.Module, got {type(module).__name__} [NN-108]")
     if isinstance(example_inputs, torch.Tensor) or not isinstance(example_inputs, Sequence):
-        raise SignatureError("example_inputs must be a tuple of tensors, e.g. (x, h)")
+        raise SignatureError("example_inputs must be a tuple of tensors, e.g. (x, h) [NN-109]")
     for path, x in pytree.tree_flatten_with_path(tuple(example_inputs))[0]:
         if not isinstance(x, torch.Tensor) or not x.is_floating_point():
             kind = x.dtype if isinstance(x, torch.Tensor) else type(x).__name__
             at = "_".join(_words(path))
             raise SignatureError(
-                f"example input {at} must be a tensor of real numbers, got {kind}; e.g. torch.zeros(3)"
+                f"example input {at} must be a tensor of real numbers, got {kind}; e.g. torch.zeros(3) [NN-110]"
             )
     copies: tuple[Any, ...] = pytree.tree_map(
         lambda x: x.detach().to(device="cpu", dtype=torch.float64).clone(), tuple(example_inputs)

@@ -124,9 +124,11 @@ def recommend(
     Source: Efron, *The jackknife, the bootstrap and other resampling plans* (1982).
     """
     if deploy and deploy not in errors:
-        raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)}")
+        raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)} [HM-IDENTIFY-003]")
     if not errors.get(prior):
-        raise InputError("there is no validation run to choose a model by; give longer recordings")
+        raise InputError(
+            "there is no validation run to choose a model by; give longer recordings [HM-IDENTIFY-004]"
+        )
     compared = _Compared(errors[prior], samples, recordings)
     figures = {name: compared.figures(runs) for name, runs in errors.items()}
     for name in errors if shrunk is not None else ():

@@ -190,20 +190,25 @@ def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
     if settings.budget not in budgets:
         raise InputError(
             f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"
+            " [HM-WORKFLOW-004]"
         )
     if settings.model is None and not settings.data:
         raise InputError(
-            "give recordings to train on with --data FILE, or a model made before with --model DIR"
+            "give recordings to train on with --data FILE, or a model made before with --model DIR [HM-WORKFLOW-005]"
         )
     if settings.model is not None and settings.data:
         raise InputError(
-            "--model is evaluated as it is: leave --data out, or leave --model out to train anew"
+            "--model is evaluated as it is: leave --data out, or leave --model out to train anew [HM-WORKFLOW-006]"
         )
     if settings.model is not None and not settings.test:
-        raise InputError("a model made before needs recordings to be evaluated on: --test FILE")
+        raise InputError(
+            "a model made before needs recordings to be evaluated on: --test FILE [HM-WORKFLOW-007]"
+        )
     names = [path.name for path in settings.test]
     if len(set(names)) < len(names):
-        raise InputError(f"two test files have the same name: {', '.join(sorted(names))}; rename one")
+        raise InputError(
+            f"two test files have the same name: {', '.join(sorted(names))}; rename one [HM-WORKFLOW-008]"
+        )
 
 
 def _read(
@@ -408,15 +413,17 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
     if not path.is_file():
         raise InputError(
             f"{folder.parent} holds no model of a benchmark; give the folder that 'hybrid-mpc benchmark {scenario} "
-            "--data FILE --out DIR' has made"
+            "--data FILE --out DIR' has made [HM-WORKFLOW-009]"
         )
     document = read_document(path, "make the benchmark anew")
     schema = document.pop("schema", None)
     if schema != SCHEMA:
-        raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; train anew")
+        raise InputError(
+            f"{path}: schema {schema}, this version reads {SCHEMA}; train anew [HM-WORKFLOW-010]"
+        )
     found = record(_Description, document, str(path))
     if found.scenario != scenario:
-        raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario}")
+        raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario} [HM-WORKFLOW-011]")
     return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in found.kinds})
 
 
@@ -475,7 +482,7 @@ def refitted(
     if n >= len(trajectory.t) - 1 or seconds < least:
         raise InputError(
             f"{trajectory.name}: {seconds:g} s are to be fitted; that takes at least {least:g} s and a recording that "
-            f"is longer than it ({len(trajectory.t) * dt:g} s)"
+            f"is longer than it ({len(trajectory.t) * dt:g} s) [HM-WORKFLOW-012]"
         )
     index = np.arange(len(trajectory.t))
     first = trajectory.part(index < n, trajectory.name, trajectory.role)

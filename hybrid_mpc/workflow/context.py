@@ -87,7 +87,7 @@ class Context:
         if self.settings.budget not in budgets:
             raise InputError(
                 f"scenario {self.scenario.name} has no budget {self.settings.budget!r}; "
-                f"it has: {', '.join(budgets)}"
+                f"it has: {', '.join(budgets)} [HM-WORKFLOW-017]"
             )
         return budgets[self.settings.budget]
 

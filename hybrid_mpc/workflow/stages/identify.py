@@ -182,7 +182,7 @@ def check_data(context: Context) -> None:
     elif context.scenario.make_data is None:
         raise InputError(
             f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
-            f"(once for each file)"
+            f"(once for each file) [HM-WORKFLOW-037]"
         )
 
 
@@ -303,7 +303,7 @@ def examined_prior(context: Context) -> PriorResult:
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
     fitted = make(fit.values)
     smoother = fit.smoother(fitted, spec.dt)
-    refuse([f"fit of the prior: {one}" for one in problems(smoother, fit, every)])
+    refuse([f"fit of the prior: {one} [HM-WORKFLOW-038]" for one in problems(smoother, fit, every)])
     context.progress.update("free runs", 1, 1, "comparing with simpler models")
     trial = trial_length(make, fit, every, spec.dt, longest, context.time_unit)
     bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)
@@ -627,7 +627,7 @@ def is_trained(folder: Path, settings: TrainingSettings) -> bool:
     if changed:
         raise InputError(
             f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
-            "version or scenario; choose another --out"
+            "version or scenario; choose another --out [HM-WORKFLOW-039]"
         )
     return True
 
