@@ -239,7 +239,7 @@ class DaskEngine(Engine[B, R]):
     def _alone(self) -> InputError:
         return InputError(
             f"the scheduler {self._address} has had no worker for {ALONE_S:g} s; what has finished is kept, "
-            "--resume goes on when there are some"
+            "--resume goes on when there are some [HM-ENGINE-006]"
         )
 
     def _result(self, future: Any) -> R | Lost:

@@ -127,7 +127,7 @@ def read_json(path: Path) -> Any:
     try:
         return nn_export.files.parse_json(content)
     except ValueError as error:
-        raise InputError(f"{path} is damaged: {error}") from error
+        raise InputError(f"{path} is damaged: {error} [HM-FILES-017]") from error
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -156,7 +156,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} is damaged: {error}") from error
+        raise InputError(f"{path} is damaged: {error} [HM-FILES-018]") from error
 
 
 def write_document(
@@ -274,7 +274,7 @@ def reason(error: BaseException) -> str:
 def cannot_write(path: Path, error: OSError) -> StorageError:
     """What to say where ``path`` cannot be written: the place, the reason, and what is left of it."""
     kept = "the file from before is kept" if _exists(path) else "nothing half-written is left"
-    return StorageError(f"cannot write {path}: {reason(error)}; {kept}")
+    return StorageError(f"cannot write {path}: {reason(error)}; {kept} [HM-FILES-019]")
 
 
 def is_file(path: Path) -> bool:

@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("hybrid_mpc", "nn_export")
+PACKAGES = ("hybrid_mpc", "nn_export", "scenarios")
 CODE = re.compile(r"\[((?:HM-[A-Z]+|NN)-\d{3})\]")
 HEAD = """# Error codes
 

@@ -372,7 +372,9 @@ def _ask(prior: Prior, name: str, arguments: Sequence[str], what: str) -> None:
         column(value, size, what, names)
     except InputError as error:
         few = name == "xdot" and TOO_FEW in error.codes
-        raise InputError(f"{error}. A state needs a rate{NO_DAE}" if few else str(error)) from error
+        raise InputError(
+            f"{error}. A state needs a rate{NO_DAE} [HM-CHECK-060]" if few else str(error)
+        ) from error
 
 
 def _check_numbers(report: Report, prior: Prior) -> bool:

@@ -275,7 +275,7 @@ def provenance_of(path: Path) -> dict[str, Any]:
     try:
         return dict(parse_json(metadata[METADATA]))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged: {error}") from error
+        raise InputError(f"{path} is damaged: {error} [HM-COMPARE-059]") from error
 
 
 def _column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:

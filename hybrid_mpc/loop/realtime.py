@@ -530,7 +530,7 @@ class SafeEnd:
                 return None
         error = SafeInputError(
             f"the safe input could not be handed over: the actuator failed {len(failures)} times, at last with "
-            f"{failures[-1]!r}. The machine may still follow the last input: cut its power"
+            f"{failures[-1]!r}. The machine may still follow the last input: cut its power [HM-LOOP-053]"
         )
         error.__cause__ = failures[0]
         return error
