@@ -158,7 +158,7 @@ def _explain(module: torch.nn.Module, examples: tuple[Any, ...], error: Exceptio
         at = f" (near {where[-1][0]}:{where[-1][1]})" if where else ""
         return ControlFlowError(
             f"{name} decides by the values of its inputs{at}; use torch.where instead of if, and tensors "
-            f"instead of float(x) or x.item(). torch says: {text[:600]}"
+            f"instead of float(x) or x.item(). torch says: {text[:600]} [NN-113]"
         )
     try:
         float64_copy(module)(*examples)
@@ -166,10 +166,10 @@ def _explain(module: torch.nn.Module, examples: tuple[Any, ...], error: Exceptio
         shapes = [tuple(x.shape) for x in pytree.tree_leaves(examples)]
         return SignatureError(
             f"{name} does not run on the example inputs of shapes {shapes}; give one tensor of the right shape "
-            f"for each argument of forward(). torch says: {type(own).__name__}: {str(own)[:600]}"
+            f"for each argument of forward(). torch says: {type(own).__name__}: {str(own)[:600]} [NN-114]"
         )
     return TraceError(
-        f"{name} runs, but torch.export cannot trace it; simplify what it names. torch says: {text[:1500]}"
+        f"{name} runs, but torch.export cannot trace it; simplify what it names. torch says: {text[:1500]} [NN-115]"
     )
 
 

@@ -111,11 +111,9 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
             one = read[full]
             pieces.append(one.values[:, 0])
             if full in one.faults:
-                problems.append(f"{one.faults[full]}{where} [HM-CHECK-001]")
+                problems.append(f"{one.faults[full]}{where}")
             elif rows and len(one.values) not in (1, rows):
-                problems.append(
-                    f"it has {len(one.values)} values{where}, the others have {rows} [HM-CHECK-002]"
-                )
+                problems.append(f"it has {len(one.values)} values{where}, the others have {rows}")
             elif (k := _diverges(pieces[-1])) is not None:
                 diverged.append(
                     f"{source.path}: {one.place(k)}, column {shown(full)}: it grows to "

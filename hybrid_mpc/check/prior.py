@@ -92,7 +92,9 @@ class Report:
             self.add(f"{what}: {error}")
         except Exception as error:  # the user's own code may raise anything, and this is where it is reported
             said = (said_by(error) or "no message").splitlines()[0]
-            self.add(f"{what} raised {type(error).__name__}: {said}{_place(error)}{_hint(error)}")
+            self.add(
+                f"{what} raised {type(error).__name__}: {said}{_place(error)}{_hint(error)} [HM-CHECK-061]"
+            )
 
     @contextmanager
     def sound(self, what: str) -> Iterator[list[bool]]:

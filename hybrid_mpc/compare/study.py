@@ -251,7 +251,9 @@ hybrid, hybrid_observer, oracle, oracle_state
         if self.guard:
             known(self.guard, GUARDS[1:], "guard")
         own = Fields(self, f"study {self.name!r}")
-        own.add(f"models: {wrong}" for label in self.folders if (wrong := name_problem(label)))
+        own.add(
+            f"models: {wrong} [HM-COMPARE-060]" for label in self.folders if (wrong := name_problem(label))
+        )
         own.refuse()
         self._check_numbers()
         self._check_combinations()

@@ -380,7 +380,7 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
             )
         elif j not in unclear:
             problems += _range_problems(channel, columns, note)
-    problems += [finding.message for finding in findings if finding.refused]
+    problems += [f"{finding.message} [HM-DATA-121]" for finding in findings if finding.refused]
     refuse([f"{path}: {problem}" for problem in problems])
     u, w, y = values[:, 1:first], values[:, first:split], values[:, split:]
     return Recording(
@@ -414,7 +414,7 @@ def _range_problems(channel: Channel, columns: Columns, note: str) -> list[str]:
         f"{columns.place(first)}, column {channel.name!r}: {column[first]:g} is outside the plausible range "
         f"{lower:g} to {upper:g} {signal.unit} of {signal.name}{note}{such if len(bad) > 1 else ''}."
         f"{hint if unit else ''} Check unit and sign, repair the rows, or widen the range of the signal in the "
-        "scenario's prior."
+        "scenario's prior. [HM-DATA-118]"
     ]
 
 
@@ -510,7 +510,7 @@ def _rounding(t: Array) -> Array:
 def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> list[str]:
     """What is wrong with the time stamps, which are finite."""
     if len(t) < 2:
-        return [f"{len(t)} row(s) of numbers; a recording needs many. Record it again."]
+        return [f"{len(t)} row(s) of numbers; a recording needs many. Record it again. [HM-DATA-119]"]
     if disorder := columns.disorder(t, _stamps(spec)):
         return [disorder]
     in_seconds = f"check that {_stamps(spec)} is in seconds (DataSpec.units names another unit)."
@@ -527,7 +527,7 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
         )
     return problems + [
         f"the {window.role} window {window.start:g} to {window.end:g} s is not within the "
-        f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window."
+        f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window. [HM-DATA-120]"
         for window in spec.windows.get(stem, ())
         if window.start < t[0] - spec.dt or window.end > t[-1] + spec.dt
     ]
@@ -553,7 +553,9 @@ def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[
     if isinstance(given, float | int):
         size = float(given)
         wrong = "" if math.isfinite(size) and size else "the factor must be finite and not zero"
-        return Conversion(size), wrong and f"data specification: units={{{name!r}: {given}}}: {wrong}."
+        return Conversion(
+            size
+        ), wrong and f"data specification: units={{{name!r}: {given}}}: {wrong}. [HM-DATA-127]"
     unit, index = name_and_unit(column)[1] if given is None else given, False
     if (
         given is None and not unit
@@ -567,7 +569,7 @@ def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[
     remedy = "Name the column of that signal, correct the unit of one of them, or give the factor"
     return Conversion(1.0), (
         f"column {column!r} is in {unit!r}, {found} for {signal.label}. {remedy}: units={{{name!r}: FACTOR}} in the "
-        "DataSpec."
+        "DataSpec. [HM-DATA-128]"
     )
 
 

@@ -69,7 +69,7 @@ class Columns:
         return (
             f"{self.place(k + 1)}, {stamps}: time {what} ({t[k]:.10g} s, then {t[k + 1]:.10g} s"
             f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete the repeated rows or "
-            "split the file into recordings."
+            "split the file into recordings. [HM-DATA-116]"
         )
 
 
@@ -241,4 +241,4 @@ def _disorder(one: Series) -> str:
         return ""
     stamps = f"sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at {one.t[k]:.10g} s"
     remedy = "Time stamps must increase: delete the repeated samples, or split the file."
-    return f"column {shown(one.name)}: {stamps}. {remedy}"
+    return f"column {shown(one.name)}: {stamps}. {remedy} [HM-DATA-117]"

@@ -255,7 +255,7 @@ def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
         if last and _is_cut(before, values):
             return (
                 f"row {numbers[-1]}, COLUMN is {shown(before[-1])}, where the file ends without the end of the "
-                "row: the number seems to be cut in two. Delete that row, or record it whole."
+                "row: the number seems to be cut in two. Delete that row, or record it whole. [HM-DATA-125]"
             )
         return ""
 
@@ -326,7 +326,7 @@ def _grouped(column: pd.Series, unsure: str, decimal: str, numbers: Sequence[int
     k = int(np.argmax(found.to_numpy()))
     return (
         f"row {numbers[k]}, COLUMN is {shown(texts.iloc[k])}: a mark between thousands, or decimals? Write "
-        "numbers with one decimal mark, as many decimals in all rows, and nothing between thousands."
+        "numbers with one decimal mark, as many decimals in all rows, and nothing between thousands. [HM-DATA-126]"
     )
 
 

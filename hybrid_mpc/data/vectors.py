@@ -117,7 +117,8 @@ def vector_source(
             if len(bad):
                 found[name] = (
                     f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
-                    f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value."
+                    f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value. "
+                    "[HM-DATA-124]"
                 )
         values[~np.isfinite(values)] = np.nan
         return Columns(values, row, range(first, first + len(values)), found)

@@ -911,7 +911,7 @@ def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> li
         if lost.min() < -1e-6 * max(np.abs(lost).max(), 1e-300):
             return [
                 f"term {term.name!r} is declared a loss, but supplies to the balance {before.name!r} at some of the "
-                "recordings' points; correct its sign, or leave loss=False."
+                "recordings' points; correct its sign, or leave loss=False. [HM-IDENTIFY-074]"
             ]
     return []
 

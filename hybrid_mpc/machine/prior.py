@@ -346,7 +346,9 @@ def column(value: Any, n: int, what: str, names: Sequence[str] = ()) -> ca.SX:
 @cache
 def _tuple_of(names: tuple[str, ...]) -> Any:
     def missing(_: Any, name: str) -> Any:
-        raise AttributeError(f"nothing is called {name!r} here; there is: {', '.join(names) or 'nothing'}")
+        raise AttributeError(
+            f"nothing is called {name!r} here; there is: {', '.join(names) or 'nothing'} [HM-MACHINE-044]"
+        )
 
     # what is no identifier has its place alone
     bases = (namedtuple("named", names, rename=True),)

@@ -475,13 +475,13 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
         parts = [(value[0], wanted), (value[1], term_units.per_second(term_units.of(term.state.unit)))]
     for one, needed in parts:
         if said := term_units.clash(one, inputs, needed):
-            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law."
+            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law. [HM-MACHINE-042]"
     if term.place == "potential":
         free = [
             v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not position
         ]
         if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
-            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force."
+            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force [HM-MACHINE-043]"
 
 
 def _uneven(term: Term) -> Term:

@@ -239,7 +239,7 @@ class Context:
         """Result of a stage; InputError with the reason if there is none."""
         found = self.find(stage)
         if isinstance(found, Absent):
-            raise InputError(found.reason)
+            raise InputError(f"{found.reason} [HM-WORKFLOW-048]")
         return found
 
     def digest_of(self, stage: Stage[Any]) -> str:

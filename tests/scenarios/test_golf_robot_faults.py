@@ -197,7 +197,7 @@ def test_names_are_unique_and_faults_end():
     ("fault", "words"),
     [
         (Fault(0.0, 1.0, "plant_fire", 1.0), "plant_friction"),
-        (Fault(0.0, 1.0, "input_gain", 1.0), "no fault"),
+        (Fault(0.0, 1.0, "input_gain", 1.0), "HM-LOOP-005"),
         (Fault(0.0, 1.0, "plant_mass", 0.0), "positive"),
         (Fault(0.0, 1.0, "plant_delay", -0.1), "positive"),
     ],

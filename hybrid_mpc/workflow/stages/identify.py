@@ -276,7 +276,7 @@ def stops(found: PriorResult, *, cause: bool = True) -> tuple[str, ...]:
     if not found.no_gain:
         return ()
     why = f". In doubt: {found.in_doubt[0]}" if found.in_doubt and cause else ""
-    return (f"fit of the prior: {found.no_gain}{why}. {REMEDY}",)
+    return (f"fit of the prior: {found.no_gain}{why}. {REMEDY} [HM-WORKFLOW-049]",)
 
 
 def examined_prior(context: Context) -> PriorResult:
@@ -303,7 +303,7 @@ def examined_prior(context: Context) -> PriorResult:
     every = smoothed(make, fit, [*train, *valid, *test], spec.dt)
     fitted = make(fit.values)
     smoother = fit.smoother(fitted, spec.dt)
-    refuse([f"fit of the prior: {one} [HM-WORKFLOW-038]" for one in problems(smoother, fit, every)])
+    refuse([f"fit of the prior: {one}" for one in problems(smoother, fit, every)])
     context.progress.update("free runs", 1, 1, "comparing with simpler models")
     trial = trial_length(make, fit, every, spec.dt, longest, context.time_unit)
     bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)

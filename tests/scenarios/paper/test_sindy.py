@@ -200,7 +200,7 @@ def bad_runs(runs, change):
         (lambda t: {"u": np.hstack([t.u, t.u])}, "run1: u has 2 columns, Pendulum has 1"),
         (lambda t: {"x": t.x[:, :1]}, "run1: x has 1 columns"),
         (lambda t: {"dt": 0.01}, "resample"),
-        (lambda t: {"x": np.where(t.t[:, None] == t.t[40], np.nan, t.x)}, r"run1: x is not finite at 0\.8 s"),
+        (lambda t: {"x": np.where(t.t[:, None] == t.t[40], np.nan, t.x)}, r"run1.*0\.8.*HM-IDENTIFY-006"),
     ],
 )
 @needs_pysindy
@@ -226,7 +226,7 @@ def test_other_bad_input_is_refused_with_the_remedy(runs):
         (training, {"target": "rate"}, "mean_rate, derivative"),
         (training, {"libraries": (nowhere,)}, "no signal psi; Pendulum has: phi, phi_dot, torque"),
         (training, {"libraries": (Library("empty", ()),)}, "has no term"),
-        (derivative, {"target": "derivative"}, "xdot is not finite"),
+        (derivative, {"target": "derivative"}, r"xdot.*HM-IDENTIFY-006"),
     ):
         with pytest.raises(InputError, match=words):
             fit_sindy(runs_given, Pendulum(), DT, validation=validation, **options)
