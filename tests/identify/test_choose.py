@@ -160,6 +160,20 @@ def test_the_bound_is_that_of_the_mean_over_recordings_and_both_must_be_better()
     assert "over all of them together the prior's is no larger" in choice.reason
 
 
+def test_of_two_sure_hybrids_the_one_of_the_lower_ratio_is_taken():
+    """One recording has nearly all of the error: there ``mopgrnn`` is better, in all seven others ``pgrnn`` is."""
+    prior = [np.full(60, 100.0 if i == 0 else 1.0) for i in range(8)]
+    factors = {"pgrnn": [0.7] + [0.3] * 7, "mopgrnn": [0.6] + [0.6] * 7}
+    errors = {"phy": prior} | {
+        name: [f * own for f, own in zip(by, prior, strict=True)] for name, by in factors.items()
+    }
+    choice = recommend(errors, recordings=[f"file{i}" for i in range(8)])
+    found = choice.candidates
+    assert choice.sure == ("pgrnn", "mopgrnn")
+    assert found["pgrnn"].error > found["mopgrnn"].error and found["pgrnn"].ratio < found["mopgrnn"].ratio
+    assert choice.recommended == choice.hybrid == "pgrnn"
+
+
 def test_runs_of_a_single_recording_are_cut_into_blocks():
     prior = runs(np.random.default_rng(7), n=3)
     errors = {"phy": prior, "pgrnn": [0.25 * own for own in prior]}
