@@ -172,20 +172,20 @@ def check_operators(calls: list[torch.fx.Node]) -> None:
 
 _DYNAMIC = (
     "sizes that depend on the values of the inputs cannot be exported; use torch.where, a product with a "
-    "mask, or constant integer positions instead:"
+    "mask, or constant integer positions instead [NN-116]:"
 )
-_COMPLEX = "complex numbers cannot be exported; write real and imaginary parts as real numbers:"
+_COMPLEX = "complex numbers cannot be exported; write real and imaginary parts as real numbers [NN-117]:"
 _DRAWN = (
     "the module is random or uses batch statistics even in evaluation mode; remove these calls "
-    "(F.dropout needs training=self.training, BatchNorm track_running_stats=True):"
+    "(F.dropout needs training=self.training, BatchNorm track_running_stats=True) [NN-118]:"
 )
 _UNKNOWN = (
     "operators or arguments that nn_export does not know; write them with others (docs/operators.md is the "
-    "table), or compute them outside the module:"
+    "table), or compute them outside the module [NN-119]:"
 )
 _NARROW = (
     "results computed in less than float64, which the export would not repeat; use dtype=torch.float64 or "
-    "x.dtype there:"
+    "x.dtype there [NN-120]:"
 )
 
 

@@ -84,14 +84,12 @@ def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_what_the_file_system_refuses_is_one_clear_line(tmp_path):
     (tmp_path / "folder").mkdir()
-    with pytest.raises(StorageError, match=r"cannot write .*folder: Is a directory"):
+    with pytest.raises(StorageError, match=r"Is a directory.*HM-FILES-019"):
         write_text(tmp_path / "folder", "x")
     (tmp_path / "file").write_text("x")
-    with pytest.raises(
-        StorageError, match=r"cannot write .*file/a.json: .*file is a file where a folder is needed"
-    ):
+    with pytest.raises(StorageError, match="HM-FILES-019"):
         write_json(tmp_path / "file" / "a.json", {})
-    with pytest.raises(StorageError, match="File name too long"):
+    with pytest.raises(StorageError, match="HM-FILES-019"):
         write_text(tmp_path / ("x" * 300) / "a.txt", "x")
     with pytest.raises(InputError, match=r"is a directory.*HM-FILES-011"):
         read_json(tmp_path / "folder")
@@ -168,7 +166,7 @@ def test_a_document_tells_any_change(tmp_path):
     with pytest.raises(InputError, match=r"a\.npz .*a\.json.*HM-FILES-003.*again"):
         read_document_arrays(path, "again")
     path.with_suffix(".npz").unlink()
-    with pytest.raises(InputError, match=r"a.npz is missing; again"):
+    with pytest.raises(InputError, match=r"a\.npz .*HM-FILES-010.*again"):
         read_document_arrays(path, "again")
 
 

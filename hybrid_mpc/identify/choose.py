@@ -96,8 +96,9 @@ def recommend(
     The ratio of a hybrid's error to the prior's is the geometric mean of each recording's where there are
     ``RECORDINGS`` or more, and its bound is that of the mean of the logarithms: another recording may be like any of
     these, so a single one in which the prior is far off does not outweigh the others. Over all runs together the hybrid
-    must be better as well. Of several hybrids that surely beat the prior the one with the lowest ratio is recommended. Within a single recording the ratio is that of the root mean squares; its scatter is
-    found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
+    must be better as well. Of several hybrids that surely beat the prior the one with the lowest ratio is recommended.
+    Within a single recording the ratio is that of the root mean squares; its scatter is found by leaving out one block
+    after the other (jackknife); a block is a contiguous part of a run.
 
     Args:
         errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error

@@ -155,7 +155,7 @@ def test_what_cannot_be_is_refused(tmp_path):
     with pytest.raises(InputError, match="HM-DATA-085"):
         write_scenario(tmp_path / "b.py", file, inputs=("volt",))
     still = write_csv(tmp_path / "still.csv", {"t": np.arange(50.0), "u": np.zeros(50)})
-    with pytest.raises(InputError, match=r"an input.*t, u.*HM-CHECK-014"):
+    with pytest.raises(InputError, match=r"(?s)an input.*t, u.*HM-CHECK-014"):
         write_scenario(tmp_path / "b.py", still)
     short = write_csv(tmp_path / "short.csv", {"t": np.arange(5.0), "u": np.arange(5.0)})
     with pytest.raises(InputError, match=r"20.*HM-CHECK-004"):
@@ -530,7 +530,7 @@ def test_the_readers_reason_is_passed_on(tmp_path, change, match):
     ("more", "match"),
     [
         ({"y": np.ones((300, 65))}, r"\(300, 65\).*HM-DATA-112"),
-        ({"y": np.ones(299)}, "HM-CHECK-002"),
+        ({"y": np.ones(299)}, r"(?s)299.*300.*HM-CHECK-014"),
         ({"y": csc_array(np.eye(3))}, r"sparse matrices.*HM-CHECK-014"),
         ({"y": "text"}, r"text.*HM-DATA-111"),
         ({"t": "2024"}, r"text.*HM-DATA-111"),

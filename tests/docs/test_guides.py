@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, load_scenario
-from hybrid_mpc.errors import CODE
 from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.errors import CODE
 
 ROOT = Path(__file__).parents[2]
 

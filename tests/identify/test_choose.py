@@ -170,7 +170,8 @@ def test_of_two_sure_hybrids_the_one_of_the_lower_ratio_is_taken():
     choice = recommend(errors, recordings=[f"file{i}" for i in range(8)])
     found = choice.candidates
     assert choice.sure == ("pgrnn", "mopgrnn")
-    assert found["pgrnn"].error > found["mopgrnn"].error and found["pgrnn"].ratio < found["mopgrnn"].ratio
+    assert found["pgrnn"].error > found["mopgrnn"].error
+    assert found["pgrnn"].ratio < found["mopgrnn"].ratio
     assert choice.recommended == choice.hybrid == "pgrnn"
 
 

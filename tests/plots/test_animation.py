@@ -233,7 +233,7 @@ def test_the_club_hangs_at_zero_and_swings_right_when_positive():
             np.testing.assert_allclose(np.hypot(*b.T), np.hypot(*a.T), atol=1e-12)
         for a, b in zip((pivot, ball, tee, floor), turned[2:], strict=True):
             np.testing.assert_array_equal(a, b)
-    with pytest.raises(InputError, match="finite angle"):
+    with pytest.raises(InputError, match="HM-SCENARIOS-005"):
         draw(np.array([np.nan]))
 
 

@@ -77,7 +77,7 @@ def test_files_that_gaps_leave_nothing_of_are_named(machine, tmp_path):
     gap = recording(tmp_path / "z_gap.csv", seed=3, seconds=3.0)
     lines = gap.read_text().splitlines()
     gap.write_text("\n".join(lines[:15] + lines[19:]) + "\n")
-    with pytest.raises(InputError, match=r"validate on.*HM-WORKFLOW-047"):
+    with pytest.raises(InputError, match=r"(?s)validate on.*HM-WORKFLOW-047"):
         read_training(scenario, [machine[1], gap])
 
 

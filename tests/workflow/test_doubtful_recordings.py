@@ -119,7 +119,7 @@ def test_inputs_and_outputs_that_do_nothing_are_refused_together(call, machine, 
     file = write(tmp_path / "dull.csv", dull)
     code, _, message = call("run", machine / "my_machine.py", "--data", file, "--out", tmp_path / "out")
     assert code == 2
-    for part in ("HM-DATA-085", "input tau is 0.1 throughout", "output phi is 0.2 throughout"):
+    for part in ("2 problems:", "input tau is 0.1 throughout", "output phi is 0.2 throughout"):
         assert part in message
 
 

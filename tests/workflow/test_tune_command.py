@@ -112,7 +112,7 @@ def test_what_is_refused(searched, words, arguments, tmp_path, call):
     ("content", "message"),
     [
         ("[1]", r"no JSON object.*HM-WORKFLOW-034"),
-        ("{", "is damaged"),
+        ("{", "HM-FILES-017"),
         ('{"hidden": 8, "kind": "rnn"}', r"also kind.*HM-WORKFLOW-034"),
         ('{"hidden": 8.5}', r"whole number.*HM-WORKFLOW-035"),
         ('{"hidden": true}', r"whole number.*HM-WORKFLOW-035"),

@@ -158,7 +158,7 @@ def test_unknown_scenarios_and_tasks():
         _ = Study("golf", "m").size
     with pytest.raises(InputError, match=r"'putt'.*HM-COMPARE-058"):
         list(make(tasks=["putt"]).runs())
-    with pytest.raises(InputError, match="models: a name"):
+    with pytest.raises(InputError, match=r"a name.*HM-COMPARE-060"):
         Study("golf_robot", {"../a": "m"})
 
 
