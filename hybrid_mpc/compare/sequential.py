@@ -115,9 +115,9 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
 
     The interval is Student's t of the logarithms of the ratios, at the level of its look (:func:`level_at`). By the
     union bound, the probability that any look's interval misses the ratio is at most 5 %, so loops may stop at any
-    look. This assumes normal logarithms and independent seeds. The level belongs to a single comparison: with equal costs,
-    one of twenty tasks may be decided wrongly. Later looks get a larger part of the 5 %, so the last interval is only a
-    little wider than that of a fixed number of seeds.
+    look. This assumes normal logarithms and independent seeds. The level belongs to a single comparison: with equal
+    costs, one of twenty tasks may be decided wrongly. Later looks get a larger part of the 5 %, so the last interval is
+    only a little wider than that of a fixed number of seeds.
 
     Args:
         costs: ``(n,)``, one a seed.

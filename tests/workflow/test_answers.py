@@ -84,7 +84,7 @@ def test_a_monitor_is_judged_by_its_false_alarms_and_by_the_faults_that_it_finds
     assert f"Not detected: {found.faults[0].title}" in lines(monitor_answer(blind))
     none = replace(found, faults=None, faults_reason="the scenario has no plant")
     assert monitor_answer(none).verdict == "plain"
-    assert monitor_answer(replace(found, alarms=None, reason="too little data")).short == "No alarms here"
+    assert monitor_answer(replace(found, alarms=None, reason="too little data")).short == "Not examined"
 
 
 def test_the_answers_come_first_on_the_page_and_hints_after_them(results):
