@@ -326,7 +326,7 @@ WRONG = {
     "fault of a channel": (
         task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), ["no input 'third'; there are"],
     ),
-    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["takes no faults"]),
+    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["HM-LOOP-006"]),
     "tasks without control": (field(control=None), ["no control problem"]),
     # plant and oracle
     "plant that raises": (plant(step=raises), ["plant raised KeyError"]),
