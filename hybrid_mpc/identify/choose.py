@@ -125,10 +125,12 @@ def recommend(
     Source: Efron, *The jackknife, the bootstrap and other resampling plans* (1982).
     """
     if deploy and deploy not in errors:
-        raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)} [HM-IDENTIFY-003]")
+        raise InputError(
+            f"deploy: no candidate {deploy!r}; choose one of: {', '.join(errors)} [HM-IDENTIFY-003]"
+        )
     if not errors.get(prior):
         raise InputError(
-            "there is no validation run to choose a model by; give longer recordings [HM-IDENTIFY-004]"
+            "choice: no validation run to compare the models on; give longer recordings [HM-IDENTIFY-004]"
         )
     compared = _Compared(errors[prior], samples, recordings)
     figures = {name: compared.figures(runs) for name, runs in errors.items()}

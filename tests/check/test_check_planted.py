@@ -125,7 +125,7 @@ PLANTED = {
     # what is measured
     "a state that no output sees": (
         lambda: replace(kettle(outputs=Kettle.outputs[:1])(), data=replace(KETTLE.data, outputs=("level",))),
-        ["no output tells of warmth (outputs: level)", "Measure it, leave it out of the states"],
+        ["no output tells of warmth (outputs: level)", "Measure it, remove it from the states"],
     ),
     "outputs of another number": (
         kettle(output=lambda self, x, u, w, p: (x.level,)),
@@ -188,7 +188,7 @@ PLANTED = {
     ),
     "a mode that is too fast": (
         rates(level=lambda x, u, w, p: u.inflow - 1e3 * x.level),
-        ["fastest mode at rest is 1e+03 1/s", "take a smaller dt"],
+        ["fastest mode at rest is 1e+03 1/s", "use a smaller dt"],
     ),
     # what is not supported: algebraic variables, whole numbers, time, jumps
     "declared algebraic variables": (
