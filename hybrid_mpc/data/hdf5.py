@@ -25,7 +25,7 @@ MOST_ITEMS = 10_000  # most groups and datasets that are looked at: some seconds
 def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
     """A file as a source."""
     matlab = path.suffix.lower() == ".mat" or content.startswith(b"MATLAB")
-    with named_extra("reading .mat files of version 7.3" if matlab else "reading HDF5 files"):
+    with named_extra(f"{path}: reading {'.mat files of version 7.3' if matlab else 'HDF5 files'}"):
         import h5py
     try:
         file = h5py.File(io.BytesIO(content), "r")

@@ -36,7 +36,7 @@ def logger_source(path: Path, content: bytes, sha256: str) -> Source:
     begins = (one[1:] for one in _READERS if content.startswith(one[0]))
     reader, what = next(begins, (_can, "CAN log"))
     try:
-        with named_extra(f"reading {what}"):
+        with named_extra(f"{path}: reading this {what}"):
             return reader(path, content, sha256)
     except (MissingPackage, InputError):
         raise

@@ -24,7 +24,7 @@ LONGER = 10  # times as many rows as any other sheet that the one which is read 
 
 def excel_source(path: Path, content: bytes, sha256: str) -> Source:
     """The table of a workbook; its formulas are not computed: their last values are read."""
-    with named_extra("reading Excel files"):
+    with named_extra(f"{path}: reading Excel files"):
         import openpyxl
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -110,7 +110,7 @@ def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes
 
 def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
     """A Parquet or Feather file; what it declares is looked at before any of it is unpacked."""
-    with named_extra("reading Parquet and Feather files"):
+    with named_extra(f"{path}: reading Parquet and Feather files"):
         import pandas as pd
         import pyarrow
     kinds, ipc = pyarrow.types, pyarrow.ipc

@@ -42,7 +42,7 @@ UNCLOSED = (
 
 def text_source(path: Path, content: bytes, sha256: str) -> Source:
     """A text file as a source."""
-    with named_extra("reading tables"):
+    with named_extra(f"{path}: reading tables"):
         import pandas  # noqa: F401  (asked for before anything is done)
     text, notes = _decoded(path, content)
     if not text.strip():

@@ -279,3 +279,18 @@ def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
     code, _, told = call("golf_robot", "--data", machine[2], "--out", made[0])
     assert code == 2
     assert "has no benchmark" in told
+
+
+def test_a_scheduler_s_workers_train_the_networks(machine, tmp_path, monkeypatch):
+    """The jobs go to the engine with the scheduler's address; tests of the engine say what it does with them."""
+    scenario, train, test = machine
+    asked = []
+
+    def engine(jobs, on_progress, workers, *, cluster):
+        asked.append((sorted(jobs), cluster))
+        raise InputError("no worker")
+
+    monkeypatch.setattr("hybrid_mpc.workflow.stages.identify.run_jobs", engine)
+    with pytest.raises(InputError, match="no worker"):
+        benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), tmp_path, cluster="tcp://127.0.0.1:9")
+    assert asked == [(["mopgrnn", "pgrnn", "rnn"], "tcp://127.0.0.1:9")]
