@@ -249,9 +249,18 @@ def drafted(
                 f".{source.note}{f' No signals are:{reasons}' if reasons else ''} [HM-CHECK-014]"
             )
         draft = Draft(
-            clock.column, clock.period, roles["input"], roles["output"], left_out, roles["disturbance"], clock.seconds,
-            clock.doubt, roles["set-point"], verdicts, length=clock.length,
-        )  # fmt: skip
+            time=clock.column,
+            period=clock.period,
+            inputs=roles["input"],
+            outputs=roles["output"],
+            left_out=left_out,
+            disturbances=roles["disturbance"],
+            seconds=clock.seconds,
+            doubt=clock.doubt,
+            set_points=roles["set-point"],
+            verdicts=verdicts,
+            length=clock.length,
+        )
         draft = _counting_on([one.path for one in sources], draft)
         still = [full for full in _at_rest([one.path for one in sources], draft) if full not in kinds]
         if not still:

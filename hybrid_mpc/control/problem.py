@@ -628,12 +628,27 @@ class Problem:
             z = np.tile(z[0], (n + 1, 1))
         x, h = z[:, : ocp.n_x], z[:, ocp.n_x :]
         nan = float("nan")
-        return Solution(plan, x, h, estimate.d, nan, Status.INITIAL, nan, nan, {}, w=w)
+        return Solution(
+            u=plan,
+            x=x,
+            h=h,
+            d=estimate.d,
+            cost=nan,
+            status=Status.INITIAL,
+            kkt=nan,
+            defect=nan,
+            timing={},
+            w=w,
+        )
 
     def target(
-        self, reference: ArrayLike, weight: ArrayLike | None = None, estimate: Estimate | None = None,
-        w: ArrayLike | None = None, start: Steady | None = None,
-    ) -> Target:  # fmt: skip
+        self,
+        reference: ArrayLike,
+        weight: ArrayLike | None = None,
+        estimate: Estimate | None = None,
+        w: ArrayLike | None = None,
+        start: Steady | None = None,
+    ) -> Target:
         """What a plan is to follow; the last value holds where the preview is shorter.
 
         Args:
@@ -659,7 +674,7 @@ class Problem:
             )
         x, u, y, steady = self._steady(y_ref, d, along, start)
         own = np.hstack([p, y, np.tile(d, (n + 1, 1)), along])
-        return Target(x, weights, own, u[:-1], ahead, d, y, e, steady)
+        return Target(x=x, weight=weights, p=own, u=u[:-1], w=ahead, d=d, y=y, e=e, steady=steady)
 
     def around(self, d: Array, w: Array, p: Array | None = None) -> Array:
         """What bounded values depend on besides ``(x, u)``: ``(N, n_d + n_w + n_p)``; ``p`` has a row more, or is 0.

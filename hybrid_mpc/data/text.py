@@ -260,7 +260,18 @@ def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
         return ""
 
     own, tops = tuple(names[j] for j in seen), [heads[j] for j in seen]
-    return Frame(path, own, columns, tops, numbers, text, fault, decimal, tuple(notes), layout.clock)
+    return Frame(
+        path=path,
+        names=own,
+        columns=columns,
+        head=tops,
+        numbers=numbers,
+        text=text,
+        fault=fault,
+        decimal=decimal,
+        notes=tuple(notes),
+        clock=layout.clock,
+    )
 
 
 def _parsed(
@@ -273,11 +284,21 @@ def _parsed(
         return pd.DataFrame({place: pd.Series(dtype=float) for place in places})
     try:
         return pd.read_csv(
-            io.BytesIO(text), sep=r"\s+" if rows.separator == " " else rows.separator, header=None,
-            names=list(range(width)), usecols=sorted(set(places)), index_col=False, dtype=str if unsure else None,
-            decimal=decimal, keep_default_na=False, na_values=[] if unsure else BLANKS, skipinitialspace=True,
-            skip_blank_lines=False, low_memory=False, encoding="utf-8",
-        )  # fmt: skip
+            io.BytesIO(text),
+            sep=r"\s+" if rows.separator == " " else rows.separator,
+            header=None,
+            names=list(range(width)),
+            usecols=sorted(set(places)),
+            index_col=False,
+            dtype=str if unsure else None,
+            decimal=decimal,
+            keep_default_na=False,
+            na_values=[] if unsure else BLANKS,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+            encoding="utf-8",
+        )
     except (pd.errors.ParserError, ValueError) as error:
         told = str(error).strip().splitlines()[0]
         raise InputError(f"{rows.path}: {told}. Export the table as plain CSV. [HM-DATA-096]") from error

@@ -269,9 +269,16 @@ class _Run:
         loop.finish()
         spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
         step = RunnerStep(
-            self.k, self.k * self._dt, loop.state.y, loop.estimate, loop.decision, loop.reading, begin - due,
-            acted - due, spent,
-        )  # fmt: skip
+            k=self.k,
+            t=self.k * self._dt,
+            y=loop.state.y,
+            estimate=loop.estimate,
+            decision=loop.decision,
+            reading=loop.reading,
+            lateness=begin - due,
+            applied=acted - due,
+            spent=spent,
+        )
         self._count(step)
         if self._runner._on_step is not None:
             self._runner._on_step(step)

@@ -275,7 +275,17 @@ def _expressions(
     def at(own: Any, term: Term, position: Any = None, driven: Any = 0.0, resting: Any = 0.0) -> At:
         x_named, u_named, w_named = (named(prior.names_of(k), ca.vertsplit(v)) for k, v in parts.items())
         p_named = named(prior.names_of("p"), ca.vertsplit(of_base))
-        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term), p_named)
+        return At(
+            x=x_named,
+            u=u_named,
+            w=w_named,
+            own=own,
+            position=position,
+            driven=driven,
+            resting=resting,
+            state=states.get(term),
+            p=p_named,
+        )
 
     def applied(term: Term, point: At) -> Any:
         value = term.law(point, given[term])
@@ -468,7 +478,7 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
     state = None if term.state is None else ca.SX.sym(term.state.name)
     if term.state is not None:
         inputs.append((state, term.state.unit))
-    point = At(x, u, w, own, position, driven, resting, state, p)
+    point = At(x=x, u=u, w=w, own=own, position=position, driven=driven, resting=resting, state=state, p=p)
     value = _uneven(term).law(point, named(term.names, given))
     parts = [(value, wanted)]
     if term.state is not None:
@@ -530,7 +540,18 @@ def _added(
     if state is not None:
         options["state"] = state
     made = Made(maker, of, parameters, {**options, **({"place": place} if by_rate else {})})
-    return Term(f"{title} of {of}", place, of, parameters, law, text, loss, state, EXPLANATIONS[maker], made)
+    return Term(
+        name=f"{title} of {of}",
+        place=place,
+        of=of,
+        parameters=parameters,
+        law=law,
+        text=text,
+        loss=loss,
+        state=state,
+        explanation=EXPLANATIONS[maker],
+        made=made,
+    )
 
 
 # Friction: against the motion of one axis.
@@ -548,9 +569,16 @@ def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") 
         place: ``"rate"`` for a prior that is not mechanical.
     """
     return _added(
-        "coulomb", "Coulomb friction", place, of, (level,), lambda at, p: -p[0] * _sign(at.own, width),
-        f"-{level.name} sign({of})", loss=True, width=width,
-    )  # fmt: skip
+        "coulomb",
+        "Coulomb friction",
+        place,
+        of,
+        (level,),
+        lambda at, p: -p[0] * _sign(at.own, width),
+        f"-{level.name} sign({of})",
+        loss=True,
+        width=width,
+    )
 
 
 def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force") -> Term:

@@ -279,7 +279,17 @@ def _make(
         *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=choice.sure
     )
     model = BenchmarkModel(
-        scenario.name, dt, fit, hybrid, validation, long, tuple(networks), linear, no_linear, choice, networks
+        scenario=scenario.name,
+        dt=dt,
+        fit=fit,
+        hybrid=hybrid,
+        validation=validation,
+        long=long,
+        kinds=tuple(networks),
+        linear=linear,
+        no_linear=no_linear,
+        choice=choice,
+        networks=networks,
     )
     save_model(out / "model", model)
     return model

@@ -356,17 +356,19 @@ def examined_prior(context: Context) -> PriorResult:
         context.progress.warn(f"{IN_DOUBT}: {doubt}")
     one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
     return PriorResult(
-        fit,
-        make().values,
-        {p.name: p.unit for p in make().parameters},
-        baselines,
-        bounds,
-        in_doubt,
-        errors,
-        "" if follows else no_gain(own, training),
-        {s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)},
-        longest_run,
-        {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
+        fit=fit,
+        nominal=make().values,
+        units={p.name: p.unit for p in make().parameters},
+        baselines=baselines,
+        bounds=bounds,
+        in_doubt=in_doubt,
+        errors=errors,
+        no_gain="" if follows else no_gain(own, training),
+        error_correlation={
+            s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)
+        },
+        longest_run=longest_run,
+        arrays={f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )
 
 
