@@ -548,7 +548,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
         return Promise(
             name, "not promised", f"{'; '.join(lacks)}; {within}",
             "Weigh no more outputs than there are inputs, and declare as many disturbances as outputs "
-            "(docs/mpc.md#set-points).",
+            "(docs/disturbances.md).",
         )  # fmt: skip
     if worst.why:
         return Promise(name, "doubted", within, remedy_of(worst.why))
@@ -568,7 +568,7 @@ def remedy_of(why: str) -> str:
     if "weight r" in why:
         return "Set r = 0."
     if "friction" in why:
-        return "Friction in the prior (docs/control.md#loads-and-stiction), or a machine that sticks less."
+        return "Friction in the prior (docs/disturbances.md#dry-friction), or a machine that sticks less."
     return (
         "Declare a disturbance where the error enters (Scenario(disturbance_model=...)), and look at friction and "
         "at the task's own loops in the report."

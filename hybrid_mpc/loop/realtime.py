@@ -68,7 +68,7 @@ class Runner:
     included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
     raised on, or the signal has its effect. Signals reach Python's main thread alone: in another thread ``stop`` ends
     a run. What no program can catch (SIGKILL, a hang in a driver, a power cut) takes a watchdog in the actuator;
-    ``docs/control.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
+    ``docs/watchdog.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
 
     Without a delay the input is assumed to act from the grid's instant on: keep steps short against the period, or
     declare the delay (:class:`~hybrid_mpc.estimate.delay.DelayCompensation`).
@@ -100,7 +100,7 @@ class Runner:
         InputError: If models, deadline, safe input, delays or ``keep`` do not fit, no safe input is declared, the
             monitor has no limits, or the estimator wants the truth.
 
-    Example: see ``docs/control.md``; in short::
+    Example: see ``docs/hardware.md``; in short::
 
         runner = Runner(read_encoder, set_torque, ekf, controller, task.reference, weight=task.weight)
         print(runner.run(duration=6.0).percentiles())

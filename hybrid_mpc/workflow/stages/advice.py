@@ -45,7 +45,7 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
             Hint(
                 "good",
                 "Nothing on this page speaks against a first try on the machine.",
-                "Close the loop with hm.Runner (docs/control.md), or export the controller as C (docs/embedded.md).",
+                "Close the loop with hm.Runner (docs/hardware.md), or export the controller as C (docs/embedded.md).",
             )
         )
     return sorted(found, key=lambda hint: hint.verdict != "bad")
