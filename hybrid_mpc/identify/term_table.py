@@ -55,8 +55,8 @@ The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` lim
 | `x`, `u`, `w`, `y` | state, input, measured disturbance, output |
 | `s` | state of the term itself |
 
-An *axis* is a pair of states, a position and its speed. *Other rates* are those of other states that a network may correct.
-A potential acts as the force `-dV/dq`. Bounds and scales of the parameters follow from the recordings.
+An *axis* is a pair of states, a position and its speed. *Other rates* are those of other states that a network may
+correct. A potential acts as the force `-dV/dq`. Bounds and scales of the parameters follow from the recordings.
 
 The units are examples: a turning axis (rad), a sliding axis (m), a level (m), a temperature (degC), inputs in V. Angles
 have no unit within a term.
