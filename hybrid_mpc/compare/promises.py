@@ -151,7 +151,10 @@ class SetPoint:
         target = self.controller.controller.problem.target(self.reference[None], None, at)
         x, u = target.x[0], target.u[0]
         if self.problem.n_y and (target.steady is None or not target.steady.steady):
-            raise InputError(f"the set-point {self.reference.tolist()} of {self.title} has no steady state")
+            raise InputError(
+                f"the set-point {self.reference.tolist()} of {self.title} has no steady state"
+                " [HM-COMPARE-020]"
+            )
         if not self.problem.n_y:
             sizes = self.controller.controller.problem.sizes.states
             best = equilibrium_input(m, sizes, self.problem.input_scale)(x, self.w).full().ravel()

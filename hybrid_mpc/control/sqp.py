@@ -420,7 +420,7 @@ class SQPController(Controller):
         inner: CondensedController | None = None,
     ) -> None:
         if not (isinstance(tolerance, int | float) and tolerance > 0):
-            raise InputError(f"tolerance must be positive, got {tolerance!r:.80}")
+            raise InputError(f"tolerance must be positive, got {tolerance!r:.80} [HM-CONTROL-053]")
         iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         inner = CondensedController(model, ocp, compiled=compiled) if inner is None else inner
         self.problem, self._cost = inner.problem, ReducedCost(inner)

@@ -84,7 +84,9 @@ class DelayCompensation:
     ) -> DelayedEstimate:
         """Estimate one period later, from what arrives and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
-            raise InputError("DelayCompensation goes on from its own estimates only; begin with start()")
+            raise InputError(
+                "DelayCompensation goes on from its own estimates only; begin with start() [HM-ESTIMATE-005]"
+            )
         base, y = estimate.filtered, sampled(y, (None,), "y")
         inputs = (*estimate.inputs, sampled(u_prev, (None,), "u_prev"))
         if estimate.missing:

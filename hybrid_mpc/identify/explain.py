@@ -220,7 +220,7 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
     if count < FEWEST or groups < 2:
         raise InputError(
             f"{len(present)} recording of {whole} samples is too little evidence for terms: record at least one more "
-            f"like it, or one of {2 * samples} samples and more"
+            f"like it, or one of {2 * samples} samples and more [HM-IDENTIFY-011]"
         )
     what = "one recording" if len(present) == 1 else f"{len(present)} recordings"
     text = f"{count} blocks of {what} in {groups} groups"
@@ -592,7 +592,7 @@ class _Explain:
                 raise InputError(
                     f"one recording of {samples} samples is too little evidence for terms, which are judged by "
                     f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples "
-                    "more, or a second recording"
+                    "more, or a second recording [HM-IDENTIFY-012]"
                 )
         periods = min(periods_of(length, dt, 2), longest)
         self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
@@ -889,9 +889,9 @@ def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points:
     problems = []
     for term in own:
         if names.count(term.name) > 1:
-            problems.append(f"term {term.name!r} is there twice; rename one.")
+            problems.append(f"term {term.name!r} is there twice; rename one. [HM-IDENTIFY-013]")
         problems += [
-            f"term {term.name!r}: parameter {name} is there twice; rename one."
+            f"term {term.name!r}: parameter {name} is there twice; rename one. [HM-IDENTIFY-014]"
             for name in term.names
             if parameters.count(name) > 1
         ]
@@ -911,7 +911,7 @@ def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> li
         if lost.min() < -1e-6 * max(np.abs(lost).max(), 1e-300):
             return [
                 f"term {term.name!r} is declared a loss, but supplies to the balance {before.name!r} at some of the "
-                "recordings' points; correct its sign, or leave loss=False."
+                "recordings' points; correct its sign, or leave loss=False. [HM-IDENTIFY-074]"
             ]
     return []
 

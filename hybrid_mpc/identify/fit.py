@@ -145,7 +145,7 @@ def fit_prior(
     if most_samples(train) < fit.lead + 3:
         raise InputError(
             f"no recording is long enough to fit {type(fit.prior).__name__} to: the longest has {most_samples(train)} "
-            f"samples, {fit.lead + 3} are needed at least"
+            f"samples, {fit.lead + 3} are needed at least [HM-IDENTIFY-017]"
         )
     if length is None:
         length = max(LENGTHS[-1] * unit, SLOWEST * slowest(fit.prior))
@@ -225,7 +225,10 @@ def fit_prior(
     on_progress(total - 1, total, "smoothing by the fitted prior")
 
     if not np.isfinite(min(scores)):
-        raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
+        raise InputError(
+            "the prior diverges with every set of parameters tried; check its signs and units"
+            " [HM-IDENTIFY-018]"
+        )
 
     def smoother_of(found: Fitted) -> Smoother:
         acting = shifted([*train, *valid], fit.delay(found.theta))
@@ -355,6 +358,7 @@ def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
             f"{type(prior).__name__}: no output tells of {', '.join(unseen)} (outputs: "
             f"{', '.join(s.name for s in prior.outputs)}): nothing that is measured changes with "
             f"{'them' if len(unseen) > 1 else 'it'}. Measure it, leave it out of the states, or check output()"
+            " [HM-IDENTIFY-019]"
         )
 
 

@@ -60,16 +60,20 @@ class FirstStates:
     def __post_init__(self) -> None:
         problems = []
         if self.kind not in (kinds := ("free", "known", "measured", "shared", "warm_up")):
-            problems.append(f"first states: kind must be one of {', '.join(kinds)}, got {self.kind!r}")
+            problems.append(
+                f"first states: kind must be one of {', '.join(kinds)}, got {self.kind!r} [HM-IDENTIFY-066]"
+            )
         if (self.kind == "known") != bool(self.values):
             problems.append(
                 f"first states: values by name belong to kind 'known' and to it alone, got {self.values}"
+                " [HM-IDENTIFY-067]"
             )
         if not all(math.isfinite(value) for value in self.values.values()):
-            problems.append(f"first states: values must be finite, got {self.values}")
+            problems.append(f"first states: values must be finite, got {self.values} [HM-IDENTIFY-068]")
         if (self.kind == "warm_up") != (0 < self.seconds < math.inf):
             problems.append(
                 f"first states: a positive length [s] belongs to kind 'warm_up' and to it alone, got {self.seconds}"
+                " [HM-IDENTIFY-069]"
             )
         refuse(problems)
 
@@ -85,19 +89,19 @@ class FirstStates:
         """
         names, outputs = ([s.name for s in signals] for signals in (prior.states, prior.outputs))
         problems = [
-            f"first states: {name!r} is no state of {type(prior).__name__} ({', '.join(names)})"
+            f"first states: {name!r} is no state of {type(prior).__name__} ({', '.join(names)}) [HM-IDENTIFY-070]"
             for name in self.values
             if name not in names
         ]
         if self.kind == "measured" and not set(names) & set(outputs):
             problems.append(
                 f"first states: no output of {type(prior).__name__} ({', '.join(outputs)}) is a state "
-                f"({', '.join(names)}); leave them free"
+                f"({', '.join(names)}); leave them free [HM-IDENTIFY-071]"
             )
         if self.kind in ("known", "shared") and largest_delay:
             problems.append(
                 f"first states: a delay costs the first samples of a trajectory, whose state is {self.kind}; leave "
-                "largest_delay 0, or the first states free"
+                "largest_delay 0, or the first states free [HM-IDENTIFY-072]"
             )
         refuse(problems)
 
@@ -166,7 +170,7 @@ def cut_outputs(
             longest = most_samples(trajectories)
             raise InputError(
                 f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
-                f"{lead} samples before it needs {periods + lead + 1}"
+                f"{lead} samples before it needs {periods + lead + 1} [HM-IDENTIFY-073]"
             )
         chosen = [starts[i] for i in evenly(len(starts), most)]
         if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample

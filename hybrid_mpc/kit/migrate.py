@@ -218,7 +218,7 @@ def migrate_kit(old: str | Path, new: str | Path) -> Path:
         if sha256(place / PROGRAMS) != held.programs_sha256:
             raise InputError(
                 f"{folder}: {OLD_FILES[1]} is not the one that the kit was saved with; take the folder from its run "
-                "again"
+                "again [HM-KIT-026]"
             )
         write_description(
             place,
@@ -265,7 +265,7 @@ def _old_folder(folder: Path) -> Path:
             return place
         if is_file(place / KIT) and read_object(place / KIT).get("schema_version") == SPLIT_SCHEMA:
             return place
-    raise InputError(f"{folder} holds no kit of a former format; there is nothing to migrate")
+    raise InputError(f"{folder} holds no kit of a former format; there is nothing to migrate [HM-KIT-027]")
 
 
 def _single(folder: Path) -> OldDescription:
@@ -274,7 +274,7 @@ def _single(folder: Path) -> OldDescription:
     if (version := read_object(path).get("schema_version")) != OLD_SCHEMA:
         raise InputError(
             f"{path} is of version {version!r} of the format (field schema_version); versions {OLD_SCHEMA} and "
-            f"{SPLIT_SCHEMA} alone can be migrated: train the models anew"
+            f"{SPLIT_SCHEMA} alone can be migrated: train the models anew [HM-KIT-028]"
         )
     found = _read(folder, OLD_FILE, OldDescription)
     assert found is not None

@@ -69,7 +69,9 @@ def again(made: Made) -> Term:
         'viscous friction of v'
     """
     if made.maker not in EXPLANATIONS:
-        raise InputError(f"no law {made.maker!r} of a term; there are {', '.join(EXPLANATIONS)}")
+        raise InputError(
+            f"no law {made.maker!r} of a term; there are {', '.join(EXPLANATIONS)} [HM-MACHINE-030]"
+        )
     term: Term = globals()[made.maker](made.of, *made.parameters, **made.options)
     return term
 
@@ -143,9 +145,11 @@ class Term:
     def __post_init__(self) -> None:
         own = Fields(self, f"term {self.name!r}")
         own.need(
-            "place", lambda: self.place in PLACES, f"place {self.place!r} is none of {', '.join(PLACES)}"
+            "place",
+            lambda: self.place in PLACES,
+            f"place {self.place!r} is none of {', '.join(PLACES)} [HM-MACHINE-031]",
         )
-        own.need("parameters", lambda: len(self.parameters) > 0, "a term needs a parameter")
+        own.need("parameters", lambda: len(self.parameters) > 0, "a term needs a parameter [HM-MACHINE-032]")
         own.refuse()
 
     @property
@@ -213,6 +217,7 @@ def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]
     if unknown := sorted(set(values) - set(names)):
         raise InputError(
             f"{prior.__name__} has no parameter {', '.join(unknown)}; there are {', '.join(names) or 'none'}"
+            " [HM-MACHINE-033]"
         )
     own: Any = prior
     terms: tuple[Term, ...] = getattr(own, "terms", ())
@@ -402,13 +407,17 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
         where = f"term {term.name!r} for {base.__name__}"
         names = [s.name for s in signals.get(term.place, base.states)]
         if term.of not in names:
-            problems.append(f"{where}: there is no {term.of!r}; choose of {', '.join(names)}.")
+            problems.append(
+                f"{where}: there is no {term.of!r}; choose of {', '.join(names)}. [HM-MACHINE-034]"
+            )
         elif term.place in ("force", "potential") and not issubclass(base, MechanicalPrior):
-            problems.append(f"{where}: a {term.place} needs a MechanicalPrior; take a rate.")
+            problems.append(f"{where}: a {term.place} needs a MechanicalPrior; take a rate. [HM-MACHINE-035]")
         elif term.place in ("force", "potential") and term.of not in moving:
-            problems.append(f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}.")
+            problems.append(
+                f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}. [HM-MACHINE-036]"
+            )
         if term.state is not None and term.place in ("force", "potential"):
-            problems.append(f"{where}: a {term.place} cannot have a state of its own.")
+            problems.append(f"{where}: a {term.place} cannot have a state of its own. [HM-MACHINE-037]")
     if not problems:
         problems = [problem for term in terms for problem in _misfits(base, prior, term)]
     for what, every in (
@@ -418,7 +427,7 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
         twice = sorted({name for name in every if every.count(name) > 1})
         if twice:
             problems.append(
-                f"{base.__name__} with terms: {what} {', '.join(twice)} is there twice; rename one."
+                f"{base.__name__} with terms: {what} {', '.join(twice)} is there twice; rename one. [HM-MACHINE-038]"
             )
     refuse(problems)
 
@@ -466,13 +475,13 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
         parts = [(value[0], wanted), (value[1], term_units.per_second(term_units.of(term.state.unit)))]
     for one, needed in parts:
         if said := term_units.clash(one, inputs, needed):
-            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law."
+            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law. [HM-MACHINE-042]"
     if term.place == "potential":
         free = [
             v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not position
         ]
         if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
-            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force."
+            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force [HM-MACHINE-043]"
 
 
 def _uneven(term: Term) -> Term:
@@ -787,7 +796,7 @@ def _signal(at: At, name: str) -> Any:
     for group in (at.x, at.u, at.w):
         if name in getattr(group, "_fields", ()):
             return getattr(group, name)
-    raise InputError(f"there is no state, input or disturbance {name!r}")
+    raise InputError(f"there is no state, input or disturbance {name!r} [HM-MACHINE-039]")
 
 
 # Inputs.

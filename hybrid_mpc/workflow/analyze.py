@@ -48,7 +48,9 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     kit = load(folder)
     scenario = scenario_of(kit.provenance.scenario, folder / KIT, settings.scenario)
     if scenario is None and settings.data:
-        raise InputError("--data needs --scenario, which names the columns of the recordings")
+        raise InputError(
+            "--data needs --scenario, which names the columns of the recordings [HM-WORKFLOW-001]"
+        )
     model = next(iter(kit.models.values()))
     if scenario is not None:
         kit = kit.on(scenario)
@@ -73,12 +75,12 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
 
 def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Array:
     if given is not None and not (np.isfinite(given) and given > 0):
-        raise InputError(f"--speed must be positive, got {given}")
+        raise InputError(f"--speed must be positive, got {given} [HM-WORKFLOW-002]")
     try:
         n_q = positions_of(model)
     except InputError as none:
         if given is not None:
-            raise InputError(f"--speed: {none}") from None
+            raise InputError(f"--speed: {none} [HM-WORKFLOW-003]") from None
         return np.zeros(0)
     if given is not None:
         return np.full(n_q, given)

@@ -46,7 +46,7 @@ def watching(model):
 
 def test_a_monitor_without_limits_is_refused_and_the_stage_that_gives_them_is_named(model, safe):
     for monitor in (energy(model), Monitor(ResidualReadings(model))):
-        with pytest.raises(InputError, match="stage watch"):
+        with pytest.raises(InputError, match=r"stage watch.*HM-LOOP-034"):
             make_runner(model, safe, Rig(), monitor=monitor)
     make_runner(model, safe, Rig(), monitor=watching(model))
     make_runner(model, safe, Rig(), monitor=Monitor(ResidualReadings(model), resolution=[1e-3]))

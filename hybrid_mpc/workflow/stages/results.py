@@ -371,6 +371,7 @@ def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
     if results.schema_version != SCHEMA_VERSION:
         raise InputError(
             f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
+            " [HM-WORKFLOW-040]"
         )
     for group in (
         "identification", "control", "estimation", "promises", "timing", "watch", "analysis",
@@ -384,9 +385,12 @@ def _check_values(values: Mapping[str, Any], path: str, where: str) -> None:
         if value is None and not (values.get(f"{key}_reason") or values.get("reason")):
             raise InputError(
                 f"{where}: {path}.{key} is null without a reason; put '{key}_reason' or 'reason' beside it"
+                " [HM-WORKFLOW-041]"
             )
         if isinstance(value, float) and not math.isfinite(value):
-            raise InputError(f"{where}: {path}.{key} is {value}; it must be a finite number")
+            raise InputError(
+                f"{where}: {path}.{key} is {value}; it must be a finite number [HM-WORKFLOW-042]"
+            )
         if isinstance(value, Mapping) and key != "details":
             _check_values(value, f"{path}.{key}", where)
 

@@ -85,6 +85,7 @@ class RecordedAlarm:
         if not self.start_s <= self.end_s:
             raise InputError(
                 f"an alarm on {self.file} ends at {self.end_s} s, before it starts at {self.start_s} s"
+                " [HM-WORKFLOW-043]"
             )
 
 
@@ -248,7 +249,7 @@ def watch_stage(context: Context) -> WatchResult | Absent:
             try:
                 limits[kind], sources[kind] = _learned(context, kit, name, kind, rest or kit.known_rest, data)
             except InputError as none:
-                missing.append(f"no limits of {kind} could be learned: {none}")
+                missing.append(f"no limits of {kind} could be learned: {none} [HM-WORKFLOW-044]")
         watch[name] = WatchFile(limits, "; ".join(missing), rest, parts.observer(name))
     write_watch(context.out / "model", watch)
     kit = context.kit
