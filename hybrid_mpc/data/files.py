@@ -178,7 +178,8 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
         )
     if decimals is not None and not (type(decimals) is int and 0 <= decimals <= MOST_DECIMALS):
         raise InputError(
-            f"write_csv: decimals must be an integer from 0 to {MOST_DECIMALS}, got {decimals!r:.80} [HM-DATA-032]"
+            f"write_csv: decimals must be an integer from 0 to {MOST_DECIMALS}, got {type(decimals).__name__} "
+            "[HM-DATA-032]"
         )
     path = Path(path)
     arrays = {n: real_numbers(column, f"write_csv: column {shown(str(n))}") for n, column in columns.items()}
