@@ -31,7 +31,7 @@ def test_it_says_what_it_understood(call, machine):
         "networks may correct the rates of: phi_dot",
         "operating point (given): phi = 0 rad, phi_dot = 0 rad/s, tau = 0 N m",
         "(-3.142, 0) unstable; (0, 0) stable; (3.142, 0) unstable",
-        "4 s; 1 Runge-Kutta steps a period of 0.02 s",  # 2 J / d: the envelope of the swing
+        "4 s; 1 Runge-Kutta steps per period of 0.02 s",  # 2 J / d: the envelope of the swing
         "control: 50 periods, 1 s",
         "monday.csv 11.98 s 0.01 s",
         "No errors",

@@ -436,9 +436,9 @@ scenario = Scenario("valve", "", "", prior=Valve, data=DataSpec("t", ("v",), ("y
     [
         (
             "integer=True",
-            ["valve.py:6", "'integer'", "Inputs of whole numbers, or on and off, are not supported"],
+            ["valve.py:6", "'integer'", "Inputs that are integers"],
         ),
-        ("values=(0, 1)", ["valve.py:6", "'values'", "Inputs of whole numbers"]),
+        ("values=(0, 1)", ["valve.py:6", "'values'", "Inputs that are integers"]),
         ("lover=0.0", ["valve.py:6", "'lover'", "did you mean 'lower'?"]),
     ],
 )

@@ -123,7 +123,7 @@ def test_what_is_written_from_a_real_recording_passes_the_check_with_it(
     assert [c.full for c in draft.outputs] == outputs
     code, told, _ = call("check", machine, "--data", RECORDINGS / file)
     assert code == 0, told
-    assert "'hybrid-mpc run' may start" in told
+    assert "continue with 'hybrid-mpc run'" in told
 
 
 def test_columns_may_be_named_and_may_have_any_names(tmp_path):
@@ -195,7 +195,7 @@ def test_several_files_after_one_option_are_explained(call, tmp_path):
     for command in ("check", "run"):
         code, _, told = call(command, path, "--data", file, file)
         assert code == 2
-        assert "--data takes one value; give it once for each: --data A --data B" in told
+        assert "--data takes one value; repeat it: --data A --data B" in told
     code, _, told = call("check", path, "something")
     assert (code, "give it once" in told) == (2, False)
 

@@ -261,7 +261,7 @@ WRONG = {
     "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), ["mass_matrix(q, p) is 0.0", "be positive"]),
     "negative inertia": (prior(mass_matrix=lambda self, q, p: -p.J), ["mass_matrix(q, p) is -0.1", "be positive"]),
     "no inertia": (prior(mass_matrix=MechanicalPrior.mass_matrix), ["must define mass_matrix(q, p)"]),
-    "inertia without return": (prior(mass_matrix=lambda self, q, p: None), ["gives None; is a 'return' missing?"]),
+    "inertia without return": (prior(mass_matrix=lambda self, q, p: None), ["HM-MACHINE-003"]),
     "inertia of two": (prior(mass_matrix=lambda self, q, p: ((p.J, 0), (0, p.J))), ["1 rows of 1 values", "got 4"]),
     "friction that drives": (prior(friction=lambda self, q, v, p: -0.1 * v.phi_dot),
                              ["balance energy [W]: the loss is -", "must not be negative"]),
@@ -270,7 +270,7 @@ WRONG = {
     "potential without return": (prior(potential=lambda self, q, p: None), ["Changed.potential(q, p)", "'return'"]),
     "force of two": (prior(force=lambda self, q, v, u, w, p: (u.tau, u.tau)), ["got 2: one for each of phi_dot"]),
     "two inputs and no force": (lambda: prior(inputs=(Signal("a", "N"), Signal("b", "N")))() | data(inputs=("a", "b")),
-                                ["2 inputs drive 1 degrees of freedom; define force(q, v, u, w, p)"]),
+                                ["2 inputs for 1 degrees of freedom", "HM-MACHINE-002"]),
     "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), ["[q, v] in pairs"]),
     # data
     "too few columns": (field(data=dataclasses.replace(DATA, inputs=())), ["0 columns of inputs", "'tau'"]),
@@ -290,7 +290,7 @@ WRONG = {
         field(control=OCP(10, (25, 1), (1, 1), (1, 1), (-1, -1), (1, 1))), ["control: r must have 1 numbers, got 2"]
     ),
     "bounds of too many": (control(u_min=(-1, -1), u_max=(1, 1)), ["u_min"]),
-    "a problem that is none": (field(control={"horizon": 10}), ["control: OCP(...) is needed"]),
+    "a problem that is none": (field(control={"horizon": 10}), ["control: must be OCP(...)"]),
     "a field there is not": (control(horizn=9), ["'horizn'; did you mean 'horizon'?"]),
     "no sensor_sigma": (field(sensor_sigma=()), ["sensor_sigma: must have 1 numbers, got 0"]),
     "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["sensor_sigma must be positive"]),
@@ -375,8 +375,8 @@ def test_states_that_no_output_sees_are_named(base, members, states):
         check_scenario(changed(base, members))
 
 
-NO_TORCH = ["Changed.xdot", "written in torch? Then it must be a TorchPrior"]
-NO_CASADI = ["Changed.xdot", "written in CasADi? Then it must be a Prior"]
+NO_TORCH = ["Changed.xdot", "needs a TorchPrior"]
+NO_CASADI = ["Changed.xdot", "needs a Prior"]
 
 
 def if_else(x, u, p, m):

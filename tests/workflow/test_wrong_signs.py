@@ -111,7 +111,7 @@ def test_a_run_says_first_that_the_prior_is_in_doubt(ran, checked):
     assert told.index(warned) < next(i for i, line in enumerate(told) if line.startswith("training"))
     (line,) = (line for line in told if line.startswith(sentence))
     assert first in line
-    assert told.index(line) < told.index("free runs on unseen data:")
+    assert told.index(line) < told.index("free runs on held-out data:")
 
     page = html.unescape((ran / "run" / "report.html").read_text())
     body = page[page.index("<body>") :]
