@@ -75,7 +75,7 @@ def test_a_sensor_that_stops_at_rest_is_told_by_the_inputs(tmp_path):
     """It never moves again, so nothing is abrupt: the inputs go on as before."""
     resting = quantised(SWING * np.clip((10 - T) / 3, 0, 1) ** 2)  # comes to rest at 10 s
     (one,) = findings(tmp_path, resting)
-    assert (one.kind, "while the inputs move as they do elsewhere" in one.message) == ("frozen", True)
+    assert (one.kind, "while the inputs move" in one.message) == ("frozen", True)
     assert one.start == pytest.approx(10.0, abs=0.3)
     assert findings(tmp_path, resting, tau=np.where(T > 9.5, 0.2 * TAU, TAU)) == ()  # too little to move it
     # a file that stands still from its begin to its end, among others that move
@@ -90,7 +90,7 @@ def test_clipped_sensors(tmp_path, sensor):
     (one,) = findings(tmp_path, phi)
     assert (one.kind, one.channel, one.count) == ("clipped", "phi", int((phi == 1.0).sum()))
     assert one.start == pytest.approx(T[np.argmax(phi == 1.0)])
-    for words in ("stands at its largest value, 1 rad", "clipped", "against a stop"):
+    for words in ("largest value, 1 rad", "clipped", "against a stop"):
         assert words in str(one)
     both = findings(tmp_path, np.clip(sensor(SWING), -0.8, 1.0))
     assert [one.message.split("its ")[1].split(" ")[0] for one in both] == ["largest", "smallest"]
@@ -153,7 +153,7 @@ def test_speeds_beyond_what_is_plausible(tmp_path):
     assert (one.kind, one.channel, one.refused) == ("speed", "phi", False)
     assert 6.9 < one.start < 7.1
     assert 0 < one.count < 10
-    for words in ("reaches", "rad/s at", "-20 to 20 rad/s", "unit is wrong", "DataSpec.units"):
+    for words in ("reaches", "rad/s at", "-20 to 20 rad/s", "DataSpec.units"):
         assert words in str(one)
     # degrees that a wide range of the position lets pass
     free = {**SIGNALS, "outputs": (Signal("phi", "rad"),)}
@@ -177,8 +177,13 @@ def test_all_files_are_told_at_once(tmp_path):
     with pytest.raises(InputError) as caught:
         load_trajectories(files, machine(**SIGNALS), SPEC)
     told = caught.value.problems
-    words = ("a.csv: column 'phi' jumps", "b.csv: row 502", "c.csv: row 3", "d.csv: there is no such file",
-             "f.csv: row")  # fmt: skip
+    words = (
+        "a.csv: column 'phi' jumps",
+        "b.csv: row 502",
+        "c.csv: row 3",
+        "d.csv: file not found",
+        "f.csv: row",
+    )
     assert len(told) == len(words)
     for problem, start in zip(told, words, strict=True):
         assert start in problem

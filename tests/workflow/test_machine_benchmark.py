@@ -247,7 +247,7 @@ def test_the_command_judges_a_model_and_draws_it(call, machine, made, tmp_path):
         (("--data", "a.csv", "--model", "m"), "leave --data out"),
         (("--model", "nowhere"), "--test FILE"),
         (("--data", "a.csv", "--budget", "huge"), "no benchmark budget 'huge'; it has: quick"),
-        (("--data", "missing.csv"), "there is no such file"),
+        (("--data", "missing.csv"), "file not found"),
         (("--model", "nowhere", "--test", "TEST"), "holds no model of a benchmark"),
     ],
 )
