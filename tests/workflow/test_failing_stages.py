@@ -62,12 +62,12 @@ def test_a_stage_that_later_ones_need_ends_the_run(call, arguments, finished, tm
 
 def test_a_page_is_there_long_before_the_end(call, arguments, finished, tmp_path, monkeypatch):
     """After the fit it has the recordings and the prior, and says that the run goes on; at the end it does not."""
-    assert "This run goes on" not in (finished / "report.html").read_text()
+    assert "The run is not finished" not in (finished / "report.html").read_text()
     out = without(finished, tmp_path, "prior")
     monkeypatch.setattr(job, "STAGES", broken(job.STAGES, "training", InputError("none")))
     assert call(*arguments, "--out", out, "--resume")[0] == 2
     page = (out / "report.html").read_text()
-    assert "This run goes on" in page
+    assert "The run is not finished" in page
     assert "standard error" in page  # of the prior's parameters
     assert "Closed loops" not in page
 
