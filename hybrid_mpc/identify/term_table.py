@@ -50,7 +50,7 @@ UNITS = 3
 HEAD = """# Terms
 
 The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search to some of them, and
-`hm.terms.LAW(...)` makes one for a prior of your own ([machines](machines.md)).
+`hm.terms.LAW(...)` makes one for a prior of your own ([how](mechanical-priors.md#friction-and-other-terms)).
 
 Units are those of examples: an axis that turns (rad) or slides (m), a level in m, a temperature in degC, inputs in V.
 Angles have no unit within a term. Symbols: v speed, q its position, x state, u input, w measured disturbance, y output,
