@@ -20,7 +20,7 @@ class Tank(Prior):
         return p.k * ca.sqrt(ca.fmax(x.level, 1e-3))  # differentiable at an empty tank
 
     def xdot(self, x, u, w, p):
-        return ((u.pump - self.out(x, p)) / (600 * p.area),)  # 600 s/min dm/m
+        return ((u.pump - self.out(x, p)) / (600 * p.area),)  # 60 s/min, 10 dm/m
 
     def balances(self, x, u, w, p):
         water, out = 10 * p.area * x.level, self.out(x, p) / 60  # [l], [l/s]
@@ -35,10 +35,13 @@ scenario = Scenario(
     data=DataSpec("time_s", ("pump_lpm",), ("level_m",), dt=5, max_gap=12, smoothing=50, warm_up=60),
     control=OCP(
         horizon=30,  # 150 s
-        q=(0,), r=(1e-3,), r_delta=(1e-2,),  # states, inputs, moves of the input
+        q=(0,),
+        r=(1e-3,),
+        r_delta=(1e-2,),  # moves of the input: 1 / (10 l/min)^2
         q_y=(1e3,),  # outputs: 1 / (0.03 m)^2
-        u_min=(0,), u_max=(20,),
-    ),  # fmt: skip
+        u_min=(0,),
+        u_max=(20,),
+    ),
     sensor_sigma=(2e-3,),  # [m] standard deviation of the level sensor
     safe_input=(0,),  # the pump may stop
 )
