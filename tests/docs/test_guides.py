@@ -192,6 +192,11 @@ def test_what_does_not_fit_is_refused_as_the_page_says(what_fits):
         check_scenario(what_fits.machine(what_fits.rod(20), 2.0))
 
 
+def test_the_comparison_of_the_page_on_seeds():
+    found = executed("docs/seeds.md", blocks("docs/seeds.md"))["found"]
+    assert f"({found.words!r}, {found.finding!r})" in (ROOT / "docs/seeds.md").read_text()
+
+
 def test_the_machines_of_the_readme():
     sources = [source for source in blocks("README.md") if re.search(r"^class ", source, re.MULTILINE)]
     assert len(sources) == 1  # a tank
