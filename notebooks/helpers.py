@@ -142,6 +142,20 @@ def picture_of_late_torques(runs: Mapping[str, Any], columns: int = 2) -> Any:
     return figure
 
 
+def cpu_times(estimator: Any, controller: Any, loop: Any, reference: Any, horizon: int) -> Any:
+    """CPU time of each period's work [ms], observer and solver, replayed on the measurements of a loop."""
+    dt = loop.t[1] - loop.t[0]
+    ahead, spent = dt * np.arange(horizon + 1), []
+    estimate = estimator.start(loop.y[0])
+    decision = controller.initial(estimate, None, reference(ahead))
+    for k in range(1, len(loop.t)):
+        begin = process_time()
+        estimate = estimator.update(estimate, loop.y[k], loop.u[k - 1])
+        decision = controller.decide(decision, estimate, reference(loop.t[k] + ahead))
+        spent.append(1e3 * (process_time() - begin))
+    return np.array(spent)
+
+
 # The monitor
 
 
