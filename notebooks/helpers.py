@@ -17,7 +17,7 @@ from nn_export import build
 
 MODEL = Path(__file__).parent / "golf_robot"
 """The trained model of the notebooks, a kit; ``make_model.py`` makes it."""
-INKS = ("rnn", "pgrnn", "phy", "reference", "mopgrnn", "oracle")
+INKS = ("rnn", "pgrnn", "phy", "reference", "oracle", "phy_nominal")
 """Colours of curves that are no models, in turn."""
 
 
