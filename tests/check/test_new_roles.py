@@ -69,7 +69,7 @@ def test_some_are_told_right_even_without_names(name):
 
 @pytest.mark.full
 def test_how_many_are_told_right_otherwise():
-    """The figures of docs/own-machine.md."""
+    """The figures of docs/columns.md."""
     rows = list(benchmark.simulated())
     assert sum(row["right"] for row in rows) >= 16
     assert len(rows) == 20
