@@ -115,8 +115,8 @@ class Simulation:
 def _with_slopes(f: ca.Function, free: Sequence[int], wanted: bool) -> Callable[..., ca.SX]:
     """``f(x, u, w, p)`` of ``z = [x, derivatives by free parameters, derivatives by a first state]``, in the same form.
 
-    A Runge-Kutta step of these rates is the step of ``x`` and its exact derivative. The Jacobians are expressions of one
-    stage, and sparse: most steps have fewer operations than one that is differentiated as a whole.
+    A Runge-Kutta step of these rates is the step of ``x`` and its exact derivative. The Jacobians are expressions of
+    one stage, and sparse: most steps have fewer operations than one that is differentiated as a whole.
 
     Args:
         f: The function.
@@ -215,7 +215,9 @@ def _chained(one: ca.Function) -> ca.Function:
     return ca.Function(one.name(), [z, signals, constants], results)
 
 
-def stepped(xdot: Callable[..., ca.SX], x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int) -> ca.SX:
+def stepped(
+    xdot: Callable[..., ca.SX], x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int
+) -> ca.SX:
     """The state a period later, by Runge-Kutta of order 4 in equal sub-steps; ``u`` and ``w`` are held."""
     s = dt / substeps
     for _ in range(substeps):
