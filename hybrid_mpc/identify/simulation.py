@@ -96,9 +96,10 @@ class Simulation:
         z, u, w, p = (ca.SX.sym(name, *size) for name, size in sizes.items())
         n = len(self.free) if columns else 0
         given = ca.horzcat(z[:, 0], ca.SX(self.n_x, n), ca.SX.eye(self.n_x)) if columns else z
-        output, correct, rate = (
+        rate = _with_slopes(self._xdot, self.free, columns > 0)
+        output, correct = (
             None if f is None else _with_slopes(f, self.free, columns > 0)
-            for f in (self._output, self._correct, self._xdot)
+            for f in (self._output, self._correct)
         )
         y = given if output is None else output(given, u, w, p)
         begin = given if correct is None else correct(given, u, w, p)
