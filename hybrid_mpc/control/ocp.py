@@ -25,7 +25,7 @@ from hybrid_mpc.control.soft import (
 from hybrid_mpc.errors import Collected, InputError
 from hybrid_mpc.model.limits import input_limits, numbers, vector
 from hybrid_mpc.model.model import output_with_jacobian
-from hybrid_mpc.model.riccati import coming_back, dare, linearization, unmoved
+from hybrid_mpc.model.riccati import dare, linearization, remedy_for_unmoved, unmoved_states
 from hybrid_mpc.records import known
 from hybrid_mpc.rules import LARGEST
 
@@ -398,7 +398,7 @@ class OCP:
         try:
             p, _ = dare(a, b, q, r)
         except InputError as error:
-            why = coming_back(unmoved(model, a, b))
+            why = remedy_for_unmoved(unmoved_states(model, a, b))
             raise InputError(f"{error}{why and '; ' + why}") from None
         if not model.n_h:
             return p

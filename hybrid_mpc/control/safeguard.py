@@ -101,7 +101,7 @@ class SafeController:
             raise InputError(f"fallback: must be a model, got {type(fallback).__name__} [HM-CONTROL-039]")
         ocp = controller.ocp
         self.controller, self.max_age, self.fallback = controller, max_age, fallback
-        self.safe_input = None if safe_input is None else checked_safe_input(safe_input, ocp)
+        self.safe_input = None if safe_input is None else check_safe_input(safe_input, ocp)
         self._split = controller if isinstance(controller, SplitController) else None
         self._first = controller if first is None else first
         sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (self._first, controller)]
@@ -239,7 +239,7 @@ def _ahead(w: Array | None) -> dict[str, Any]:
     return {} if w is None else {"w": w}
 
 
-def checked_safe_input(given: ArrayLike, ocp: OCP) -> Array:
+def check_safe_input(given: ArrayLike, ocp: OCP) -> Array:
     """The safe input ``(n_u,)`` of a problem, within its limits."""
     u = vector(given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):

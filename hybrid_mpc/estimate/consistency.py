@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
-from hybrid_mpc.estimate.tuning import Recording, surroundings
+from hybrid_mpc.estimate.tuning import Recording, measured_disturbances
 
 Array = NDArray[np.float64]
 LEVEL = 0.95
@@ -116,7 +116,7 @@ def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Inno
             f"consistency: y and u must have shapes (n, {n_y}) and (n, {estimator.model.n_u}) with n > 0, got "
             f"{recording.y.shape} and {recording.u.shape} [HM-ESTIMATE-003]"
         )
-    ws = surroundings(estimator.model, recording)
+    ws = measured_disturbances(estimator.model, recording)
     estimate = estimator.start(recording.y[0], w=ws[0])
     rows: list[Array] = []
     nis: list[float] = []

@@ -12,7 +12,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
-from hybrid_mpc.model.riccati import coming_back, unmoved
+from hybrid_mpc.model.riccati import remedy_for_unmoved, unmoved_states
 
 Array = NDArray[np.float64]
 AROUND = 5
@@ -33,7 +33,7 @@ class OffsetFree:
         target_rank: Rank of ``[[A - I, B], [C_c, D_c]]``, ``c`` the controlled outputs.
         target_needed: ``n_z + n_c``: with less, not every set-point has a steady state.
         unmoved: If the targets' rank is too low: states that no input affects and that do not return to rest
-            (:func:`~hybrid_mpc.model.riccati.unmoved`).
+            (:func:`~hybrid_mpc.model.riccati.unmoved_states`).
     """
 
     n_d: int
@@ -81,7 +81,7 @@ class OffsetFree:
         if self.reachable:
             return ""
         ranks = f"(rank of the targets {self.target_rank}, needed {self.target_needed})"
-        why = coming_back(self.unmoved) or "Weigh other outputs in q_y"
+        why = remedy_for_unmoved(self.unmoved) or "Weigh other outputs in q_y"
         return f"the inputs cannot hold the controlled outputs at arbitrary set-points {ranks}. {why}"
 
 
@@ -139,7 +139,7 @@ def offset_free(
     return OffsetFree(
         model.n_d, model.n_y,
         _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d, target_rank, target_needed,
-        unmoved(model, a, b) if target_rank < target_needed else (),
+        unmoved_states(model, a, b) if target_rank < target_needed else (),
     )  # fmt: skip
 
 

@@ -51,7 +51,7 @@ class Known(Recording, Protocol):
         """States ``(n, n_x)``."""
 
 
-def surroundings(model: HybridModel, recording: Recording) -> Array:
+def measured_disturbances(model: HybridModel, recording: Recording) -> Array:
     """Measured disturbances of a recording ``(n, n_w)``; empty if the model has none.
 
     Raises:
@@ -84,7 +84,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
     """
     errors: list[Array] = []
     for recording in recordings:
-        h, ws = np.zeros(model.n_h), surroundings(model, recording)
+        h, ws = np.zeros(model.n_h), measured_disturbances(model, recording)
         for k in range(len(recording.u) - 1):
             x_next, h = (
                 m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], ws[k], model.p)
@@ -109,7 +109,7 @@ def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> f
 
     Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
     """
-    ws = surroundings(estimator.model, recording)
+    ws = measured_disturbances(estimator.model, recording)
     estimate, total = estimator.start(recording.y[0], w=ws[0]), 0.0
     for k in range(1, len(recording.y)):
         ahead = estimator.measuring(estimator.predict(estimate, recording.u[k - 1]), ws[k])
@@ -121,7 +121,7 @@ def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> f
     return total
 
 
-def most_likely(
+def choose_most_likely(
     make: Callable[[float], Filter], recordings: Sequence[Recording], scales: Sequence[float]
 ) -> float:
     """The scale whose filter ``make(scale)`` gives undisturbed recordings the largest likelihood."""
@@ -129,7 +129,7 @@ def most_likely(
     return float(scales[int(np.argmax(values))])
 
 
-def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
+def remaining_load(ekf: ExtendedKalmanFilter, periods: int) -> Array:
     """Remaining share of each constant disturbance after ``periods`` of a filter, ``(n_d,)``.
 
     With the gain of the settled covariance, at the model's operating point and beside it, where every state is moved by
@@ -143,7 +143,7 @@ def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> slow, quick = (ExtendedKalmanFilter(model, sigma_y=[1.0], sigma_x=[1.0], sigma_x0=[1.0], sigma_d=[step])
         ...                for step in (0.01, 0.1))
-        >>> load_left(slow, 50).round(2), load_left(quick, 50).round(2)
+        >>> remaining_load(slow, 50).round(2), remaining_load(quick, 50).round(2)
         (array([0.61]), array([0.01]))
 
     Source: Anderson and Moore, *Optimal Filtering*, 1979, section 4.4.
@@ -177,7 +177,7 @@ def periods_to_find(ekf: ExtendedKalmanFilter, most: int) -> Array:
 
 
 def _left(errors: Sequence[Array], periods: int, n_d: int) -> Array:
-    """:meth:`load_left` for the error matrices of several points."""
+    """:func:`remaining_load` for the error matrices of several points."""
     powers = [np.linalg.matrix_power(one, periods) for one in errors]
     found = [np.abs(np.diag(power)[len(power) - n_d :]) for power in powers]
     return np.min(found, axis=0) if found else np.full(n_d, np.nan)
