@@ -209,7 +209,7 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
 
 def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
     """Check that the operating point is an equilibrium."""
-    if moving := moves_at_rest(prior, second):
+    if moving := drift_at_rest(prior, second):
         x, u, w = rest_of(prior)
         report.add(
             f"prior: operating_point is not an equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}. Give the "
@@ -218,7 +218,7 @@ def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
         )
 
 
-def moves_at_rest(prior: Prior, second: float) -> str:
+def drift_at_rest(prior: Prior, second: float) -> str:
     """The states that move at the operating point, as text; empty if none moves, or no point is given.
 
     ``second`` is the time [s] within which a state may drift by a hundredth of its size.
@@ -234,9 +234,9 @@ def moves_at_rest(prior: Prior, second: float) -> str:
     )
 
 
-def rests_no_more(prior: Prior, second: float) -> tuple[str, ...]:
+def warn_of_drift(prior: Prior, second: float) -> tuple[str, ...]:
     """A warning if a fitted prior has no steady state at its operating point, with the nearest steady state."""
-    moving = moves_at_rest(prior, second)
+    moving = drift_at_rest(prior, second)
     if not moving:
         return ()
     return (

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.machine.units import parsed
+from hybrid_mpc.machine.units import parse_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -155,7 +155,7 @@ def is_unit(cell: str) -> bool:
     return (
         re.search(r"[^\W\d_]|[%°]", bare) is not None
         and bare.casefold() not in BLANK
-        and parsed(bare) is not None
+        and parse_unit(bare) is not None
     )
 
 

@@ -149,7 +149,7 @@ class Channel:
         found, signal, angle, t = list[Finding](), self.signal, None, self.t
         again = "Record an angle without jumps, or unwrap it first: numpy.unwrap(..., period="
         if (turn := turn_of(signal)) is not None:
-            angle = unwrapped(t, self.y, turn, max_gap, periodic=signal.periodic)
+            angle = unwrap(t, self.y, turn, max_gap, periodic=signal.periodic)
             if len(angle.jumps):
                 told = (
                     "no smooth motion explains such jumps, so the angle is wrapped. Declare Signal(..., periodic=True) "
@@ -166,7 +166,7 @@ class Channel:
                         "are missing to count the turns: the recording is cut there."
                     )
                 found.append(_jumping(self, angle.jumps, "a full turn", 4, told, not signal.periodic))
-            elif parted := folded(t, self.y, turn, max_gap):
+            elif parted := find_folding(t, self.y, turn, max_gap):
                 part = f"1/{parted[0]} of a turn"
                 told = (
                     f"the angle restarts after {part}, or its unit is wrong. {again}{turn / parted[0]:.6g})."
@@ -174,7 +174,7 @@ class Channel:
                 found.append(_jumping(self, parted[1], f"{part} against its motion", 4, told, True))
         # integers of b bits span less than 2^b
         if (raw == np.round(raw)).all() and (
-            over := _anew(t, raw, [2.0**b for b in BITS], 1 - 1e-10, max_gap)
+            over := _find_restarts(t, raw, [2.0**b for b in BITS], 1 - 1e-10, max_gap)
         ):
             bits = BITS[over[0]]
             told = f"a counter of {bits} bits overflows. {again}{2**bits})."
@@ -252,7 +252,7 @@ class Unwrapped:
     unclear: Indices
 
 
-def unwrapped(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: bool = True) -> Unwrapped:
+def unwrap(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: bool = True) -> Unwrapped:
     """Unwrap an angle; missing samples are left out of ``angle``.
 
     An angle is wrapped if it stays within one turn and moves by more than half a turn between neighbouring samples; if
@@ -284,7 +284,7 @@ def unwrapped(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: 
     return Unwrapped(counted, np.flatnonzero(turns) + 1, np.array(unclear, dtype=np.intp))
 
 
-def _anew(
+def _find_restarts(
     t: Array, x: Array, sizes: Sequence[float], most: float, max_gap: float
 ) -> tuple[int, Indices] | None:
     """Which of the ``sizes`` a signal ``(m,)`` jumps by against its motion, and the samples before which it jumps.
@@ -313,11 +313,11 @@ def _anew(
     return None
 
 
-def folded(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, Indices] | None:
+def find_folding(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, Indices] | None:
     """Number of parts of a turn after each of which an angle restarts, and the samples before which it jumps; None if
     it never restarts.
     """
-    found = _anew(t, angle, [turn / parts for parts in PARTS], SPAN, max_gap)
+    found = _find_restarts(t, angle, [turn / parts for parts in PARTS], SPAN, max_gap)
     return found and (PARTS[found[0]], found[1])
 
 

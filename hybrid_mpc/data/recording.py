@@ -261,7 +261,7 @@ def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
     return list(dict.fromkeys(problems))
 
 
-def misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
+def find_misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
     """Settings of recordings that are not given, if the name is nearly that of a given recording without such settings.
 
     Names that differ only in their digits belong to different recordings.
@@ -454,7 +454,7 @@ def _one_clock(
     t, begins = values[:, 0].copy(), restarts(values[:, 0])
     pause = 3 * spec.max_gap / seconds  # in the column's unit
     for a, b in pairwise([0, *begins, len(t)]):
-        own = even(t[a:b])
+        own = make_even(t[a:b])
         values[a:b, 0] = own if a == 0 else own - own[0] + values[a - 1, 0] + pause
     if begins:
         k, count = begins[0], len(begins)
@@ -465,7 +465,7 @@ def _one_clock(
     return columns, values, findings
 
 
-def even(t: Array) -> Array:
+def make_even(t: Array) -> Array:
     """Replace time stamps ``(m,)`` that are uneven only by rounding by a uniform grid; return all others unchanged.
 
     Stamps may be rounded to single precision or to decimals. A grid of equal steps, with samples missing here and

@@ -47,14 +47,14 @@ class Outputs(Protocol):
         """Measured outputs ``(n, n_y)``, NaN where a sample is missing."""
 
 
-def thinned(recordings: Sequence[Outputs], i: int) -> tuple[list[Array], int]:
+def thin(recordings: Sequence[Outputs], i: int) -> tuple[list[Array], int]:
     """Samples ``(m,)`` of one output of each recording, and their distance in periods: one, or more for a sensor that
     is slower than the grid. Missing samples stay NaN.
 
     Example:
         >>> from types import SimpleNamespace
         >>> run = SimpleNamespace(y=np.where(np.arange(9) % 3 == 1, np.arange(9.0), np.nan)[:, None])
-        >>> thinned([run], 0)
+        >>> thin([run], 0)
         ([array([1., 4., 7.])], 3)
     """
     known = [np.flatnonzero(np.isfinite(r.y[:, i])) for r in recordings]
@@ -71,7 +71,7 @@ def noise_of(recordings: Sequence[Outputs]) -> Array:
     machine's motion within three samples counts as noise too, so the estimate is an upper bound. Zero if too few
     samples are known.
     """
-    return np.array([_noise_of(thinned(recordings, i)[0]) for i in range(recordings[0].y.shape[1])])
+    return np.array([_noise_of(thin(recordings, i)[0]) for i in range(recordings[0].y.shape[1])])
 
 
 def _noise_of(pieces: Sequence[Array]) -> float:
@@ -79,7 +79,7 @@ def _noise_of(pieces: Sequence[Array]) -> float:
     return robust_spread(third) / math.sqrt(20.0)
 
 
-def within(values: Array) -> Array:
+def trim_outliers(values: Array) -> Array:
     """Values ``(n,)`` without gross outliers: more than two ranges of the middle 80 % away from that range.
 
     Normally distributed values keep (nearly) all samples. Nothing is removed if the middle 80 % are equal.
@@ -96,7 +96,7 @@ def robust_spread(values: Array) -> float:
         >>> robust_spread(np.array([1.0, 3.0, np.nan, 1.0, 3.0, 1.0, 3.0, 1.0, 3.0, 1.0, 3.0, 1e6]))
         1.0
     """
-    there = within(values[np.isfinite(values)])
+    there = trim_outliers(values[np.isfinite(values)])
     return float(np.std(there)) if len(there) else 0.0
 
 
@@ -153,8 +153,8 @@ def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
 
 def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
     """Time scale of one output; NaN if its acceleration never stands out of the noise."""
-    thin, step = thinned(recordings, i)
-    pieces = [_bridged(piece) for piece in thin]
+    sparse, step = thin(recordings, i)
+    pieces = [_bridged(piece) for piece in sparse]
     half, longest, dt = SHORTEST, max(map(len, pieces)), step * dt
     while 2 * half + 1 <= longest:
         speed, acceleration = (

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
 from hybrid_mpc.data.findings import MIN_SCORED, Finding, findings_of, gaps
-from hybrid_mpc.data.recording import Flags, Recording, Samples, Signals, misspelt, read_recordings
+from hybrid_mpc.data.recording import Flags, Recording, Samples, Signals, find_misspelt, read_recordings
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
 
@@ -172,7 +172,7 @@ def load_trajectories(
         t, x = [piece.t for piece in own], [piece.x for piece in own]
         motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
     findings = findings_of(recordings, motions, spec, outputs=outputs, states=states if positions else ())
-    findings = (*findings, *misspelt(spec, [recording.path for recording in recordings]))
+    findings = (*findings, *find_misspelt(spec, [recording.path for recording in recordings]))
     paths_of = {recording.path.name: recording.path for recording in recordings}
     refuse(
         problems + [f"{paths_of[one.file]}: {one.message} [HM-DATA-100]" for one in findings if one.refused]

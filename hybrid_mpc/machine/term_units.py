@@ -10,7 +10,7 @@ from typing import Any
 
 import casadi as ca
 
-from hybrid_mpc.machine.units import BASES, parsed
+from hybrid_mpc.machine.units import BASES, parse_unit
 
 Unit = tuple[float, ...] | None
 """Exponents of the base units; None: any unit."""
@@ -32,7 +32,7 @@ def of(unit: str) -> Unit:
         >>> of("N m")
         (2.0, 1.0, -2.0, 0.0, 0.0, 0.0, 0.0)
     """
-    found = parsed(unit)
+    found = parse_unit(unit)
     return None if found is None else tuple(float(e) for e in (*found[1], *NONE[len(found[1]) :]))
 
 

@@ -66,13 +66,13 @@ NEAR = 1e-9
 
 
 @cache
-def parsed(unit: str) -> tuple[float, tuple[int, ...]] | None:
+def parse_unit(unit: str) -> tuple[float, tuple[int, ...]] | None:
     """Factor to SI and exponents of metre, kilogram, second, ampere, kelvin, mole, candela; None if unknown.
 
     Factors are separated by blanks, ``*`` or ``·``; everything after a ``/`` divides.
 
     Example:
-        >>> parsed("N m"), parsed("mm/s"), parsed("furlong")
+        >>> parse_unit("N m"), parse_unit("mm/s"), parse_unit("furlong")
         ((1.0, (2, 1, -2, 0, 0, 0, 0)), (0.001, (1, 0, -1, 0, 0, 0, 0)), None)
     """
     text = unit.replace("µ", "u").replace("μ", "u").replace("°", "deg").replace("²", "^2").replace("³", "^3")
@@ -114,7 +114,7 @@ def differ(one: str, other: str) -> bool:
         >>> differ("N m", "J"), differ("rad", "deg"), differ("m", "kg"), differ("m", "furlong")
         (False, True, True, False)
     """
-    first, second = parsed(one), parsed(other)
+    first, second = parse_unit(one), parse_unit(other)
     if first is None or second is None:
         return False
     return first[1] != second[1] or abs(first[0] - second[0]) > NEAR * abs(first[0])
@@ -142,7 +142,7 @@ def conversion(one: str, other: str) -> Conversion | str:
     """
     if plain(one) == plain(other):
         return Conversion(1.0)
-    first, second = parsed(one), parsed(other)
+    first, second = parse_unit(one), parse_unit(other)
     if first is None or second is None:
         return "which is not known"
     if first[1] != second[1]:
@@ -184,7 +184,7 @@ def is_product(one: str, other: str, whole: str) -> bool:
         >>> is_product("N m", "rad/s", "W"), is_product("V", "rad/s", "W"), is_product("furlong", "1/s", "W")
         (True, False, True)
     """
-    first, second, third = parsed(one), parsed(other), parsed(whole)
+    first, second, third = parse_unit(one), parse_unit(other), parse_unit(whole)
     if first is None or second is None or third is None:
         return True
     exponents = tuple(i + j for i, j in zip(first[1], second[1], strict=True))
@@ -198,7 +198,7 @@ def alike(one: str, other: str) -> bool:
         >>> alike("mm", "m"), alike("mm", "kg"), alike("mm", "furlong")
         (True, False, True)
     """
-    first, second = parsed(one), parsed(other)
+    first, second = parse_unit(one), parse_unit(other)
     return first is None or second is None or first[1] == second[1]
 
 

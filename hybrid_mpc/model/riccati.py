@@ -113,7 +113,7 @@ def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array,
     return a.full(), b.full(), h
 
 
-def unmoved(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
+def unmoved_states(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
     """Names of states that no input affects and that do not return to rest by themselves.
 
     They belong to modes of ``z+ = A z + B u`` on or outside the unit circle that ``B`` does not reach (Hautus test):
@@ -131,7 +131,7 @@ def unmoved(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
         >>> room = HybridModel.of("room", 1.0, (Signal("oven", "degC"), Signal("room", "degC")), (Signal("u", "W"),),
         ...     (Signal("oven", "degC"),), x=v, u=u, y=v[0], x_next=ca.vertcat(0.9 * v[0] + 0.1 * v[1] + u, v[1]),
         ...     xdot=ca.vertcat(u, 0))
-        >>> unmoved(room, *linearization(room, [20.0, 20.0], [0.0])[:2])
+        >>> unmoved_states(room, *linearization(room, [20.0, 20.0], [0.0])[:2])
         ('room',)
     """
     if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
@@ -148,8 +148,8 @@ def unmoved(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
     return tuple(s.name for s, part in zip(model.states, share, strict=False) if part > least)
 
 
-def coming_back(names: tuple[str, ...]) -> str:
-    """A remedy for states from :func:`unmoved`; empty for none."""
+def remedy_for_unmoved(names: tuple[str, ...]) -> str:
+    """A remedy for states from :func:`unmoved_states`; empty for none."""
     if not names:
         return ""
     name = names[0]

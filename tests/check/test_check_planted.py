@@ -297,7 +297,7 @@ PLANTED = {
     ),
     "no disturbance that is unmeasured": (
         cart_with(disturbance_model=()),
-        ["disturbance model: none is given; leave disturbance_model out for one at each input"],
+        ["disturbance model: it is empty", "HM-MODEL-005"],
     ),
     "no sensor_sigma": (cart_with(sensor_sigma=()), ["sensor_sigma: must have 1 numbers, got 0"]),
 }  # fmt: skip

@@ -279,7 +279,7 @@ WRONG = {
     # control
     "horizon 0": (control(horizon=0), ["horizon must be a whole number of periods"]),
     "horizon half": (control(horizon=2.5), ["horizon must be a whole number of periods"]),
-    "crossed bounds": (control(u_min=(1,), u_max=(-1,)), ["input bounds cross", "u_min"]),
+    "crossed bounds": (control(u_min=(1,), u_max=(-1,)), ["HM-MODEL-013", "u_min"]),
     "NaN weight": (control(q=(math.nan, 1)), ["q: weights must be finite and not negative"]),
     "negative weight": (control(r=(-1,)), ["r: weights must be finite and not negative"]),
     "no weight at all": (control(r=(0,), r_delta=(0,)), ["every input needs a positive weight"]),
@@ -306,7 +306,7 @@ WRONG = {
     ),
     "hard bound out of reach": (
         control(hard=[HardBound(ca.Function("one", [ca.SX.sym("x", 2), ca.SX.sym("u")], [ca.SX(1)]), [0.0], [2.0])]),
-        ["hard bound on one: no input of the plan reaches it"],
+        ["hard bound on one", "HM-CONTROL-030"],
     ),
     "working point of one": (control(working_point=((0.0,), (0.0,))), ["working_point x: 1 values given, 2 needed"]),
     "starts of another shape": (control(starts=(((0.0,),),)), ["starts[0]: shape (1, 1) given", "(10, 1)"]),
@@ -470,7 +470,7 @@ def test_the_command_tells_it_before_it_reads_anything(call, tmp_path):
     )
     code, _, message = call("run", machine, "--data", tmp_path / "none.csv", "--out", tmp_path / "out")
     assert code == 2
-    assert "horizon must be a whole number of periods, from 1 to 10000; got 0" in message
+    assert "horizon: must be an integer from 1 to 10000 periods, got 0" in message
     assert "machine.py:3" in message
     assert not (tmp_path / "out").exists()
 

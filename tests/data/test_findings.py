@@ -8,7 +8,7 @@ import pytest
 from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
-from hybrid_mpc.data.findings import still_stretches, unwrapped
+from hybrid_mpc.data.findings import still_stretches, unwrap
 from hybrid_mpc.data.recording import read_recording
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
@@ -230,7 +230,7 @@ def test_turns_are_counted_over_missing_samples_at_any_speed(speed, lost):
     k = np.arange(600)
     angle = 2 * np.pi * speed * k + 0.2 * np.sin(k / 40)
     there = ~np.isin(k % 37, range(1, 1 + lost))
-    found = unwrapped(0.01 * k[there], turned(angle)[there], 2 * np.pi, 1.0)
+    found = unwrap(0.01 * k[there], turned(angle)[there], 2 * np.pi, 1.0)
     np.testing.assert_allclose(found.angle - found.angle[0], angle[there] - angle[0], atol=1e-9)
     assert not len(found.unclear)
 
@@ -240,7 +240,7 @@ def test_where_the_number_of_turns_is_not_known_the_recording_is_cut(tmp_path):
     k = np.arange(1200)
     angle = np.where(k < 600, 0.5 * k, 300 - 0.5 * (k - 600))
     angle[560:640] = np.nan
-    found = unwrapped(0.01 * k[np.isfinite(angle)], turned(angle)[np.isfinite(angle)], 2 * np.pi, 5.0)
+    found = unwrap(0.01 * k[np.isfinite(angle)], turned(angle)[np.isfinite(angle)], 2 * np.pi, 5.0)
     assert found.unclear.tolist() == [560]
     np.testing.assert_allclose(np.diff(found.angle)[:559], 0.5)
     np.testing.assert_allclose(np.diff(found.angle)[560:], -0.5)
@@ -249,7 +249,7 @@ def test_where_the_number_of_turns_is_not_known_the_recording_is_cut(tmp_path):
 def test_an_angle_that_is_not_periodic_may_step_by_half_a_turn():
     t = 0.01 * np.arange(300)
     slider = np.where(t < 1.5, -1.0, 2.5)  # 0.56 turns
-    assert not len(unwrapped(t, slider, 2 * np.pi, 1.0, periodic=False).jumps)
+    assert not len(unwrap(t, slider, 2 * np.pi, 1.0, periodic=False).jumps)
 
 
 def test_settled_answers_to_steps_are_not_frozen(tmp_path):
