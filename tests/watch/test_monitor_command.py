@@ -92,7 +92,7 @@ def test_the_kit_s_own_limits_need_no_option(folder, noisy_artifact, tmp_path):
 
 def test_too_little_nominal_data_says_how_much_is_needed(folder, noisy_artifact, tmp_path):
     done = command(folder, noisy_artifact, tmp_path / "out", "--learn", "1")
-    assert "zero or missing throughout the nominal data; record the machine in motion" in str(done.exception)
+    assert "HM-WATCH-025" in str(done.exception)
     assert not (tmp_path / "out" / "calibration.json").exists()
 
 
