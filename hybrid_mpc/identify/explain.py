@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from hybrid_mpc.data.scales import evenly, robust_spread
+from hybrid_mpc.data.scales import evenly, robust_spread, time_unit
 from hybrid_mpc.data.scales import periods as periods_of
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
@@ -99,6 +99,9 @@ ALONG = 4
 """Steps of a period in which a term's state is followed along a recording."""
 LOWERED = 0.99
 """Ratio of errors over all windows that a candidate has to reach before it is fitted in every fold."""
+MEMORY = 3.0
+"""Length of a block at least, in the machine's seconds: shorter ones are no separate evidence. ``FEWEST`` there are in
+any case: then a term must take off much in all of them."""
 SHORTEST = 4
 """Samples of a block at least."""
 DRAWN = 200
@@ -209,6 +212,7 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
             Evidence(len(present), len(present), groups, length, text),
             warm,
         )
+    lasting = MEMORY * time_unit(known, known[0].dt) / known[0].dt
     pieces, count, blocks_of = (
         np.zeros((len(of), samples), dtype=np.int64),
         0,
@@ -217,7 +221,8 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
     for recorded in present:  # a few recordings are pieces of evidence in blocks
         at = np.flatnonzero(recording == recorded)
         whole = len(at) * samples
-        blocks = max(1, min(math.ceil(BLOCKS / len(present)), whole // SHORTEST))
+        most = max(FEWEST / len(present), min(BLOCKS / len(present), whole / lasting))
+        blocks = max(1, min(math.ceil(most), whole // SHORTEST))
         pieces[at] = (count + np.arange(whole) * blocks // whole).reshape(len(at), samples)
         blocks_of[at] = np.arange(len(at))
         count += blocks

@@ -277,7 +277,7 @@ class _Library:
                 laws.overflow(
                     own,
                     weight(f"s_{n}", high - edge, over(unit, state.unit), "overflow"),
-                    edge=edge,
+                    Parameter(f"edge_{n}_{own}", edge, state.unit, 0.5 * (low + high), high, "edge"),
                     width=width,
                 )
                 for n, edge in enumerate(edges, 1)

@@ -762,12 +762,12 @@ def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:
     )  # fmt: skip
 
 
-def overflow(of: str, k: Parameter, *, edge: float, width: float) -> Term:
+def overflow(of: str, k: Parameter, edge: Parameter, *, width: float) -> Term:
     """What runs over an edge: ``-k max(x - edge, 0)``, smooth over ``width``."""
     return _added(
-        "overflow", f"overflow at {edge:.3g}", "rate", of, (k,),
-        lambda at, p: -0.5 * p[0] * (at.own - edge + ca.sqrt((at.own - edge) ** 2 + width**2)),
-        f"-{k.name} max({of} - {edge:.3g}, 0)", loss=True, edge=edge, width=width,
+        "overflow", "overflow", "rate", of, (k, edge),
+        lambda at, p: -0.5 * p[0] * (at.own - p[1] + ca.sqrt((at.own - p[1]) ** 2 + width**2)),
+        f"-{k.name} max({of} - {edge.name}, 0)", loss=True, width=width,
     )  # fmt: skip
 
 
