@@ -192,6 +192,9 @@ def planted(one: Candidate, rng: np.random.Generator) -> Term:
     form = one.forms[int(rng.integers(len(one.forms)))]
     own = []
     for p in form.parameters:
+        if p.value != 0.0 and p.unit != "s":  # an edge, an exponent
+            own.append(p)
+            continue
         size = rng.uniform(*SHARES) / 3.0
         value = (
             p.upper * size
