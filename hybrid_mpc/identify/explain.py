@@ -59,11 +59,6 @@ SHORTER = 5
 """How much shorter the short windows are, by which candidates are scored and begun, too."""
 TRIED = 3
 """Candidates of a step that are fitted in every fold."""
-SHARP = frozenset({"coulomb", "stribeck", "loaded", "dead_zone", "saturation", "overflow", "elastic_end"})
-"""Laws whose effect is not proportional to their weight: a step to first order misjudges them where a model is far
-off."""
-ACTING = 0.1
-"""Share of its bound at which the weight of such a law begins, where the step from zero did not find it."""
 PAIRS = 3
 """Pairs that are fitted in every fold where no single term is added."""
 STEPS = 8
@@ -376,12 +371,6 @@ class _Search:
         """``theta`` of all terms from that of the first ones: the others begin at their nominal values."""
         return np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
 
-    def acting(self, terms: Terms, theta: Array) -> Array:
-        """As :meth:`start`, with the first weight of the others large enough to act."""
-        start = self.start(terms, theta)
-        start[len(theta)] = ACTING * self.fit(terms).upper[len(theta)]
-        return start
-
     def by_short_windows(self, terms: Terms, start: Array) -> Array:
         """A fit to the short windows."""
         return self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
@@ -480,11 +469,6 @@ def _with_state(terms: Sequence[Term]) -> list[Term]:
 def _vanishes(term: Term) -> bool:
     """Whether a term does nothing at its nominal values, so that slopes tell what it would do."""
     return term.state is None and term.parameters[0].value == 0.0
-
-
-def _sharp(term: Term) -> bool:
-    """Whether a step to first order from zero may misjudge a term."""
-    return _vanishes(term) and (term.made is None or term.made.maker in SHARP)
 
 
 def _index(base: type[Prior], term: Term) -> int:
@@ -679,16 +663,11 @@ class _Explain:
         """Candidates that were fitted, the number of those that were scored, and what is added."""
         number = 1 + sum(step.action == "added" for step in self.steps)
         singles, pairs, diverged = self._scored(number)
-        now = self.now.theta
-        fitted = list(self._fitted([(forms, now) for forms in singles.best(TRIED)], f"step {number}"))
+        fitted = list(self._fitted(singles.best(TRIED), f"step {number}"))
         chosen = _chosen(fitted)
         if chosen is None:
-            again = list(self._fitted(*self._sharp(number, fitted)))
-            fitted += again
-            chosen = _chosen(again)
-        if chosen is None:
             some = pairs.best(PAIRS, singles)
-            both = list(self._fitted([(forms, now) for forms in some], f"step {number}, pairs"))
+            both = list(self._fitted(some, f"step {number}, pairs"))
             fitted += both
             chosen = _chosen([one for one in both if self._both_needed(one)])
         return (
@@ -742,40 +721,17 @@ class _Explain:
                     found.append((by.of(i, j), (plain[i][1], plain[j][1])))
         return _Ranked(*lists), _Ranked(*pairs), diverged
 
-    def _sharp(self, number: int, fitted: Sequence[_Fitted]) -> tuple[list[tuple[Terms, Array]], str]:
-        """Candidates that a step to first order misjudges, each with the start that a fit to short windows from a
-        weight that acts gave: those that lower the error most, but for those that were fitted already.
-        """
-        search, now, text = self.search, self.now, f"step {number}, from weights that act"
-        ends, done = search.error(now.terms, now.theta), {one.forms for one in fitted}
-        scores: list[tuple[float, Terms, Array]] = []
-        for one in self.pool:
-            forms = [form for form in one.forms if _sharp(form) and (form,) not in done]
-            tried = []
-            for form in forms:
-                terms = (*now.terms, form)
-                try:
-                    theta = search.by_short_windows(terms, search.acting(terms, now.theta))
-                    score = 0.5 * math.log(search.error(terms, theta) / ends)
-                except (InputError, np.linalg.LinAlgError):  # the step to first order had its say already
-                    continue
-                tried.append((score, (form,), theta))
-            scores += sorted(tried, key=lambda s: s[0])[:1]
-            self.on_progress(0, len(self.pool), f"{text}: {one.name} is scored")
-        best = sorted((s for s in scores if s[0] < math.log(WORTH)), key=lambda s: s[0])[:TRIED]
-        return [(forms, theta) for _, forms, theta in best], text
-
-    def _fitted(self, some: Sequence[tuple[Terms, Array]], text: str) -> Iterator[_Fitted]:
-        """Candidates, each from a start, fitted in every fold and judged."""
+    def _fitted(self, some: Sequence[Terms], text: str) -> Iterator[_Fitted]:
+        """Candidates, fitted in every fold and judged."""
         search, now = self.search, self.now
         ends = search.error(now.terms, now.theta)
-        for done, (forms, start) in enumerate(some):
+        for done, forms in enumerate(some):
             self.on_progress(
                 done, len(some), f"{text}: {' and '.join(form.name for form in forms)} is fitted"
             )
             terms = (*now.terms, *forms)
             try:
-                own = search.begun(terms, start)
+                own = search.begun(terms, now.theta)
                 left = math.sqrt(search.error(terms, own.theta) / ends)
                 if left > LOWERED:
                     said = f"fitted to all data, it leaves {left:.2f} of the error"

@@ -104,7 +104,7 @@ class Trial:
         terms: The candidate's terms: one, or a pair.
         outcome: ``"added"``; ``"alternative"``: the data do not tell it from what was added; ``"unsure"``: it may
             lower the error, but not surely; ``"worse"``: it does not lower it; ``"diverged"``: its fit failed.
-        held_out: Its error over held-out data; None where the fit failed.
+        held_out: Its error over held-out data; None where the fit failed, or did not lower the error of all data.
         reason: Why it was not added; empty where it was.
     """
 
