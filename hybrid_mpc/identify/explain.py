@@ -72,6 +72,9 @@ HARM = 1.05
 GAIN = 0.7
 """Ratio of errors below which a gain counts no more in the upper bound: a bound that is larger for it, and that no
 single recording of a large gain widens."""
+POOR = 0.7
+"""Error [spreads] of a model that explains half of the outputs' variance: where a term leaves more, only a gain beyond
+``GAIN`` counts, since small ones of such free runs are chance."""
 DOUBT = 0.1
 """Probability of an error beyond an end of an interval, for all candidates of a step together that were fitted: a term
 is added where the upper end is below 1, so that it surely lowers the error."""
@@ -758,6 +761,8 @@ class _Explain:
             reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
             if more:
                 reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
+        elif found.error > POOR and found.ratio > GAIN:
+            reason = f"it leaves an error of {found.error:.2f} of the outputs' spread, where a ratio of {found.ratio:.2f} may be chance"
         elif untold:
             reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
         elif ends := self._at_bounds(forms, theta):

@@ -153,7 +153,7 @@ class ExplainStep:
         held_out: Error with the step's change, over that before the step.
         parameters: Fitted values of the terms' parameters: of the last fit, or of the step for removed terms.
         scored: Candidates that were scored in the step by one Gauss-Newton step.
-        trials: Candidates that were fitted in every fold, the best first; the alternatives are among them.
+        trials: Candidates that were fitted, the best first; the alternatives are among them.
         pictures: Of each term; empty for terms that were removed later.
     """
 

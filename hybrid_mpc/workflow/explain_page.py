@@ -156,7 +156,7 @@ def trials_table(told: Explanation) -> Table:
     return Table(
         ("step", "candidate", "ratio [-]", "outcome", "why"),
         rows,
-        "Candidates that were fitted in every fold.",
+        "Candidates that were fitted and not added.",
     )
 
 
