@@ -762,7 +762,7 @@ class _Explain:
             if more:
                 reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
         elif found.error > POOR and found.ratio > GAIN:
-            reason = f"it leaves an error of {found.error:.2f} spreads, where {found.ratio:.2f} of it may be chance"
+            reason = f"the error is {found.error:.2f} of the outputs' spread with it: so small a gain may be chance"
         elif untold:
             reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
         elif ends := self._at_bounds(forms, theta):
