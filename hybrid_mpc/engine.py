@@ -204,7 +204,7 @@ class DaskEngine(Engine[B, R]):
             self._seen = set(self._client.nthreads())
             if not self._seen:
                 raise InputError(
-                    f"the scheduler {self._address} has no worker; start some: dask worker ADDRESS"
+                    f"the scheduler {self._address} has no worker; start some: dask worker ADDRESS [HM-ENGINE-001]"
                 )
         except BaseException:
             self.close()
@@ -239,7 +239,7 @@ class DaskEngine(Engine[B, R]):
     def _alone(self) -> InputError:
         return InputError(
             f"the scheduler {self._address} has had no worker for {ALONE_S:g} s; what has finished is kept, "
-            "--resume goes on when there are some"
+            "--resume goes on when there are some [HM-ENGINE-006]"
         )
 
     def _result(self, future: Any) -> R | Lost:
@@ -256,6 +256,7 @@ class DaskEngine(Engine[B, R]):
             if self._client.status != "running":
                 raise InputError(
                     f"the scheduler {self._address} is gone; what has finished is kept, --resume goes on"
+                    " [HM-ENGINE-002]"
                 ) from error
             if not isinstance(error, (CancelledError, OSError)):  # a result that does not unpickle
                 raise
@@ -475,7 +476,7 @@ def _began(parent: int, begin: Callable[[], None] | None) -> None:
 
 def _check(workers: int) -> None:
     if workers < 1:
-        raise InputError(f"workers must be 1 or more, got {workers}")
+        raise InputError(f"workers must be 1 or more, got {workers} [HM-ENGINE-003]")
 
 
 def _connected(address: str) -> Any:
@@ -484,12 +485,12 @@ def _connected(address: str) -> Any:
     if not ADDRESS.fullmatch(address):
         raise InputError(
             f"the scheduler's address must be tcp://HOST:PORT, got {address!r}; for another kind (tls://) connect a "
-            "distributed.Client yourself, and give it in place of the address"
+            "distributed.Client yourself, and give it in place of the address [HM-ENGINE-004]"
         )
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
             f"no dask scheduler at {address} within {CONNECT_S:g} s ({type(error).__name__}); start one with "
-            "'dask scheduler', or leave --scheduler out to use this machine"
+            "'dask scheduler', or leave --scheduler out to use this machine [HM-ENGINE-005]"
         ) from error

@@ -1,7 +1,12 @@
-"""Errors that speak to the user: what was given, what is needed, how to fix it."""
+"""Errors that speak to the user: what was given, what is needed, how to fix it, and a code.
+
+A message ends with its code in brackets, ``[HM-DATA-085]``: the room that found the problem and a number. A code stays
+with its problem when the words change; a number is given once. ``docs/errors.md`` lists all of them.
+"""
 
 from __future__ import annotations
 
+import re
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,6 +14,8 @@ from typing import ParamSpec, TypeVar
 
 P = ParamSpec("P")
 T = TypeVar("T")
+CODE = re.compile(r"\[((?:HM-[A-Z]+|NN)-\d{3})\]")
+"""A code as it stands in a message; ``NN`` are those of ``nn_export``."""
 
 
 class InputError(ValueError):
@@ -29,6 +36,16 @@ class InputError(ValueError):
     def problems(self) -> tuple[str, ...]:
         """What is wrong, one by one."""
         return self._problems or (str(self),)
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Codes of all problems, in the order of the message.
+
+        Example:
+            >>> InputError("run.csv: no column 'pos_rad'; it has 'time_s'. Rename one. [HM-DATA-085]").codes
+            ('HM-DATA-085',)
+        """
+        return tuple(CODE.findall("\n".join(self.problems)))
 
 
 class MissingPackage(InputError, ImportError):
@@ -79,6 +96,7 @@ def named_extra(what: str = "") -> Iterator[None]:
             raise
         raise MissingPackage(
             f"{what or 'this'} needs {package}, which is not installed: pip install 'hybrid-mpc[{EXTRAS[package]}]'"
+            " [HM-ERRORS-001]"
         ) from missing
 
 
@@ -128,7 +146,7 @@ def no_exit(what: str = "") -> Iterator[None]:
         of = f"{what}: " if what and not place.startswith(what) else ""
         raise InputError(
             f"{of}{place}{_ending(stop)} would end Python; take sys.exit or exit out, or put what a script "
-            'does under if __name__ == "__main__":'
+            'does under if __name__ == "__main__": [HM-ERRORS-002]'
         ) from stop
 
 

@@ -87,7 +87,7 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         kept = "it is as it was before" if there else "nothing half-written is left"
         raise StorageError(
             f"cannot write {folder}: {reason(cause)}; {kept}. Make room there, or choose another folder, "
-            "and give the same command again"
+            "and give the same command again [HM-FILES-001]"
         ) from error
 
 
@@ -127,14 +127,14 @@ def read_json(path: Path) -> Any:
     try:
         return nn_export.files.parse_json(content)
     except ValueError as error:
-        raise InputError(f"{path} is damaged: {error}") from error
+        raise InputError(f"{path} is damaged: {error} [HM-FILES-017]") from error
 
 
 def read_object(path: Path) -> dict[str, Any]:
     """The object that a JSON file holds; InputError if it holds anything else, or as :func:`read_json`."""
     found = read_json(path)
     if not isinstance(found, dict):
-        raise InputError(f"{path} is damaged: an object (fields and values) is needed")
+        raise InputError(f"{path} is damaged: an object (fields and values) is needed [HM-FILES-002]")
     return found
 
 
@@ -156,7 +156,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} is damaged: {error}") from error
+        raise InputError(f"{path} is damaged: {error} [HM-FILES-018]") from error
 
 
 def write_document(
@@ -186,7 +186,7 @@ def read_document_arrays(path: Path, remedy: str = "") -> dict[str, NDArray[Any]
     expected, beside = _whole(path, remedy).get(ARRAYS_HASH), path.with_suffix(".npz")
     try:
         if sha256(beside) != expected:
-            raise InputError(f"{beside} is damaged, or does not belong to {path.name}")
+            raise InputError(f"{beside} is damaged, or does not belong to {path.name} [HM-FILES-003]")
         return read_arrays(beside)
     except InputError as error:
         raise type(error)(_with(str(error), remedy)) from error
@@ -196,7 +196,9 @@ def _whole(path: Path, remedy: str) -> dict[str, Any]:
     try:
         document = read_object(path)
         if document.pop(HASH, None) != digest(document):
-            raise InputError(f"{path} is damaged or was changed by hand: its content is not what was saved")
+            raise InputError(
+                f"{path} is damaged or was changed by hand: its content is not what was saved [HM-FILES-004]"
+            )
     except InputError as error:
         raise type(error)(_with(str(error), remedy)) from error
     return document
@@ -219,14 +221,14 @@ def check_npz(content: bytes, budget: int, names: Sequence[str] | None = None) -
         KeyError: If there is no array of such a name.
     """
     if content.count(b"PK\x01\x02") > MOST_MEMBERS:  # the mark of an entry in the list of members
-        raise ValueError(f"it has more than {MOST_MEMBERS} members")
+        raise ValueError(f"it has more than {MOST_MEMBERS} members [HM-FILES-005]")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.namelist()
         wanted = members if names is None else [n if n in members else f"{n}.npy" for n in names]
         size = sum(_declared(archive, name) for name in wanted)
     if size > budget:
         raise ValueError(
-            f"its arrays take {size / 1e6:.4g} MB, more than the {budget / 1e6:.4g} MB that are read"
+            f"its arrays take {size / 1e6:.4g} MB, more than the {budget / 1e6:.4g} MB that are read [HM-FILES-006]"
         )
 
 
@@ -234,12 +236,12 @@ def _declared(archive: zipfile.ZipFile, name: str) -> int:
     """Bytes that an array takes by its header, each number counted as 8 of them at least [byte]."""
     member = archive.getinfo(name)
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"member {name[:80]!r} is packed in another way than numpy's")
+        raise ValueError(f"member {name[:80]!r} is packed in another way than numpy's [HM-FILES-007]")
     with archive.open(member) as file:
         begin = io.BytesIO(file.read(HEADER))
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(npy.read_magic(begin))
     if read is None:
-        raise ValueError(f"member {name[:80]!r} is no array of numbers")
+        raise ValueError(f"member {name[:80]!r} is no array of numbers [HM-FILES-008]")
     shape, _, dtype = read(begin)
     if dtype.hasobject:  # which are refused when they are to be read
         return member.file_size
@@ -247,7 +249,7 @@ def _declared(archive: zipfile.ZipFile, name: str) -> int:
     if min(shape, default=0) < 0 or begin.tell() + count * dtype.itemsize != member.file_size:
         raise ValueError(
             f"member {name[:80]!r} declares the shape {shown(str(shape))} of {dtype.str} and holds "
-            f"{member.file_size} bytes"
+            f"{member.file_size} bytes [HM-FILES-009]"
         )
     return count * max(8, dtype.itemsize)
 
@@ -257,9 +259,9 @@ def read_bytes(path: Path, limit: int) -> bytes:
     try:
         return nn_export.files.read_bytes(path, limit)
     except FileNotFoundError as error:
-        raise InputError(f"{path} is missing") from error
+        raise InputError(f"{path} is missing [HM-FILES-010]") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {reason(error)}") from error
+        raise InputError(f"cannot read {path}: {reason(error)} [HM-FILES-011]") from error
 
 
 def reason(error: BaseException) -> str:
@@ -272,7 +274,7 @@ def reason(error: BaseException) -> str:
 def cannot_write(path: Path, error: OSError) -> StorageError:
     """What to say where ``path`` cannot be written: the place, the reason, and what is left of it."""
     kept = "the file from before is kept" if _exists(path) else "nothing half-written is left"
-    return StorageError(f"cannot write {path}: {reason(error)}; {kept}")
+    return StorageError(f"cannot write {path}: {reason(error)}; {kept} [HM-FILES-019]")
 
 
 def is_file(path: Path) -> bool:
@@ -305,7 +307,7 @@ def is_empty(folder: Path) -> bool:
     try:
         return not folder.exists() or (folder.is_dir() and all(_leftover(path) for path in folder.iterdir()))
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot look into {folder}: {reason(error)}") from error
+        raise InputError(f"cannot look into {folder}: {reason(error)} [HM-FILES-012]") from error
 
 
 def _leftover(path: Path) -> bool:
@@ -315,7 +317,7 @@ def _leftover(path: Path) -> bool:
 def check_folder(folder: Path) -> None:
     """Refuse a folder for results that holds something, or in which nothing can be written; none is made."""
     if not is_empty(folder):
-        raise InputError(f"{folder} exists and is no empty folder; choose another --out")
+        raise InputError(f"{folder} exists and is no empty folder; choose another --out [HM-FILES-013]")
     check_writable(folder)
 
 
@@ -323,7 +325,7 @@ def check_writable(folder: Path) -> None:
     """Refuse a folder in which nothing can be written; it need not be there yet."""
     try:
         if "\0" in str(folder):
-            raise ValueError("its name holds a null character")
+            raise ValueError("its name holds a null character [HM-FILES-014]")
         place = folder.absolute()
         while not place.exists():  # a name that is too long for the file system raises here
             place = place.parent
@@ -332,7 +334,9 @@ def check_writable(folder: Path) -> None:
             file.flush()
             os.fsync(file.fileno())
     except (OSError, ValueError) as error:
-        raise StorageError(f"cannot write into {folder}: {reason(error)}; choose another --out") from error
+        raise StorageError(
+            f"cannot write into {folder}: {reason(error)}; choose another --out [HM-FILES-015]"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -351,6 +355,7 @@ def locked(folder: Path) -> Iterator[None]:
     except Timeout as error:
         raise InputError(
             f"{folder} is in use: another process works in this folder; wait for it, or choose another --out"
+            " [HM-FILES-016]"
         ) from error
     except OSError as error:
         raise cannot_write(folder, error) from error

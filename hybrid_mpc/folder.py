@@ -33,7 +33,7 @@ def read_note(out: Path, noun: str) -> dict[str, Any]:
     """The note of a job's folder: ``settings``, and what else it says; InputError if it is missing or damaged."""
     note = read_document(out / f"{noun}.json", DAMAGED)
     if not isinstance(note.get("settings"), dict):
-        raise InputError(f"{out / noun}.json is damaged: no settings in it; {DAMAGED}")
+        raise InputError(f"{out / noun}.json is damaged: no settings in it; {DAMAGED} [HM-FOLDER-001]")
     return note
 
 
@@ -53,11 +53,16 @@ def check_out(out: Path, noun: str, *, resume: bool | None) -> None:
 def _check_place(out: Path, noun: str, resume: bool | None) -> None:
     if not (out / f"{noun}.json").is_file():
         if not is_empty(out):
-            raise InputError(f"{out} exists and holds something else than a {noun}; choose another --out")
+            raise InputError(
+                f"{out} exists and holds something else than a {noun}; choose another --out [HM-FOLDER-002]"
+            )
         if resume and not (out / LOCK).is_file():  # a job that ended before its note leaves the lock
-            raise InputError(f"{out} holds no {noun} to resume; leave --resume out")
+            raise InputError(f"{out} holds no {noun} to resume; leave --resume out [HM-FOLDER-003]")
     elif resume is False:
-        raise InputError(f"{out} already holds a {noun}; add --resume to finish it, or choose another --out")
+        raise InputError(
+            f"{out} already holds a {noun}; add --resume to finish it, or choose another --out"
+            " [HM-FOLDER-004]"
+        )
 
 
 @contextmanager
@@ -90,7 +95,7 @@ def _check_settings(out: Path, note: JobNote) -> None:
     if differ := sorted(k for k in {**own, **held} if digest(held.get(k)) != digest(own.get(k))):
         raise InputError(
             f"{out} holds a {note.noun} with other settings ({', '.join(differ)} differ); give the same ones to go on "
-            "with it, or choose another --out"
+            "with it, or choose another --out [HM-FOLDER-005]"
         )
 
 

@@ -74,7 +74,7 @@ def _program(function: Any) -> Any:
     try:
         return to_json(program_of(function))
     except ExportError as error:
-        raise InputError(f"an expression that is to be written: {error}") from error
+        raise InputError(f"an expression that is to be written: {error} [HM-RECORDS-001]") from error
 
 
 def record(kind: type[T], data: object, where: str) -> T:
@@ -118,7 +118,7 @@ def known(word: object, names: Iterable[str], what: str) -> str:
 def _unknown(word: object, names: Sequence[str], what: str) -> str:
     near = difflib.get_close_matches(_short(word).strip("'"), names, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? There are" if near else "there are"
-    return f"no {what} {_short(word)}; {hint}: {', '.join(names) or 'none'}"
+    return f"no {what} {_short(word)}; {hint}: {', '.join(names) or 'none'} [HM-RECORDS-011]"
 
 
 def _short(value: object) -> str:
@@ -145,14 +145,14 @@ def _dataclass(kind: type[Any], data: object, where: str, problems: list[str]) -
         return data
     head = f"{where}: " if where else ""
     if not isinstance(data, Mapping):
-        problems.append(f"{head}an object (fields and values) is needed, got {_short(data)}")
+        problems.append(f"{head}an object (fields and values) is needed, got {_short(data)} [HM-RECORDS-002]")
         return None
     taken = {f.name: f for f in dataclasses.fields(kind) if f.init}
     hints = _hints(kind)  # type: ignore[arg-type]
     before = len(problems)
     problems += [head + _unknown(key, list(taken), "field") for key in data if key not in taken]
     problems += [
-        f"{head}{name} is missing"
+        f"{head}{name} is missing [HM-RECORDS-003]"
         for name, f in taken.items()
         if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and name not in data
     ]
@@ -212,7 +212,7 @@ class Fields:
         """Nothing stands twice among some values."""
         given = list(values()) if self._wrong.isdisjoint(names.split()) else []
         if twice := [value for i, value in enumerate(given) if value in given[:i]]:
-            self._problems.append(f"{what} {_short(twice[0])} stands twice")
+            self._problems.append(f"{what} {_short(twice[0])} stands twice [HM-RECORDS-004]")
 
     def add(self, problems: Iterable[str]) -> None:
         """Problems that were found elsewhere."""
@@ -276,9 +276,9 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
             }
         needed = "an object (names and values) is"
     else:
-        raise TypeError(f"{where}: records know no {kind}")
+        raise TypeError(f"{where}: records know no {kind} [HM-RECORDS-005]")
     problems.append(
-        f"{where}: {needed if needed.endswith('is') else needed + ' is'} needed, got {_short(value)}"
+        f"{where}: {needed if needed.endswith('is') else needed + ' is'} needed, got {_short(value)} [HM-RECORDS-006]"
     )
     return None
 
@@ -288,7 +288,7 @@ def _ruled(kind: Any, rules: Sequence[Any], value: object, where: str, problems:
     before = len(problems)
     found = _value(kind, value, where, problems)
     if len(problems) == before:
-        problems += [f"{where}: {wrong}" for rule in rules if (wrong := rule(found))]
+        problems += [f"{where}: {wrong} [HM-RECORDS-007]" for rule in rules if (wrong := rule(found))]
     return found
 
 
@@ -320,7 +320,7 @@ def _depth(own: Sequence[str]) -> int:
 
 def _either(tried: Sequence[Sequence[str]], where: str, value: object) -> str:
     wanted = [own[0].removeprefix(f"{where}: ").split(" is needed")[0] for own in tried]
-    return f"{where}: {' or '.join(dict.fromkeys(wanted))} is needed, got {_short(value)}"
+    return f"{where}: {' or '.join(dict.fromkeys(wanted))} is needed, got {_short(value)} [HM-RECORDS-012]"
 
 
 def _sequence(kind: Any, value: object, where: str, problems: list[str]) -> Any:
@@ -328,11 +328,11 @@ def _sequence(kind: Any, value: object, where: str, problems: list[str]) -> Any:
     if isinstance(value, np.ndarray) and value.ndim:
         value = value.tolist()
     if not isinstance(value, list | tuple):
-        problems.append(f"{where}: a list is needed, got {_short(value)}")
+        problems.append(f"{where}: a list is needed, got {_short(value)} [HM-RECORDS-008]")
         return None
     fixed = make is tuple and (get_origin(kind) or kind) is tuple and arms and arms[-1] is not Ellipsis
     if fixed and len(value) != len(arms):
-        problems.append(f"{where}: a list of {len(arms)} is needed, got {_short(value)}")
+        problems.append(f"{where}: a list of {len(arms)} is needed, got {_short(value)} [HM-RECORDS-009]")
         return None
     kinds = arms if fixed else [arms[0] if arms else Any] * len(value)
     return make(
@@ -367,7 +367,7 @@ def _built(value: object, where: str, problems: list[str]) -> Any:
         problems.append(f"{where}: {error}")
     except RuntimeError as error:  # an operator that CasADi has for matrices alone
         problems.append(
-            f"{where}: a program of scalar operators is needed: {str(error).strip().splitlines()[-1]}"
+            f"{where}: a program of scalar operators is needed: {str(error).strip().splitlines()[-1]} [HM-RECORDS-010]"
         )
     return None
 

@@ -104,7 +104,7 @@ class Task:
         own.need(
             "control",
             lambda: _is_problem(self.control),
-            f"control: OCP(...) is needed, got {self.control!r:.60}",
+            f"control: OCP(...) is needed, got {self.control!r:.60} [HM-SCENARIO-001]",
         )
         own.refuse()
 
@@ -232,7 +232,7 @@ class Scenario:
         own.need(
             "control",
             lambda: _is_problem(self.control),
-            f"control: OCP(...) is needed, got {self.control!r:.60}",
+            f"control: OCP(...) is needed, got {self.control!r:.60} [HM-SCENARIO-002]",
         )
         own.distinct("tasks", lambda: [task.name for task in self.tasks], "tasks: the name")
         own.refuse()
@@ -264,14 +264,16 @@ def scenario_of(named: str, where: Path, given: str = "") -> Scenario | None:
     if given:
         scenario = load_scenario(given)
         if named and scenario.name != named:
-            raise InputError(f"{where} was made for scenario {named!r}, not for {scenario.name!r}")
+            raise InputError(
+                f"{where} was made for scenario {named!r}, not for {scenario.name!r} [HM-SCENARIO-003]"
+            )
         return scenario
     if not named:
         return None
     if named not in registered_scenarios():
         raise InputError(
             f"{where} names the scenario {named!r}, which is not registered; if it is yours, give its file: "
-            "--scenario FILE.py"
+            "--scenario FILE.py [HM-SCENARIO-004]"
         )
     return load_scenario(named)
 
@@ -299,14 +301,14 @@ def load_scenario(name_or_path: str) -> Scenario:
     if path.suffix != ".py":
         names = ", ".join(registered_scenarios()) or "none is registered"
         raise InputError(
-            f"no scenario {name_or_path!r}; registered: {names}. Or give the path of a .py file."
+            f"no scenario {name_or_path!r}; registered: {names}. Or give the path of a .py file. [HM-SCENARIO-005]"
         )
     try:
         there = path.is_file()
     except OSError as error:  # a name that is too long for the file system
-        raise InputError(f"no scenario file {path}: {error.strerror}") from error
+        raise InputError(f"no scenario file {path}: {error.strerror} [HM-SCENARIO-006]") from error
     if not there:
-        raise InputError(f"no scenario file {path}")
+        raise InputError(f"no scenario file {path} [HM-SCENARIO-007]")
     spec = importlib.util.spec_from_file_location(f"hybrid_mpc_user_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
@@ -320,16 +322,21 @@ def load_scenario(name_or_path: str) -> Scenario:
             spec.loader.exec_module(module)
         except Exception as error:
             line = _line_in(error, path)
-            raise InputError(f"{path}{line}: {_missing(error) or _told(error)}") from error
+            raise InputError(f"{path}{line}: {_missing(error) or _told(error)} [HM-SCENARIO-008]") from error
     if not hasattr(module, "scenario"):
-        raise InputError(f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)")
+        raise InputError(
+            f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)"
+            " [HM-SCENARIO-009]"
+        )
     return _checked(module.scenario, str(path))
 
 
 def _checked(scenario: object, where: str) -> Scenario:
     if not isinstance(scenario, Scenario):
         kind = type(scenario).__name__
-        raise InputError(f"{where}: 'scenario' is a {kind}, it must be a hybrid_mpc Scenario")
+        raise InputError(
+            f"{where}: 'scenario' is a {kind}, it must be a hybrid_mpc Scenario [HM-SCENARIO-010]"
+        )
     return scenario
 
 

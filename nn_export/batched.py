@@ -100,7 +100,7 @@ class Batched:
         if self.steps is None:
             raise ExportError(
                 f"{self.function.name()} has no form in torch operators (a solver, a table, external code, or more "
-                f"than {MAX_WALK} operations): it can be trained with on the CPU, but not be exported or moved"
+                f"than {MAX_WALK} operations): it can be trained with on the CPU, but not be exported or moved [NN-001]"
             )
 
     def walk(self, args: list[Tensor], shape: torch.Size | tuple[int, ...]) -> list[Tensor]:
@@ -140,7 +140,7 @@ class Batched:
             evaluate()
             if buffer.ret():
                 raise ExportError(
-                    f"{f.name()}: CasADi could not evaluate it; call it with one sample to see why"
+                    f"{f.name()}: CasADi could not evaluate it; call it with one sample to see why [NN-002]"
                 )
             start += count
         return [torch.from_numpy(r).reshape(*shape, r.shape[1]).to(device) for r in results]
@@ -187,7 +187,7 @@ def _derivative(f: ca.Function, *, forward: bool) -> ca.Function:
     except RuntimeError as error:
         raise DerivativeError(
             f"{f.name()} has no derivative ({last_line(error)}); give the CasADi function one, "
-            "e.g. by the option custom_jacobian or enable_fd"
+            "e.g. by the option custom_jacobian or enable_fd [NN-003]"
         ) from error
     results = [ca.project(v, s) for v, s in zip(values, theirs if forward else ours, strict=True)]
     name = f"{'forward' if forward else 'reverse'}_{f.name()}"

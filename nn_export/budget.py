@@ -91,7 +91,7 @@ class Budget:
             f"{what}: it would come to {_count(cost[measure])} {_MEASURES[measure]}"
             + (f" with {_count(earlier)} before it" if earlier else "")
             + f", the limit is {_count(getattr(limits, measure))}; if you know where it is from, raise the limit: "
-            f"limits=nn_export.Limits({measure}=...)"
+            f"limits=nn_export.Limits({measure}=...) [NN-112]"
         )
 
     def add(self, program: Program, where: str = "") -> None:
@@ -157,7 +157,9 @@ def check_arguments(op: str, args: list[Any], kwargs: dict[str, Any]) -> None:
         named = signature.bind(*args, **kwargs).arguments.items()
     for name, value in named:
         if not _is(value, kinds[name]):
-            raise TypeError(f"{name} is {_said(value)}, {signature.parameters[name].annotation} is needed")
+            raise TypeError(
+                f"{name} is {_said(value)}, {signature.parameters[name].annotation} is needed [NN-004]"
+            )
 
 
 Kinds = dict[type, Any]

@@ -95,7 +95,7 @@ def compile_function(
         return ca.external(function.name(), str(library.resolve()))
     except RuntimeError as error:
         raise CompileError(
-            f"{library} cannot be loaded: {last_line(error)}; remove it or choose another folder"
+            f"{library} cannot be loaded: {last_line(error)}; remove it or choose another folder [NN-005]"
         ) from error
 
 
@@ -120,7 +120,7 @@ def compile_library(
     """
     command = _compiler(compiler)
     if command is None:
-        raise CompileError("no C compiler found (cc, gcc, clang or the variable CC); install one")
+        raise CompileError("no C compiler found (cc, gcc, clang or the variable CC); install one [NN-006]")
     return _library(source, command, flags, folder, timeout).resolve()
 
 
@@ -207,7 +207,9 @@ def _compiler(given: str | None) -> list[str] | None:
         if words and shutil.which(words[0]):
             return words
     if given:
-        raise CompileError(f"compiler {given!r}: no such command; install it or leave the argument out")
+        raise CompileError(
+            f"compiler {given!r}: no such command; install it or leave the argument out [NN-007]"
+        )
     return None
 
 
@@ -216,14 +218,14 @@ def _source(functions: list[ca.Function]) -> str:
     if reason := refused_name(name, _OWN_NAMES):
         raise CompileError(
             f"a function named {name!r} cannot be written as C: the name {reason}; give it another, as in "
-            'ca.Function("f", ...)'
+            'ca.Function("f", ...) [NN-008]'
         )
     for f in (one for own in functions for one in (own, *own.find_functions())):
         # CasADi writes the names of arguments into comments as they are
         if strange := [n for n in (*f.name_in(), *f.name_out()) if not re.fullmatch(r"\w+", n, re.ASCII)]:
             raise CompileError(
                 f"{name} cannot be written as C: an argument of {f.name()} is called {strange[0]!r:.80}; a name has "
-                "letters, digits and _"
+                "letters, digits and _ [NN-009]"
             )
     try:
         generator = ca.CodeGenerator("compiled")
@@ -231,11 +233,13 @@ def _source(functions: list[ca.Function]) -> str:
             generator.add(f)
         text: str = generator.dump()
     except RuntimeError as error:
-        raise CompileError(f"{functions[0].name()} cannot be written as C: {last_line(error)}") from error
+        raise CompileError(
+            f"{functions[0].name()} cannot be written as C: {last_line(error)} [NN-010]"
+        ) from error
     if kinds := sorted(set(re.findall("#error Code generation not supported for (.*)", text))):
         raise CompileError(
             f"{functions[0].name()} cannot be written as C: CasADi has no C for {', '.join(kinds)}; leave "
-            "callbacks and solvers outside the function"
+            "callbacks and solvers outside the function [NN-011]"
         )
     return text
 
@@ -253,10 +257,12 @@ def _named_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
-        raise CompileError(f"{folder} cannot be made: {error.strerror}; take another folder") from error
+        raise CompileError(
+            f"{folder} cannot be made: {error.strerror}; take another folder [NN-012]"
+        ) from error
     if reason := _distrust(folder, stat.S_ISDIR, 0o022):
         raise CompileError(
-            f"{folder}: {reason}, so somebody else's code could be run; take a folder of your own, chmod 700"
+            f"{folder}: {reason}, so somebody else's code could be run; take a folder of your own, chmod 700 [NN-013]"
         )
     return folder
 
@@ -330,10 +336,10 @@ def _build(source: str, folder: Path, key: str, command: list[str], timeout: flo
         except subprocess.TimeoutExpired as error:
             raise CompileError(
                 f"the C compiler took more than {timeout:g} s; take -O0 or -O1, a matrix (MX) graph instead of a "
-                "scalar one, or a longer timeout"
+                "scalar one, or a longer timeout [NN-014]"
             ) from error
         if done.returncode or not library.is_file():
-            raise CompileError(f"{shlex.join(words)} failed:\n{done.stderr[-2000:]}")
+            raise CompileError(f"{shlex.join(words)} failed:\n{done.stderr[-2000:]} [NN-015]")
         with library.open("rb+") as file:
             digest = hashlib.sha256(file.read()).hexdigest()[:16]
             os.fsync(file.fileno())

@@ -117,7 +117,7 @@ def parity(
     scales = [1.0] * len(example_inputs) if scale is None else list(scale)
     if not len(scales) == len(example_inputs) == function.n_in():
         raise SignatureError(
-            f"{len(example_inputs)} inputs, {len(scales)} scales, the function takes {function.n_in()}"
+            f"{len(example_inputs)} inputs, {len(scales)} scales, the function takes {function.n_in()} [NN-016]"
         )
     copy = float64_copy(module).requires_grad_(False)
     rng, weights = np.random.default_rng(seed), np.random.default_rng([seed, 1])

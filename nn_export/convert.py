@@ -50,7 +50,9 @@ def convert(exported: torch.export.ExportedProgram, input_names: list[str], n_ou
     output = next(n for n in exported.graph.nodes if n.op == "output")
     found = list(output.args[0])
     if n_outputs != len(found):
-        raise SignatureError(f"{n_outputs} output names, but the module returns {len(found)} tensors")
+        raise SignatureError(
+            f"{n_outputs} output names, but the module returns {len(found)} tensors [NN-017]"
+        )
     sources = [_output(i, value, refs) for i, value in enumerate(found)]
     used = {ref["weight"] for n in nodes for ref in _weight_refs([n.args, n.kwargs])}
     used |= {ref["weight"] for ref, _ in sources if "weight" in ref}
@@ -77,7 +79,7 @@ def _check_mutations(exported: torch.export.ExportedProgram) -> None:
     names = [str(s.target) for s in exported.graph_signature.output_specs if s.kind in changed]
     if names:
         raise HiddenStateError(
-            f"the module writes into {', '.join(names)}: take the state as an input, return the new one"
+            f"the module writes into {', '.join(names)}: take the state as an input, return the new one [NN-018]"
         )
 
 
@@ -92,7 +94,9 @@ def _placeholders(
     specs = exported.graph_signature.input_specs
     n_inputs = sum(s.kind is InputKind.USER_INPUT for s in specs)
     if n_inputs != len(input_names):
-        raise SignatureError(f"{len(input_names)} input names, but the module takes {n_inputs} tensors")
+        raise SignatureError(
+            f"{len(input_names)} input names, but the module takes {n_inputs} tensors [NN-019]"
+        )
     for spec in specs:
         name = str(getattr(spec.arg, "name", ""))
         if spec.kind is InputKind.USER_INPUT:
@@ -101,7 +105,7 @@ def _placeholders(
             continue
         tensor = tensors[str(spec.target)]
         if tensor.is_complex():
-            raise DtypeError(f"{spec.target} is complex; split it into real and imaginary parts")
+            raise DtypeError(f"{spec.target} is complex; split it into real and imaginary parts [NN-020]")
         weights[str(spec.target)] = tensor.detach().cpu().to(torch.float64).numpy().copy()
         refs[name] = {"weight": str(spec.target)}
     return refs, weights, tuple(ports)
@@ -123,17 +127,19 @@ def _plain(value: Any, refs: dict[str, Reference]) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise UnsupportedOperatorError(
-        f"an argument of type {type(value).__name__} ({value!r:.60}); use a number"
+        f"an argument of type {type(value).__name__} ({value!r:.60}); use a number [NN-021]"
     )
 
 
 def _output(index: int, value: Any, refs: dict[str, Reference]) -> tuple[Reference, tuple[int, ...]]:
     if not isinstance(value, torch.fx.Node):
-        raise SignatureError(f"output {index} of the module is {value!r}, not a tensor; do not return it")
+        raise SignatureError(
+            f"output {index} of the module is {value!r}, not a tensor; do not return it [NN-022]"
+        )
     tensor = value.meta["val"]
     if not tensor.is_floating_point():
         raise DtypeError(
-            f"output {index} of the module is {tensor.dtype}; return real numbers, e.g. x.double()"
+            f"output {index} of the module is {tensor.dtype}; return real numbers, e.g. x.double() [NN-023]"
         )
     return refs[value.name], tuple(int(n) for n in tensor.shape)
 
@@ -166,20 +172,20 @@ def check_operators(calls: list[torch.fx.Node]) -> None:
 
 _DYNAMIC = (
     "sizes that depend on the values of the inputs cannot be exported; use torch.where, a product with a "
-    "mask, or constant integer positions instead:"
+    "mask, or constant integer positions instead [NN-116]:"
 )
-_COMPLEX = "complex numbers cannot be exported; write real and imaginary parts as real numbers:"
+_COMPLEX = "complex numbers cannot be exported; write real and imaginary parts as real numbers [NN-117]:"
 _DRAWN = (
     "the module is random or uses batch statistics even in evaluation mode; remove these calls "
-    "(F.dropout needs training=self.training, BatchNorm track_running_stats=True):"
+    "(F.dropout needs training=self.training, BatchNorm track_running_stats=True) [NN-118]:"
 )
 _UNKNOWN = (
     "operators or arguments that nn_export does not know; write them with others (docs/operators.md is the "
-    "table), or compute them outside the module:"
+    "table), or compute them outside the module [NN-119]:"
 )
 _NARROW = (
     "results computed in less than float64, which the export would not repeat; use dtype=torch.float64 or "
-    "x.dtype there:"
+    "x.dtype there [NN-120]:"
 )
 
 

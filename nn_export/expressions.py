@@ -64,11 +64,13 @@ def scalar_steps(function: ca.Function, most: int) -> list[Step]:
         if calls:
             raise UnsupportedOperatorError(
                 f"{function.name()}: no scalar operations stand for {calls}; write it with operations of scalars alone"
+                " [NN-024]"
             )
         if f.n_instructions() <= most:
             return [_step(f, k) for k in range(f.n_instructions())]
     raise ProgramError(
         f"{function.name()}: more than {most} scalar operations; write it with fewer, or export a network as a module"
+        " [NN-025]"
     )
 
 
@@ -134,10 +136,12 @@ def program_of(function: ca.Function, limits: Limits | None = None) -> Program:
         ['aten.select.int', 'aten.select.int', 'aten.mul.Tensor', 'aten.stack.default']
     """
     if not isinstance(function, ca.Function):
-        raise SignatureError(f"program_of: a casadi.Function is needed, got {type(function).__name__}")
+        raise SignatureError(
+            f"program_of: a casadi.Function is needed, got {type(function).__name__} [NN-026]"
+        )
     if function.has_free():
         raise SignatureError(
-            f"program_of: {function.name()} depends on {', '.join(function.get_free())}; make them inputs"
+            f"program_of: {function.name()} depends on {', '.join(function.get_free())}; make them inputs [NN-027]"
         )
     limits = Limits() if limits is None else limits
     program = _written(function, limits)
@@ -192,6 +196,7 @@ class _Writer:
         if code not in _OPERATORS:
             raise UnsupportedOperatorError(
                 f"{self._function.name()}: no operator stands for {_NAMES.get(code, code)}; write it with others"
+                " [NN-028]"
             )
         if code in _COMMUTATIVE and not _is_reference(args[1]):
             args = args[::-1]

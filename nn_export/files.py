@@ -103,42 +103,44 @@ def parse_json(content: bytes) -> Any:
     values.
     """
     if sum(map(content.count, (b",", b":", b"[", b"{"))) > MAX_VALUES:
-        raise ValueError(f"more than {MAX_VALUES} values")
+        raise ValueError(f"more than {MAX_VALUES} values [NN-029]")
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ValueError(f"no UTF-8 text at byte {error.start}") from error
+        raise ValueError(f"no UTF-8 text at byte {error.start} [NN-030]") from error
     try:
         whole = _whole if b"0" * (MAX_DIGITS + 1) in content.translate(_DIGITS) else None
         data = json.loads(
             text, parse_constant=_constant, parse_float=_float, parse_int=whole, object_pairs_hook=_object
         )
     except RecursionError as error:  # soon: the reader counts its levels
-        raise ValueError(f"nested deeper than {MAX_DEPTH} levels") from error
+        raise ValueError(f"nested deeper than {MAX_DEPTH} levels [NN-031]") from error
     if _too_deep(data):
-        raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
+        raise ValueError(f"nested deeper than {MAX_DEPTH} levels [NN-032]")
     if _SURROGATE.search(text):
         try:
             json.dumps(data, ensure_ascii=False).encode()
         except UnicodeEncodeError as error:
-            raise ValueError("half a surrogate pair (\\ud800 to \\udfff), which is no character") from error
+            raise ValueError(
+                "half a surrogate pair (\\ud800 to \\udfff), which is no character [NN-033]"
+            ) from error
     return data
 
 
 def _constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not JSON")
+    raise ValueError(f"{text} is not JSON [NN-034]")
 
 
 def _float(text: str) -> float:
     value = float(text)
     if math.isinf(value):
-        raise ValueError(f"{text:.20} is too large a number")
+        raise ValueError(f"{text:.20} is too large a number [NN-035]")
     return value
 
 
 def _whole(text: str) -> int:
     if len(text) - text.startswith("-") > MAX_DIGITS:
-        raise ValueError(f"{text:.20}... has more than {MAX_DIGITS} digits")
+        raise ValueError(f"{text:.20}... has more than {MAX_DIGITS} digits [NN-036]")
     return int(text)
 
 
@@ -147,7 +149,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         seen: set[str] = set()
         twice = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
-        raise ValueError(f"{twice!r:.60} stands twice in one object")
+        raise ValueError(f"{twice!r:.60} stands twice in one object [NN-037]")
     return found
 
 

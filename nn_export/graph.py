@@ -17,7 +17,7 @@ from nn_export.operators.value import Value, constant, matrix_shape
 from nn_export.program import Node, Program
 
 _IDENTIFIER = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")
-_BAD_NAME = "{!r} is no name for CasADi: use letters, digits and single underscores"
+_BAD_NAME = "{!r} is no name for CasADi: use letters, digits and single underscores [NN-111]"
 
 
 def valid_name(name: str) -> bool:
@@ -75,7 +75,7 @@ def named(name: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        raise ProgramError(f"{name}: CasADi cannot build it: {last_line(error)}") from error
+        raise ProgramError(f"{name}: CasADi cannot build it: {last_line(error)} [NN-038]") from error
 
 
 def graph(
@@ -103,7 +103,7 @@ def graph(
         _size(f"output {port.name}", port.shape)
         if not isinstance(value, Value) or value.shape != port.shape:
             raise ProgramError(
-                f"output {port.name}: {port.source} has not its shape {port.shape}; export again"
+                f"output {port.name}: {port.source} has not its shape {port.shape}; export again [NN-039]"
             )
         results.append(value)
     return symbols, results
@@ -120,7 +120,7 @@ def function(
     try:
         return ca.Function(name, symbols, results, *names, {"allow_duplicate_io_names": True})
     except RuntimeError as error:
-        raise ProgramError(f"CasADi refuses the function: {error}") from error
+        raise ProgramError(f"CasADi refuses the function: {error} [NN-040]") from error
 
 
 def _size(what: str, shape: tuple[int, ...]) -> tuple[int, int]:
@@ -139,12 +139,14 @@ def _evaluate(node: Node, values: dict[tuple[str, str], Any], table: Mapping[str
     except ShapeError as error:
         raise ShapeError(f"{place(node)}: {error}") from error
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError) as error:
-        raise ProgramError(f"{place(node)}: arguments that nn_export does not know: {error}") from error
+        raise ProgramError(
+            f"{place(node)}: arguments that nn_export does not know: {error} [NN-041]"
+        ) from error
     except (NotImplementedError, MemoryError) as error:
-        raise ProgramError(f"{place(node)}: cannot be built: {error}") from error
+        raise ProgramError(f"{place(node)}: cannot be built: {error} [NN-042]") from error
     if given != node.shapes:
         raise ProgramError(
-            f"{place(node)}: gives shapes {given}, the program says {node.shapes}; export again"
+            f"{place(node)}: gives shapes {given}, the program says {node.shapes}; export again [NN-043]"
         )
     return result
 

@@ -120,26 +120,30 @@ def _roles(step: ca.Function, n: int, states: Mapping[str, str] | None, held: Se
     inputs, outputs = step.name_in(), step.name_out()
     given = f"{step.name()}: inputs {', '.join(inputs)}, outputs {', '.join(outputs)}"
     if type(n) is not int or n < 1:
-        raise SignatureError(f"n = {n!r}: give a whole number of steps, at least 1")
+        raise SignatureError(f"n = {n!r}: give a whole number of steps, at least 1 [NN-044]")
     if states is None:
         states = {s: f"{s}_next" for s in inputs if f"{s}_next" in outputs}
     if not states:
         raise SignatureError(
-            f"{given}: no output is an input's name with _next; say states={{'x': 'output_0'}}"
+            f"{given}: no output is an input's name with _next; say states={{'x': 'output_0'}} [NN-045]"
         )
     if unknown := sorted((set(states) | set(held)) - set(inputs)) + sorted(
         set(states.values()) - set(outputs)
     ):
-        raise SignatureError(f"{given}: it has no {', '.join(unknown)}; choose among these")
+        raise SignatureError(f"{given}: it has no {', '.join(unknown)}; choose among these [NN-046]")
     if both := sorted(set(states) & set(held)):
-        raise SignatureError(f"{given}: {', '.join(both)} cannot be a state and held; leave it out of one")
+        raise SignatureError(
+            f"{given}: {', '.join(both)} cannot be a state and held; leave it out of one [NN-047]"
+        )
     if len(set(states.values())) < len(states):
-        raise SignatureError(f"{given}: two states have the same next value; give each its own output")
+        raise SignatureError(
+            f"{given}: two states have the same next value; give each its own output [NN-048]"
+        )
     for state, after in states.items():
         sizes = step.size_in(state), step.size_out(after)
         if sizes[0] != sizes[1]:
             raise SignatureError(
-                f"{given}: {state} is {sizes[0]}, its next value {after} is {sizes[1]}; make them equal"
+                f"{given}: {state} is {sizes[0]}, its next value {after} is {sizes[1]}; make them equal [NN-049]"
             )
     return _Roles(dict(states), frozenset(held))
 

@@ -81,7 +81,7 @@ def checked_blocks(
     inputs = [port.name for port in program.inputs]
     blocks = {"jacobian": inputs} if blocks is None else blocks
     if unknown := sorted({i for names in blocks.values() for i in names} - set(inputs)):
-        raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)}")
+        raise ProgramError(f"no inputs {', '.join(unknown)}; the program has {', '.join(inputs)} [NN-050]")
     return blocks
 
 

@@ -98,25 +98,27 @@ class Program:
 
         known = {("input", p.name) for p in self.inputs} | {("weight", name) for name in self.weights}
         if len(known) < len(self.inputs) + len(self.weights):
-            raise ProgramError("two inputs have the same name; rename one")
+            raise ProgramError("two inputs have the same name; rename one [NN-072]")
         for node in self.nodes:
             if node.op not in OPERATORS:
                 raise ProgramError(
                     f"node {node.name:.80}: operator {node.op:.80} is unknown to this version of nn_export; "
-                    "update nn_export or export the module again"
+                    "update nn_export or export the module again [NN-073]"
                 )
             for reference in references((node.args, node.kwargs)):
                 if reference not in known:
                     raise ProgramError(
-                        f"node {node.name:.80}: {reference[0]} {reference[1]!r:.80} is not defined"
+                        f"node {node.name:.80}: {reference[0]} {reference[1]!r:.80} is not defined [NN-074]"
                     )
             if ("node", node.name) in known:
-                raise ProgramError(f"node {node.name:.80}: its name is used twice")
+                raise ProgramError(f"node {node.name:.80}: its name is used twice [NN-075]")
             known.add(("node", node.name))
         for port in self.outputs:
             found = list(references(port.source))
             if len(found) != 1 or found[0] not in known:
-                raise ProgramError(f"output {port.name:.80}: its source {port.source!s:.80} is not defined")
+                raise ProgramError(
+                    f"output {port.name:.80}: its source {port.source!s:.80} is not defined [NN-076]"
+                )
 
     def save(self, folder: str | Path) -> None:
         """Write ``programs.json`` and ``weights.safetensors`` into the folder (made if missing)."""
@@ -139,7 +141,9 @@ class Program:
 
         programs = load_programs(folder, limits)
         if len(programs) != 1:
-            raise ProgramError(f"{folder}: holds {sorted(programs)}; use load_programs and choose one")
+            raise ProgramError(
+                f"{folder}: holds {sorted(programs)}; use load_programs and choose one [NN-077]"
+            )
         return next(iter(programs.values()))
 
 
@@ -182,7 +186,7 @@ def from_json(data: Any, weights: dict[str, np.ndarray], where: str) -> Program:
     outputs = [_port(p, f"{where}.outputs[{i}]", True) for i, p in enumerate(top["outputs"])]
     nodes = [_node(n, f"{where}.nodes[{i}]") for i, n in enumerate(top["nodes"])]
     if not all(isinstance(v, str) for v in top["metadata"].values()):
-        raise ProgramError(f"{where}.metadata: expected text; export the module again")
+        raise ProgramError(f"{where}.metadata: expected text; export the module again [NN-078]")
     try:
         return Program(tuple(inputs), tuple(outputs), tuple(nodes), weights, top["metadata"])
     except ProgramError as error:
@@ -192,11 +196,13 @@ def from_json(data: Any, weights: dict[str, np.ndarray], where: str) -> Program:
 def _fields(data: Any, types: Mapping[str, type], where: str) -> dict[str, Any]:
     if not isinstance(data, dict) or data.keys() != types.keys():
         given = sorted(data) if isinstance(data, dict) else type(data).__name__
-        raise ProgramError(f"{where}: expected the fields {sorted(types)}, got {given!s:.200}; export again")
+        raise ProgramError(
+            f"{where}: expected the fields {sorted(types)}, got {given!s:.200}; export again [NN-079]"
+        )
     for name, kind in types.items():
         if not isinstance(data[name], kind):
             raise ProgramError(
-                f"{where}.{name}: expected {kind.__name__}, got {data[name]!r:.60}; export again"
+                f"{where}.{name}: expected {kind.__name__}, got {data[name]!r:.60}; export again [NN-080]"
             )
     return data
 
@@ -209,7 +215,7 @@ def shape_of(data: Any, where: str) -> Shape:
                 break
         else:
             return tuple(data)
-    raise ProgramError(f"{where}: {data!r:.60} is no shape; export the module again")
+    raise ProgramError(f"{where}: {data!r:.60} is no shape; export the module again [NN-081]")
 
 
 def _port(data: Any, where: str, output: bool) -> Port:

@@ -59,7 +59,7 @@ class SideBySide:
         limits: Limits | None = None,
     ) -> None:
         if n < 1:
-            raise ProgramError(f"n = {n} points given; at least 1 needed")
+            raise ProgramError(f"n = {n} points given; at least 1 needed [NN-082]")
         blocks = checked_blocks(program, blocks)
         inputs, wanted = (
             [port.name for port in program.inputs],
@@ -100,7 +100,7 @@ class SideBySide:
         """Outputs ``(n, size)`` and Jacobians ``(n, rows, columns)``, new arrays."""
         if [p.shape for p in points] != [b.T.shape for b in self._inputs]:
             needed = ", ".join(str(b.T.shape) for b in self._inputs)
-            raise ShapeError(f"arrays of {[p.shape for p in points]} given, {needed} needed")
+            raise ShapeError(f"arrays of {[p.shape for p in points]} given, {needed} needed [NN-083]")
         for buffer, values in zip(self._inputs, points, strict=True):
             buffer[...] = values.T
         results = {name: np.empty(shape) for name, shape in self._shapes.items()}

@@ -70,7 +70,9 @@ def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
         document["sha256"] = _content_hash(document)
         text = dumps(document)
     except (TypeError, ValueError, RecursionError) as error:
-        raise ProgramError(f"a program holds something that JSON has no form for: {error}") from error
+        raise ProgramError(
+            f"a program holds something that JSON has no form for: {error} [NN-084]"
+        ) from error
     path = Path(folder)
     write_bytes(path / WEIGHTS, blob)
     write_bytes(path / PROGRAMS, text.encode())
@@ -105,7 +107,7 @@ def load_programs(folder: str | Path, limits: Limits | None = None) -> dict[str,
     for name, entry in document["programs"].items():
         where = f"{path / PROGRAMS}: programs.{name:.80}"
         if not isinstance(entry, dict) or set(entry) != {"program", "weights"}:
-            raise ProgramError(f"{where}: expected the fields program and weights; save it again")
+            raise ProgramError(f"{where}: expected the fields program and weights; save it again [NN-085]")
         tables[name], stand_ins = _weights(entry["weights"], shapes, f"{where}.weights", budget)
         result[name] = from_json(entry["program"], stand_ins, where)
         budget.add(result[name], f"{where}: ")
@@ -113,7 +115,7 @@ def load_programs(folder: str | Path, limits: Limits | None = None) -> dict[str,
     if given != _content_hash(document):
         raise ProgramError(
             f"{path / PROGRAMS}: its content is not what was saved (field sha256): damaged or changed by hand; "
-            "save the programs again"
+            "save the programs again [NN-086]"
         )
     tensors = _tensors(path / WEIGHTS, document["weights"]["sha256"], shapes)
     for name, program in result.items():
@@ -134,18 +136,20 @@ def _document(path: Path, limit: int) -> dict[str, Any]:
     except ProgramError:
         raise
     except ValueError as error:
-        raise ProgramError(f"{path}: not readable as JSON ({error!s:.80}); {remedy}") from error
+        raise ProgramError(f"{path}: not readable as JSON ({error!s:.80}); {remedy} [NN-087]") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ProgramError(f"{path}: field format is not {FORMAT!r}; this file was not written by nn_export")
+        raise ProgramError(
+            f"{path}: field format is not {FORMAT!r}; this file was not written by nn_export [NN-088]"
+        )
     if document.get("schema") != SCHEMA:
         raise ProgramError(
             f"{path}: schema {document.get('schema')!r:.40}, this version of nn_export reads {SCHEMA}; "
-            "update nn_export or export again"
+            "update nn_export or export again [NN-089]"
         )
     weights, programs = document.get("weights"), document.get("programs")
     sha256 = weights.get("sha256") if isinstance(weights, dict) else None
     if not isinstance(sha256, str) or not isinstance(programs, dict):
-        raise ProgramError(f"{path}: field weights.sha256 or programs is missing; {remedy}")
+        raise ProgramError(f"{path}: field weights.sha256 or programs is missing; {remedy} [NN-090]")
     return document
 
 
@@ -164,16 +168,16 @@ def _weights(
     ``shapes`` collects the shapes by the arrays' names.
     """
     if not isinstance(table, dict):
-        raise ProgramError(f"{where}: expected a table; save the programs again")
+        raise ProgramError(f"{where}: expected a table; save the programs again [NN-091]")
     keys, stand_ins = {}, {}
     for name, entry in table.items():
         place = f"{where}.{name:.80}"
         if not isinstance(entry, dict) or set(entry) != {"tensor", "shape"}:
-            raise ProgramError(f"{place}: expected the fields tensor and shape; save it again")
+            raise ProgramError(f"{place}: expected the fields tensor and shape; save it again [NN-092]")
         key, shape = entry["tensor"], shape_of(entry["shape"], f"{place}.shape")
         budget.spend(place, elements=size_of(shape))
         if not isinstance(key, str) or shapes.setdefault(key, shape) != shape:
-            raise ProgramError(f"{place}: {WEIGHTS} has no such array; save the programs again")
+            raise ProgramError(f"{place}: {WEIGHTS} has no such array; save the programs again [NN-093]")
         keys[name], stand_ins[name] = key, np.broadcast_to(np.float64(0.0), shape)
     return keys, stand_ins
 
@@ -189,18 +193,24 @@ def _tensors(path: Path, sha256: str, shapes: Mapping[str, Shape]) -> dict[str, 
     if hashlib.sha256(blob).hexdigest() != sha256:
         raise ProgramError(
             f"{path}: its hash is not the one in {PROGRAMS} (field weights.sha256): damaged, truncated or of "
-            "another model; save the programs again"
+            "another model; save the programs again [NN-094]"
         )
     try:
         tensors: dict[str, np.ndarray] = load(blob)
     except (SafetensorError, ValueError, KeyError) as error:
-        raise ProgramError(f"{path}: no safetensors file ({error}); save the programs again") from error
+        raise ProgramError(
+            f"{path}: no safetensors file ({error}); save the programs again [NN-095]"
+        ) from error
     for key, shape in shapes.items():
         if key not in tensors or tensors[key].shape != shape:
-            raise ProgramError(f"{path}: no array {key:.80} of shape {shape}; save the programs again")
+            raise ProgramError(
+                f"{path}: no array {key:.80} of shape {shape}; save the programs again [NN-096]"
+            )
     for name, array in tensors.items():
         if array.dtype != np.float64:
-            raise ProgramError(f"{path}: {name} is {array.dtype}, float64 is needed; save the programs again")
+            raise ProgramError(
+                f"{path}: {name} is {array.dtype}, float64 is needed; save the programs again [NN-097]"
+            )
     return tensors
 
 
@@ -208,6 +218,6 @@ def _content(path: Path, limit: int) -> bytes:
     try:
         return read_bytes(path, limit)
     except FileNotFoundError as error:
-        raise ProgramError(f"{path}: no such file; save the programs there first") from error
+        raise ProgramError(f"{path}: no such file; save the programs there first [NN-098]") from error
     except OSError as error:
-        raise ProgramError(f"cannot read {path}: {error.strerror or error}") from error
+        raise ProgramError(f"cannot read {path}: {error.strerror or error} [NN-099]") from error

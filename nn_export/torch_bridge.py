@@ -67,9 +67,9 @@ class CasadiModule(torch.nn.Module):
     def __init__(self, function: ca.Function, own_derivatives: bool = True) -> None:
         super().__init__()
         if not isinstance(function, ca.Function):
-            raise SignatureError(f"expected a casadi.Function, got {type(function).__name__}")
+            raise SignatureError(f"expected a casadi.Function, got {type(function).__name__} [NN-100]")
         if not function.n_in() or not function.n_out():
-            raise SignatureError(f"{function}: at least one input and one output are needed")
+            raise SignatureError(f"{function}: at least one input and one output are needed [NN-101]")
         self.batched, self.own_derivatives = Batched(function), own_derivatives
         if not own_derivatives:
             self.batched.check_walkable()
@@ -84,7 +84,7 @@ class CasadiModule(torch.nn.Module):
         """
         f = self.batched.function
         if len(inputs) != f.n_in():
-            raise SignatureError(f"{f}: {f.n_in()} tensors are needed, got {len(inputs)}")
+            raise SignatureError(f"{f}: {f.n_in()} tensors are needed, got {len(inputs)} [NN-102]")
         flat = [_nonzeros(f, i, x) for i, x in enumerate(inputs)]
         wide = [x if x.dtype is torch.float64 else x.to(torch.float64) for x in flat]
         walked = (
@@ -145,7 +145,9 @@ def _batch(f: ca.Function, inputs: tuple[Tensor, ...], flat: list[Tensor]) -> tu
         return tuple(torch.broadcast_shapes(*(x.shape[:-1] for x in flat)))
     except RuntimeError as error:
         shapes = ", ".join(str(tuple(x.shape)) for x in inputs)
-        raise SignatureError(f"{f}: leading axes of {shapes} cannot be broadcast together") from error
+        raise SignatureError(
+            f"{f}: leading axes of {shapes} cannot be broadcast together [NN-103]"
+        ) from error
 
 
 def _nonzeros(f: ca.Function, i: int, x: Tensor) -> Tensor:
@@ -156,13 +158,13 @@ def _nonzeros(f: ca.Function, i: int, x: Tensor) -> Tensor:
     if not isinstance(x, Tensor) or not x.is_floating_point():
         given = x.dtype if isinstance(x, Tensor) else type(x).__name__
         raise DtypeError(
-            f"{f}: {name} must be a tensor of real numbers, got {given}; use torch.as_tensor(..).double()"
+            f"{f}: {name} must be a tensor of real numbers, got {given}; use torch.as_tensor(..).double() [NN-104]"
         )
     if x.ndim == 0 and sparsity.numel() == 1:
         x = x.reshape(1)
     if tuple(x.shape[-len(wanted) :]) != wanted or x.ndim < len(wanted):
         expected = f"(..., {', '.join(map(str, wanted))})"
-        raise SignatureError(f"{f}: {name} must have the shape {expected}, got {tuple(x.shape)}")
+        raise SignatureError(f"{f}: {name} must have the shape {expected}, got {tuple(x.shape)} [NN-105]")
     flat = x if columns == 1 else x.transpose(-1, -2).flatten(-2)
     return flat if sparsity.is_dense() else flat[..., sparsity.find()]
 

@@ -70,11 +70,11 @@ def trace(
     outputs = list(output_names) if output_names is not None else _output_names(exported)
     nodes, sources, weights, inputs = convert(exported, names, len(outputs))
     if len(set(names)) < len(names) or len(set(outputs)) < len(outputs):
-        raise SignatureError(f"names must differ: inputs {names}, outputs {outputs}")
+        raise SignatureError(f"names must differ: inputs {names}, outputs {outputs} [NN-106]")
     for name in (*names, *outputs):
         if not valid_name(name):
             raise SignatureError(
-                f"{name!r} is no name for CasADi: use letters, digits and single underscores"
+                f"{name!r} is no name for CasADi: use letters, digits and single underscores [NN-107]"
             )
     metadata = {"module": type(module).__name__, "torch": version("torch"), "casadi": version("casadi")}
     metadata["nn_export"] = _version()
@@ -119,15 +119,15 @@ def float64_copy(module: torch.nn.Module) -> torch.nn.Module:
 
 def _examples(module: Any, example_inputs: Any) -> tuple[Any, ...]:
     if not isinstance(module, torch.nn.Module):
-        raise SignatureError(f"expected a torch.nn.Module, got {type(module).__name__}")
+        raise SignatureError(f"expected a torch.nn.Module, got {type(module).__name__} [NN-108]")
     if isinstance(example_inputs, torch.Tensor) or not isinstance(example_inputs, Sequence):
-        raise SignatureError("example_inputs must be a tuple of tensors, e.g. (x, h)")
+        raise SignatureError("example_inputs must be a tuple of tensors, e.g. (x, h) [NN-109]")
     for path, x in pytree.tree_flatten_with_path(tuple(example_inputs))[0]:
         if not isinstance(x, torch.Tensor) or not x.is_floating_point():
             kind = x.dtype if isinstance(x, torch.Tensor) else type(x).__name__
             at = "_".join(_words(path))
             raise SignatureError(
-                f"example input {at} must be a tensor of real numbers, got {kind}; e.g. torch.zeros(3)"
+                f"example input {at} must be a tensor of real numbers, got {kind}; e.g. torch.zeros(3) [NN-110]"
             )
     copies: tuple[Any, ...] = pytree.tree_map(
         lambda x: x.detach().to(device="cpu", dtype=torch.float64).clone(), tuple(example_inputs)
@@ -158,7 +158,7 @@ def _explain(module: torch.nn.Module, examples: tuple[Any, ...], error: Exceptio
         at = f" (near {where[-1][0]}:{where[-1][1]})" if where else ""
         return ControlFlowError(
             f"{name} decides by the values of its inputs{at}; use torch.where instead of if, and tensors "
-            f"instead of float(x) or x.item(). torch says: {text[:600]}"
+            f"instead of float(x) or x.item(). torch says: {text[:600]} [NN-113]"
         )
     try:
         float64_copy(module)(*examples)
@@ -166,10 +166,10 @@ def _explain(module: torch.nn.Module, examples: tuple[Any, ...], error: Exceptio
         shapes = [tuple(x.shape) for x in pytree.tree_leaves(examples)]
         return SignatureError(
             f"{name} does not run on the example inputs of shapes {shapes}; give one tensor of the right shape "
-            f"for each argument of forward(). torch says: {type(own).__name__}: {str(own)[:600]}"
+            f"for each argument of forward(). torch says: {type(own).__name__}: {str(own)[:600]} [NN-114]"
         )
     return TraceError(
-        f"{name} runs, but torch.export cannot trace it; simplify what it names. torch says: {text[:1500]}"
+        f"{name} runs, but torch.export cannot trace it; simplify what it names. torch says: {text[:1500]} [NN-115]"
     )
 
 

@@ -43,7 +43,7 @@ def whole_windows(stems: Iterable[str], seconds: float) -> dict[str, tuple[Windo
 def sizes_of(machine: str, budget: str, sizes: Mapping[str, Mapping[Role, int]]) -> Mapping[Role, int]:
     """Recordings of each role in a budget."""
     if budget not in sizes:
-        raise InputError(f"{machine}: no budget {budget!r}; it has: {', '.join(sizes)}")
+        raise InputError(f"{machine}: no budget {budget!r}; it has: {', '.join(sizes)} [HM-SCENARIOS-001]")
     return sizes[budget]
 
 

@@ -88,11 +88,11 @@ def test_many_points_at_once_are_the_points_one_by_one(delay):
 def test_what_cannot_be_is_refused():
     model = pendulum_model(dt=DT)
     for delay in (0.0, -0.01, np.nan):
-        with pytest.raises(InputError, match="must be positive"):
+        with pytest.raises(InputError, match="HM-MODEL-001"):
             with_input_delay(model, delay)
-    with pytest.raises(InputError, match="delay states already"):
+    with pytest.raises(InputError, match="HM-MODEL-003"):
         with_input_delay(with_input_delay(model, DT), DT)
-    with pytest.raises(InputError, match="delay_states must be whole inputs"):
+    with pytest.raises(InputError, match="HM-MODEL-037"):
         replace(model, delay_states=1)
 
 
@@ -121,7 +121,5 @@ def test_an_artifact_keeps_the_delay(tmp_path):
     x, u = np.array([0.2, 0.1]), np.array([4.0, 8.0, 9.0])  # the last one comes too late for this period
     np.testing.assert_array_equal(step(late, x, u[:2], u[2])[0], step(at_once, x, [], 0.25 * 4 + 0.75 * 8)[0])
     assert step(late, x, u[:2], u[2])[1].tolist() == [8.0, 9.0]
-    with pytest.raises(
-        InputError, match=r"1e\+09 s is 1e\+11 periods of 0.01 s, so that 1e\+11 delay states would be needed"
-    ):
+    with pytest.raises(InputError, match=r"1e\+09.*1e\+11.*0\.01.*HM-MODEL-002"):
         load(tmp_path / "years").models["prior"]

@@ -366,7 +366,7 @@ def test_a_half_written_set_of_tasks_is_missing(whole, tmp_path):
     shutil.copyfile(tmp_path / "other" / "tasks" / path.name, path)
     kit = hm.load(folder)
     assert "tasks" in kit.lacks[TASK_LIST]
-    with pytest.raises(InputError, match="stage tasks"):
+    with pytest.raises(InputError, match=r"stage tasks.*HM-KIT-007"):
         kit.problem(path.stem)
 
 
@@ -448,11 +448,11 @@ def test_a_kit_of_a_former_format_is_migrated_or_refused_with_the_line(tmp_path,
         ]  # fmt: skip
         assert (own.travel, own.repeats) == ((1.0,), (3,))
     for place in (tmp_path / "new5", tmp_path / "none"):
-        with pytest.raises(InputError, match="former format"):
+        with pytest.raises(InputError, match="HM-KIT-027"):
             migrate_kit(place, tmp_path / "again")
     document = read_document(old / OLD_FILE)
     write_document(old / OLD_FILE, document | {"schema_version": 3})
-    with pytest.raises(InputError, match="train the models anew"):
+    with pytest.raises(InputError, match="HM-KIT-028"):
         migrate_kit(old, tmp_path / "again")
     assert not (tmp_path / "again").exists()
 

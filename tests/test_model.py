@@ -122,25 +122,21 @@ def test_what_does_not_fit_is_refused():
     model = sled()
     x, h, u = step_symbols(model)[:3]
     bare = ca.Function("step", [x, h, u], list(model.step(x, h, u, model.w, model.p)))
-    with pytest.raises(
-        InputError, match=r"model sled: step takes \[\(2, 1\), \(1, 1\), \(1, 1\)\] and returns"
-    ):
+    with pytest.raises(InputError, match=r"sled.*step.*\[\(2, 1\), \(1, 1\), \(1, 1\)\].*HM-MODEL-038"):
         replace(model, step=bare, with_jacobian=None)
-    with pytest.raises(InputError, match=r"nominal_w needs 1 finite values, got \(0.1, 0.2\)"):
+    with pytest.raises(InputError, match=r"nominal_w.*HM-MODEL-033"):
         sled(nominal_w=(0.1, 0.2))
     assert sled(nominal_w=()).w.tolist() == [0.0]
-    with pytest.raises(InputError, match="covariance needs 1 rows of 1 values"):
+    with pytest.raises(InputError, match="HM-MODEL-035"):
         replace(model, covariance=((1.0, 0.0), (0.0, 1.0)))
-    with pytest.raises(InputError, match="balances need different names, got energy, energy"):
+    with pytest.raises(InputError, match=r"balances.*energy, energy.*HM-MODEL-036"):
         replace(model, balances=2 * model.balances)
     silent = Balance("heat", "J", "W", ca.Function("r", [x, u], [x[0]]))
-    with pytest.raises(InputError, match="balance heat takes"):
+    with pytest.raises(InputError, match=r"balance heat.*HM-MODEL-038"):
         replace(model, balances=(silent,))
     given = {"x": ca.MX.sym("s"), "u": u, "x_next": u, "xdot": u, "y": u}
     for changed in ({"xdot": ca.MX.sym("stranger")}, {"x": x[0]}):
-        with pytest.raises(
-            InputError, match=r"must be an expression of the symbols given.*(stranger|symbolic)"
-        ):
+        with pytest.raises(InputError, match="HM-MODEL-027"):
             HybridModel.of("odd", DT, STATES[:1], model.inputs, STATES[:1], **(given | changed))
 
 
@@ -156,7 +152,7 @@ def test_the_acceleration_of_the_prior_behind_a_model():
     assert float(prior_acceleration(prior)([0.5, 1.0], 3.0, 0.0, 1.5)) == 1.5
     late = with_input_delay(prior, DT)  # it takes the input that acts
     assert float(prior_acceleration(late)([0.5, 1.0], 3.0, 0.0, 1.5)) == 1.5
-    with pytest.raises(InputError, match=r"hybrid has a network.* give prior="):
+    with pytest.raises(InputError, match=r"hybrid.*HM-MODEL-029"):
         prior_acceleration(model)
-    with pytest.raises(InputError, match="parameters, the same of both, are needed"):
+    with pytest.raises(InputError, match="HM-MODEL-030"):
         prior_acceleration(pendulum_model())

@@ -103,9 +103,10 @@ def equilibria(
     if box.shape != (model.n_x, 2) or not np.all(np.isfinite(box)) or not np.all(box[:, 0] < box[:, 1]):
         raise InputError(
             f"model {model.name}: region must be {model.n_x} pairs (lower, upper) of finite bounds, got {region}"
+            " [HM-ANALYZE-008]"
         )
     if starts < 1:
-        raise InputError(f"equilibria: at least one start is needed, got {starts}")
+        raise InputError(f"equilibria: at least one start is needed, got {starts} [HM-ANALYZE-009]")
     from scipy.stats import qmc  # a second of start-up that few need
 
     size = box[:, 1] - box[:, 0]

@@ -31,7 +31,9 @@ def period(sys: Any) -> float:
     """Period [s] of a discrete system; an InputError for a continuous one."""
     dt = sys.dt
     if dt is None or dt is True or not dt > 0:
-        raise InputError(f"linear analysis: needs a discrete system with a period, its dt is {dt}")
+        raise InputError(
+            f"linear analysis: needs a discrete system with a period, its dt is {dt} [HM-ANALYZE-010]"
+        )
     return float(dt)
 
 
@@ -69,7 +71,7 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
     if continuous and model.n_h:
         raise InputError(
             f"model {model.name} has {model.n_h} hidden states, which step once a period of {model.dt:g} s and have "
-            "no rate; leave continuous=True out, or linearize the prior"
+            "no rate; leave continuous=True out, or linearize the prior [HM-ANALYZE-011]"
         )
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
     if continuous:
@@ -175,7 +177,7 @@ def linearize_secant(
     n_q, n_z = positions_of(model), model.n_x + model.n_h
     size = _positive(speed, n_q)
     if kind not in ("secant", "harmonic"):
-        raise InputError(f"secant: kind must be 'secant' or 'harmonic', got {kind!r}")
+        raise InputError(f"secant: kind must be 'secant' or 'harmonic', got {kind!r} [HM-ANALYZE-012]")
     x0, u0, h0 = operating_point(model, x, u, h)
     in_phase = np.concatenate([np.zeros(n_q), size])
     around = [x0 + share * in_phase for share in _shares(kind)]
@@ -237,7 +239,9 @@ def friction_slopes(
     n_q = positions_of(model)
     size = _positive(speeds, np.size(speeds))
     if not 0 <= axis < n_q:
-        raise InputError(f"friction: axis {axis} given, model {model.name} has axes 0 to {n_q - 1}")
+        raise InputError(
+            f"friction: axis {axis} given, model {model.name} has axes 0 to {n_q - 1} [HM-ANALYZE-013]"
+        )
     held = np.zeros(model.n_u) if u is None else vector(u, model.n_u, "u")
     x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
     h, i = hidden_equilibrium(model, x, held), n_q + axis
@@ -257,7 +261,7 @@ def friction_slopes(
 def _positive(speed: ArrayLike, n: int) -> Array:
     size = vector(speed, n, "speed")
     if not n or not np.all(size > 0):
-        raise InputError(f"speed: sizes of a motion must be positive, got {size.tolist()}")
+        raise InputError(f"speed: sizes of a motion must be positive, got {size.tolist()} [HM-ANALYZE-014]")
     return size
 
 
@@ -318,13 +322,18 @@ class AlongTrajectory:
         Source: Roberts and Spanos, *Random Vibration and Statistical Linearization*, 1990, section 5.3.
         """
         if not 0 <= skip < len(self.A):
-            raise InputError(f"mean: {skip} periods to leave out, the trajectory has {len(self.A)}")
+            raise InputError(
+                f"mean: {skip} periods to leave out, the trajectory has {len(self.A)} [HM-ANALYZE-015]"
+            )
         return _state_space(self.model, *(m[skip:].mean(axis=0) for m in (self.A, self.B, self.C, self.D)))
 
     def transition(self, start: int, end: int) -> Array:
         """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``."""
         if not 0 <= start <= end <= len(self.A):
-            raise InputError(f"transition: 0 <= start <= end <= {len(self.A)} needed, got {start} and {end}")
+            raise InputError(
+                f"transition: 0 <= start <= end <= {len(self.A)} needed, got {start} and {end}"
+                " [HM-ANALYZE-016]"
+            )
         product = np.eye(self.A.shape[1])
         for a in self.A[start:end]:
             product = a @ product
@@ -362,11 +371,11 @@ def linearize_along(
     if inputs.shape != (n, model.n_u) or not n or start.shape != (model.n_h,):
         raise InputError(
             f"model {model.name}: u {inputs.shape} and h {start.shape} given, (n, {model.n_u}) with n > 0 and "
-            f"({model.n_h},) needed"
+            f"({model.n_h},) needed [HM-ANALYZE-017]"
         )
     if not free and given.shape != (n, model.n_x):
         raise InputError(
-            f"model {model.name}: x {given.shape} given, ({model.n_x},) or ({n}, {model.n_x}) needed"
+            f"model {model.name}: x {given.shape} given, ({model.n_x},) or ({n}, {model.n_x}) needed [HM-ANALYZE-018]"
         )
     states, hidden = np.empty((n, model.n_x)), np.empty((n, model.n_h))
     now, h_now = given if free else given[0], start
@@ -375,7 +384,7 @@ def linearize_along(
         now, h_now = (m.full().ravel() for m in model.step(states[k], h_now, inputs[k], model.w, model.p))
     if not (np.all(np.isfinite(states)) and np.all(np.isfinite(hidden))):
         raise InputError(
-            f"model {model.name}: the free run is not finite; take a shorter one or other inputs"
+            f"model {model.name}: the free run is not finite; take a shorter one or other inputs [HM-ANALYZE-019]"
         )
     every = jacobians(model).map(n)(states.T, hidden.T, inputs.T)
     a, b, c, d = (m.full().reshape(m.shape[0], n, -1).transpose(1, 0, 2) for m in every)

@@ -100,17 +100,18 @@ def mpc_gain(
     x0, u0, h0 = operating_point(model, x, u, h)
     if np.any(u0 <= ocp.u_min) or np.any(u0 >= ocp.u_max):
         raise InputError(
-            f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move"
+            f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move [HM-ANALYZE-020]"
         )
     if ocp.economic is not None or ocp.n_y:
         raise InputError(
             "MPC gain: the problem has an economic stage cost, or weights on outputs; its gain depends on its plan"
+            " [HM-ANALYZE-021]"
         )
     z0 = np.concatenate([x0, h0])
     plan, z = np.tile(u0, (n, 1)), np.tile(z0, (n + 1, 1))
     if np.any(controller.problem.soft.excess(controller.problem.soft.values(z[:, :n_x], plan)) > 0):
         raise InputError(
-            f"MPC gain: the point x = {x0.tolist()} violates a soft bound; take one where none acts"
+            f"MPC gain: the point x = {x0.tolist()} violates a soft bound; take one where none acts [HM-ANALYZE-022]"
         )
     sys = linearize(model, x0, u0, h0) if system is None else system
     a, b = np.asarray(sys.A, dtype=float), np.asarray(sys.B, dtype=float)
@@ -175,13 +176,18 @@ def solved_gain(
     def solved(estimate: Estimate, before: Array, goal: Array, last: Solution) -> Solution:
         found = controller.solve(last.beginning_with(before), estimate, np.tile(goal, (ocp.horizon + 1, 1)))
         if not found.status.ok:
-            raise InputError(f"MPC gain: a solve at x = {x0.tolist()} fails: {found.status.value}")
+            raise InputError(
+                f"MPC gain: a solve at x = {x0.tolist()} fails: {found.status.value} [HM-ANALYZE-023]"
+            )
         return found
 
     for _ in range(SETTLE):
         plan = solved(at, u0, row, plan)
     if np.any(plan.u[0] <= ocp.u_min) or np.any(plan.u[0] >= ocp.u_max):
-        raise InputError(f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, where it does not move")
+        raise InputError(
+            f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, where it does not move"
+            " [HM-ANALYZE-024]"
+        )
     steps = DIFFERENCE * np.concatenate(
         [sizes.states, sizes.hidden, disturbance_sizes(model, ocp), ocp.input_scale, np.ones(row.size)]
     )
@@ -243,7 +249,7 @@ def gain_schedule(
     """
     given = [operating_point(model, x, u, None) for x, u in points]
     if not given:
-        raise InputError("gain schedule: no operating point given")
+        raise InputError("gain schedule: no operating point given [HM-ANALYZE-025]")
     weights = np.diag(np.concatenate([vector(q, model.n_x, "q"), np.zeros(model.n_h)]))
     costs = np.diag(vector(r, model.n_u, "r"))
     gains, radii = [], []
@@ -303,6 +309,7 @@ def steady_filter(
     if np.any(np.asarray(sys.D) != 0):
         raise InputError(
             f"model {model.name}: an output depends on the input at once; the loop here has no such path"
+            " [HM-ANALYZE-026]"
         )
     n_z, n_u, n_d = model.n_x + model.n_h, model.n_u, model.n_d
     on_u, on_x, on_y = model.disturbed
@@ -324,7 +331,7 @@ def steady_filter(
     except (LinAlgError, ValueError) as error:
         raise InputError(
             f"model {model.name}: the filter's covariance does not settle ({error}); its noise must reach, and the "
-            "outputs show, every mode on or outside the unit circle"
+            "outputs show, every mode on or outside the unit circle [HM-ANALYZE-027]"
         ) from error
     seen = c[:, alive]
     gain[alive] = np.linalg.solve(seen @ before @ seen.T + noise_y, seen @ before).T
@@ -385,7 +392,7 @@ class LinearLoop:
         """The loop transfer function with one input cut open, the others closed, in negative-feedback sign."""
         n_u = self.plant.ninputs
         if not 0 <= input < n_u:
-            raise InputError(f"loop: input {input} asked for, the plant has {n_u}")
+            raise InputError(f"loop: input {input} asked for, the plant has {n_u} [HM-ANALYZE-028]")
         a, b, c, d = _open(self.plant, self.feedback)
         others = [j for j in range(n_u) if j != input]
         if others:
@@ -407,6 +414,7 @@ class LinearLoop:
         if not self.stable:
             raise InputError(
                 f"loop: the closed loop is not stable (spectral radius {abs(self.poles[0]):.6g}); it has no margins"
+                " [HM-ANALYZE-029]"
             )
         control, dt, broken = control_toolbox(), period(self.plant), self.broken(input)
         omega = _grid(broken, dt)
@@ -425,16 +433,16 @@ class LinearLoop:
         disk, _, _ = control.disk_margins(broken, omega, skew=0.0)
         size = min(float(disk), 2.0)
         return Margins(
-            float(min((k for k in gains if k > 1), default=np.inf)),
-            float(max((k for k in gains if k < 1), default=0.0)),
-            float(np.abs(phases).min(initial=np.inf)),
-            float(min(delays, default=np.inf)),
-            self._delay_periods(input),
-            float(at.max()) if at.size else float("nan"),
-            float(np.abs(1 + g).min()),
-            float(disk),
-            (1 + size / 2) / (1 - size / 2) if size < 2 else float("inf"),
-            2 * float(np.arctan(size / 2)),
+            gain_up=float(min((k for k in gains if k > 1), default=np.inf)),
+            gain_down=float(max((k for k in gains if k < 1), default=0.0)),
+            phase=float(np.abs(phases).min(initial=np.inf)),
+            delay=float(min(delays, default=np.inf)),
+            delay_periods=self._delay_periods(input),
+            crossover=float(at.max()) if at.size else float("nan"),
+            modulus=float(np.abs(1 + g).min()),
+            disk=float(disk),
+            disk_gain=(1 + size / 2) / (1 - size / 2) if size < 2 else float("inf"),
+            disk_phase=2 * float(np.arctan(size / 2)),
         )
 
     def _delay_periods(self, input: int) -> int:
@@ -503,13 +511,16 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
         raise InputError(
             f"loop: plant with {plant.ninputs} inputs and {plant.noutputs} outputs, filter over {n_w} with {n_y} "
             f"outputs, gain of {n_u} inputs by {n_z} states and {n_d} disturbances; these do not fit each other"
+            " [HM-ANALYZE-030]"
         )
     if np.any(np.asarray(plant.D) != 0):
         raise InputError(
-            "loop: an output of the plant depends on its input at once; the loop here has no such path"
+            "loop: an output of the plant depends on its input at once; the loop here has no such path [HM-ANALYZE-031]"
         )
     if delay < 0:
-        raise InputError(f"loop: delay must be a whole number of periods, not negative, got {delay}")
+        raise InputError(
+            f"loop: delay must be a whole number of periods, not negative, got {delay} [HM-ANALYZE-032]"
+        )
     # a disturbance that the filter takes for constant stays zero: it is no state of the loop
     alive = (np.arange(n_w) < n_z) | np.any(filter.gain != 0, axis=1)
     k, follow = np.hstack([gain.by_state, gain.by_load])[:, alive], filter.gain[alive]

@@ -78,6 +78,7 @@ def welch_response(
         if u.shape != y.shape:
             raise InputError(
                 f"frequency response: {u.size} inputs and {y.size} outputs given, as many of each needed"
+                " [HM-ANALYZE-033]"
             )
         if n < 8 or u.size < n:
             continue
@@ -90,7 +91,7 @@ def welch_response(
     if count < 4:
         raise InputError(
             f"frequency response: {count} windows of {length:g} s in the recordings, at least 4 needed; take shorter "
-            "windows or more data"
+            "windows or more data [HM-ANALYZE-034]"
         )
     uu, yy, uy = total[0].real[1:-1], total[1].real[1:-1], total[2][1:-1]
     omega = np.asarray(2 * np.pi * np.arange(1, n // 2) / (n * dt), dtype=np.float64)
@@ -130,13 +131,13 @@ def multisine_response(
     if periods < 2 or settle < 0 or abs(n * dt - period) > 1e-9 * period:
         raise InputError(
             f"multisine: at least 2 periods of a multiple of {dt:g} s needed, got {periods} of {period:g} s, {settle} "
-            "left out"
+            "left out [HM-ANALYZE-035]"
         )
     t = np.asarray(dt * np.arange((settle + periods) * n), dtype=np.float64)
     u = multisine(t, amplitude, *band, period=period, odd=odd, offset=bias)
     y = np.asarray(run(u), dtype=float).ravel()
     if y.shape != u.shape:
-        raise InputError(f"multisine: the run returned {y.size} outputs for {u.size} inputs")
+        raise InputError(f"multisine: the run returned {y.size} outputs for {u.size} inputs [HM-ANALYZE-036]")
     _check_power(y, "output")
     lines = np.arange(np.ceil(band[0] * period - 1e-9), np.floor(band[1] * period + 1e-9) + 1).astype(int)
     lines = lines[lines % 2 == 1] if odd else lines
@@ -187,7 +188,7 @@ def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *,
         ``welch_response([(u, run_model(model, x0)(u))], model.dt, length=5.0)``
     """
     if model.n_u != 1:
-        raise InputError(f"model {model.name} has {model.n_u} inputs; a run drives one")
+        raise InputError(f"model {model.name} has {model.n_u} inputs; a run drives one [HM-ANALYZE-037]")
 
     def run(u: Array) -> Array:
         x, h = np.asarray(x0, dtype=float), np.zeros(model.n_h) if h0 is None else np.asarray(h0, dtype=float)
@@ -206,7 +207,7 @@ def _check_power(signal: Array, what: str) -> None:
     if wrong.size:
         raise InputError(
             f"frequency response: the {what} diverges, sample {wrong[0]} is {signal[wrong[0]]:.3g}; take shorter "
-            "recordings, or leave this model out"
+            "recordings, or leave this model out [HM-ANALYZE-038]"
         )
 
 

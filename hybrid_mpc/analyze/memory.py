@@ -51,14 +51,18 @@ def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple
         elif op in _RULES:
             work[into[0]] = _RULES[op](*(work[i] for i in at))
         else:
-            raise InputError(f"interval: operation {op} of CasADi (casadi.OP_...) is not known here")
+            raise InputError(
+                f"interval: operation {op} of CasADi (casadi.OP_...) is not known here [HM-ANALYZE-039]"
+            )
     return result[0], result[1]
 
 
 def _box(lower: ArrayLike, upper: ArrayLike, n: int) -> tuple[Array, Array]:
     low, high = vector(lower, n, "lower bounds"), vector(upper, n, "upper bounds")
     if np.any(low > high):
-        raise InputError(f"box: lower bounds {low.tolist()} lie above upper ones {high.tolist()}")
+        raise InputError(
+            f"box: lower bounds {low.tolist()} lie above upper ones {high.tolist()} [HM-ANALYZE-040]"
+        )
     return low, high
 
 
@@ -69,7 +73,9 @@ def _times(a: Interval, b: Interval) -> Interval:
 
 def _inverse(a: Interval) -> Interval:
     if a[0] <= 0 <= a[1]:
-        raise InputError(f"interval: division by a range {a} that holds zero; take a smaller box")
+        raise InputError(
+            f"interval: division by a range {a} that holds zero; take a smaller box [HM-ANALYZE-041]"
+        )
     return 1 / a[1], 1 / a[0]
 
 
@@ -137,7 +143,10 @@ class GruWeights:
         n = self.r.shape[-1]
         shapes = self.w.shape[:1], self.r.shape, self.b_w.shape, self.b_r.shape
         if shapes != ((3 * n,), (3 * n, n), (3 * n,), (3 * n,)):
-            raise InputError(f"GRU weights: shapes {shapes} do not belong to one cell of {n} hidden states")
+            raise InputError(
+                f"GRU weights: shapes {shapes} do not belong to one cell of {n} hidden states"
+                " [HM-ANALYZE-042]"
+            )
 
 
 @dataclass(frozen=True)
@@ -178,10 +187,13 @@ def gru_weights(program: Program) -> GruWeights:
         if name is None:
             raise InputError(
                 "contraction: the cell's weights are computed in the program; only stored ones are read"
+                " [HM-ANALYZE-043]"
             )
         found.append(np.asarray(program.weights[name], dtype=float))
     if len(found) != 4:
-        raise InputError("contraction: the GRU cell has no biases; only cells with them are read")
+        raise InputError(
+            "contraction: the GRU cell has no biases; only cells with them are read [HM-ANALYZE-044]"
+        )
     return GruWeights(*found)
 
 
@@ -209,7 +221,7 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
     s = f.call([z[:n_x], rest[0], z[n_x:], *rest[1:]], True, False)[0]
     if ca.depends_on(s, ca.veccat(*rest)):
         raise InputError(
-            "contraction: the GRU cell's inputs depend on more than x and u, of which there is a box"
+            "contraction: the GRU cell's inputs depend on more than x and u, of which there is a box [HM-ANALYZE-045]"
         )
     return interval_bounds(ca.Function("s", [z], [ca.vec(s)]), box[:, 0], box[:, 1])
 
@@ -276,7 +288,7 @@ def _cell(program: Program) -> Node:
     if len(cells) != 1:
         raise InputError(
             f"contraction: the program has {len(cells)} GRU cells{' beside ' + ', '.join(others) if others else ''}; "
-            "the condition is for exactly one"
+            "the condition is for exactly one [HM-ANALYZE-046]"
         )
     return cells[0]
 
@@ -345,11 +357,13 @@ def lyapunov_exponent(
     maps = along.A
     if part == "hidden":
         if not model.n_h:
-            raise InputError(f"model {model.name} has no hidden state")
+            raise InputError(f"model {model.name} has no hidden state [HM-ANALYZE-047]")
         maps = maps[:, model.n_x :, model.n_x :]
     n = len(maps)
     if n < 50:
-        raise InputError(f"Lyapunov exponent: {n} periods given, at least 50 needed for a mean over time")
+        raise InputError(
+            f"Lyapunov exponent: {n} periods given, at least 50 needed for a mean over time [HM-ANALYZE-048]"
+        )
     v: Array = np.asarray(np.random.default_rng(0).normal(size=maps.shape[1]), dtype=np.float64)
     v = np.asarray(v / np.linalg.norm(v))
     steps = np.empty(n)
@@ -358,7 +372,7 @@ def lyapunov_exponent(
         size = float(np.linalg.norm(v))
         if not size > 0:
             raise InputError(
-                "Lyapunov exponent: a step forgets everything at once; the exponent is minus infinity"
+                "Lyapunov exponent: a step forgets everything at once; the exponent is minus infinity [HM-ANALYZE-049]"
             )
         steps[k] = np.log(size)
         v = np.asarray(v / size)

@@ -136,7 +136,9 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
     dt = period(sys)
     w = np.asarray(omega, dtype=np.float64).reshape(-1)
     if w.size == 0 or not (w.min() > 0 and w.max() <= np.pi / dt * (1 + 1e-9)):
-        raise InputError(f"frequency response: give frequencies in (0, {np.pi / dt:.6g}] rad/s (Nyquist)")
+        raise InputError(
+            f"frequency response: give frequencies in (0, {np.pi / dt:.6g}] rad/s (Nyquist) [HM-ANALYZE-050]"
+        )
     a, b, c, d = matrices(sys)
     z = np.exp(1j * w * dt)
     response = c @ np.linalg.solve(z[:, None, None] * np.eye(a.shape[0]) - a, b.astype(complex)) + d
@@ -178,7 +180,9 @@ def steady_gain(sys: Any) -> SteadyGain:
     a, b, c, d = matrices(sys)
     away = np.eye(a.shape[0]) - a
     if a.size and np.linalg.cond(away) > 1.0 / EDGE:
-        raise InputError("steady gain: a pole lies at 1, so the outputs do not settle under a held input")
+        raise InputError(
+            "steady gain: a pole lies at 1, so the outputs do not settle under a held input [HM-ANALYZE-051]"
+        )
     gain = np.asarray(c @ np.linalg.solve(away, b) + d)
     square = gain.shape[0] == gain.shape[1] and np.linalg.cond(gain) < 1.0 / EDGE
     return SteadyGain(gain, np.asarray(gain * np.linalg.inv(gain).T) if square else None)
@@ -238,7 +242,7 @@ def balanced_truncation(sys: Any, order: int) -> Reduced:
     if not fixed <= order <= n:
         raise InputError(
             f"balanced truncation: order {order} asked for; the system has {n} states, {fixed} of them not stable and "
-            f"kept, so give {fixed} to {n}"
+            f"kept, so give {fixed} to {n} [HM-ANALYZE-052]"
         )
     r = min(order - fixed, right.shape[1])
     t, w = right[:, :r], left[:r]
@@ -295,7 +299,7 @@ def physical_states(
     if reduced.order < n_x or np.linalg.cond(turn / by_x[:, None]) > 1.0 / np.sqrt(np.finfo(float).eps):
         raise InputError(
             f"model {model.name}: {n_x} states of the reduced system do not tell the physical states apart "
-            "(one is not reached by any input); keep the full linearization"
+            "(one is not reached by any input); keep the full linearization [HM-ANALYZE-053]"
         )
     small = control.ss(
         turn @ reduced.system.A @ np.linalg.inv(turn), turn @ reduced.system.B / by_u, c[:, :n_x], d, sys.dt,
@@ -308,7 +312,7 @@ def physical_states(
 def _scale(value: ArrayLike | None, n: int, name: str) -> Array:
     scale = np.ones(n) if value is None else np.asarray(value, dtype=float).reshape(-1)
     if scale.shape != (n,) or not np.all(np.isfinite(scale)) or not np.all(scale > 0):
-        raise InputError(f"{name}: {n} positive numbers needed, got {scale.tolist()}")
+        raise InputError(f"{name}: {n} positive numbers needed, got {scale.tolist()} [HM-ANALYZE-054]")
     return scale
 
 

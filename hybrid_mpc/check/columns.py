@@ -118,7 +118,7 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
                 diverged.append(
                     f"{source.path}: {one.place(k)}, column {shown(full)}: it grows to "
                     f"{np.nanmax(np.abs(pieces[-1])):.3g}; the recording or the simulation diverged. Cut the file "
-                    "before that row, or leave the recording out"
+                    "before that row, or leave the recording out [HM-CHECK-003]"
                 )
         known = np.concatenate([piece[np.isfinite(piece)] for piece in pieces]) if pieces else np.zeros(0)
         if problem := column_problem(full):
@@ -152,7 +152,7 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
         why = "".join(f"\n  {shown(name)}: {reason}" for name, reason in left_out.items())
         raise InputError(
             f"{sources[0].path}: no column has {FEWEST} numbers that move; give a recording in which the machine moves."
-            f"{sources[0].note}{why}"
+            f"{sources[0].note}{why} [HM-CHECK-004]"
         )
     return found, left_out
 
@@ -257,7 +257,9 @@ def clock_of(
         if isinstance(clock, Clock):
             clocks.append(clock)
         else:
-            problems.append(f"{source.path}: column {shown(full)}, the time, cannot be used: {clock}")
+            problems.append(
+                f"{source.path}: column {shown(full)}, the time, cannot be used: {clock} [HM-CHECK-005]"
+            )
     refuse(problems)
     lengths = [
         clock.period * m
@@ -303,7 +305,7 @@ def _time(
             role = "was named as" if asked else "says that it is"
             many = troubles | dict.fromkeys(lost, f"it is of a kind that is not read.{source.note}")
             refuse([
-                f"{source.path}: column {shown(name)} {role} the time and cannot be used: {trouble}"
+                f"{source.path}: column {shown(name)} {role} the time and cannot be used: {trouble} [HM-CHECK-006]"
                 for name, trouble in many.items()
             ])  # fmt: skip
     for full in names:

@@ -162,13 +162,13 @@ def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None)
         moving = ", ".join(s.name for s, r in zip(prior.states, rates, strict=True) if not abs(r) < RESTS)
         raise InputError(
             f"{why}{moving} of the prior would not rest at the operating point; give operating_point = "
-            "OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),)"
+            "OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),) [HM-CHECK-007]"
         )
     steps = _steps(rest)
     if not steps:
         raise InputError(
             f"{why}no signal that the control problem weighs has another point of rest within half of the room to the "
-            "limits; give tasks=(Task(...),)"
+            "limits; give tasks=(Task(...),) [HM-CHECK-008]"
         )
     return _step_task(rest, steps, dt), _hold_task(rest, dt)
 

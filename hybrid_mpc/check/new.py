@@ -159,12 +159,14 @@ def write_scenario(
         ``write_scenario(Path("my_machine.py"), [Path("monday.csv"), Path("tuesday.csv")])``
     """
     if path.suffix != ".py":
-        raise InputError(f"{path}: a scenario is a Python file; give a name that ends with .py")
+        raise InputError(
+            f"{path}: a scenario is a Python file; give a name that ends with .py [HM-CHECK-009]"
+        )
     if path.exists():
-        raise InputError(f"{path} is there already; give another name, or remove it")
+        raise InputError(f"{path} is there already; give another name, or remove it [HM-CHECK-010]")
     files = (data,) if isinstance(data, Path) else tuple(data)
     if not files:
-        raise InputError("no recordings given; name at least one file with --data")
+        raise InputError("no recordings given; name at least one file with --data [HM-CHECK-011]")
     draft = drafted([opened(file) for file in files], inputs, outputs, time, disturbances)
     write_text(path, scenario_text(path, files, draft))
     return draft
@@ -191,7 +193,9 @@ def left_to_decide(path: Path) -> list[str]:
                 if token.type == tokenize.COMMENT and token.string.startswith(mark):
                     found.append(f"line {token.start[0]}: {token.string.removeprefix(mark).lstrip(': ')}")
     except (SyntaxError, UnicodeDecodeError, tokenize.TokenError) as error:
-        raise InputError(f"{path}: cannot be read as Python ({error}). Save it as UTF-8 text.") from error
+        raise InputError(
+            f"{path}: cannot be read as Python ({error}). Save it as UTF-8 text. [HM-CHECK-012]"
+        ) from error
     return found
 
 
@@ -210,7 +214,7 @@ def drafted(
         found = list(map(source.find, names))
         refuse(
             [
-                f"{source.path}: column {shown(name)} is no signal: {left_out[name]}"
+                f"{source.path}: column {shown(name)} is no signal: {left_out[name]} [HM-CHECK-013]"
                 for name in found
                 if name in left_out
             ]
@@ -242,12 +246,21 @@ def drafted(
             raise InputError(
                 f"{source.path}: no column is left for {'an output' if roles['input'] else 'an input'}; it has "
                 f"{', '.join(source.header)}. Say which is which: --input-column, --output-column, --disturbance-column"
-                f".{source.note}{f' No signals are:{reasons}' if reasons else ''}"
+                f".{source.note}{f' No signals are:{reasons}' if reasons else ''} [HM-CHECK-014]"
             )
         draft = Draft(
-            clock.column, clock.period, roles["input"], roles["output"], left_out, roles["disturbance"], clock.seconds,
-            clock.doubt, roles["set-point"], verdicts, length=clock.length,
-        )  # fmt: skip
+            time=clock.column,
+            period=clock.period,
+            inputs=roles["input"],
+            outputs=roles["output"],
+            left_out=left_out,
+            disturbances=roles["disturbance"],
+            seconds=clock.seconds,
+            doubt=clock.doubt,
+            set_points=roles["set-point"],
+            verdicts=verdicts,
+            length=clock.length,
+        )
         draft = _counting_on([one.path for one in sources], draft)
         still = [full for full in _at_rest([one.path for one in sources], draft) if full not in kinds]
         if not still:

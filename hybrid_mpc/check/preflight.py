@@ -213,7 +213,7 @@ def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
         x, u, w = rest_of(prior)
         report.add(
             f"prior: operating_point is no equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}; give the input "
-            f"that holds it there, or the states where this input does{_nearest(prior, x, u, w)}"
+            f"that holds it there, or the states where this input does{_nearest(prior, x, u, w)} [HM-CHECK-015]"
         )
 
 
@@ -317,7 +317,7 @@ def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
         if len(columns) != len(signals):
             report.add(
                 f"data: {len(columns)} columns of {what} {list(columns)}, the prior has {len(signals)}: "
-                f"{[s.name for s in signals]}"
+                f"{[s.name for s in signals]} [HM-CHECK-016]"
             )
             continue
         for column, signal in zip(columns, signals, strict=True):
@@ -331,7 +331,7 @@ def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
     ]
     if unknown:
         report.add(
-            f"causes: the prior has no parameter {', '.join(unknown)}; it has: {', '.join(prior.values)}"
+            f"causes: the prior has no parameter {', '.join(unknown)}; it has: {', '.join(prior.values)} [HM-CHECK-017]"
         )
 
 
@@ -341,7 +341,9 @@ def _check_control(
     control = scenario.control
     if control is None:
         if scenario.tasks:
-            report.add("tasks: there is no control problem to run them with; give control=OCP(...)")
+            report.add(
+                "tasks: there is no control problem to run them with; give control=OCP(...) [HM-CHECK-018]"
+            )
         return
     before = len(report.problems)
     _check_sensors(report, scenario, prior)
@@ -369,17 +371,19 @@ def _structure(control: OCP) -> tuple[Any, ...]:
 def _check_sensors(report: Report, scenario: Scenario, prior: Prior | None) -> None:
     if prior is not None and len(scenario.sensor_sigma) != len(prior.outputs):
         given = scenario.sensor_sigma
-        report.add(f"sensor_sigma needs {len(prior.outputs)} numbers, got {len(given)}: {given}")
+        report.add(
+            f"sensor_sigma needs {len(prior.outputs)} numbers, got {len(given)}: {given} [HM-CHECK-019]"
+        )
     for name in ("sensor_sigma", "first_sigma"):
         values = getattr(scenario, name)
         if values is not None and not all(s > 0 for s in values):
-            report.add(f"{name} must be positive, got {values}")
+            report.add(f"{name} must be positive, got {values} [HM-CHECK-020]")
     for name, sigma in scenario.state_noise.items():
         if prior is not None and name not in [s.name for s in prior.states]:
             names = ", ".join(s.name for s in prior.states)
-            report.add(f"state_noise: no state {name!r}; there are: {names}")
+            report.add(f"state_noise: no state {name!r}; there are: {names} [HM-CHECK-021]")
         if not sigma > 0:
-            report.add(f"state_noise of {name} must be positive, got {sigma}")
+            report.add(f"state_noise of {name} must be positive, got {sigma} [HM-CHECK-022]")
 
 
 def _check_problem(
@@ -397,7 +401,7 @@ def _check_problem(
     for name, size in {"q": len(prior.states), "r": len(prior.inputs)}.items():
         values = getattr(control, name)
         if len(values) != size:
-            report.add(f"{what}: {name} needs {size} numbers, got {len(values)}: {values}")
+            report.add(f"{what}: {name} needs {size} numbers, got {len(values)}: {values} [HM-CHECK-023]")
     if model is None or rest is None or len(report.problems) > before:
         return
     # each start is sought from for seconds, and their shapes are known to be right
@@ -435,7 +439,7 @@ def _check_plant(
             if sizes != (model.n_x, model.n_u, model.n_y):
                 raise InputError(
                     f"its model has (states, inputs, outputs) = {sizes}, the prior "
-                    f"{(model.n_x, model.n_u, model.n_y)}"
+                    f"{(model.n_x, model.n_u, model.n_y)} [HM-CHECK-024]"
                 )
 
 
@@ -450,9 +454,9 @@ def _check_methods(plant: Plant, prior: Prior, dt: float) -> None:
     y, x = plant.measure(state, np.random.default_rng(0)), plant.truth(state)
     for name, found, size in (("measure", y, n_y), ("truth", x, n_x)):
         if np.shape(found) != (size,):
-            raise InputError(f"{name} must return the shape ({size},), got {np.shape(found)}")
+            raise InputError(f"{name} must return the shape ({size},), got {np.shape(found)} [HM-CHECK-025]")
         if not np.all(np.isfinite(found)):
-            raise InputError(f"{name} gives {found} one period after rest; it must be finite")
+            raise InputError(f"{name} gives {found} one period after rest; it must be finite [HM-CHECK-026]")
 
 
 def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) -> None:
@@ -495,7 +499,7 @@ def _check_task(
     control = task.control or scenario.control
     n_p = 0 if control is None else control.n_p
     if len(task.x0) != n_x:
-        report.add(f"{what}: x0 needs {n_x} numbers, got {task.x0}")
+        report.add(f"{what}: x0 needs {n_x} numbers, got {task.x0} [HM-CHECK-027]")
     else:
         with report.part(what):
             _check_within("x0", np.array([task.x0]), np.zeros(1), prior.states)
@@ -504,12 +508,15 @@ def _check_task(
             names = ([s.name for s in signals] for signals in (prior.outputs, prior.inputs))
             check_channels(install(plant, task.faults)[1], *names)
     if task.duration < dt:
-        report.add(f"{what}: duration must be at least a period of {dt} s, got {task.duration}")
+        report.add(
+            f"{what}: duration must be at least a period of {dt} s, got {task.duration} [HM-CHECK-028]"
+        )
         return
     t = np.arange(0.0, task.duration, dt)
     by_output = control is not None and control.n_y > 0
     signals = prior.outputs if by_output else prior.states
     n_r = len(signals) + n_p
+    last = f"; the last {n_p} for the parameters of the economic cost and of bounds"
     for name, preview, columns in (("reference", task.reference, n_r), ("weight", task.weight, n_x)):
         if preview is None:
             continue
@@ -518,17 +525,15 @@ def _check_task(
             if values.shape != (len(t), columns):
                 raise InputError(
                     f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
-                    + (
-                        f"; the last {n_p} for the parameters of the economic cost and of bounds"
-                        if columns > len(signals)
-                        else ""
-                    )
+                    f"{last if columns > len(signals) else ''} [HM-CHECK-059]"
                 )
             if not np.all(np.isfinite(values)):
                 k = int(np.argmax(~np.isfinite(values).all(axis=1)))
-                raise InputError(f"{name} is {values[k]} at {t[k]:g} s; it must be finite during the task")
+                raise InputError(
+                    f"{name} is {values[k]} at {t[k]:g} s; it must be finite during the task [HM-CHECK-029]"
+                )
             if name == "weight" and np.any(values < 0):
-                raise InputError("weight: factors must not be negative")
+                raise InputError("weight: factors must not be negative [HM-CHECK-030]")
             if name == "reference":
                 _check_within(name, values[:, : len(signals)], t, signals)
                 if control is not None and rest is not None:
@@ -544,7 +549,7 @@ def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal])
             k = int(np.argmax(beyond))
             raise InputError(
                 f"{name}: {signal.label} is {values[k, j]:g} at {t[k]:g} s, outside its range from {signal.lower:g} to "
-                f"{signal.upper:g}; correct its unit, or the bounds of the signal"
+                f"{signal.upper:g}; correct its unit, or the bounds of the signal [HM-CHECK-031]"
             )
 
 

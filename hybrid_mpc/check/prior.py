@@ -51,6 +51,8 @@ NO_DAE = (
     "their own"
 )
 FINITE = "; it must be within the signals' ranges. Keep a root, a logarithm or a division off its end"
+TOO_FEW = "HM-MACHINE-016"
+"""Code of equations that give another number of values than there are signals."""
 IF = "Cannot compute the truth value"
 """What CasADi says where code decides by an expression."""
 NUMBER = ("must be real number", "float() argument", "to_int not defined", "loop of ufunc")
@@ -90,7 +92,9 @@ class Report:
             self.add(f"{what}: {error}")
         except Exception as error:  # the user's own code may raise anything, and this is where it is reported
             said = (said_by(error) or "no message").splitlines()[0]
-            self.add(f"{what} raised {type(error).__name__}: {said}{_place(error)}{_hint(error)}")
+            self.add(
+                f"{what} raised {type(error).__name__}: {said}{_place(error)}{_hint(error)} [HM-CHECK-061]"
+            )
 
     @contextmanager
     def sound(self, what: str) -> Iterator[list[bool]]:
@@ -201,7 +205,7 @@ def _made(report: Report, make: Callable[..., Prior]) -> Prior | None:
         found = make()
         if not isinstance(found, Prior):
             raise InputError(
-                f"it makes a {type(found).__name__}; needed is a hybrid_mpc Prior, e.g. prior=MyPrior"
+                f"it makes a {type(found).__name__}; needed is a hybrid_mpc Prior, e.g. prior=MyPrior [HM-CHECK-032]"
             )
         prior = found
     if prior is not None:
@@ -209,7 +213,7 @@ def _made(report: Report, make: Callable[..., Prior]) -> Prior | None:
             again = make(dict(prior.values))
             if again.values != prior.values:
                 raise InputError(
-                    f"prior(values) must take its values over; {prior.values} became {again.values}"
+                    f"prior(values) must take its values over; {prior.values} became {again.values} [HM-CHECK-033]"
                 )
     return prior
 
@@ -218,12 +222,14 @@ def _check_signals(report: Report, prior: Prior) -> None:
     for role in ROLES[:-1]:
         signals = getattr(prior, role)
         if not (signals or role == "disturbances"):
-            report.add(f"prior: {role} must be a tuple of one Signal or more, got {signals!r}")
+            report.add(f"prior: {role} must be a tuple of one Signal or more, got {signals!r} [HM-CHECK-034]")
         elif len({s.name for s in signals}) < len(signals):
-            report.add(f"prior: two of the {role} have the same name: {[s.name for s in signals]}")
+            report.add(
+                f"prior: two of the {role} have the same name: {[s.name for s in signals]} [HM-CHECK-035]"
+            )
     names = [p.name for p in prior.parameters]
     if len(set(names)) < len(names):
-        report.add(f"prior: two parameters have the same name: {names}")
+        report.add(f"prior: two parameters have the same name: {names} [HM-CHECK-036]")
 
 
 def _check_attributes(report: Report, prior: Prior) -> None:
@@ -234,17 +240,18 @@ def _check_attributes(report: Report, prior: Prior) -> None:
     ]
     for name, value in {name: value for c in own for name, value in vars(c).items()}.items():
         if name.startswith("algebraic") or name in ("alg", "dae", "z"):
-            report.add(f"prior: {kind.__name__} has {name!r}{NO_DAE}")
+            report.add(f"prior: {kind.__name__} has {name!r}{NO_DAE} [HM-CHECK-037]")
         held = isinstance(value, tuple) and value and all(isinstance(v, Signal) for v in value)
         near = difflib.get_close_matches(name, ROLES, n=1, cutoff=0.8)
         if held and near and name not in ROLES:
             report.add(
                 f"prior: {kind.__name__} has signals under {name!r}, which nobody reads; did you mean {near[0]!r}?"
+                " [HM-CHECK-038]"
             )
     if isinstance(prior, MechanicalPrior) and "xdot" not in prior.methods and kind.xdot is not Prior.xdot:
         report.add(
             f"prior: {kind.__name__}.xdot is never asked: a MechanicalPrior's rates are made of "
-            f"{', '.join(list(prior.methods)[:4])}. Write these, or make it a Prior"
+            f"{', '.join(list(prior.methods)[:4])}. Write these, or make it a Prior [HM-CHECK-039]"
         )
 
 
@@ -258,6 +265,7 @@ def _check_units(report: Report, prior: Prior) -> None:
                 report.add(
                     f"prior: the output {one.label} is the state {state.label} as it is; give both one unit, or write "
                     "output(x, u, w, p), which converts. Columns in other units: units={...} in the DataSpec"
+                    " [HM-CHECK-040]"
                 )
     if not isinstance(prior, MechanicalPrior):
         return
@@ -265,14 +273,14 @@ def _check_units(report: Report, prior: Prior) -> None:
         if differ(v.unit, per_second(q.unit)):
             report.add(
                 f"prior: {v.label} is the rate of {q.label}, so its unit must be {per_second(q.unit)}; are the states "
-                "in the order [q, v]?"
+                "in the order [q, v]? [HM-CHECK-041]"
             )
     if type(prior).force is MechanicalPrior.force and len(prior.inputs) == prior.n_q:
         for u, q in zip(prior.inputs, prior.states[: prior.n_q], strict=True):
             if not is_product(u.unit, q.unit, "J"):
                 report.add(
                     f"prior: the input {u.label} drives {q.label} as a force, so their product must be an energy [J]; "
-                    "correct a unit, or write force(q, v, u, w, p), which converts"
+                    "correct a unit, or write force(q, v, u, w, p), which converts [HM-CHECK-042]"
                 )
 
 
@@ -282,14 +290,16 @@ def _check_point(prior: Prior) -> None:
     if point is None:
         return
     if not isinstance(point, OperatingPoint):
-        raise InputError(f"operating_point must be OperatingPoint(x=(...), u=(...)), got {point!r:.80}")
+        raise InputError(
+            f"operating_point must be OperatingPoint(x=(...), u=(...)), got {point!r:.80} [HM-CHECK-043]"
+        )
     for name, values, signals in (
         ("x", point.x, prior.states), ("u", point.u, prior.inputs), ("w", point.w, prior.disturbances),
     ):  # fmt: skip
         if len(values) != len(signals):
             raise InputError(
                 f"operating_point: {name} needs {len(signals)} numbers ("
-                f"{', '.join(s.name for s in signals) or 'there are none'}), got {len(values)}: {values}"
+                f"{', '.join(s.name for s in signals) or 'there are none'}), got {len(values)}: {values} [HM-CHECK-044]"
             )
         beyond = [
             f"{s.label} from {s.lower:g} to {s.upper:g}"
@@ -299,7 +309,7 @@ def _check_point(prior: Prior) -> None:
         if beyond:
             raise InputError(
                 f"operating_point: {name} = {values} is outside the range of {', '.join(beyond)}; correct it, or the "
-                "bounds of the signal"
+                "bounds of the signal [HM-CHECK-045]"
             )
 
 
@@ -340,7 +350,7 @@ def _check_arguments(report: Report, prior: Prior, name: str, arguments: Sequenc
         return False
     report.add(
         f"prior: {type(prior).__name__}.{name} must take ({', '.join(arguments)}), it takes "
-        f"({', '.join(signature.parameters)}){NO_TIME if time else NO_DAE if algebraic else ''}"
+        f"({', '.join(signature.parameters)}){NO_TIME if time else NO_DAE if algebraic else ''} [HM-CHECK-046]"
     )
     return True
 
@@ -363,8 +373,10 @@ def _ask(prior: Prior, name: str, arguments: Sequence[str], what: str) -> None:
     try:
         column(value, size, what, names)
     except InputError as error:
-        few = name == "xdot" and "must give" in str(error)
-        raise InputError(f"{error}. A state needs a rate{NO_DAE}" if few else str(error)) from error
+        few = name == "xdot" and TOO_FEW in error.codes
+        raise InputError(
+            f"{error}. A state needs a rate{NO_DAE} [HM-CHECK-060]" if few else str(error)
+        ) from error
 
 
 def _check_numbers(report: Report, prior: Prior) -> bool:
@@ -402,7 +414,7 @@ def _check_numbers(report: Report, prior: Prior) -> bool:
         if differ(balance.rate_unit, per_second(balance.unit)):
             report.add(
                 f"prior: balance {balance.name}: what is stored in {balance.unit} comes and goes in "
-                f"{per_second(balance.unit)}, not in {balance.rate_unit}; correct unit or rate_unit"
+                f"{per_second(balance.unit)}, not in {balance.rate_unit}; correct unit or rate_unit [HM-CHECK-047]"
             )
     if len(finite) == 2:
         return True
@@ -437,7 +449,7 @@ def _check_again(prior: Prior, points: Points) -> None:
         if not np.allclose(found, before, rtol=1e-9, atol=0.0, equal_nan=True):
             raise InputError(
                 f"{what} gives something else when it is asked again; it must be a function of (x, u, w, p) alone, "
-                f"without a clock or random numbers{NO_TIME}"
+                f"without a clock or random numbers{NO_TIME} [HM-CHECK-048]"
             )
 
 
@@ -453,7 +465,7 @@ def _check_masses(prior: Prior, points: Points) -> None:
             found = matrix.tolist() if prior.n_q > 1 else float(matrix[0, 0])
             raise InputError(
                 f"mass_matrix(q, p) is {found} at {points.named(k)}; an inertia must be positive, a mass matrix "
-                "symmetric and positive definite. Check its terms and their signs"
+                "symmetric and positive definite. Check its terms and their signs [HM-CHECK-049]"
             )
 
 
@@ -468,11 +480,11 @@ def _check_finite(what: str, f: ca.Function, points: Points) -> None:
     for which, values in zip(parts, found, strict=True):
         bad = ~np.isfinite(values.full()).all(axis=0)
         if which == "it" and bad.all():
-            raise InputError(f"{what}: it is not finite anywhere{NO_NUMBERS}")
+            raise InputError(f"{what}: it is not finite anywhere{NO_NUMBERS} [HM-CHECK-050]")
         if bad.any():
             where = points.named(int(np.argmax(bad)))
             raise InputError(
-                f"{what}: {which} is not finite at {where}{FINITE}, e.g. sqrt(fmax(level, 1e-6))"
+                f"{what}: {which} is not finite at {where}{FINITE}, e.g. sqrt(fmax(level, 1e-6)) [HM-CHECK-051]"
             )
 
 
@@ -518,7 +530,7 @@ def _check_smooth(what: str, f: ca.Function, prior: Prior, points: Points) -> No
             raise InputError(
                 f"{what}: {of}{signal.name} jumps from {first[found]:.4g} to {last[found]:.4g} at {where}. What "
                 "switches needs a smooth form of a width that you choose, e.g. tanh(v / 0.01) for sign(v); an input "
-                "that takes whole numbers, or is on or off, is not supported"
+                "that takes whole numbers, or is on or off, is not supported [HM-CHECK-052]"
             )
 
 
@@ -530,6 +542,7 @@ def _check_clock(prior: Prior) -> None:
         if rate.is_constant() and float(rate) != 0.0:
             raise InputError(
                 f"the rate of {state.label} is {float(rate):g} whatever happens: it counts the time{NO_TIME}"
+                " [HM-CHECK-053]"
             )
 
 
@@ -557,7 +570,7 @@ def _check_effects(report: Report, prior: Prior, points: Points) -> None:
                 if there
                 else "changes no rate and no output; use it in the equations, or leave it out"
             )
-            report.add(f"prior: the input {one.label} {how}")
+            report.add(f"prior: the input {one.label} {how} [HM-CHECK-054]")
 
 
 def _check_balance(prior: Prior, balance: BalanceEquations, points: Points, rates: Array) -> None:
@@ -568,25 +581,27 @@ def _check_balance(prior: Prior, balance: BalanceEquations, points: Points, rate
         corrected = ", ".join(prior.states[i].name for i in prior.corrected)
         raise InputError(
             f"{name}: the storage does not change with {corrected or 'any state'}, whose rates a network may correct, "
-            "so it tells nothing; store what changes with them, or leave the balance out"
+            "so it tells nothing; store what changes with them, or leave the balance out [HM-CHECK-055]"
         )
     x, u, w, p = points.columns
     supply, loss = (f(x, u, w, p).full()[0] for f in (balance.supply, balance.loss))
     residual = np.abs(balance.residual(x, rates, u, w, p).full()[0])
     bad = ~np.isfinite([supply, loss, residual]).all(axis=0)
     if bad.any():
-        raise InputError(f"{name}: it is not finite at {points.named(int(np.argmax(bad)))}{FINITE}")
+        raise InputError(
+            f"{name}: it is not finite at {points.named(int(np.argmax(bad)))}{FINITE} [HM-CHECK-056]"
+        )
     size, k = float(np.max(np.abs([supply, loss, residual]))), int(np.argmax(residual))
     if residual[k] > BALANCE * size:
         raise InputError(
             f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, "
-            "where it must be 0; is a term or a sign left out?"
+            "where it must be 0; is a term or a sign left out? [HM-CHECK-057]"
         )
     k = int(np.argmin(loss))
     if loss[k] < -BALANCE * size:
         raise InputError(
             f"{name}: the loss is {loss[k]:.3g} at {points.named(k)}; it must not be negative. Put what may have "
-            "either sign into the supply"
+            "either sign into the supply [HM-CHECK-058]"
         )
 
 

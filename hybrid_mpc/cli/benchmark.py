@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hybrid_mpc.cli.options import ScenarioName
+from hybrid_mpc.cli.options import ScenarioName, Scheduler
 from hybrid_mpc.rules import MOST_SEED
 
 EXAMPLES = (
@@ -41,6 +41,7 @@ def benchmark(
         ),
     ] = None,
     workers: Annotated[int, typer.Option(help="Kinds of networks trained at the same time.", min=1)] = 2,
+    scheduler: Scheduler = None,
 ) -> None:
     """Fit the prior, train networks on it, and evaluate free runs over unseen recordings."""
     from hybrid_mpc.cli.progress import make_progress, print_summary
@@ -53,6 +54,6 @@ def benchmark(
         machine, tuple(data or ()), tuple(test or ()), model, budget, seed, workers, refit
     )
     with make_progress() as progress:
-        results = run_job(settings, folder, progress=progress)
+        results = run_job(settings, folder, progress=progress, cluster=scheduler)
         draw(load_scenario(machine), results, folder)
     print_summary(table(results), folder / "results.json")

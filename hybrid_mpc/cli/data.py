@@ -97,11 +97,14 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
     if make is None:
         raise InputError(
             f"{scenario.name} makes no data of its own; give its recordings to 'hybrid-mpc run' with --data"
+            " [HM-CLI-001]"
         )
     if budget not in scenario.budgets:
-        raise InputError(f"{scenario.name} has no budget {budget!r}; it has: {', '.join(scenario.budgets)}")
+        raise InputError(
+            f"{scenario.name} has no budget {budget!r}; it has: {', '.join(scenario.budgets)} [HM-CLI-002]"
+        )
     if data_set and "data_set" not in inspect.signature(make).parameters:
-        raise InputError(f"{scenario.name} has one data set only; leave --set {data_set} out")
+        raise InputError(f"{scenario.name} has one data set only; leave --set {data_set} out [HM-CLI-003]")
     from hybrid_mpc.files import check_folder, write_text
 
     check_folder(out)

@@ -74,7 +74,7 @@ def monitor(
     if scenario or held.predicting is None:  # else the folder has all that is needed
         machine = scenario_of(held.provenance.scenario, folder / KIT, scenario)
         if machine is None:
-            raise InputError(f"{folder / KIT} does not say whose model it is; give --scenario")
+            raise InputError(f"{folder / KIT} does not say whose model it is; give --scenario [HM-CLI-004]")
     job = prepared(
         machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration, residuals=residuals,

@@ -91,9 +91,18 @@ def run(
 
     folder = out or Path("runs") / Path(scenario).stem
     settings = RunSettings(
-        scenario, tuple(data or ()), seed, budget, tuple(input_column or ()), tuple(output_column or ()), time_column,
-        network_settings, device, deploy, explain,
-    )  # fmt: skip
+        scenario=scenario,
+        data=tuple(data or ()),
+        seed=seed,
+        budget=budget,
+        inputs=tuple(input_column or ()),
+        outputs=tuple(output_column or ()),
+        time=time_column,
+        network_file=network_settings,
+        device=device,
+        deploy=deploy,
+        explain=explain,
+    )
     with make_progress() as progress:
         results = run_job(
             settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress, cluster=scheduler,

@@ -121,13 +121,16 @@ def _study(name: str, models: dict[str, str], scenario: str) -> Study:
     there = built_in_studies()
     if name in there:
         if scenario:
-            raise InputError(f"study {name} has a scenario of its own; leave --scenario out")
+            raise InputError(f"study {name} has a scenario of its own; leave --scenario out [HM-CLI-005]")
         if not models:
-            raise InputError(f"study {name} needs a model: --model FOLDER, e.g. model/ of a finished run")
+            raise InputError(
+                f"study {name} needs a model: --model FOLDER, e.g. model/ of a finished run [HM-CLI-006]"
+            )
         return built_in_study(name, models)
     if not Path(name).is_file() and Path(name).suffix not in (".yaml", ".yml"):
         raise InputError(
             f"no study {name!r}; built-in studies are: {', '.join(there)}. Or give the path of a .yaml file."
+            " [HM-CLI-007]"
         )
     return read_study(
         name, **({"models": models} if models else {}), **({"scenario": scenario} if scenario else {})
@@ -142,7 +145,7 @@ def _models(given: list[str] | None) -> dict[str, str]:
             label, folder = "model", text
         if label in models:
             raise InputError(
-                f"--model {text}: there is a model {label!r} already; give labels: --model LABEL=FOLDER"
+                f"--model {text}: there is a model {label!r} already; give labels: --model LABEL=FOLDER [HM-CLI-008]"
             )
         models[label] = folder
     return models

@@ -74,7 +74,7 @@ def build(
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
         return estimator, make_controller(model, prior, control, solver=solver, safe_input=kit.safe_input)
     if scenario.oracle is None:
-        raise InputError(f"scenario {scenario.name} has no oracle")
+        raise InputError(f"scenario {scenario.name} has no oracle [HM-COMPARE-001]")
     model = _oracle(scenario, prior)
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(kit.models[m], ocp) for m in ("prior", "hybrid")]
@@ -169,7 +169,7 @@ def _estimated_noise(
     if scenario.make_data is None or scenario.control is None:
         raise InputError(
             f"the model holds no process noise for {', '.join(lacking)}, and scenario {scenario.name} makes no data to "
-            "estimate it on; run the scenario again"
+            "estimate it on; run the scenario again [HM-COMPARE-002]"
         )
     prior = scenario.prior(artifact.provenance.prior_parameters)
     with tempfile.TemporaryDirectory() as folder:

@@ -132,22 +132,25 @@ class LoopSpec:
         if self.guard and (self.monitor not in ALARMING or CONTROLLERS[self.controller].model != "hybrid"):
             raise InputError(
                 f"a guard acts on alarms: give a controller with the hybrid and monitor {' or '.join(ALARMING)}, got "
-                f"controller {self.controller} and monitor {self.monitor}"
+                f"controller {self.controller} and monitor {self.monitor} [HM-COMPARE-003]"
             )
         for name in ("faults", "drawn_faults"):
             given = getattr(self, name)
             if not isinstance(given, tuple) or not all(isinstance(f, Fault) for f in given):
                 raise InputError(
                     f"LoopSpec: {name} is a tuple of Fault, got {given!r}; write (Fault(start, end, target, value),), "
-                    'or parsed_fault("TARGET:CHANNEL=VALUE@START:END") for a text'
+                    'or parsed_fault("TARGET:CHANNEL=VALUE@START:END") for a text [HM-COMPARE-004]'
                 )
         seeds = (self.seed, self.run_seed)
         if not all(isinstance(seed, int) and seed >= 0 for seed in seeds):
             raise InputError(
                 f"seed and run_seed are whole numbers from 0 on, got {self.seed!r} and {self.run_seed!r}"
+                " [HM-COMPARE-005]"
             )
         if self.duration is not None and not self.duration > 0:
-            raise InputError(f"duration: a positive number of seconds needed, got {self.duration}")
+            raise InputError(
+                f"duration: a positive number of seconds needed, got {self.duration} [HM-COMPARE-006]"
+            )
         for name in self.keep:
             known(name, ARRAYS, "array to keep")
 
@@ -290,14 +293,20 @@ class Bench:
     @no_exit()
     def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
         if not isinstance(scenario, Scenario):
-            raise InputError(f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME)")
+            raise InputError(
+                f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME) [HM-COMPARE-007]"
+            )
         if not isinstance(kits, Mapping):
             raise InputError(
                 f'Bench: kits by label are needed, got a {type(kits).__name__}; give {{"model": hm.load(FOLDER)}}'
+                " [HM-COMPARE-008]"
             )
         for label, kit in kits.items():
             if not isinstance(kit, Kit):
-                raise InputError(f"Bench: kit {label!r} is a {type(kit).__name__}; load it: hm.load(FOLDER)")
+                raise InputError(
+                    f"Bench: kit {label!r} is a {type(kit).__name__}; load it: hm.load(FOLDER)"
+                    " [HM-COMPARE-009]"
+                )
             check_kit(scenario, kit, f"model {label}")
         first = next(iter(kits.values()), None)  # all kits run the same tasks
         scenario = ready(scenario, None if first is None else first.fitted)
@@ -312,7 +321,9 @@ class Bench:
         own = self.scenario.name
         others = () if spec.scenario == own else registered_scenarios()
         if spec.scenario in others and load_scenario(spec.scenario).name != own:
-            raise InputError(f"a loop of scenario {spec.scenario} given, the bench has {own}")
+            raise InputError(
+                f"a loop of scenario {spec.scenario} given, the bench has {own} [HM-COMPARE-010]"
+            )
         return self.kits[known(spec.model, self.kits, "model on the bench")]
 
     def task(self, spec: LoopSpec) -> Task:
@@ -612,7 +623,7 @@ def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
     if not is_dataclass(holder) or isinstance(holder, type):
         raise InputError(
             f"the plant {type(plant).__name__} has no parameters to vary: it must be a dataclass, or have one "
-            "named 'parameters'"
+            "named 'parameters' [HM-COMPARE-011]"
         )
     numbers = [f.name for f in fields(holder) if f.init and isinstance(getattr(holder, f.name), float)]
     changed = {
@@ -636,7 +647,7 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
     of = CONTROLLERS[controller].model
     if of == "oracle":
         raise InputError(
-            f"controller {controller} knows the equations of a plant, and there is none; leave it out"
+            f"controller {controller} knows the equations of a plant, and there is none; leave it out [HM-COMPARE-012]"
         )
     held = kit.models.get("hybrid")
     others = kit.members.values() if of == "hybrid" else () if held is None else (held,)
@@ -645,7 +656,7 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
         raise InputError(
             f"there is no plant, and the model of scenario {kit.name} holds no model to stand in for the machine of "
             f"controller {controller}: needed is {needed}. Train 2 networks or more (networks of the budget) and run "
-            "it again, leave this controller out, or write a plant"
+            "it again, leave this controller out, or write a plant [HM-COMPARE-013]"
         )
     own = kit.models[of]
     problem = next(iter(kit.loop.control.values()), None)
@@ -658,7 +669,7 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
         raise InputError(
             f"there is no plant, and all models of scenario {kit.name} move as that of controller {controller} does: "
             "the networks correct nothing, and the fit tells no spread of the prior's parameters. A loop on the "
-            "controller's own model would tell nothing; leave this controller out, or write a plant"
+            "controller's own model would tell nothing; leave this controller out, or write a plant [HM-COMPARE-014]"
         )
     return ModelPlant(drawn, kit.sensor_sigma)
 
@@ -721,7 +732,7 @@ def check_complete(scenario: Scenario, *, plant: bool = False) -> None:
         parts = {"plant": scenario.plant, **parts}
     if lacks := [name for name, part in parts.items() if part is None]:
         raise InputError(
-            f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation"
+            f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation [HM-COMPARE-015]"
         )
 
 
@@ -729,14 +740,19 @@ def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
     """Refuse an artifact without prior or hybrid, of another scenario, or of other sizes; ``where`` names it."""
     assert scenario.control is not None
     if missing := [name for name in ("prior", "hybrid") if name not in kit.models]:
-        raise InputError(f"{where} holds {', '.join(kit.models)}; needed is a model {missing[0]} too")
+        raise InputError(
+            f"{where} holds {', '.join(kit.models)}; needed is a model {missing[0]} too [HM-COMPARE-016]"
+        )
     if kit.name and kit.name != scenario.name:
-        raise InputError(f"{where} was made for scenario {kit.name}, not for {scenario.name}")
+        raise InputError(
+            f"{where} was made for scenario {kit.name}, not for {scenario.name} [HM-COMPARE-017]"
+        )
     needed = scenario.control.n_x, scenario.control.n_u, len(scenario.sensor_sigma)
     for name, model in kit.models.items():
         if (sizes := (model.n_x, model.n_u, model.n_y)) != needed:
             raise InputError(
                 f"{where}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
+                " [HM-COMPARE-018]"
             )
 
 

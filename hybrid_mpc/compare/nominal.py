@@ -45,7 +45,7 @@ def nominal_tasks(scenario: Scenario) -> list[Task]:
     tasks = [task for task in calm if task.weight is None] or calm
     if not tasks:
         raise InputError(
-            f"scenario {scenario.name}: every task brings a fault; limits are learned from one without"
+            f"scenario {scenario.name}: every task brings a fault; limits are learned from one without [HM-COMPARE-019]"
         )
     return tasks
 

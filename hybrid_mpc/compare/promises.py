@@ -151,7 +151,10 @@ class SetPoint:
         target = self.controller.controller.problem.target(self.reference[None], None, at)
         x, u = target.x[0], target.u[0]
         if self.problem.n_y and (target.steady is None or not target.steady.steady):
-            raise InputError(f"the set-point {self.reference.tolist()} of {self.title} has no steady state")
+            raise InputError(
+                f"the set-point {self.reference.tolist()} of {self.title} has no steady state"
+                " [HM-COMPARE-020]"
+            )
         if not self.problem.n_y:
             sizes = self.controller.controller.problem.sizes.states
             best = equilibrium_input(m, sizes, self.problem.input_scale)(x, self.w).full().ravel()
@@ -545,7 +548,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
         return Promise(
             name, "not promised", f"{'; '.join(lacks)}; {within}",
             "Weigh no more outputs than there are inputs, and declare as many disturbances as outputs "
-            "(docs/mpc.md#set-points).",
+            "(docs/disturbances.md).",
         )  # fmt: skip
     if worst.why:
         return Promise(name, "doubted", within, remedy_of(worst.why))
@@ -565,7 +568,7 @@ def remedy_of(why: str) -> str:
     if "weight r" in why:
         return "Set r = 0."
     if "friction" in why:
-        return "Friction in the prior (docs/control.md#loads-and-stiction), or a machine that sticks less."
+        return "Friction in the prior (docs/disturbances.md#dry-friction), or a machine that sticks less."
     return (
         "Declare a disturbance where the error enters (Scenario(disturbance_model=...)), and look at friction and "
         "at the task's own loops in the report."

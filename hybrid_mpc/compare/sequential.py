@@ -139,7 +139,9 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
 
     x, y, n, every = np.asarray(costs, dtype=float), np.asarray(base, dtype=float), len(costs), looks(most)
     if x.shape != y.shape or n not in every:
-        raise ValueError(f"{n} costs and {len(base)} of the base; needed as many of each, one of {every}")
+        raise ValueError(
+            f"{n} costs and {len(base)} of the base; needed as many of each, one of {every} [HM-COMPARE-021]"
+        )
     for values, of in ((x, "its own"), (y, "the baseline's")):
         if not np.all(np.isfinite(values)):
             return Comparison(None, None, None, n, f"a loop diverged, {of}")

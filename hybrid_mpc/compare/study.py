@@ -110,9 +110,13 @@ class RandomFaults:
         fewest, most = (int(n) for n in _span(self.at_once, "random_faults: at_once", least=0.0))
         object.__setattr__(self, "at_once", (fewest, most))
         if most < 1 or most > len(kinds):
-            raise InputError(f"random_faults: at_once goes up to {most}; there are {len(kinds)} kinds")
+            raise InputError(
+                f"random_faults: at_once goes up to {most}; there are {len(kinds)} kinds [HM-COMPARE-022]"
+            )
         if not 0.0 <= self.lasting <= 1.0:
-            raise InputError(f"random_faults: lasting is a share from 0 to 1, got {self.lasting}")
+            raise InputError(
+                f"random_faults: lasting is a share from 0 to 1, got {self.lasting} [HM-COMPARE-023]"
+            )
 
     def drawn(self, rng: np.random.Generator) -> tuple[tuple[Fault, ...], Intervals]:
         """Faults, and the intervals [s] in which solves are late."""
@@ -162,12 +166,13 @@ def _span(
     try:
         low, high = (float(v) for v in values)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what}: two numbers are needed, got {values!r}") from error
+        raise InputError(f"{what}: two numbers are needed, got {values!r} [HM-COMPARE-024]") from error
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and low >= least and low > above):
         bounds = f" of {least:g} or more" if math.isfinite(least) else ""
         bounds = f" above {above:g}" if math.isfinite(above) else bounds
         raise InputError(
             f"{what}: [{low:g}, {high:g}] is no range; needed are two finite numbers{bounds}, the smaller one first"
+            " [HM-COMPARE-025]"
         )
     return low, high
 
@@ -237,16 +242,18 @@ hybrid, hybrid_observer, oracle, oracle_state
         for name in AXES:
             values = getattr(self, name)
             if not values and name != "tasks":
-                raise InputError(f"study: {name} is empty; leave it out for the default")
+                raise InputError(f"study: {name} is empty; leave it out for the default [HM-COMPARE-026]")
             if len(set(values)) != len(values):
-                raise InputError(f"study: {name} lists something twice: {values}")
+                raise InputError(f"study: {name} lists something twice: {values} [HM-COMPARE-027]")
         for what, table in (("controllers", CONTROLLERS), ("solvers", SOLVERS), ("monitors", MONITORS)):
             for word in getattr(self, what):
                 known(word, table, what[:-1])
         if self.guard:
             known(self.guard, GUARDS[1:], "guard")
         own = Fields(self, f"study {self.name!r}")
-        own.add(f"models: {wrong}" for label in self.folders if (wrong := name_problem(label)))
+        own.add(
+            f"models: {wrong} [HM-COMPARE-060]" for label in self.folders if (wrong := name_problem(label))
+        )
         own.refuse()
         self._check_numbers()
         self._check_combinations()
@@ -295,10 +302,24 @@ hybrid, hybrid_observer, oracle, oracle_state
             for draw, (parameters, some, late) in enumerate(drawn):
                 for seed in self.loop_seeds:
                     yield LoopSpec(
-                        self.scenario, model, task, controller, solver, horizon, monitor,
-                        faults, some, late, parameters, draw, seed, self.duration, self.guard, self.run_seed,
+                        scenario=self.scenario,
+                        model=model,
+                        task=task,
+                        controller=controller,
+                        solver=solver,
+                        horizon=horizon,
+                        monitor=monitor,
+                        faults=faults,
+                        drawn_faults=some,
+                        late=late,
+                        parameters=parameters,
+                        draw=draw,
+                        seed=seed,
+                        duration=self.duration,
+                        guard=self.guard,
+                        run_seed=self.run_seed,
                         number=next(number),
-                    )  # fmt: skip
+                    )
 
     def identity(self) -> dict[str, Any]:
         """The study as plain data, without where its models lie."""
@@ -325,38 +346,46 @@ hybrid, hybrid_observer, oracle, oracle_state
                 if not whole or not least <= number <= most:  # type: ignore[operator]
                     raise InputError(
                         f"study: {name}: whole numbers from {least} to {most} are needed, got {str(number)[:40]}"
+                        " [HM-COMPARE-028]"
                     )
         for name, span in self.spans:
             if not (isinstance(span, int | float) and 0.0 < span < 1.0):
-                raise InputError(f"study: vary {name}: a share between 0 and 1 is needed, got {span!r}")
+                raise InputError(
+                    f"study: vary {name}: a share between 0 and 1 is needed, got {span!r} [HM-COMPARE-029]"
+                )
 
     def _check_combinations(self) -> None:
         oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and set(self.solvers) != {"rti"}:
             raise InputError(
                 f"study: {oracles[0]} has a solver of its own (several starts); leave it or solvers out"
+                " [HM-COMPARE-030]"
             )
         if oracles and self.vary:
             raise InputError(
                 f"study: {oracles[0]} knows the machine as it is built, not as it is drawn; leave it or vary out"
+                " [HM-COMPARE-031]"
             )
         if self.draws > 1 and not self.vary and self.random_faults is None:
             raise InputError(
                 f"study: {self.draws} draws, and nothing that is drawn: give vary or random_faults, or use seeds"
+                " [HM-COMPARE-032]"
             )
         others = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
         alarming = [name for name in self.monitors if name in ALARMING]
         if self.guard and others:
             raise InputError(
                 f"the guard watches with the hybrid, controller {others[0]} has another model; with a guard give the "
-                "controllers hybrid_observer or hybrid alone"
+                "controllers hybrid_observer or hybrid alone [HM-COMPARE-033]"
             )
         if self.guard and len(alarming) < len(self.monitors):
-            raise InputError(f"study: a guard acts on alarms; give monitors {' or '.join(ALARMING)}")
+            raise InputError(
+                f"study: a guard acts on alarms; give monitors {' or '.join(ALARMING)} [HM-COMPARE-034]"
+            )
         if alarming and others:
             raise InputError(
                 f"study: monitor {alarming[0]} is calibrated for the hybrid, {others[0]} has none; take monitor own, "
-                "or controllers with a hybrid"
+                "or controllers with a hybrid [HM-COMPARE-035]"
             )
 
 
@@ -367,7 +396,9 @@ def _normal(s: Study) -> dict[str, Any]:
         pairs = tuple((str(k), str(v)) for k, v in _items(models))
         vary = tuple((str(k), v) for k, v in _items(s.vary))
     except (TypeError, ValueError) as error:
-        raise InputError(f"study: models and vary are mappings (name: value); {error}") from error
+        raise InputError(
+            f"study: models and vary are mappings (name: value); {error} [HM-COMPARE-036]"
+        ) from error
     drawn = s.random_faults
     if isinstance(drawn, Mapping):
         drawn = record(RandomFaults, drawn, "random_faults")
@@ -378,7 +409,7 @@ def _normal(s: Study) -> dict[str, Any]:
     if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
         if not 1 <= s.seeds <= MOST_DRAWS:
             raise InputError(
-                f"study: seeds: their number must be from 1 to {MOST_DRAWS}, got {str(s.seeds)[:40]}"
+                f"study: seeds: their number must be from 1 to {MOST_DRAWS}, got {str(s.seeds)[:40]} [HM-COMPARE-037]"
             )
         seeds: tuple[Any, ...] = tuple(range(s.seeds))
     else:
@@ -393,7 +424,7 @@ def _items(value: Any) -> Any:
 
 def _listed(value: Any, name: str) -> tuple[Any, ...]:
     if isinstance(value, str | Fault) or value is None or not isinstance(value, Sequence):
-        raise InputError(f"study: {name} is a list, got {value!r}; write [{value!r}]")
+        raise InputError(f"study: {name} is a list, got {value!r}; write [{value!r}] [HM-COMPARE-038]")
     return tuple(value)
 
 
@@ -404,7 +435,7 @@ def _fault_set(entry: Any) -> tuple[Fault, ...]:
         words = [word.strip() for word in entry.split(" + ")]
         return () if words in (["none"], [""]) else tuple(parsed_fault(word) for word in words)
     if not isinstance(entry, Sequence):
-        raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r}")
+        raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r} [HM-COMPARE-039]")
     return tuple(fault for part in entry for fault in _fault_set(part))
 
 
@@ -433,7 +464,9 @@ def read_study(path: str | Path, **instead: Any) -> Study:
     if "scenario" not in instead and isinstance(keys.get("scenario"), str):
         scenario_of(keys["scenario"], path)
     if "models" not in keys:
-        raise InputError(f"{path}: no models; add 'models: {{label: FOLDER}}', or give --model FOLDER")
+        raise InputError(
+            f"{path}: no models; add 'models: {{label: FOLDER}}', or give --model FOLDER [HM-COMPARE-040]"
+        )
     study = record(Study, keys, str(path))
     return study if "name" in keys else replace(study, name=path.stem)
 
@@ -447,9 +480,13 @@ def _mapping(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path} is no YAML: {' '.join(str(error).split())[:300]}") from error
+        raise InputError(
+            f"{path} is no YAML: {' '.join(str(error).split())[:300]} [HM-COMPARE-041]"
+        ) from error
     if not isinstance(found, dict):
-        raise InputError(f"{path}: a mapping of keys to values is needed, got {type(found).__name__}")
+        raise InputError(
+            f"{path}: a mapping of keys to values is needed, got {type(found).__name__} [HM-COMPARE-042]"
+        )
     return {str(key): value for key, value in found.items()}
 
 

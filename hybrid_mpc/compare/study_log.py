@@ -81,7 +81,9 @@ def study_note(folder: Path) -> StudyNote:
         InputError: If it is no folder of a study, damaged, or of another version.
     """
     if not (folder / f"{NOUN}.json").is_file():
-        raise InputError(f"{folder} holds no study; give the folder that 'study run --out' made")
+        raise InputError(
+            f"{folder} holds no study; give the folder that 'study run --out' made [HM-COMPARE-043]"
+        )
     note = read_note(folder, NOUN)
     del note["settings"]
     return note_of(note, str(folder / f"{NOUN}.json"))
@@ -92,7 +94,7 @@ def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
     if data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(
             f"{where}: a study of schema version {str(data.get('schema_version'))[:20]}, this version of hybrid-mpc "
-            f"reads {SCHEMA_VERSION}; run it anew"
+            f"reads {SCHEMA_VERSION}; run it anew [HM-COMPARE-044]"
         )
     return record(StudyNote, data, where)
 
@@ -159,7 +161,7 @@ class RunLog:
             os.ftruncate(self._file, end)  # needs no room
             raise InputError(
                 f"{self._folder}: cannot write ({error.strerror}); the runs that were finished before are kept. Make "
-                "room, then the same command with --resume goes on"
+                "room, then the same command with --resume goes on [HM-COMPARE-045]"
             ) from error
         self._rows += len(lines)
 
@@ -191,13 +193,13 @@ def rows(folder: Path) -> Iterator[RunRow]:
 def _parsed(line: bytes, path: Path, number: int) -> RunRow:
     try:
         if len(line) == MOST_LINE:
-            raise ValueError(f"longer than {MOST_LINE} bytes")
+            raise ValueError(f"longer than {MOST_LINE} bytes [HM-COMPARE-046]")
         row = parse_json(line)
         if not (isinstance(row, dict) and isinstance(row.get("id"), str) and row.get("status") in STATUS):
-            raise ValueError("no row of a run: id and status are needed")
+            raise ValueError("no row of a run: id and status are needed [HM-COMPARE-047]")
     except ValueError as error:
         raise InputError(
-            f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again"
+            f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again [HM-COMPARE-048]"
         ) from error
     name, status, why = (row.pop(key, "") for key in ("id", "status", "error"))
     columns = {key: NUMBERS.get(v, v) if isinstance(v, str) else v for key, v in row.items()}
@@ -267,13 +269,13 @@ def provenance_of(path: Path) -> dict[str, Any]:
     try:
         metadata = pq.read_schema(path).metadata or {}
     except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path} is missing or damaged: {error}") from error
+        raise InputError(f"{path} is missing or damaged: {error} [HM-COMPARE-049]") from error
     if METADATA not in metadata:
-        raise InputError(f"{path} is no table of a study")
+        raise InputError(f"{path} is no table of a study [HM-COMPARE-050]")
     try:
         return dict(parse_json(metadata[METADATA]))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged: {error}") from error
+        raise InputError(f"{path} is damaged: {error} [HM-COMPARE-059]") from error
 
 
 def _column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:

@@ -154,7 +154,9 @@ class StudyResults:
         levels = list(dict.fromkeys(table[over].tolist()))
         base = levels[0] if base is None else base
         if base not in levels:
-            raise InputError(f"no {over} {base!r} in this study; there are: {', '.join(map(str, levels))}")
+            raise InputError(
+                f"no {over} {base!r} in this study; there are: {', '.join(map(str, levels))} [HM-COMPARE-051]"
+            )
         by = [c for c in self.factors if c != over] if by is None else list(by)
         found = []
         for key, group in _groups(table, by):
@@ -196,7 +198,7 @@ class StudyResults:
         if joined.empty:
             raise InputError(
                 f"{self.folder} and {other.folder} have no run in common: their tasks, controllers, draws or seeds "
-                "differ"
+                "differ [HM-COMPARE-052]"
             )
         found = []
         for key, group in _groups(joined, by):
@@ -273,10 +275,12 @@ def write_study_report(results: StudyResults, path: str | Path | None = None) ->
     Example: ``write_study_report(StudyResults.load("studies/first"))``
     """
     if len(results.table) == len(results.failed):
-        raise InputError(f"{results.folder}: no run has been done yet, there is nothing to report")
+        raise InputError(
+            f"{results.folder}: no run has been done yet, there is nothing to report [HM-COMPARE-053]"
+        )
     if lacking := [column for column in NEEDED if column not in results.table]:
         raise InputError(
-            f"{results.folder}: its rows have no {', '.join(lacking)}; another version wrote them"
+            f"{results.folder}: its rows have no {', '.join(lacking)}; another version wrote them [HM-COMPARE-054]"
         )
     with tempfile.TemporaryDirectory() as folder:
         report = _report(results, Path(folder))

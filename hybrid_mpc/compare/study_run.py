@@ -107,7 +107,9 @@ def load_models(
     check_complete(scenario, plant=plant)
     selected_tasks(scenario, study.tasks)
     if scenario.oracle is None and (oracles := [c for c in study.controllers if c in ORACLES]):
-        raise InputError(f"scenario {scenario.name} has no oracle; leave controller {oracles[0]} out")
+        raise InputError(
+            f"scenario {scenario.name} has no oracle; leave controller {oracles[0]} out [HM-COMPARE-055]"
+        )
     found = {}
     for label, given in study.folders.items():
         folder = artifact_folder(given)
@@ -206,7 +208,7 @@ def local_folder(model: ModelInput) -> Path:
     if not model.files:
         raise InputError(
             f"study: {folder} is not the model {model.label} any more that the study began with; take a copy of the "
-            "folder that nobody changes"
+            "folder that nobody changes [HM-COMPARE-056]"
         )
     unpacked = Path(tempfile.mkdtemp(prefix="hybrid-mpc-model-"))
     for name, content in model.files:

@@ -37,7 +37,7 @@ def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...
     missing = [name for name in names if name not in there]
     if missing:
         raise InputError(
-            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)}"
+            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)} [HM-COMPARE-057]"
         )
     return tuple(there[name] for name in names)
 
@@ -62,6 +62,7 @@ def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]
         if not fitting:
             raise InputError(
                 f"scenario {scenario.name}: no task {name!r}, none begins so; there are: {', '.join(there) or 'none'}"
+                " [HM-COMPARE-058]"
             )
         chosen.update(fitting)
     return tuple(task for task in scenario.tasks if task.name in chosen)

@@ -50,19 +50,23 @@ class BestOf(Controller):
     ) -> None:
         ocp = controller.ocp
         if most is not None and most < 1:
-            raise InputError(f"most: 1 or more guesses needed, got {most}; leave it out for all")
+            raise InputError(
+                f"most: 1 or more guesses needed, got {most}; leave it out for all [HM-CONTROL-001]"
+            )
         for rival in rivals:
             given = rival.ocp.n_x, rival.ocp.n_u, rival.ocp.horizon
             if given != (ocp.n_x, ocp.n_u, ocp.horizon):
                 raise InputError(
                     f"rival on {rival.model.name}: (n_x, n_u, N) = {given}, "
-                    f"needed: {(ocp.n_x, ocp.n_u, ocp.horizon)}"
+                    f"needed: {(ocp.n_x, ocp.n_u, ocp.horizon)} [HM-CONTROL-002]"
                 )
         for start in starts:
             if not callable(start):
                 input_plan(start, ocp.horizon, ocp.n_u, "start")
         if not starts and not rivals:
-            raise InputError("best of one start is the controller itself; give starts or rivals")
+            raise InputError(
+                "best of one start is the controller itself; give starts or rivals [HM-CONTROL-003]"
+            )
         self.problem, self._controller = controller.problem, controller
         self._starts, self._rivals, self._most = tuple(starts), tuple(rivals), most
 

@@ -76,9 +76,12 @@ def shortest_move(
         ``move = shortest_move(model, ocp, estimate, HardBound("x", goal - 0.01, goal + 0.01, at_end=True))``
     """
     if not isinstance(target, HardBound) or not target.at_end:
-        raise InputError(f"target: {target!r} given; needed: a HardBound(..., at_end=True)")
+        raise InputError(f"target: {target!r} given; needed: a HardBound(..., at_end=True) [HM-CONTROL-004]")
     if reference is None and target.what != "x":
-        raise InputError("reference: none follows from a target that is not of the states; give a row of it")
+        raise InputError(
+            "reference: none follows from a target that is not of the states; give a row of it"
+            " [HM-CONTROL-005]"
+        )
     row = np.atleast_2d(_middle(target, estimate.x) if reference is None else np.asarray(reference, float))
     bounded = ocp.changed(hard=(*ocp.hard, target))
     plans: dict[int, Solution] = {}
@@ -98,6 +101,7 @@ def shortest_move(
             raise InputError(
                 f"no move of {longest} periods ({longest * model.dt:g} s) ends within the target; the longest one "
                 f"misses {_missed(plans[most])}. Give a wider target, wider limits, or a larger longest"
+                " [HM-CONTROL-006]"
             )
         least, most = most, min(2 * most, longest)
     while most - least > 1:

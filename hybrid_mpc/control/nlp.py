@@ -67,7 +67,7 @@ class IpoptController(Controller):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         if not (isinstance(tolerance, int | float) and tolerance > 0):
-            raise InputError(f"tolerance must be positive, got {tolerance!r:.80}")
+            raise InputError(f"tolerance must be positive, got {tolerance!r:.80} [HM-CONTROL-007]")
         iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         self.problem = Problem(model, ocp)
         self._bounds: dict[str, Array] = {}
@@ -81,7 +81,9 @@ class IpoptController(Controller):
         try:
             self._solver = ca.nlpsol("mpc", "ipopt", nlp, settings)
         except RuntimeError as error:
-            raise InputError(f"options: IPOPT does not take {dict(options or {})}: {error}") from error
+            raise InputError(
+                f"options: IPOPT does not take {dict(options or {})}: {error} [HM-CONTROL-008]"
+            ) from error
         w, g = nlp["x"], nlp["g"]
         multipliers = ca.MX.sym("lam", g.shape[0])
         slope = ca.gradient(nlp["f"] + ca.dot(multipliers, g), w)
@@ -166,17 +168,17 @@ class IpoptController(Controller):
         defect = float(np.max(np.abs(after - z[1:])))
         spent = {"solve": (perf_counter() - start) * 1e3}
         return Solution(
-            u,
-            z[:, :n_x],
-            z[:, n_x:],
-            d,
-            cost,
-            status,
-            kkt,
-            defect,
-            spent,
-            soft.largest(excess),
-            i,
+            u=u,
+            x=z[:, :n_x],
+            h=z[:, n_x:],
+            d=d,
+            cost=cost,
+            status=status,
+            kkt=kkt,
+            defect=defect,
+            timing=spent,
+            excess=soft.largest(excess),
+            iterations=i,
             w=target.w,
             steady=target.steady,
             given_way=soft.given_way(excess),

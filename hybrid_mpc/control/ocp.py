@@ -62,7 +62,7 @@ class Limits:
         lower, upper = numbers(u_min, "limits: u_min"), numbers(u_max, "limits: u_max")
         if lower.shape != upper.shape or not np.all(lower <= upper):
             raise InputError(
-                f"limits: u_min {lower}, u_max {upper} given; needed: a u_min <= u_max for each input"
+                f"limits: u_min {lower}, u_max {upper} given; needed: a u_min <= u_max for each input [HM-CONTROL-009]"
             )
         object.__setattr__(self, "u_min", lower)
         object.__setattr__(self, "u_max", upper)
@@ -361,7 +361,9 @@ class OCP:
         if limits is None:
             return np.broadcast_to(self.u_min, shape), np.broadcast_to(self.u_max, shape)
         if limits.u_min.size != self.n_u:
-            raise InputError(f"limits of {limits.u_min.size} inputs given, the problem has {self.n_u}")
+            raise InputError(
+                f"limits of {limits.u_min.size} inputs given, the problem has {self.n_u} [HM-CONTROL-010]"
+            )
         lower, upper = (np.clip(v, self.u_min, self.u_max) for v in (limits.u_min, limits.u_max))
         if self.du_max is None:
             return np.broadcast_to(lower, shape), np.broadcast_to(upper, shape)
@@ -436,14 +438,14 @@ def _horizon(value: object) -> int:
     """A number of periods."""
     if not _whole(value) or not 1 <= value <= MOST_HORIZON:  # type: ignore[operator]
         raise InputError(
-            f"horizon must be a whole number of periods, from 1 to {MOST_HORIZON}; got {value!r:.80}"
+            f"horizon must be a whole number of periods, from 1 to {MOST_HORIZON}; got {value!r:.80} [HM-CONTROL-011]"
         )
     return int(value)  # type: ignore[call-overload]
 
 
 def _flag(value: object, name: str) -> bool:
     if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} must be True or False, got {value!r:.80}")
+        raise InputError(f"{name} must be True or False, got {value!r:.80} [HM-CONTROL-012]")
     return bool(value)
 
 
@@ -455,9 +457,9 @@ def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:
         else "HardBound(what, lower, upper, ...)"
     )
     if not isinstance(given, tuple | list):
-        raise InputError(f"{name}: {given!r:.80} given; needed: a list of {example}")
+        raise InputError(f"{name}: {given!r:.80} given; needed: a list of {example} [HM-CONTROL-013]")
     if wrong := [bound for bound in given if not isinstance(bound, kind)]:
-        raise InputError(f"{name}: {wrong[0]!r:.80} given; needed: {example}")
+        raise InputError(f"{name}: {wrong[0]!r:.80} given; needed: {example} [HM-CONTROL-014]")
     return tuple(given)
 
 
@@ -466,7 +468,10 @@ def _check_hard(hard: Sequence[HardBound], n_x: int, n_y: int) -> None:
     for bound in hard:
         needed = {"x": n_x, "y": n_y}.get(bound.what if isinstance(bound.what, str) else "", 0)
         if needed and bound.lower.size != needed:
-            raise InputError(f"hard bound on {bound.what}: {bound.lower.size} values given, {needed} needed")
+            raise InputError(
+                f"hard bound on {bound.what}: {bound.lower.size} values given, {needed} needed"
+                " [HM-CONTROL-015]"
+            )
 
 
 def _check_shared(economic: ca.Function | None, soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> None:
@@ -475,27 +480,33 @@ def _check_shared(economic: ca.Function | None, soft: Sequence[SoftBound], hard:
     if len(given := own | {f.numel_in(3) for f in _parametric(soft, hard)}) > 1:
         raise InputError(
             f"parameters p of {sorted(given)} numbers given; all costs and bounds that have some share them"
+            " [HM-CONTROL-016]"
         )
 
 
 def _stage_cost(value: ca.Function | None) -> ca.Function | None:
     """An economic stage cost ``(x, u) -> scalar`` or ``(x, u, p) -> scalar``, or none."""
     if value is not None and not _is_stage_cost(value):
-        raise InputError(f"economic: {value!r:.80} given; needed: a function (x, u) or (x, u, p) -> scalar")
+        raise InputError(
+            f"economic: {value!r:.80} given; needed: a function (x, u) or (x, u, p) -> scalar"
+            " [HM-CONTROL-017]"
+        )
     return value
 
 
 def _largest_change(value: ArrayLike, n_u: int) -> Array:
     found = vector(numbers(value, "du_max", most=LARGEST), n_u, "du_max")
     if not np.all(found > 0):
-        raise InputError(f"du_max must be positive, got {found}; leave it out for no limit")
+        raise InputError(f"du_max must be positive, got {found}; leave it out for no limit [HM-CONTROL-018]")
     return found
 
 
 def _plans(starts: object, horizon: int, n_u: int) -> tuple[Array, ...]:
     """Plans of the inputs, as a tuple."""
     if not isinstance(starts, tuple | list | np.ndarray):
-        raise InputError(f"starts: {starts!r:.80} given; needed: a list of plans of the inputs")
+        raise InputError(
+            f"starts: {starts!r:.80} given; needed: a list of plans of the inputs [HM-CONTROL-019]"
+        )
     for i, plan in enumerate(starts):
         numbers(plan, f"starts[{i}]", most=LARGEST)
     return tuple(input_plan(s, horizon, n_u, f"starts[{i}]") for i, s in enumerate(starts))
@@ -521,9 +532,11 @@ def _diagonal(values: ArrayLike, name: str) -> Array:
     array = _weights(values, name)
     shape = np.shape(values)
     if len(shape) > 1 and max(shape) < array.size:
-        raise InputError(f"{name}: shape {shape} given; needed: the diagonal alone, a weight each")
+        raise InputError(
+            f"{name}: shape {shape} given; needed: the diagonal alone, a weight each [HM-CONTROL-020]"
+        )
     if not array.size:
-        raise InputError(f"{name}: no weight given; needed: one each")
+        raise InputError(f"{name}: no weight given; needed: one each [HM-CONTROL-021]")
     return array
 
 
@@ -531,7 +544,7 @@ def _weights(values: ArrayLike, name: str) -> Array:
     """Weights, finite and not negative."""
     array = numbers(values, name, most=LARGEST)
     if not (np.all(np.isfinite(array)) and np.all(array >= 0)):
-        raise InputError(f"{name}: weights must be finite and not negative, got {array}")
+        raise InputError(f"{name}: weights must be finite and not negative, got {array} [HM-CONTROL-022]")
     return array
 
 
@@ -540,7 +553,7 @@ def _change_weights(values: ArrayLike, r: Array) -> Array:
     array = _weights(vector(values, r.size, "r_delta"), "r_delta")
     if not np.all(r + array > 0):
         raise InputError(
-            "every input needs a positive weight in r or r_delta, otherwise it is not determined"
+            "every input needs a positive weight in r or r_delta, otherwise it is not determined [HM-CONTROL-023]"
         )
     return array
 
@@ -551,6 +564,7 @@ def input_plan(value: ArrayLike, horizon: int, n_u: int, name: str) -> Array:
     if array.shape != (horizon, n_u) or not np.all(np.isfinite(array)):
         raise InputError(
             f"{name}: shape {array.shape} given; needed: a finite plan of the inputs ({horizon}, {n_u})"
+            " [HM-CONTROL-024]"
         )
     return array
 
@@ -558,7 +572,9 @@ def input_plan(value: ArrayLike, horizon: int, n_u: int, name: str) -> Array:
 def _point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
     """A state ``(n_x,)`` and an input ``(n_u,)``, finite."""
     if not isinstance(value, tuple | list) or len(value) != 2:
-        raise InputError(f"working_point: {value!r} given; needed: (x, u), a state and an input")
+        raise InputError(
+            f"working_point: {value!r} given; needed: (x, u), a state and an input [HM-CONTROL-025]"
+        )
     own = Collected()
     x, u = (
         own(vector, numbers(part, f"working_point {name}", most=LARGEST), size, f"working_point {name}")
@@ -582,6 +598,7 @@ def _block_lengths(blocks: object, horizon: int) -> tuple[int, ...]:
     if not given or len(lengths) < len(given) or min(lengths) < 1 or sum(lengths) != horizon:
         raise InputError(
             f"blocks: {blocks!r:.80} given; needed: whole numbers of at least 1 that sum to the horizon of {horizon}"
+            " [HM-CONTROL-026]"
         )
     return lengths
 
@@ -591,7 +608,9 @@ def _terminal_matrix(value: ArrayLike, n_x: int) -> Array | Literal["riccati"]:
     if isinstance(value, str) and value == "riccati":
         return "riccati"
     if isinstance(value, str):
-        raise InputError(f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix")
+        raise InputError(
+            f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix [HM-CONTROL-027]"
+        )
     matrix = numbers(value, "terminal", most=LARGEST).reshape(np.shape(value))
     fits = matrix.shape == (n_x, n_x) and bool(np.all(np.isfinite(matrix)))
     size = np.sqrt(np.abs(np.diag(matrix))) if fits else np.ones(n_x)
@@ -599,8 +618,10 @@ def _terminal_matrix(value: ArrayLike, n_x: int) -> Array | Literal["riccati"]:
     scaled = matrix / np.outer(size, size) if fits else matrix  # entries have units of their own
     if not fits or not np.allclose(scaled, scaled.T):
         raise InputError(
-            f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix"
+            f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix [HM-CONTROL-028]"
         )
     if np.min(np.linalg.eigvalsh(scaled)) < -1e-9 * float(np.max(np.abs(scaled))):
-        raise InputError("terminal: the matrix has a negative eigenvalue; needed: positive semi-definite")
+        raise InputError(
+            "terminal: the matrix has a negative eigenvalue; needed: positive semi-definite [HM-CONTROL-029]"
+        )
     return matrix

@@ -196,7 +196,7 @@ class BoundRows:
         if lost := {self.names[row] for row in np.flatnonzero(out)} - kept:
             raise InputError(
                 f"hard bound on {', '.join(sorted(lost))}: no input of the plan reaches it; needed: a value that "
-                "inputs change within the horizon"
+                "inputs change within the horizon [HM-CONTROL-030]"
             )
         return np.where(out, -np.inf, lower), np.where(out, np.inf, upper)
 
@@ -345,7 +345,7 @@ def _weights(weight: Array, lower: Array, upper: Array, size: Array, sizes: Size
     if lost := np.flatnonzero(open_ & np.isnan(size)).tolist():
         raise InputError(
             f"soft bounds: how large {what} {lost[0]} may be is not known, so neither what a violation costs; give its "
-            "signal a range, or it a weight"
+            "signal a range, or it a weight [HM-CONTROL-031]"
         )
     return np.where(open_, sizes.cost / size**2, own)
 
@@ -366,7 +366,7 @@ def _violations(
     ).tolist():
         raise InputError(
             f"{what}: how large value {lost[0]} may be is not known: nothing moves it at the operating point. Give it "
-            "both bounds"
+            "both bounds [HM-CONTROL-032]"
         )
     return np.where(np.isnan(found), 1.0, found)  # of what is not bounded, or does not matter
 
@@ -413,7 +413,7 @@ def _of_point(f: ca.Function, ocp: OCP, model: HybridModel) -> ca.Function:
     if [f.size_in(i) for i in range(f.n_in())] != wanted:
         raise InputError(
             f"soft bound: expression {f} does not take (x, u) of {ocp.n_x} states and {ocp.n_u} inputs, nor these "
-            f"and w of {n_w} measured disturbances, nor these and p"
+            f"and w of {n_w} measured disturbances, nor these and p [HM-CONTROL-033]"
         )
     # in scalar code where the expression is some
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
@@ -462,6 +462,7 @@ def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None
     ):
         raise InputError(
             f"economic: {f} does not take (x, u) of {n_x} states and {n_u} inputs, nor these and a column p"
+            " [HM-CONTROL-034]"
         )
     if not ocp.n_y or model is None:
         return f
@@ -583,17 +584,19 @@ class Problem:
         if (ocp.n_x, ocp.n_u) != (model.n_x, model.n_u):
             raise InputError(
                 f"the problem has {ocp.n_x} states and {ocp.n_u} inputs, model {model.name} has "
-                f"{model.n_x} and {model.n_u}"
+                f"{model.n_x} and {model.n_u} [HM-CONTROL-035]"
             )
         for name, values in (("q_y", ocp.q_y), ("y_min", ocp.y_min), ("y_max", ocp.y_max)):
             if values.size not in (0, model.n_y):
                 raise InputError(
                     f"{name} has {values.size} values, model {model.name} {model.n_y} outputs; give one each"
+                    " [HM-CONTROL-036]"
                 )
         for bound in ocp.hard:
             if isinstance(bound.what, str) and bound.what == "y" and bound.lower.size != model.n_y:
                 raise InputError(
                     f"hard bound on y: {bound.lower.size} values given, model {model.name} has {model.n_y} outputs"
+                    " [HM-CONTROL-037]"
                 )
         self.model, self.ocp, self.sizes = model, ocp, Sizes(model, ocp)
         self.targets = Targets(model, ocp, self.sizes) if ocp.n_y else None
@@ -625,12 +628,27 @@ class Problem:
             z = np.tile(z[0], (n + 1, 1))
         x, h = z[:, : ocp.n_x], z[:, ocp.n_x :]
         nan = float("nan")
-        return Solution(plan, x, h, estimate.d, nan, Status.INITIAL, nan, nan, {}, w=w)
+        return Solution(
+            u=plan,
+            x=x,
+            h=h,
+            d=estimate.d,
+            cost=nan,
+            status=Status.INITIAL,
+            kkt=nan,
+            defect=nan,
+            timing={},
+            w=w,
+        )
 
     def target(
-        self, reference: ArrayLike, weight: ArrayLike | None = None, estimate: Estimate | None = None,
-        w: ArrayLike | None = None, start: Steady | None = None,
-    ) -> Target:  # fmt: skip
+        self,
+        reference: ArrayLike,
+        weight: ArrayLike | None = None,
+        estimate: Estimate | None = None,
+        w: ArrayLike | None = None,
+        start: Steady | None = None,
+    ) -> Target:
         """What a plan is to follow; the last value holds where the preview is shorter.
 
         Args:
@@ -656,7 +674,7 @@ class Problem:
             )
         x, u, y, steady = self._steady(y_ref, d, along, start)
         own = np.hstack([p, y, np.tile(d, (n + 1, 1)), along])
-        return Target(x, weights, own, u[:-1], ahead, d, y, e, steady)
+        return Target(x=x, weight=weights, p=own, u=u[:-1], w=ahead, d=d, y=y, e=e, steady=steady)
 
     def around(self, d: Array, w: Array, p: Array | None = None) -> Array:
         """What bounded values depend on besides ``(x, u)``: ``(N, n_d + n_w + n_p)``; ``p`` has a row more, or is 0.
@@ -736,7 +754,9 @@ class Problem:
     def _preview(self, values: ArrayLike, name: str, columns: int) -> Array:
         array = np.asarray(values, dtype=float)
         if array.ndim != 2 or len(array) < 1 or array.shape[1] != columns:
-            raise InputError(f"{name}: shape {array.shape} given, (m, {columns}) with m > 0 needed")
+            raise InputError(
+                f"{name}: shape {array.shape} given, (m, {columns}) with m > 0 needed [HM-CONTROL-038]"
+            )
         return array.take(self._rows, axis=0, mode="clip")
 
     def state_weights(self, weight: Array) -> tuple[Array, Array]:

@@ -303,10 +303,21 @@ class CondensedController(SplitController):
         lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
         u = np.minimum(np.maximum(u, lower), upper)  # the QP keeps them to its tolerance only
         return Solution(
-            u, z[:, :n_x], z[:, n_x:], estimate.d, cost, answer.status, answer.kkt, _largest(prepared.defects),
-            self._timing(prepared, start), largest, w=target.w, steady=target.steady,
-            active=answer.active, given_way=given_way,
-        )  # fmt: skip
+            u=u,
+            x=z[:, :n_x],
+            h=z[:, n_x:],
+            d=estimate.d,
+            cost=cost,
+            status=answer.status,
+            kkt=answer.kkt,
+            defect=_largest(prepared.defects),
+            timing=self._timing(prepared, start),
+            excess=largest,
+            w=target.w,
+            steady=target.steady,
+            active=answer.active,
+            given_way=given_way,
+        )
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
@@ -421,16 +432,16 @@ class CondensedController(SplitController):
         x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]
         defect, spent = _largest(prepared.defects), self._timing(prepared, start)
         return Solution(
-            prepared.u,
-            x,
-            h,
-            prepared.d,
-            NAN,
-            status,
-            kkt,
-            defect,
-            spent,
-            NAN,
+            u=prepared.u,
+            x=x,
+            h=h,
+            d=prepared.d,
+            cost=NAN,
+            status=status,
+            kkt=kkt,
+            defect=defect,
+            timing=spent,
+            excess=NAN,
             w=prepared.w,
             steady=prepared.steady,
         )

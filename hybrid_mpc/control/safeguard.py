@@ -99,7 +99,7 @@ class SafeController:
         max_age = whole(max_age, "max_age [periods]", 0, 10**9)
         check_part(controller, "controller", "a controller", "model", "ocp", "solve")
         if not isinstance(fallback, HybridModel | None):
-            raise InputError(f"fallback: a model is needed, got {type(fallback).__name__}")
+            raise InputError(f"fallback: a model is needed, got {type(fallback).__name__} [HM-CONTROL-039]")
         ocp = controller.ocp
         self.controller, self.max_age, self.fallback = controller, max_age, fallback
         self.safe_input = None if safe_input is None else checked_safe_input(safe_input, ocp)
@@ -109,14 +109,14 @@ class SafeController:
         if sizes[0] != sizes[1]:
             raise InputError(
                 f"first: (n_x, n_h, n_u, N) = {sizes[0]}, the controller has {sizes[1]}; "
-                "give both the same model and problem"
+                "give both the same model and problem [HM-CONTROL-040]"
             )
         self._rest_input = None
         if fallback is not None:
             if (fallback.n_x, fallback.n_u) != (ocp.n_x, ocp.n_u):
                 raise InputError(
                     f"fallback {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
-                    f"the problem {ocp.n_x} and {ocp.n_u}"
+                    f"the problem {ocp.n_x} and {ocp.n_u} [HM-CONTROL-041]"
                 )
             gain = dare(*ocp.linear_quadratic(fallback))[1]
             self._gain = gain[:, : ocp.n_x]
@@ -244,5 +244,5 @@ def checked_safe_input(given: ArrayLike, ocp: OCP) -> Array:
     """The safe input ``(n_u,)`` of a problem, within its limits."""
     u = vector(given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
-        raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max}")
+        raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max} [HM-CONTROL-042]")
     return u

@@ -58,6 +58,7 @@ class Sizes:
             raise InputError(
                 f"control problem: how large {names} may be is not known: no weight in q, no range, no recordings, and "
                 f"nothing moves it. Give the signal a range, Signal({names.split(',')[0]!r}, unit, lower, upper)"
+                " [HM-CONTROL-043]"
             )
         self.states: Array = size
         """Sizes of the states ``(n_x,)``."""

@@ -79,7 +79,7 @@ class SoftBound:
         own = Collected()
         fits = _is_expression(expression)
         if not fits:
-            own.add(f"soft bound: {expression} given; needed: a function {EXPRESSION}")
+            own.add(f"soft bound: {expression} given; needed: a function {EXPRESSION} [HM-CONTROL-044]")
         n = int(expression.size1_out(0)) if fits else None
         arrays = own(_checked, "soft bound", n, lower, upper, linear, quadratic)
         own.refuse()
@@ -145,13 +145,16 @@ class HardBound:
         own = Collected()
         fits = what in ("x", "y") if isinstance(what, str) else _is_expression(what)
         if not fits:
-            own.add(f"hard bound: {what!r:.80} given; needed: 'x', 'y', or a function {EXPRESSION}")
+            own.add(
+                f"hard bound: {what!r:.80} given; needed: 'x', 'y', or a function {EXPRESSION} [HM-CONTROL-045]"
+            )
         if not isinstance(priority, int) or isinstance(priority, bool) or abs(priority) > MOST_PRIORITY:
             own.add(
                 f"hard bound: priority must be a whole number of at most {MOST_PRIORITY} in size, got {priority!r:.80}"
+                " [HM-CONTROL-046]"
             )
         if not isinstance(at_end, bool):
-            own.add(f"hard bound: at_end must be True or False, got {at_end!r:.80}")
+            own.add(f"hard bound: at_end must be True or False, got {at_end!r:.80} [HM-CONTROL-047]")
         n = int(what.size1_out(0)) if fits and isinstance(what, ca.Function) else None
         ends = own(_range, "hard bound", n, lower, upper)
         own.refuse()
@@ -224,7 +227,10 @@ def output_bounds(weights: Array, lower: ArrayLike, upper: ArrayLike) -> tuple[A
     if not n:
         return tuple(np.zeros(0) for _ in range(4))  # type: ignore[return-value]
     if weights.size not in (0, n):
-        raise InputError(f"output bounds: {n} values given, q_y has {weights.size}; give one for each output")
+        raise InputError(
+            f"output bounds: {n} values given, q_y has {weights.size}; give one for each output"
+            " [HM-CONTROL-048]"
+        )
     low, up = (v if v.size else np.full(n, side) for v, side in zip(given, (-np.inf, np.inf), strict=True))
     weight = weights if weights.size else np.ones(n)
     return _checked("output bounds", n, low, up, PENALTY * np.sqrt(weight), PENALTY * weight)
@@ -241,9 +247,9 @@ def _checked(
         for name, value in (("linear", linear), ("quadratic", quadratic))
     )
     if lin is not None and not (np.all(np.isfinite(lin)) and np.all(lin >= 0)):
-        own.add(f"{what}: linear penalties must be finite and not negative, got {lin}")
+        own.add(f"{what}: linear penalties must be finite and not negative, got {lin} [HM-CONTROL-049]")
     if quad is not None and not (np.all(np.isfinite(quad)) and np.all(quad > 0)):
-        own.add(f"{what}: quadratic penalties must be finite and positive, got {quad}")
+        own.add(f"{what}: quadratic penalties must be finite and positive, got {quad} [HM-CONTROL-050]")
     own.refuse()
     assert low is not None
     assert up is not None
@@ -258,7 +264,9 @@ def _range(what: str, n: int | None, lower: ArrayLike, upper: ArrayLike) -> tupl
     low = own(_sized, lower, n, f"{what}: lower")
     up = own(_sized, upper, n if n is not None or low is None else low.size, f"{what}: upper")
     if low is not None and up is not None and low.shape == up.shape and not np.all(low < up):
-        own.add(f"{what} cross: lower {low}, upper {up}; every lower must be below its upper")
+        own.add(
+            f"{what} cross: lower {low}, upper {up}; every lower must be below its upper [HM-CONTROL-051]"
+        )
     own.refuse()
     assert low is not None
     assert up is not None
@@ -269,7 +277,7 @@ def _sized(values: ArrayLike, n: int | None, name: str) -> Array:
     """``values`` as a vector ``(n,)``, or of any size where none is known."""
     array = numbers(values, name, most=LARGEST)
     if n is not None and array.shape != (n,):
-        raise InputError(f"{name} has {array.size} values, {n} needed")
+        raise InputError(f"{name} has {array.size} values, {n} needed [HM-CONTROL-052]")
     return array
 
 

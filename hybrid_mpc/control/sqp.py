@@ -420,7 +420,7 @@ class SQPController(Controller):
         inner: CondensedController | None = None,
     ) -> None:
         if not (isinstance(tolerance, int | float) and tolerance > 0):
-            raise InputError(f"tolerance must be positive, got {tolerance!r:.80}")
+            raise InputError(f"tolerance must be positive, got {tolerance!r:.80} [HM-CONTROL-053]")
         iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         inner = CondensedController(model, ocp, compiled=compiled) if inner is None else inner
         self.problem, self._cost = inner.problem, ReducedCost(inner)
@@ -505,8 +505,20 @@ class SQPController(Controller):
         at, n_x = descent.at.run, self.ocp.n_x
         excess = self.problem.soft.excess(at.soft[0])
         return Solution(
-            at.u, at.z[:, :n_x], at.z[:, n_x:], case.d, at.cost, descent.status, descent.kkt, 0.0,
-            {"solve": (perf_counter() - start) * 1e3}, self.problem.soft.largest(excess), descent.count,
-            descent.curvature, w=case.target.w, steady=case.target.steady, active=descent.active,
+            u=at.u,
+            x=at.z[:, :n_x],
+            h=at.z[:, n_x:],
+            d=case.d,
+            cost=at.cost,
+            status=descent.status,
+            kkt=descent.kkt,
+            defect=0.0,
+            timing={"solve": (perf_counter() - start) * 1e3},
+            excess=self.problem.soft.largest(excess),
+            iterations=descent.count,
+            curvature=descent.curvature,
+            w=case.target.w,
+            steady=case.target.steady,
+            active=descent.active,
             given_way=self.problem.soft.given_way(excess),
-        )  # fmt: skip
+        )

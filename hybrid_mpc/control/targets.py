@@ -81,6 +81,7 @@ class Targets:
         if ocp.q_y.size != model.n_y or not ocp.n_y:
             raise InputError(
                 f"targets: the problem has q_y = {ocp.q_y}, model {model.name} {model.n_y} outputs; give a weight each"
+                " [HM-CONTROL-054]"
             )
         self.model, self._ocp = model, ocp
         n_x, n_z = model.n_x, model.n_x + model.n_h
@@ -134,7 +135,9 @@ class Targets:
         m, search = self.model, self._search
         goal = np.asarray(y_ref, dtype=float).ravel()
         if goal.size != m.n_y or not np.all(np.isfinite(goal[self._tracked])):
-            raise InputError(f"y_ref {goal} given; needed: {m.n_y} outputs, finite where q_y weighs them")
+            raise InputError(
+                f"y_ref {goal} given; needed: {m.n_y} outputs, finite where q_y weighs them [HM-CONTROL-055]"
+            )
         d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
         w = m.w if w is None else vector(w, m.n_w, "w")
         given = start.unknowns if start is not None and start.steady else None

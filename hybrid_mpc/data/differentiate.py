@@ -103,15 +103,19 @@ def differentiate(y: Array, dt: float, method: Differentiator) -> Derivatives:
     y = real_numbers(y, "differentiate: samples")
     if not hasattr(method, "derivatives") or isinstance(method, type):
         raise InputError(
-            f"differentiate: a method such as LocalPolynomial(0.2) is needed, got {method!r:.80}"
+            f"differentiate: a method such as LocalPolynomial(0.2) is needed, got {method!r:.80} [HM-DATA-001]"
         )
     if y.ndim not in (1, 2) or not y.size:
-        raise InputError(f"differentiate: needs samples (n,) or (n, n_y), got an array of shape {y.shape}")
+        raise InputError(
+            f"differentiate: needs samples (n,) or (n, n_y), got an array of shape {y.shape} [HM-DATA-002]"
+        )
     if not positive(dt):
-        raise InputError(f"differentiate: the period must be positive, got {dt} s")
+        raise InputError(f"differentiate: the period must be positive, got {dt} s [HM-DATA-003]")
     if not np.isfinite(y).all():
         row = int(np.argwhere(~np.isfinite(y))[0, 0])
-        raise InputError(f"differentiate: sample {row} is not finite; cut the signal there or repair it")
+        raise InputError(
+            f"differentiate: sample {row} is not finite; cut the signal there or repair it [HM-DATA-004]"
+        )
     return method.derivatives(y, dt)
 
 
@@ -130,13 +134,13 @@ def window_samples(length: float, dt: float, order: int = 4) -> int:
         11
     """
     if not positive(length):
-        raise InputError(f"smoothing: a length above 0 s is needed, got {length!r:.80}")
+        raise InputError(f"smoothing: a length above 0 s is needed, got {length!r:.80} [HM-DATA-005]")
     n = 2 * int(np.floor(length / (2 * dt) + 1e-6)) + 1
     if n <= order + 1:
         need = 2 * (order // 2 + 1) * dt
         raise InputError(
             f"smoothing of {length:g} s holds {n} samples at {dt:g} s; a polynomial of order {order} needs "
-            f"at least {need:g} s. Raise smoothing in the DataSpec or record faster."
+            f"at least {need:g} s. Raise smoothing in the DataSpec or record faster. [HM-DATA-006]"
         )
     return n
 
@@ -155,7 +159,7 @@ def local_polynomial(y: Array, dt: float, length: float, order: int = 4) -> Deri
     if n > len(y):
         raise InputError(
             f"smoothing of {length:g} s needs {n} samples, the signal has {len(y)}. Shorten smoothing or "
-            "give a longer recording."
+            "give a longer recording. [HM-DATA-007]"
         )
     value, first, second = (
         np.asarray(savgol_filter(y, n, order, deriv=i, delta=dt, axis=0, mode="interp"), dtype=float)
@@ -242,6 +246,7 @@ class CausalPolynomial(Differentiator):
         if not 0 <= back < n:
             raise InputError(
                 f"causal polynomial: its lag of {self.lag:g} s must be within the {self.length:g} s window"
+                " [HM-DATA-008]"
             )
         return n, back
 
@@ -272,7 +277,7 @@ class SmoothingSpline(Differentiator):
         if self.cutoff * dt < SLOWEST:
             raise InputError(
                 f"smoothing spline: cutoff of {self.cutoff:g} Hz at {1 / dt:g} Hz is too low to be computed. Raise it "
-                f"to {SLOWEST / dt:g} Hz, take ZeroPhaseFilter, or keep fewer samples."
+                f"to {SLOWEST / dt:g} Hz, take ZeroPhaseFilter, or keep fewer samples. [HM-DATA-009]"
             )
         k = np.arange(len(y), dtype=float)
         lam = ROOM * _spline_ratio(np.array(2 * np.pi * self.cutoff * dt)).item()
@@ -353,7 +358,7 @@ def gcv_cutoff(y: Array, dt: float) -> float:
     n = len(y)
     if y.ndim != 1 or n < 16:
         raise InputError(
-            f"gcv_cutoff: needs at least 16 samples of one signal, got an array of shape {y.shape}"
+            f"gcv_cutoff: needs at least 16 samples of one signal, got an array of shape {y.shape} [HM-DATA-010]"
         )
     ratio = 1 / _spline_ratio(np.pi * np.arange(1, n) / n)
 
@@ -381,11 +386,11 @@ def _spline_ratio(w: Array) -> Array:
 
 def _check_cutoff(cutoff: float, dt: float, n: int) -> None:
     if not positive(cutoff):
-        raise InputError(f"cutoff: a positive frequency [Hz] is needed, got {cutoff!r:.80}")
+        raise InputError(f"cutoff: a positive frequency [Hz] is needed, got {cutoff!r:.80} [HM-DATA-011]")
     if not 0 < cutoff < 0.5 / dt:
         raise InputError(
             f"cutoff of {cutoff:g} Hz must be positive and below {0.5 / dt:g} Hz, half the sampling rate of "
-            f"{1 / dt:g} Hz"
+            f"{1 / dt:g} Hz [HM-DATA-012]"
         )
     need = max(5, math.ceil(1 / (cutoff * dt)))
     if n < need:
@@ -393,4 +398,7 @@ def _check_cutoff(cutoff: float, dt: float, n: int) -> None:
 
 
 def _too_short(need: int, got: int) -> str:
-    return f"differentiate: the method needs {need} samples, the signal has {got}. Give more or smooth less."
+    return (
+        f"differentiate: the method needs {need} samples, the signal has {got}. Give more or smooth less. "
+        "[HM-DATA-115]"
+    )

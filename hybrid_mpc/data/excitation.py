@@ -66,7 +66,7 @@ def chirp(
     """
     s = np.asarray(t, dtype=float) - t[0]
     if not s[-1] > 0:
-        raise InputError("chirp: its times must span more than one instant")
+        raise InputError("chirp: its times must span more than one instant [HM-DATA-013]")
     cycles = start_frequency * s + (end_frequency - start_frequency) * s**2 / (2 * s[-1])
     return offset + amplitude * np.sin(2 * np.pi * cycles)
 
@@ -97,7 +97,7 @@ def random_steps(
     if not (lower <= upper and 0 < shortest <= longest):
         raise InputError(
             f"random_steps: need lower <= upper and 0 < shortest <= longest hold, got levels "
-            f"{lower:g} to {upper:g} and holds {shortest:g} to {longest:g} s"
+            f"{lower:g} to {upper:g} and holds {shortest:g} to {longest:g} s [HM-DATA-014]"
         )
     t = np.asarray(t, dtype=float)
     most = math.ceil((t[-1] - t[0]) / shortest) + 1
@@ -141,7 +141,7 @@ def multisine(
     if not (period > 0 and 0 < lower_frequency <= upper_frequency < 0.5 / dt):
         raise InputError(
             f"multisine: need a positive period and 0 < lower <= upper frequency < {0.5 / dt:g} Hz (half the sampling "
-            f"rate), got {period:g} s and {lower_frequency:g} to {upper_frequency:g} Hz"
+            f"rate), got {period:g} s and {lower_frequency:g} to {upper_frequency:g} Hz [HM-DATA-015]"
         )
     near = 1e-9  # a multiple on the band's edge belongs to it, rounded or not
     lines = np.arange(
@@ -151,7 +151,7 @@ def multisine(
     if not len(lines):
         raise InputError(
             f"multisine: no line between {lower_frequency:g} and {upper_frequency:g} Hz; they are {1 / period:g} Hz "
-            f"apart{' and odd multiples only' if odd else ''}. Lengthen the period or widen the band."
+            f"apart{' and odd multiples only' if odd else ''}. Lengthen the period or widen the band. [HM-DATA-016]"
         )
     i = np.arange(1, len(lines) + 1)
     u = np.zeros(len(t))
@@ -194,14 +194,14 @@ def prbs(
     if not (lower < upper and clock >= dt * (1 - 1e-6)):
         raise InputError(
             f"prbs: need lower < upper and a clock of at least the sampling time {dt:g} s, got levels {lower:g} to "
-            f"{upper:g} and a clock of {clock:g} s"
+            f"{upper:g} and a clock of {clock:g} s [HM-DATA-017]"
         )
     ticks = np.floor((t - t[0]) / clock + 1e-6).astype(int)  # 1e-6: rounding of the times
     if bits is None:
         bits = max(2, math.ceil(math.log2(ticks[-1] + 2)))
     if not 2 <= bits <= 32:
         raise InputError(
-            f"prbs: a shift register has 2 to 32 bits, got {bits}. Lengthen the clock or give bits."
+            f"prbs: a shift register has 2 to 32 bits, got {bits}. Lengthen the clock or give bits. [HM-DATA-018]"
         )
     length = 2**bits - 1
     first = shift % length
@@ -213,7 +213,7 @@ def prbs(
 
 def _period_of(what: str, t: Array) -> float:
     if len(t) < 2 or not t[-1] > t[0]:
-        raise InputError(f"{what}: its times must span more than one instant")
+        raise InputError(f"{what}: its times must span more than one instant [HM-DATA-019]")
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
@@ -255,7 +255,7 @@ def excitation_of(
         [0.5, 2.0]
     """
     if not trajectories:
-        raise InputError("excitation: no trajectories given")
+        raise InputError("excitation: no trajectories given [HM-DATA-020]")
     found = []
     for j in range(trajectories[0].u.shape[1]):
         name = inputs[j].name if j < len(inputs) else f"input {j + 1}"
@@ -302,7 +302,7 @@ def check_excitation(
             level = trajectories[0].u[0, j]
             problems.append(
                 f"{names}: the input {one.name} is {level:.10g} throughout; its effect cannot be identified. Add a "
-                "recording in which it moves, or check that the DataSpec names the right column."
+                "recording in which it moves, or check that the DataSpec names the right column. [HM-DATA-021]"
             )
     for j in range(trajectories[0].y.shape[1]):
         every = np.concatenate([piece.y[:, j] for piece in trajectories])
@@ -313,7 +313,7 @@ def check_excitation(
             name = outputs[j].name if j < len(outputs) else f"output {j + 1}"
             problems.append(
                 f"{names}: the output {name} is {every[0]:.10g} throughout: the machine never moved. Excite it harder "
-                "than its friction, or check that the DataSpec names the right column."
+                "than its friction, or check that the DataSpec names the right column. [HM-DATA-022]"
             )
     refuse(problems)
     need = -(-parameters // 2)

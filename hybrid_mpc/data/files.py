@@ -73,7 +73,9 @@ def opened(path: Path) -> Source:
     if reader is None:
         reader = next((found for begin, found in BEGINS if begin.match(content)), ("text", "text_source"))
     if other := next((what for begin, what in OTHERS if begin.match(content)), ""):
-        raise InputError(f"{path}: is {other}, which is not read. Save the table as .xlsx or as CSV (UTF-8).")
+        raise InputError(
+            f"{path}: is {other}, which is not read. Save the table as .xlsx or as CSV (UTF-8). [HM-DATA-023]"
+        )
     module = importlib.import_module(f"hybrid_mpc.data.{reader[0]}")
     source: Source = getattr(module, reader[1])(path, content, hashlib.sha256(content).hexdigest())
     return source
@@ -94,7 +96,7 @@ def _content(path: Path, is_text: bool) -> bytes:
                 if max(longest + first, *others, 0) > LONGEST_ROW:
                     raise InputError(
                         f"{path}: has a row of more than {megabytes(LONGEST_ROW)}. Write one line a sample, with the "
-                        "columns that are needed."
+                        "columns that are needed. [HM-DATA-024]"
                     )
                 longest = others[-1] if others else longest + first
                 left -= len(piece)
@@ -102,7 +104,7 @@ def _content(path: Path, is_text: bool) -> bytes:
             content = file.read(size)
     except FileNotFoundError:
         raise InputError(
-            f"{path}: there is no such file{_beside(path)}. Check the path given with --data."
+            f"{path}: there is no such file{_beside(path)}. Check the path given with --data. [HM-DATA-025]"
         ) from None
     except OSError as error:
         large = error.errno == errno.EFBIG
@@ -111,9 +113,9 @@ def _content(path: Path, is_text: bool) -> bytes:
             if large
             else "Give a readable file."
         )
-        raise InputError(f"{path}: cannot be read ({error.strerror}). {remedy}") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}). {remedy} [HM-DATA-026]") from error
     if not content or content.isspace():
-        raise InputError(f"{path}: {EMPTY}")
+        raise InputError(f"{path}: {EMPTY} [HM-DATA-027]")
     return content
 
 
@@ -140,8 +142,10 @@ def real_numbers(values: object, name: str) -> Array:
         if given.dtype.kind in "biufO":
             return np.asarray(given, dtype=np.float64)
     except Exception as error:  # whatever an object of anybody's raises where it is asked for its numbers
-        raise InputError(f"{name}: numbers are needed, got {type(values).__name__}") from error
-    raise InputError(f"{name}: numbers are needed, got {type(values).__name__} of {given.dtype}")
+        raise InputError(f"{name}: numbers are needed, got {type(values).__name__} [HM-DATA-028]") from error
+    raise InputError(
+        f"{name}: numbers are needed, got {type(values).__name__} of {given.dtype} [HM-DATA-029]"
+    )
 
 
 def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int | None = None) -> Path:
@@ -163,18 +167,20 @@ def write_csv(path: Path | str, columns: Mapping[str, Array], *, decimals: int |
         't\n0\n0.1\n'
     """
     if not isinstance(path, str | Path) or not Path(path).name:
-        raise InputError(f"write_csv: the path of a file is needed, got {path!r:.80}")
+        raise InputError(f"write_csv: the path of a file is needed, got {path!r:.80} [HM-DATA-030]")
     if not isinstance(columns, Mapping):
-        raise InputError(f"write_csv: columns by name are needed, got {type(columns).__name__}")
+        raise InputError(f"write_csv: columns by name are needed, got {type(columns).__name__} [HM-DATA-031]")
     if decimals is not None and not (type(decimals) is int and 0 <= decimals <= MOST_DECIMALS):
         raise InputError(
-            f"write_csv: decimals from 0 to {MOST_DECIMALS} are needed, got {type(decimals).__name__}"
+            f"write_csv: decimals from 0 to {MOST_DECIMALS} are needed, got {type(decimals).__name__} [HM-DATA-032]"
         )
     path = Path(path)
     arrays = {n: real_numbers(column, f"write_csv: column {shown(str(n))}") for n, column in columns.items()}
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
-        raise InputError(f"{path}: columns must be one-dimensional and of one length, got {shapes}")
+        raise InputError(
+            f"{path}: columns must be one-dimensional and of one length, got {shapes} [HM-DATA-033]"
+        )
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(arrays)

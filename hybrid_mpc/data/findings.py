@@ -1,6 +1,6 @@
 """What is doubtful about the channels of recordings: codes, outliers, angles that jump, stuck sensors, absurd speeds.
 
-A sensor is stuck where it repeats itself although the machine cannot stand still (docs/data.md).
+A sensor is stuck where it repeats itself although the machine cannot stand still (docs/data-checks.md).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ SPANS = (1, 2, 5)
 """Samples over which speeds are taken: steps of the sensor hide a slow motion in one, a fast one is over in five."""
 ABRUPT = 3.0
 """A stop this many times sharper than any ordinary change of speed is a sensor's fault, not the machine's. In the
-recordings of five machines whose sensors work it is 1.5 at most (docs/data.md)."""
+recordings of five machines whose sensors work it is 1.5 at most (docs/results/data_checks.md)."""
 ORDINARY = 0.99  # share of the changes of speed, and of the times between two changes, that are ordinary
 STEP = 0.1  # quantile of the changes that is the sensor's step; the least one may be a rounding of the file
 FEW = 20  # fewest changes of speed in full motion from which the ordinary ones follow

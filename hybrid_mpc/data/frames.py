@@ -101,7 +101,7 @@ class Frame:
     def fault_of(self, name: str, one: Cells, may_be_blank: bool) -> str:
         """What is wrong with a column's cells; empty if nothing is."""
         if one.fault:
-            return f"column {shown(name)}: {one.fault}."
+            return f"column {shown(name)}: {one.fault}. [HM-DATA-122]"
         bad = np.flatnonzero(~np.isfinite(one.values) & ~(one.blank & may_be_blank))
         place = self.places[name][-1]
         if not len(bad):
@@ -111,7 +111,7 @@ class Frame:
         what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
         why = cause(cell)
         remedy = f": {why}." if why else ". Delete the row (longer gaps are cut out) or repair the value."
-        return f"row {self.numbers[int(bad[0])]}, column {shown(name)} {what}{such}{remedy}"
+        return f"row {self.numbers[int(bad[0])]}, column {shown(name)} {what}{such}{remedy} [HM-DATA-123]"
 
     def in_long_form(self, source: Source) -> Source | None:
         """The source where each row names what it measured; None where rows do not."""

@@ -25,7 +25,7 @@ MOST_ITEMS = 10_000  # most groups and datasets that are looked at: some seconds
 def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
     """A file as a source."""
     matlab = path.suffix.lower() == ".mat" or content.startswith(b"MATLAB")
-    with named_extra("reading .mat files of version 7.3" if matlab else "reading HDF5 files"):
+    with named_extra(f"{path}: reading {'.mat files of version 7.3' if matlab else 'HDF5 files'}"):
         import h5py
     try:
         file = h5py.File(io.BytesIO(content), "r")
@@ -34,7 +34,9 @@ def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
         what, again = "HDF5 file", "Write it again."
         if matlab:
             what, again = ".mat file", f"Save it again in MATLAB with save('{path.name}', ..., '-v7')."
-        raise InputError(f"{path}: is no {what} or damaged ({line_of(error)}). {again}") from error
+        raise InputError(
+            f"{path}: is no {what} or damaged ({line_of(error)}). {again} [HM-DATA-034]"
+        ) from error
     return leaf_source(path, content, sha256, leaves, matlab)
 
 
@@ -74,7 +76,7 @@ class _Walk:
 
         self.left -= 1
         if self.left < 0:
-            raise ValueError(f"it has more than {MOST_ITEMS} groups and datasets")
+            raise ValueError(f"it has more than {MOST_ITEMS} groups and datasets [HM-DATA-035]")
         kind = _class(item) if self.matlab else ""
         if self.matlab and (item.attrs.get("MATLAB_object_decode", 0) or kind in CONVERT):
             yield Leaf(name, what=f"{OBJECTS} of class {kind}", kind=kind)
@@ -115,6 +117,6 @@ def _numbers(item: Any, field: str = "") -> NDArray[Any]:
     """A dataset's numbers, or those of a field of its records; what it declares is looked at first."""
     if max(8, item.dtype.itemsize) * item.size > budget_of(item.file.id.get_filesize()):
         raise InputError(
-            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file"
+            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file [HM-DATA-036]"
         )
     return np.asarray(item[()][field] if field else item[()])

@@ -36,13 +36,13 @@ def logger_source(path: Path, content: bytes, sha256: str) -> Source:
     begins = (one[1:] for one in _READERS if content.startswith(one[0]))
     reader, what = next(begins, (_can, "CAN log"))
     try:
-        with named_extra(f"reading {what}"):
+        with named_extra(f"{path}: reading this {what}"):
             return reader(path, content, sha256)
     except (MissingPackage, InputError):
         raise
     except Exception as error:  # a damaged file raises nearly anything
         raise InputError(
-            f"{path}: is no {what} or damaged ({line_of(error)}). Record or export it again."
+            f"{path}: is no {what} or damaged ({line_of(error)}). Record or export it again. [HM-DATA-037]"
         ) from error
 
 
@@ -71,7 +71,9 @@ def _source(
     """A source of signals: group, name, unit, stamps [s], numbers; times begin with the file's first stamp."""
     found = [one for one in found if len(one[3])]
     if not found:
-        raise InputError(f"{path}: has no signal with numbers. Record some, or export them as CSV.")
+        raise InputError(
+            f"{path}: has no signal with numbers. Record some, or export them as CSV. [HM-DATA-038]"
+        )
     names, twice, series = _distinct([(group, own) for group, own, *_ in found]), 0, list[Series]()
     for name, (_, _, unit, t, values) in zip(names, found, strict=True):
         last = np.r_[np.diff(t) != 0, True]  # of samples with one stamp the last one
@@ -175,7 +177,7 @@ def _of_messages(path: Path, sha256: str, messages: Iterable[tuple[str, str, Any
         for field, value in _fields_of(decode(data), ""):
             left -= 1
             if left < 0:
-                raise InputError("it holds more numbers than are read. Split the recording")
+                raise InputError("it holds more numbers than are read. Split the recording [HM-DATA-039]")
             stamps, values = fields.setdefault(field, ([], []))
             stamps.append(stamp)
             values.append(value)
@@ -276,7 +278,7 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
         there = f"; that folder has {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
         raise InputError(
             f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Its bytes "
-            "have no meaning without it."
+            "have no meaning without it. [HM-DATA-040]"
         )
     base = cantools.database.load_string(own[0].read_text(encoding="cp1252"), "dbc", strict=False)
     known = {message.frame_id: message for message in base.messages}

@@ -49,7 +49,7 @@ def mat_source(path: Path, content: bytes, sha256: str) -> Source:
     except ValueError as error:
         raise InputError(
             f"{path}: is no .mat file, damaged or too large ({line_of(error)}). Save it again in MATLAB with "
-            f"save('{path.name}', ..., '-v7'), large vectors with '-v6'."
+            f"save('{path.name}', ..., '-v7'), large vectors with '-v6'. [HM-DATA-041]"
         ) from error
     return leaf_source(path, content, sha256, leaves)
 
@@ -75,7 +75,7 @@ def leaves_of(content: bytes, budget: int) -> list[Leaf]:
     file = _File(content, budget)
     found = list(file.level_4() if version(content) == "4" else file.level_5())
     if twice := next((name for name, count in Counter(file.names).items() if count > 1), None):
-        raise ValueError(f"two variables have the name {twice!r}")
+        raise ValueError(f"two variables have the name {twice!r} [HM-DATA-042]")
     return found
 
 
@@ -102,9 +102,9 @@ class _File:
         """Use some of it up."""
         self.size, self.count = self.size - size, self.count - count
         if self.count < 0:
-            raise ValueError(f"it has more than {ELEMENTS} elements")
+            raise ValueError(f"it has more than {ELEMENTS} elements [HM-DATA-043]")
         if self.size < 0:
-            raise ValueError(f"it declares more than {self.budget / 1e6:.4g} MB of numbers")
+            raise ValueError(f"it declares more than {self.budget / 1e6:.4g} MB of numbers [HM-DATA-044]")
 
     def level_4(self) -> Iterator[Leaf]:
         """All variables."""
@@ -112,20 +112,20 @@ class _File:
         order = "<" if len(content) < 4 or 0 <= struct.unpack_from("<i", content)[0] <= 5000 else ">"
         while begin < len(content):
             if len(content) - begin < 20:
-                raise ValueError("a variable is cut off")
+                raise ValueError("a variable is cut off [HM-DATA-045]")
             kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", content, begin)
             number, matrix = kind // 10 % 10, kind % 10
             if not 0 <= kind <= 5000 or kind // 100 % 10 or number >= len(LEVEL_4) or matrix > 2:
-                raise ValueError("a variable of an unknown type")
+                raise ValueError("a variable of an unknown type [HM-DATA-046]")
             if min(rows, columns) < 0 or length < 1:
-                raise ValueError("a variable without its dimensions or its name")
+                raise ValueError("a variable without its dimensions or its name [HM-DATA-047]")
             self.take(8 * rows * columns, 4)
             pair = 1 + (imaginary == 1 and matrix != 2)
             dtype, start = np.dtype(order + LEVEL_4[number]), begin + 20 + length
             name = content[begin + 20 : start].split(b"\0")[0].decode("latin-1")
             begin = start + rows * columns * dtype.itemsize * pair
             if begin > len(content):
-                raise ValueError("a variable is longer than the file")
+                raise ValueError("a variable is longer than the file [HM-DATA-048]")
             self.names.append(name)
             if matrix:
                 yield Leaf(name, (), _text) if matrix == 1 else Leaf(name, what="sparse matrices")
@@ -151,11 +151,11 @@ class _File:
         try:
             inner = stream.decompress(data, self.size + 1)
         except zlib.error as error:
-            raise ValueError("a compressed variable does not match its checksum") from error
+            raise ValueError("a compressed variable does not match its checksum [HM-DATA-049]") from error
         if len(inner) > self.size:
             self.take(len(inner))
         if not stream.eof:
-            raise ValueError("a compressed variable is cut off")
+            raise ValueError("a compressed variable is cut off [HM-DATA-050]")
         return inner
 
     def elements(self, data: bytes, begin: int, end: int) -> Iterator[_Element]:
@@ -163,7 +163,7 @@ class _File:
         while begin < end:
             self.take(count=1)
             if end - begin < 8:
-                raise ValueError("an element is cut off")
+                raise ValueError("an element is cut off [HM-DATA-051]")
             kind, size = struct.unpack_from(f"{self.order}II", data, begin)
             start, after = begin + 8, begin + 8 + size
             if kind >> 16:
@@ -171,7 +171,7 @@ class _File:
             elif kind != COMPRESSED:
                 after += -size % 8
             if start + size > end or start + size > after:
-                raise ValueError("an element is longer than the file")
+                raise ValueError("an element is longer than the file [HM-DATA-052]")
             yield _Element(kind, start, start + size)
             begin = after
 
@@ -180,20 +180,20 @@ class _File:
     ) -> Iterator[Leaf]:
         """What an array holds, at any depth; a variable has its own name."""
         if matrix.kind != MATRIX:
-            raise ValueError(f"an element of type {matrix.kind} where a variable is expected")
+            raise ValueError(f"an element of type {matrix.kind} where a variable is expected [HM-DATA-053]")
         if depth > DEEPEST:
-            raise ValueError("structs lie too deep in each other")
+            raise ValueError("structs lie too deep in each other [HM-DATA-054]")
         parts = list(self.elements(data, matrix.begin, matrix.end))
         if not parts and named is not None:
             yield Leaf(named, (0, 0))
             return
         if not parts or parts[0].kind != 6 or parts[0].size != 8:
-            raise ValueError("a variable without its flags")
+            raise ValueError("a variable without its flags [HM-DATA-055]")
         flags = struct.unpack_from(f"{self.order}I", data, parts[0].begin)[0]
         kind, pair = flags & 0xFF, 1 + bool(flags >> 8 & COMPLEX)
         own = parts[1 if kind == OPAQUE else 2 :][:1]
         if not own or own[0].kind not in (1, *TEXT):
-            raise ValueError("a variable without its name")
+            raise ValueError("a variable without its name [HM-DATA-056]")
         name = data[own[0].begin : own[0].end].decode("latin-1") if named is None else named
         if named is None:
             self.names.append(name)
@@ -205,10 +205,10 @@ class _File:
             yield Leaf(name, what=f"{OBJECTS} of class {told or 'unknown'}", kind=told)
             return
         if parts[1].kind not in (5, 6) or parts[1].size < 8 or parts[1].size % 4:
-            raise ValueError("a variable without its dimensions")
+            raise ValueError("a variable without its dimensions [HM-DATA-057]")
         shape = struct.unpack_from(f"{self.order}{parts[1].size // 4}i", data, parts[1].begin)
         if min(shape) < 0:
-            raise ValueError("a variable with a negative dimension")
+            raise ValueError("a variable with a negative dimension [HM-DATA-058]")
         count, rest = math.prod(shape), parts[3:]
         if kind != SPARSE:  # whose dimensions are not what is stored
             self.take(8 * count * pair)
@@ -226,7 +226,7 @@ class _File:
             sparse = kind == SPARSE and fits and len(rest) == 2 + pair
             leaf = Leaf(name, what="sparse matrices") if sparse else None
         if leaf is None:
-            raise ValueError("a variable without its contents")
+            raise ValueError("a variable without its contents [HM-DATA-059]")
         yield leaf
 
     def inner(
@@ -238,13 +238,13 @@ class _File:
             length, names = rest[:2] if len(rest) > 1 else 2 * [_Element(0, 0, 0)]
             size = struct.unpack_from(f"{self.order}i", data, length.begin)[0] if length.size == 4 else 0
             if size < 1 or length.kind not in (5, 6) or names.kind != 1 or names.size % size:
-                raise ValueError("a struct without the names of its fields")
+                raise ValueError("a struct without the names of its fields [HM-DATA-060]")
             begins = range(names.begin, names.end, size)
             fields = ["." + data[k : k + size].split(b"\0")[0].decode("latin-1") for k in begins]
             self.take(8 * count * max(0, len(fields) - 1))
             rest = rest[2:]
         if len(rest) != count * len(fields):
-            raise ValueError("a variable without its contents")
+            raise ValueError("a variable without its contents [HM-DATA-061]")
         if count > MOST_STRUCTS:
             yield Leaf(name, what="cells" if cell else "arrays of structs")
             return

@@ -69,7 +69,7 @@ class Samples:
         if len(self.w) != n or self.censored.shape != self.y.shape:
             raise ValueError(
                 f"{n} samples with w {self.w.shape}, y {self.y.shape} and censored {self.censored.shape}: w needs "
-                "a row, censored a number for each"
+                "a row, censored a number for each [HM-DATA-062]"
             )
 
 
@@ -149,7 +149,9 @@ def read_recordings(
     for path in map(Path, paths):
         try:
             if any("\ud800" <= c <= "\udfff" for c in path.name):
-                raise InputError(f"{str(path)!a}: the file's name is no text (UTF-8). Rename the file.")
+                raise InputError(
+                    f"{str(path)!a}: the file's name is no text (UTF-8). Rename the file. [HM-DATA-063]"
+                )
             source = opened(path)
             names, lacking = _found(source, spec, there, missing)
             problems += lacking
@@ -168,13 +170,13 @@ def read_recordings(
         if same := next((other for other in recordings[:i] if _alike(one, other)), None):
             problems.append(
                 f"{one.path} holds the same samples as {same.path.name}. Leave one out: one recording must not "
-                "count twice."
+                "count twice. [HM-DATA-064]"
             )
     stems = [Path(path).stem for path in paths]
     if len(set(stems)) < len(stems):
         problems.append(
             f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
-            "rename one: pieces and windows are named by the stem."
+            "rename one: pieces and windows are named by the stem. [HM-DATA-065]"
         )
     return recordings, problems
 
@@ -230,7 +232,7 @@ def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
             if also := [other for other in others if other != role and name in roles[other]]:
                 problems.append(
                     f"data specification: column {name!r} is named in {' and '.join(sorted([role, *also]))}. A column "
-                    "holds one signal: name it once."
+                    "holds one signal: name it once. [HM-DATA-066]"
                 )
     signals = spec.columns - set(time)
     any_signal = "Name a column of an input, a disturbance or an output."
@@ -242,7 +244,7 @@ def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
     ]
     problems += [
         f"data specification: {role} names column {name!r}, which is none of {', '.join(sorted(map(repr, columns)))}. "
-        f"{remedy}"
+        f"{remedy} [HM-DATA-067]"
         for role, names, columns, remedy in known
         for name in names
         if name not in columns
@@ -251,7 +253,7 @@ def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
     meant = {name.casefold(): path.stem for path in paths for name in (path.name, path.stem)}
     problems += [
         f"data specification: {setting} names the recording {name!r}, and the file's stem is "
-        f"{meant[name.strip().casefold()]!r}. Write it so."
+        f"{meant[name.strip().casefold()]!r}. Write it so. [HM-DATA-068]"
         for setting, of_files in _settings(spec).items()
         for name in of_files
         if name not in stems and name.strip().casefold() in meant
@@ -297,7 +299,7 @@ def _found(
         if len(same) > 1:
             problems.append(
                 f"{source.path}: columns {' and '.join(map(repr, same))} are one, {full!r}. A column holds one "
-                "signal: name each whole."
+                "signal: name each whole. [HM-DATA-069]"
             )
     return names, problems
 
@@ -349,14 +351,14 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
         if j >= first and len(t) and not there.any() and not faulty:
             problems.append(
                 f"column {name!r} has no number in any row; {signal.name} was not measured. Record it, or leave this "
-                "recording out."
+                "recording out. [HM-DATA-070]"
             )
         if clean and j >= split and there.any() and (censored[there, j - split] != 0).all():
             lower, upper = signal.saturation or (-math.inf, math.inf)
             problems.append(
                 f"column {name!r} is at an end of its sensor's range {lower:g} to {upper:g} {signal.unit} or beyond in "
                 f"all rows ({values[there, j].min():.6g} to {values[there, j].max():.6g}): nothing was measured. Check "
-                f"the unit and Signal.saturation of {signal.name}, or leave this recording out."
+                f"the unit and Signal.saturation of {signal.name}, or leave this recording out. [HM-DATA-071]"
             )
         if clean and j >= first:
             channel = Channel(path.name, name, signal, t[there], values[there, j])
@@ -374,11 +376,11 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
             problems.append(
                 f"{columns.place(int(rows[0]))}, column {name!r}: {code:.10g}, in {len(rows)} of {len(t)} rows, is far "
                 "from all other values: a code for missing ones? Leave these cells blank; inputs are needed in every "
-                "row."
+                "row. [HM-DATA-072]"
             )
         elif j not in unclear:
             problems += _range_problems(channel, columns, note)
-    problems += [finding.message for finding in findings if finding.refused]
+    problems += [f"{finding.message} [HM-DATA-121]" for finding in findings if finding.refused]
     refuse([f"{path}: {problem}" for problem in problems])
     u, w, y = values[:, 1:first], values[:, first:split], values[:, split:]
     return Recording(
@@ -412,7 +414,7 @@ def _range_problems(channel: Channel, columns: Columns, note: str) -> list[str]:
         f"{columns.place(first)}, column {channel.name!r}: {column[first]:g} is outside the plausible range "
         f"{lower:g} to {upper:g} {signal.unit} of {signal.name}{note}{such if len(bad) > 1 else ''}."
         f"{hint if unit else ''} Check unit and sign, repair the rows, or widen the range of the signal in the "
-        "scenario's prior."
+        "scenario's prior. [HM-DATA-118]"
     ]
 
 
@@ -508,7 +510,7 @@ def _rounding(t: Array) -> Array:
 def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> list[str]:
     """What is wrong with the time stamps, which are finite."""
     if len(t) < 2:
-        return [f"{len(t)} row(s) of numbers; a recording needs many. Record it again."]
+        return [f"{len(t)} row(s) of numbers; a recording needs many. Record it again. [HM-DATA-119]"]
     if disorder := columns.disorder(t, _stamps(spec)):
         return [disorder]
     in_seconds = f"check that {_stamps(spec)} is in seconds (DataSpec.units names another unit)."
@@ -516,16 +518,16 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
     if gaps(t, spec.max_gap).all():
         problems.append(
             f"sampling is {np.median(np.diff(t)):g} s, declared max_gap is {spec.max_gap:g} s: every step is a gap. "
-            f"Record faster, raise max_gap, or {in_seconds}"
+            f"Record faster, raise max_gap, or {in_seconds} [HM-DATA-073]"
         )
     if length < need:
         problems.append(
             f"{len(t)} samples over {length:g} s are fewer than the {need:g} s that the warm-up ({spec.warm_up:g} s) "
-            f"and {MIN_SCORED} periods need. Give a longer recording, or {in_seconds}"
+            f"and {MIN_SCORED} periods need. Give a longer recording, or {in_seconds} [HM-DATA-074]"
         )
     return problems + [
         f"the {window.role} window {window.start:g} to {window.end:g} s is not within the "
-        f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window."
+        f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window. [HM-DATA-120]"
         for window in spec.windows.get(stem, ())
         if window.start < t[0] - spec.dt or window.end > t[-1] + spec.dt
     ]
@@ -551,7 +553,9 @@ def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[
     if isinstance(given, float | int):
         size = float(given)
         wrong = "" if math.isfinite(size) and size else "the factor must be finite and not zero"
-        return Conversion(size), wrong and f"data specification: units={{{name!r}: {given}}}: {wrong}."
+        return Conversion(
+            size
+        ), wrong and f"data specification: units={{{name!r}: {given}}}: {wrong}. [HM-DATA-127]"
     unit, index = name_and_unit(column)[1] if given is None else given, False
     if (
         given is None and not unit
@@ -565,7 +569,7 @@ def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[
     remedy = "Name the column of that signal, correct the unit of one of them, or give the factor"
     return Conversion(1.0), (
         f"column {column!r} is in {unit!r}, {found} for {signal.label}. {remedy}: units={{{name!r}: FACTOR}} in the "
-        "DataSpec."
+        "DataSpec. [HM-DATA-128]"
     )
 
 

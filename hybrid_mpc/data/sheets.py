@@ -24,13 +24,13 @@ LONGER = 10  # times as many rows as any other sheet that the one which is read 
 
 def excel_source(path: Path, content: bytes, sha256: str) -> Source:
     """The table of a workbook; its formulas are not computed: their last values are read."""
-    with named_extra("reading Excel files"):
+    with named_extra(f"{path}: reading Excel files"):
         import openpyxl
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             size = sum(one.file_size for one in archive.infolist())
         if size > min(LARGEST, max(2**28, UNPACKED * len(content))):
-            raise ValueError(f"it unpacks to {megabytes(size)}")
+            raise ValueError(f"it unpacks to {megabytes(size)} [HM-DATA-075]")
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
         sheets = {name: _cells_of(book[name]) for name in book.sheetnames if hasattr(book[name], "iter_rows")}
     except InputError:
@@ -38,6 +38,7 @@ def excel_source(path: Path, content: bytes, sha256: str) -> Source:
     except Exception as error:  # a damaged workbook raises nearly anything
         raise InputError(
             f"{path}: is no Excel workbook, damaged or too large ({line_of(error)}). Save the table as CSV (UTF-8)."
+            " [HM-DATA-076]"
         ) from error
     found = {}
     for name, rows in sheets.items():
@@ -50,16 +51,16 @@ def excel_source(path: Path, content: bytes, sha256: str) -> Source:
     order = sorted(found, key=lambda name: -found[name][0])
     if not order:
         raise InputError(
-            f"{path}: no sheet has a table of numbers. Save the table alone, with a header above it."
+            f"{path}: no sheet has a table of numbers. Save the table alone, with a header above it. [HM-DATA-077]"
         )
     if len(order) > 1 and found[order[0]][0] < LONGER * found[order[1]][0]:
         raise InputError(
             f"{path}: {len(order)} sheets have tables ({', '.join(map(shown, order[:LISTED]))}). Save the one to "
-            "be read alone."
+            "be read alone. [HM-DATA-078]"
         )
     layout = found[order[0]][1]
     if isinstance(layout, str):
-        raise InputError(f"{path}: sheet {shown(order[0])}: {layout}")
+        raise InputError(f"{path}: sheet {shown(order[0])}: {layout} [HM-DATA-079]")
     note = [f"sheet {shown(order[0])}"] if len(sheets) > 1 else []
     return _frame_of(path, sheets[order[0]], layout, note).source(sha256)
 
@@ -69,7 +70,7 @@ def _cells_of(sheet: Any) -> list[tuple[Any, ...]]:
     for row in sheet.iter_rows(values_only=True):
         count += len(row)
         if count > MOST_CELLS:
-            raise ValueError(f"a sheet has more than {MOST_CELLS} cells")
+            raise ValueError(f"a sheet has more than {MOST_CELLS} cells [HM-DATA-080]")
         rows.append(row)
     return rows
 
@@ -109,7 +110,7 @@ def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes
 
 def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
     """A Parquet or Feather file; what it declares is looked at before any of it is unpacked."""
-    with named_extra("reading Parquet and Feather files"):
+    with named_extra(f"{path}: reading Parquet and Feather files"):
         import pandas as pd
         import pyarrow
     kinds, ipc = pyarrow.types, pyarrow.ipc
@@ -129,7 +130,9 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
             and schema.names.count(field.name) == 1
         )
         if 8 * rows * max(1, len(names)) > LARGEST:
-            raise InputError(f"{path}: has {rows} rows, more than are read. Split the recording.")
+            raise InputError(
+                f"{path}: has {rows} rows, more than are read. Split the recording. [HM-DATA-081]"
+            )
         if file is None:
             own = ipc.IpcReadOptions(included_fields=[schema.get_field_index(name) for name in names])
             table = ipc.open_file(io.BytesIO(content), options=own).read_all()
@@ -141,6 +144,7 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
     except Exception as error:  # a damaged file raises nearly anything
         raise InputError(
             f"{path}: is no Parquet or Feather file, or damaged ({line_of(error)}). Write it again, e.g. with pandas."
+            " [HM-DATA-082]"
         ) from error
     frame = Frame(
         path,

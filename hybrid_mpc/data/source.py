@@ -69,7 +69,7 @@ class Columns:
         return (
             f"{self.place(k + 1)}, {stamps}: time {what} ({t[k]:.10g} s, then {t[k + 1]:.10g} s"
             f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete the repeated rows or "
-            "split the file into recordings."
+            "split the file into recordings. [HM-DATA-116]"
         )
 
 
@@ -122,7 +122,7 @@ class Source:
         there = ", ".join(map(shown, self.header[:LISTED])) + more or "none"
         if count > 1:
             raise InputError(
-                f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one."
+                f"{self.path}: column {name!r} appears {count} times in {there}. Rename all but one. [HM-DATA-083]"
             )
         own, inner = name_and_unit(name)[0], f".{name}"
         ways: list[Callable[[str], bool]] = [
@@ -137,7 +137,7 @@ class Source:
         if fields:
             raise InputError(
                 f"{self.path}: column {name!r} may be {' or '.join(map(shown, fields[:LISTED]))}. "
-                "Name it whole in the scenario's DataSpec."
+                "Name it whole in the scenario's DataSpec. [HM-DATA-084]"
             )
         near = difflib.get_close_matches(
             name, [c for c in self.header[:COMPARED] if len(c) < LONGEST], n=1, cutoff=ALIKE
@@ -145,7 +145,7 @@ class Source:
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise MissingColumn(
             f"{self.path}: no column {name!r}; it has {there}.{hint} "
-            f"Rename the column or name yours in the scenario's DataSpec.{self.note}"
+            f"Rename the column or name yours in the scenario's DataSpec.{self.note} [HM-DATA-085]"
         )
 
 
@@ -191,6 +191,7 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
         if 8 * len(t) * len(names) > LARGEST:
             raise InputError(
                 f"{path}: {len(names)} signals at {len(t)} stamps are more numbers than are read. Name fewer of them."
+                " [HM-DATA-086]"
             )
         values, first = np.full((len(t), len(names)), np.nan), t[0] if len(t) else 0.0
         for j, name in enumerate(names):
@@ -212,7 +213,9 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
         return Columns(values[rows], "sample", range(1, int(rows.sum()) + 1), faults)
 
     if len(by_name) < len(series):
-        raise InputError(f"{path}: two signals have the same name and the same clock. Rename one.")
+        raise InputError(
+            f"{path}: two signals have the same name and the same clock. Rename one. [HM-DATA-087]"
+        )
     return Source(path, sha256, (time, *by_name), read, note)
 
 
@@ -238,4 +241,4 @@ def _disorder(one: Series) -> str:
         return ""
     stamps = f"sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at {one.t[k]:.10g} s"
     remedy = "Time stamps must increase: delete the repeated samples, or split the file."
-    return f"column {shown(one.name)}: {stamps}. {remedy}"
+    return f"column {shown(one.name)}: {stamps}. {remedy} [HM-DATA-117]"

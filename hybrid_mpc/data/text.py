@@ -42,11 +42,11 @@ UNCLOSED = (
 
 def text_source(path: Path, content: bytes, sha256: str) -> Source:
     """A text file as a source."""
-    with named_extra("reading tables"):
+    with named_extra(f"{path}: reading tables"):
         import pandas  # noqa: F401  (asked for before anything is done)
     text, notes = _decoded(path, content)
     if not text.strip():
-        raise InputError(f"{path}: {EMPTY}")
+        raise InputError(f"{path}: {EMPTY} [HM-DATA-088]")
     sample = text[:SAMPLE]
     best: tuple[float, bool, int, str, Layout | str] | None = None
     tops: dict[str, Look] = {}
@@ -65,7 +65,7 @@ def text_source(path: Path, content: bytes, sha256: str) -> Source:
         best = 0.0, True, len(cells), separator, Layout(row, row + 1, tuple(cells), len(cells))
     *_, separator, layout = best
     if isinstance(layout, str):
-        raise InputError(f"{path}: {layout}")
+        raise InputError(f"{path}: {layout} [HM-DATA-089]")
     return _frame(_Rows(path, text, separator), layout, notes).source(sha256)
 
 
@@ -78,7 +78,9 @@ def _decoded(path: Path, content: bytes) -> tuple[bytes, list[str]]:
         try:
             content = content.decode(kind).encode()
         except UnicodeDecodeError as error:
-            raise InputError(f"{path}: is no UTF-16 text. Export the table as CSV (UTF-8).") from error
+            raise InputError(
+                f"{path}: is no UTF-16 text. Export the table as CSV (UTF-8). [HM-DATA-090]"
+            ) from error
         notes.append("text is UTF-16")
     content = content.removeprefix(b"\xef\xbb\xbf")
     codes = np.frombuffer(content, dtype=np.uint8)
@@ -87,7 +89,7 @@ def _decoded(path: Path, content: bytes) -> tuple[bytes, list[str]]:
         row = 1 + content.count(b"\n", 0, int(odd[0]))
         raise InputError(
             f"{path}: row {row} is no text. Export the table as CSV (UTF-8), or give the file the ending of its "
-            "format; unpack it if it is packed."
+            "format; unpack it if it is packed. [HM-DATA-091]"
         )
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").rstrip(b"\x1a")
     try:
@@ -120,7 +122,7 @@ class _Rows:
             outside = (np.cumsum(codes == 34, dtype=np.uint8) & 1) == 0
             if whole and not outside[-1]:
                 odd = (k for k, line in enumerate(text.split(b"\n"), 1) if line.count(b'"') % 2)
-                raise InputError(f"{path}: row {next(odd, 1)}: {UNCLOSED}")
+                raise InputError(f"{path}: row {next(odd, 1)}: {UNCLOSED} [HM-DATA-092]")
             newline = newline & outside
             is_sep = is_sep & (np.r_[True, outside[:-1]] if separator == " " else outside)
         ends = np.flatnonzero(newline)
@@ -199,12 +201,12 @@ class _Rows:
             raise InputError(
                 f"{self.path}: row {self.numbers[k]} has {self.widths[k]} cells, {place} has {layout.width}{such}. "
                 f"Separate cells by {SEPARATORS[self.separator]}, write decimals with a point, and complete or delete "
-                "the row."
+                "the row. [HM-DATA-093]"
             )
         for k in np.flatnonzero(keep[:-1] & (np.diff(self.numbers) > 1)).tolist():
             inner = self.line(k).decode().split("\n")[1:-1]
             if any(line.count(self.separator) >= layout.width - 1 for line in inner):
-                raise InputError(f"{self.path}: row {self.numbers[k]}: {UNCLOSED}")
+                raise InputError(f"{self.path}: row {self.numbers[k]}: {UNCLOSED} [HM-DATA-094]")
 
 
 def split(line: str, separator: str) -> list[str]:
@@ -227,7 +229,7 @@ def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
     chosen, numbers = np.flatnonzero(keep), rows.numbers[keep].tolist()
     count = len(numbers)
     if count * len(names) * 8 > 4 * LARGEST:
-        raise InputError(f"{path}: has {count} rows, more than are read. Split the recording.")
+        raise InputError(f"{path}: has {count} rows, more than are read. Split the recording. [HM-DATA-095]")
     body = rows.kept(keep)
     decimal, unsure = _decimal(path, body, rows.separator)
     if decimal == ",":
@@ -253,12 +255,23 @@ def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
         if last and _is_cut(before, values):
             return (
                 f"row {numbers[-1]}, COLUMN is {shown(before[-1])}, where the file ends without the end of the "
-                "row: the number seems to be cut in two. Delete that row, or record it whole."
+                "row: the number seems to be cut in two. Delete that row, or record it whole. [HM-DATA-125]"
             )
         return ""
 
     own, tops = tuple(names[j] for j in seen), [heads[j] for j in seen]
-    return Frame(path, own, columns, tops, numbers, text, fault, decimal, tuple(notes), layout.clock)
+    return Frame(
+        path=path,
+        names=own,
+        columns=columns,
+        head=tops,
+        numbers=numbers,
+        text=text,
+        fault=fault,
+        decimal=decimal,
+        notes=tuple(notes),
+        clock=layout.clock,
+    )
 
 
 def _parsed(
@@ -271,14 +284,24 @@ def _parsed(
         return pd.DataFrame({place: pd.Series(dtype=float) for place in places})
     try:
         return pd.read_csv(
-            io.BytesIO(text), sep=r"\s+" if rows.separator == " " else rows.separator, header=None,
-            names=list(range(width)), usecols=sorted(set(places)), index_col=False, dtype=str if unsure else None,
-            decimal=decimal, keep_default_na=False, na_values=[] if unsure else BLANKS, skipinitialspace=True,
-            skip_blank_lines=False, low_memory=False, encoding="utf-8",
-        )  # fmt: skip
+            io.BytesIO(text),
+            sep=r"\s+" if rows.separator == " " else rows.separator,
+            header=None,
+            names=list(range(width)),
+            usecols=sorted(set(places)),
+            index_col=False,
+            dtype=str if unsure else None,
+            decimal=decimal,
+            keep_default_na=False,
+            na_values=[] if unsure else BLANKS,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+            encoding="utf-8",
+        )
     except (pd.errors.ParserError, ValueError) as error:
         told = str(error).strip().splitlines()[0]
-        raise InputError(f"{rows.path}: {told}. Export the table as plain CSV.") from error
+        raise InputError(f"{rows.path}: {told}. Export the table as plain CSV. [HM-DATA-096]") from error
 
 
 def _decimal(path: Path, body: bytes, separator: str) -> tuple[str, str]:
@@ -290,6 +313,7 @@ def _decimal(path: Path, body: bytes, separator: str) -> tuple[str, str]:
     if point and comma:
         raise InputError(
             f"{path}: numbers have commas and points, e.g. {point} and {comma}. Write the file with one decimal mark."
+            " [HM-DATA-097]"
         )
     between = rb"(?<![\d.,:])\d{1,3}[%s]\d{3}(?![\d:])"
     grouped = "".join(mark for mark in ".," if re.search(between % mark.encode(), body))
@@ -323,7 +347,7 @@ def _grouped(column: pd.Series, unsure: str, decimal: str, numbers: Sequence[int
     k = int(np.argmax(found.to_numpy()))
     return (
         f"row {numbers[k]}, COLUMN is {shown(texts.iloc[k])}: a mark between thousands, or decimals? Write "
-        "numbers with one decimal mark, as many decimals in all rows, and nothing between thousands."
+        "numbers with one decimal mark, as many decimals in all rows, and nothing between thousands. [HM-DATA-126]"
     )
 
 

@@ -149,9 +149,9 @@ def load_trajectories(
         [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
     """
     if isinstance(paths, str | bytes | Path) or not all(isinstance(path, str | Path) for path in paths):
-        raise InputError(f"recordings: a list of paths is needed, got {paths!r:.80}")
+        raise InputError(f"recordings: a list of paths is needed, got {paths!r:.80} [HM-DATA-098]")
     if not paths:
-        raise InputError("no recordings given; name at least one file with --data")
+        raise InputError("no recordings given; name at least one file with --data [HM-DATA-099]")
     _check_windows(spec)
     recordings, problems = read_recordings(paths, prior, spec)
     outputs, states = prior.outputs, prior.states
@@ -174,7 +174,9 @@ def load_trajectories(
     findings = findings_of(recordings, motions, spec, outputs=outputs, states=states if positions else ())
     findings = (*findings, *misspelt(spec, [recording.path for recording in recordings]))
     paths_of = {recording.path.name: recording.path for recording in recordings}
-    refuse(problems + [f"{paths_of[one.file]}: {one.message}" for one in findings if one.refused])
+    refuse(
+        problems + [f"{paths_of[one.file]}: {one.message} [HM-DATA-100]" for one in findings if one.refused]
+    )
     _check_roles(trajectories, cuts, spec, needed)
     contents = "".join(sorted(f"{one.name} {one.sha256}\n" for one in recordings))
     return Dataset(
@@ -275,17 +277,18 @@ def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
     if samples and mean > UNEVEN * recording.dt:
         raise InputError(
             f"sampling is uneven: the time stamps are {recording.dt:.3g} s apart in the median and {mean:.3g} s in "
-            "the mean. Record at one rate, or check the time stamps."
+            "the mean. Record at one rate, or check the time stamps. [HM-DATA-101]"
         )
     if samples * len(recording.t) * mean / recording.dt > WORK:
         raise InputError(
             f"smoothing of {spec.smoothing:g} s holds {samples} of {len(recording.t)} samples, too many to work "
             f"with. The model's period is {spec.dt:g} s: give every tenth or hundredth row, or split the recording."
+            " [HM-DATA-102]"
         )
     if mean > FINEST * spec.dt:
         raise InputError(
             f"the model's period of {spec.dt:g} s is more than {FINEST} times finer than the sampling, {mean:.3g} s in "
-            "the mean. Raise dt in the DataSpec, or check that time is in seconds."
+            "the mean. Raise dt in the DataSpec, or check that time is in seconds. [HM-DATA-103]"
         )
 
 
@@ -436,7 +439,7 @@ def _check_windows(spec: DataSpec) -> None:
             if two.start < one.end:
                 raise InputError(
                     f"windows overlap in {stem}: {one.role} {one.start:g} to {one.end:g} s, "
-                    f"{two.role} {two.start:g} to {two.end:g} s. A sample can have one role only."
+                    f"{two.role} {two.start:g} to {two.end:g} s. A sample can have one role only. [HM-DATA-104]"
                 )
 
 
@@ -456,7 +459,7 @@ def _check_roles(
         f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
         "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
         f"without gaps that is split by fractions needs {needed_s:.3g} s."
-        + (f" Cut out:{dropped}" if dropped else "")
+        f"{f' Cut out:{dropped}' if dropped else ''} [HM-DATA-114]"
     )
 
 

@@ -33,7 +33,7 @@ def npz_source(path: Path, content: bytes, sha256: str) -> Source:
     if content.startswith(npy.MAGIC_PREFIX):
         raise InputError(
             f"{path}: is no .npz file but one array without a name. Write named vectors with numpy.savez(file, "
-            "name=vector, ...)."
+            "name=vector, ...). [HM-DATA-105]"
         )
     try:
         check_npz(content, 0, ())
@@ -41,6 +41,7 @@ def npz_source(path: Path, content: bytes, sha256: str) -> Source:
     except Exception as error:  # a damaged archive raises nearly anything
         raise InputError(
             f"{path}: is no .npz file or damaged ({line_of(error)}). Write it with numpy.savez(file, name=vector, ...)."
+            " [HM-DATA-106]"
         ) from error
 
     def lookup(name: str) -> NDArray[Any]:
@@ -51,6 +52,7 @@ def npz_source(path: Path, content: bytes, sha256: str) -> Source:
             raise InputError(
                 f"{path}: column {shown(name)} cannot be read ({line_of(error)}). Save it as a vector of numbers, "
                 "large ones with numpy.savez and not packed; objects are refused, since loading them could run code."
+                " [HM-DATA-107]"
             ) from error
 
     return vector_source(path, sha256, budget_of(len(content)), tuple(file.files), lookup, "index", 0)
@@ -88,13 +90,13 @@ def vector_source(
                 if time is not None and name == names[0] and array.dtype == np.float16 and array.size > 1:
                     raise InputError(
                         f"{path}: column {shown(name)} has half precision, three digits, which do not tell time stamps "
-                        "apart. Save it in double precision."
+                        "apart. Save it in double precision. [HM-DATA-108]"
                     )
                 left -= 8 * array.size
                 if left < 0:
                     raise InputError(
                         f"{path}: its columns take more than the {megabytes(budget)} of numbers that are "
-                        "read from a file of this length. Save it unpacked, or split the recording."
+                        "read from a file of this length. Save it unpacked, or split the recording. [HM-DATA-109]"
                     )
                 columns.append(_vector(path, name, array))
             except InputError as error:
@@ -105,7 +107,9 @@ def vector_source(
         lengths = dict(zip(names, map(len, columns), strict=True))
         if len(set(lengths.values())) > 1:
             each = ", ".join(f"{shown(name)} {length}" for name, length in lengths.items())
-            raise InputError(f"{path}: columns differ in length: {each}. Save vectors of one length.")
+            raise InputError(
+                f"{path}: columns differ in length: {each}. Save vectors of one length. [HM-DATA-110]"
+            )
         values = np.column_stack(columns)
         found = {}
         for name, column in zip(names, values.T, strict=True):
@@ -113,7 +117,8 @@ def vector_source(
             if len(bad):
                 found[name] = (
                     f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
-                    f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value."
+                    f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value. "
+                    "[HM-DATA-124]"
                 )
         values[~np.isfinite(values)] = np.nan
         return Columns(values, row, range(first, first + len(values)), found)
@@ -126,12 +131,12 @@ def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
         what = {"c": "complex numbers", "U": "text", "S": "text", "M": "dates"}.get(array.dtype.kind)
         raise InputError(
             f"{path}: column {shown(name)} holds {what or 'cells or other objects'}, not real numbers. "
-            "Save it as a vector of numbers."
+            "Save it as a vector of numbers. [HM-DATA-111]"
         )
     if array.size and sum(length != 1 for length in array.shape) > 1:
         raise InputError(
             f"{path}: column {shown(name)} has the shape {array.shape}, not that of a vector. Save each of its columns "
-            "under a name of its own."
+            "under a name of its own. [HM-DATA-112]"
         )
     return np.asarray(array, dtype=np.float64).ravel()
 
@@ -140,7 +145,7 @@ def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
             f"{path}: column {shown(name)} is the single number {dt:g}; as a sampling time [s] it must be positive. "
-            "Give that, or a vector of time stamps."
+            "Give that, or a vector of time stamps. [HM-DATA-113]"
         )
     return dt * np.arange(m, dtype=np.float64)
 

@@ -132,7 +132,9 @@ def _scalar(model: HybridModel, name: str, point: list[ca.MX], value: ca.MX) -> 
     try:
         return f.expand()
     except RuntimeError as error:
-        raise InputError(f"model {model.name}: its {name} is no scalar code: {last_line(error)}") from error
+        raise InputError(
+            f"model {model.name}: its {name} is no scalar code: {last_line(error)} [HM-EMBEDDED-001]"
+        ) from error
 
 
 def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int | None:

@@ -172,7 +172,9 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
     """
     gcc, size = shutil.which("gcc"), shutil.which("size")
     if gcc is None or size is None:
-        raise InputError("the check needs gcc and size (binutils), which are not installed; leave it out")
+        raise InputError(
+            "the check needs gcc and size (binutils), which are not installed; leave it out [HM-EMBEDDED-002]"
+        )
     with tempfile.TemporaryDirectory() as work:
         flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
         sources = [str((folder / name).resolve()) for name in names]
@@ -185,7 +187,9 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
             [gcc, *flags[:3], *test], cwd=work, capture_output=True, text=True, check=False
         )
         if made.returncode or linked.returncode:
-            raise InputError(f"the generated C does not compile: {(made.stderr + linked.stderr)[-2000:]}")
+            raise InputError(
+                f"the generated C does not compile: {(made.stderr + linked.stderr)[-2000:]} [HM-EMBEDDED-003]"
+            )
         table_of = subprocess.run([size, *objects], capture_output=True, text=True, check=True).stdout
         flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
         frames = [
@@ -195,7 +199,9 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
         ]
         done = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False)
         if done.returncode:
-            raise InputError(f"the generated C decides otherwise than Python: {done.stderr[-2000:]}")
+            raise InputError(
+                f"the generated C decides otherwise than Python: {done.stderr[-2000:]} [HM-EMBEDDED-004]"
+            )
         state = re.search(r"the state has (\d+) bytes", done.stderr)
         return Footprint(flash, int(state[1]) if state else 0, sum(frames))
 

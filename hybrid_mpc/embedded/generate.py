@@ -120,9 +120,9 @@ def make_sources(
     try:
         backup = backup_of(guard, single)
     except InputError as error:
-        refused.append(f"its guard's backup: {error}")
+        refused.append(f"its guard's backup: {error} [HM-EMBEDDED-005]")
     if refused or parts is None:
-        raise InputError("no C for this controller: " + "; ".join(refused))
+        raise InputError("no C for this controller: " + "; ".join(refused) + " [HM-EMBEDDED-011]")
     problem = Problem(model, ocp)
     soft = problem.soft
     expressions = sum(int(f.numel_out(0)) for f in soft.functions)
@@ -409,7 +409,9 @@ def _scalar(what: str, f: ca.Function) -> ca.Function:
     try:
         return f.expand()
     except RuntimeError as error:
-        raise InputError(f"no C for this controller: {what} is no scalar code: {last_line(error)}") from error
+        raise InputError(
+            f"no C for this controller: {what} is no scalar code: {last_line(error)} [HM-EMBEDDED-006]"
+        ) from error
 
 
 def target_starts(own: Targets | None) -> Array:

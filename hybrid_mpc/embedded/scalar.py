@@ -104,6 +104,7 @@ def c_function(
         raise InputError(
             f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; products with constant matrices "
             f"of more than {SMALL} numbers do not count: write networks with them (torch's Linear, GRUCell, LSTM)"
+            " [HM-EMBEDDED-008]"
         )
     lines, names = [], list(inputs)
     register: dict[int, str] = {}
@@ -128,6 +129,7 @@ def c_function(
                 called = " (a lookup table or a solver)" if code == ca.OP_CALL else ""
                 raise InputError(
                     f"{name}: no C for {_NAMES.get(code, code)}{called}; write the prior with other operations"
+                    " [HM-EMBEDDED-009]"
                 )
             operations += 1
         register[given[0]] = f"t{k}"

@@ -175,7 +175,9 @@ def _scalar(what: str, given: list[ca.MX], value: ca.MX) -> ca.Function:
     try:
         return ca.Function("watched", given, [value]).expand()
     except RuntimeError as error:
-        raise InputError(f"no C for this monitor: {what} is no scalar code: {last_line(error)}") from error
+        raise InputError(
+            f"no C for this monitor: {what} is no scalar code: {last_line(error)} [HM-EMBEDDED-010]"
+        ) from error
 
 
 def _energy(readings: EnergyReadings, model: HybridModel, parts: Cut) -> Watched:

@@ -78,7 +78,9 @@ def consistency(
     from scipy.stats import chi2, norm
 
     if skip < 1 or lags < 1:
-        raise InputError(f"consistency: skip and lags must be 1 or more, got {skip} and {lags}")
+        raise InputError(
+            f"consistency: skip and lags must be 1 or more, got {skip} and {lags} [HM-ESTIMATE-001]"
+        )
     runs = tuple(innovations(estimator, recording, skip) for recording in recordings)
     nis = np.concatenate([np.zeros(0), *(run.nis for run in runs)])
     degrees = np.concatenate([np.zeros(0, dtype=int), *(run.degrees for run in runs)])
@@ -87,7 +89,7 @@ def consistency(
     if n < 5 * lags:
         raise InputError(
             f"consistency: {n} samples are left after the first {skip} of each recording, at least {5 * lags} "
-            f"are needed for {lags} lags; give longer recordings or fewer lags"
+            f"are needed for {lags} lags; give longer recordings or fewer lags [HM-ESTIMATE-002]"
         )
     tail = (1.0 - LEVEL) / 2
     low, high = (float(chi2.ppf(share, freedom)) / n for share in (tail, 1.0 - tail))
@@ -112,7 +114,7 @@ def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Inno
     if recording.y.shape != (n, n_y) or recording.u.shape != (n, estimator.model.n_u) or n == 0:
         raise InputError(
             f"consistency: y {recording.y.shape} and u {recording.u.shape} given; needed: (n, {n_y}) and "
-            f"(n, {estimator.model.n_u}) with n > 0"
+            f"(n, {estimator.model.n_u}) with n > 0 [HM-ESTIMATE-003]"
         )
     ws = surroundings(estimator.model, recording)
     estimate = estimator.start(recording.y[0], w=ws[0])
@@ -153,5 +155,8 @@ def _autocorrelation(runs: Sequence[Array], lags: int) -> tuple[Array, Array]:
             r[lag - 1] += np.sum((e[lag:] * e[:-lag])[both], axis=0)
             pairs[lag - 1] += both.sum()
     if np.any(power == 0) or np.any(pairs == 0):
-        raise InputError("consistency: the recordings hold no pairs of samples at some lag; use fewer lags")
+        raise InputError(
+            "consistency: the recordings hold no pairs of samples at some lag; use fewer lags"
+            " [HM-ESTIMATE-004]"
+        )
     return r / power, pairs

@@ -84,7 +84,9 @@ class DelayCompensation:
     ) -> DelayedEstimate:
         """Estimate one period later, from what arrives and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
-            raise InputError("DelayCompensation goes on from its own estimates only; begin with start()")
+            raise InputError(
+                "DelayCompensation goes on from its own estimates only; begin with start() [HM-ESTIMATE-005]"
+            )
         base, y = estimate.filtered, sampled(y, (None,), "y")
         inputs = (*estimate.inputs, sampled(u_prev, (None,), "u_prev"))
         if estimate.missing:
@@ -99,7 +101,17 @@ class DelayCompensation:
         for u in inputs:
             now = self.estimator.predict(now, u)
         return DelayedEstimate(
-            now.t, now.x, now.h, now.d, now.P, base.innovation, base.nis, base, inputs, missing, w=now.w
+            t=now.t,
+            x=now.x,
+            h=now.h,
+            d=now.d,
+            P=now.P,
+            innovation=base.innovation,
+            nis=base.nis,
+            filtered=base,
+            inputs=inputs,
+            missing=missing,
+            w=now.w,
         )
 
 

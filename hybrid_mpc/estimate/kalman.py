@@ -139,7 +139,7 @@ class ExtendedKalmanFilter:
         hidden0 = _variance(np.zeros(n_h) if sigma_h0 is None else sigma_h0, n_h, "sigma_h0")
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
-            raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)}")
+            raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)} [HM-ESTIMATE-006]")
         self.model, self._sizes = model, (n_x, n_h, n_d, n_y)
         self._on_u, self._on_x, self._on_y = model.disturbed
         self._noise_y = variance_y
@@ -384,7 +384,7 @@ class ExtendedKalmanFilter:
         ys = sampled(y, (None, self.model.n_y), "y")
         n = len(ys)
         if not n:
-            raise InputError("y has no samples")
+            raise InputError("y has no samples [HM-ESTIMATE-007]")
         us = sampled(u, (n, self.model.n_u), "u")
         ws = np.tile(self.model.w, (n, 1)) if w is None else sampled(w, (n, self.model.n_w), "w")
         estimates = [self.start(ys[0], t, w=ws[0])]
@@ -396,7 +396,7 @@ class ExtendedKalmanFilter:
 def _variance(sigma: ArrayLike, size: int, name: str) -> Array:
     values = vector(sigma, size, name)
     if np.any(values < 0):
-        raise InputError(f"{name} must not be negative, got {values}")
+        raise InputError(f"{name} must not be negative, got {values} [HM-ESTIMATE-008]")
     return values**2
 
 
@@ -423,7 +423,9 @@ class TrueState:
         m, z = self.model, sampled(y, (None,), "the true state")
         n_z = m.n_x + m.n_h
         if z.size < n_z:
-            raise InputError(f"true state: the plant gives {z.size} states, the oracle model needs {n_z}")
+            raise InputError(
+                f"true state: the plant gives {z.size} states, the oracle model needs {n_z} [HM-ESTIMATE-009]"
+            )
         p, empty = np.zeros((n_z + m.n_d, n_z + m.n_d)), np.full(m.n_y, np.nan)
         known = m.w if w is None else sampled(w, (m.n_w,), "w")
         return Estimate(

@@ -132,7 +132,9 @@ def offset_free(
     b_d[: model.n_x] += on_x
     chosen = list(range(model.n_y)) if controlled is None else list(controlled)
     if not all(0 <= i < model.n_y for i in chosen):
-        raise InputError(f"controlled: {chosen} given; needed: places of the {model.n_y} outputs")
+        raise InputError(
+            f"controlled: {chosen} given; needed: places of the {model.n_y} outputs [HM-ESTIMATE-010]"
+        )
     target_rank, target_needed = _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen)
     return OffsetFree(
         model.n_d, model.n_y,

@@ -82,10 +82,12 @@ def with_parameter_states(
     _check_model(model, prior or model)
     if not (math.isfinite(most) and most > 1):
         raise InputError(
-            f"parameter states: most = {most} given, the largest factor; it must be above 1, e.g. 4"
+            f"parameter states: most = {most} given, the largest factor; it must be above 1, e.g. 4 [HM-ESTIMATE-011]"
         )
     if not groups:
-        raise InputError('parameter states: at least one group needed, e.g. {"mass": ("m", "J")}')
+        raise InputError(
+            'parameter states: at least one group needed, e.g. {"mass": ("m", "J")} [HM-ESTIMATE-012]'
+        )
     acceleration = _acceleration(model, given, groups, most)
     change, n_g = _change(model, acceleration), len(groups)
     x, _, u, w, p = step_symbols(model)
@@ -145,6 +147,7 @@ def parameter_filter(
     if not 1 <= groups <= model.n_h:
         raise InputError(
             f"parameter filter: {groups} groups given, model {model.name} has {model.n_h} hidden states"
+            " [HM-ESTIMATE-013]"
         )
     own = np.zeros(model.n_h - groups)
 
@@ -181,7 +184,7 @@ def parameter_states(factors: ArrayLike, most: float = 4.0) -> Array:
     """
     values, bound = np.asarray(factors, dtype=float), math.log(most)
     if not np.all(values > 0):
-        raise InputError(f"parameter states: factors must be positive, got {values}")
+        raise InputError(f"parameter states: factors must be positive, got {values} [HM-ESTIMATE-014]")
     return np.asarray(bound * np.arctanh(np.clip(np.log(values) / bound, -LEAST, LEAST)))
 
 
@@ -192,12 +195,12 @@ def _check_model(model: HybridModel, prior: HybridModel) -> None:
     if model.n_x % 2 or not np.array_equal(found, np.eye(n_q, model.n_x + model.n_u, n_q)):
         raise InputError(
             f"parameter states: the states {[s.name for s in model.states]} of model {model.name} are not positions "
-            "and then their velocities; nothing else is dealt with, no lags"
+            "and then their velocities; nothing else is dealt with, no lags [HM-ESTIMATE-015]"
         )
     if model.delay_states:
         raise InputError(
             f"parameter states: the inputs of model {model.name} act later; parameters as states are for "
-            "models without a delay"
+            "models without a delay [HM-ESTIMATE-016]"
         )
 
 
@@ -206,7 +209,7 @@ def _acceleration(
 ) -> ca.Function:
     """``(x, u, theta, w, p) -> a`` of the prior; one function, so that it is exactly itself at equal arguments."""
     if empty := [group for group, names in groups.items() if not names]:
-        raise InputError(f"parameter states: group {empty[0]!r} is empty")
+        raise InputError(f"parameter states: group {empty[0]!r} is empty [HM-ESTIMATE-017]")
     changed = ca.DM(incidence(model, groups, "parameter states"))
     x, _, u, w, p = step_symbols(model)
     theta, bound = ca.MX.sym("theta", len(groups)), math.log(most)

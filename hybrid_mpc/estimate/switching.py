@@ -90,10 +90,13 @@ class SwitchingFilter:
     def __init__(self, filters: Sequence[ExtendedKalmanFilter], transition: ArrayLike) -> None:
         m, p = len(filters), np.array(transition, dtype=float)
         if not m or any(f.model is not filters[0].model for f in filters):
-            raise InputError("a switching filter needs at least one filter, all on the same model")
+            raise InputError(
+                "a switching filter needs at least one filter, all on the same model [HM-ESTIMATE-018]"
+            )
         if p.shape != (m, m) or np.any(p < 0) or not np.allclose(p.sum(axis=1), 1.0, atol=1e-9):
             raise InputError(
                 f"transition: probabilities of shape {(m, m)} whose rows sum to 1 needed, got {p.tolist()}"
+                " [HM-ESTIMATE-019]"
             )
         model = filters[0].model
         self.model, self.filters, self.transition = model, tuple(filters), p
@@ -247,7 +250,9 @@ class SwitchingFilter:
 
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
         if not isinstance(estimate, SwitchingEstimate) or len(estimate.z) != len(self.filters):
-            raise InputError("SwitchingFilter goes on from its own estimates only; begin with start()")
+            raise InputError(
+                "SwitchingFilter goes on from its own estimates only; begin with start() [HM-ESTIMATE-020]"
+            )
         return estimate
 
     def _together(

@@ -62,7 +62,9 @@ def surroundings(model: HybridModel, recording: Recording) -> Array:
         return np.zeros((n, 0))
     w: Array = np.asarray(recording.w, dtype=np.float64)
     if w.shape != (n, model.n_w):
-        raise InputError(f"recording: measured disturbances {w.shape} given, needed: {(n, model.n_w)}")
+        raise InputError(
+            f"recording: measured disturbances {w.shape} given, needed: {(n, model.n_w)} [HM-ESTIMATE-021]"
+        )
     return w
 
 
@@ -95,7 +97,7 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
             break
     if not errors:
         raise InputError(
-            "process noise: no recording with at least two samples given; pass training recordings"
+            "process noise: no recording with at least two samples given; pass training recordings [HM-ESTIMATE-022]"
         )
     sizes = np.sqrt(np.mean(np.square(np.concatenate([r.x for r in recordings])), axis=0))
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), ROUNDING * sizes)

@@ -96,8 +96,9 @@ def recommend(
     The ratio of a hybrid's error to the prior's is the geometric mean of each recording's where there are
     ``RECORDINGS`` or more, and its bound is that of the mean of the logarithms: another recording may be like any of
     these, so a single one in which the prior is far off does not outweigh the others. Over all runs together the hybrid
-    must be the better one as well. Within a single recording the ratio is that of the root mean squares; its scatter is
-    found by leaving out one block after the other (jackknife); a block is a contiguous part of a run.
+    must be better as well. Of several hybrids that surely beat the prior the one with the lowest ratio is recommended.
+    Within a single recording the ratio is that of the root mean squares; its scatter is found by leaving out one block
+    after the other (jackknife); a block is a contiguous part of a run.
 
     Args:
         errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
@@ -124,9 +125,11 @@ def recommend(
     Source: Efron, *The jackknife, the bootstrap and other resampling plans* (1982).
     """
     if deploy and deploy not in errors:
-        raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)}")
+        raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)} [HM-IDENTIFY-003]")
     if not errors.get(prior):
-        raise InputError("there is no validation run to choose a model by; give longer recordings")
+        raise InputError(
+            "there is no validation run to choose a model by; give longer recordings [HM-IDENTIFY-004]"
+        )
     compared = _Compared(errors[prior], samples, recordings)
     figures = {name: compared.figures(runs) for name, runs in errors.items()}
     for name in errors if shrunk is not None else ():
@@ -140,7 +143,8 @@ def recommend(
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)
     safe = [name for name in hybrids if compared.sure(figures[name])]
-    chosen = min(safe, key=lambda name: figures[name].error, default=prior)
+    # the lowest mean of the logarithms: what the next recording is expected to have; two that are alike by their error
+    chosen = min(safe, key=lambda name: (figures[name].ratio, figures[name].error), default=prior)
     pieces = compared.pieces
     of_what = f"{evidence}, their geometric mean" if compared.whole else "block" if pieces == 1 else "blocks"
     reason = _reason(figures, best, chosen, prior, f"{pieces} {of_what}")

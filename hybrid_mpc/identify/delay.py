@@ -26,7 +26,9 @@ def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
     share, first = rest / trajectory.dt, lost_samples(delay, trajectory.dt)
     n = len(trajectory.t)
     if n <= first + 1:
-        raise InputError(f"{trajectory.name}: a delay of {delay:g} s leaves nothing of {n} samples")
+        raise InputError(
+            f"{trajectory.name}: a delay of {delay:g} s leaves nothing of {n} samples [HM-IDENTIFY-007]"
+        )
     younger = trajectory.u[first - whole : n - whole]
     older = trajectory.u[first - whole - 1 : n - whole - 1] if share > 0 else younger
     rest_of = trajectory.part(slice(first, None))
@@ -47,7 +49,9 @@ def lost_samples(delay: float, dt: float) -> int:
 def _split(delay: float, dt: float) -> tuple[int, float]:
     """Whole periods of a delay and what is left [s]."""
     if not (delay > 0 and math.isfinite(delay)):
-        raise InputError(f"delay must be positive, got {delay} s; without one use the prior as it is")
+        raise InputError(
+            f"delay must be positive, got {delay} s; without one use the prior as it is [HM-IDENTIFY-008]"
+        )
     whole = math.floor(delay / dt + TINY)
     rest = delay - whole * dt
     return whole, (rest if rest > TINY * dt else 0.0)

@@ -266,13 +266,15 @@ def output_errors(
         (0.1, 87.75)
     """
     if not y:
-        raise InputError("there is no free run to score; give longer recordings")
+        raise InputError("there is no free run to score; give longer recordings [HM-IDENTIFY-009]")
     measured, predicted = np.concatenate(y), np.concatenate(y_hat)
     rmse, sizes = [], []
     for signal, truth, guess in zip(outputs, measured.T, predicted.T, strict=True):
         seen = np.isfinite(truth)
         if not seen.any():
-            raise InputError(f"output {signal.label} was never measured in the free runs that are scored")
+            raise InputError(
+                f"output {signal.label} was never measured in the free runs that are scored [HM-IDENTIFY-010]"
+            )
         with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinitely wrong
             rmse.append(_finite(np.sqrt(np.mean(np.square(guess[seen] - truth[seen])))))
         size = float(truth[seen].std())
@@ -305,9 +307,19 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
         for point in ((x, xdot), (x_hat[:n], xdot_hat))
     )
     return FreeRun(
-        trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat,
-        measured, model, w,
-    )  # fmt: skip
+        name=trajectory.name,
+        t=trajectory.t[part],
+        u=u,
+        x=x,
+        x_hat=x_hat[:n],
+        y=trajectory.y[part],
+        y_hat=y_hat,
+        xdot=xdot,
+        xdot_hat=xdot_hat,
+        balances=measured,
+        balances_hat=model,
+        w=w,
+    )
 
 
 def measured_as(prior: Prior, y: Array) -> Array:

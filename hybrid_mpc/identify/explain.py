@@ -230,7 +230,7 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
     if count < FEWEST or groups < 2:
         raise InputError(
             f"{len(present)} recording of {whole} samples is too little evidence for terms: record at least one more "
-            f"like it, or one of {2 * samples} samples and more"
+            f"like it, or one of {2 * samples} samples and more [HM-IDENTIFY-011]"
         )
     what = "one recording" if len(present) == 1 else f"{len(present)} recordings"
     text = f"{count} blocks of {what} in {groups} groups"
@@ -344,7 +344,17 @@ class _Search:
             named(prior.names_of(key), ca.vertsplit(v)) for key, v in zip("xuwp", (x, u, w, p), strict=True)
         )
         x_named, u_named, w_named, p_named = names
-        at = At(x_named, u_named, w_named, own, None, 0.0, 0.0, state, p_named)
+        at = At(
+            x=x_named,
+            u=u_named,
+            w=w_named,
+            own=own,
+            position=None,
+            driven=0.0,
+            resting=0.0,
+            state=state,
+            p=p_named,
+        )
         rate = term.law(at, named(term.names, ca.vertsplit(given)))[1]
         f = ca.Function("rate", [state, x, u, w, given, p], [rate])
         h, one = self.dt / ALONG, state
@@ -586,7 +596,17 @@ def explain(
         InputError: If there are too few recordings to judge terms by, two terms have one name, or an own term does not
             fit to the prior, its units or its balances.
     """
-    found = _Explain(base, values, known, dt, length, warm_up, candidates, own, on_progress)
+    found = _Explain(
+        base=base,
+        values=values,
+        known=known,
+        dt=dt,
+        length=length,
+        warm_up=warm_up,
+        candidates=candidates,
+        own=own,
+        on_progress=on_progress,
+    )
     return found.run(begun, most, on_step)
 
 
@@ -594,9 +614,17 @@ class _Explain:
     """One search."""
 
     def __init__(
-        self, base: type[Prior], values: dict[str, float], known: Sequence[Trajectory], dt: float, length: float,
-        warm_up: float, candidates: Sequence[Candidate] | None, own: Sequence[Term], on_progress: Progress,
-    ) -> None:  # fmt: skip
+        self,
+        base: type[Prior],
+        values: dict[str, float],
+        known: Sequence[Trajectory],
+        dt: float,
+        length: float,
+        warm_up: float,
+        candidates: Sequence[Candidate] | None,
+        own: Sequence[Term],
+        on_progress: Progress,
+    ) -> None:
         prior = base(values)
         self.base, self.known, self.own, self.on_progress = base, known, tuple(own), on_progress
         ends = {name: max(len(t.t) for t in known if t.file == name) - 1 for name in {t.file for t in known}}
@@ -611,7 +639,7 @@ class _Explain:
                 raise InputError(
                     f"one recording of {samples} samples is too little evidence for terms, which are judged by "
                     f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples "
-                    "more, or a second recording"
+                    "more, or a second recording [HM-IDENTIFY-012]"
                 )
         periods = min(periods_of(length, dt, 2), longest)
         self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
@@ -879,10 +907,17 @@ class _Explain:
                 )  # fmt: skip
             steps.append(step)
         return Explanation(
-            self.base.__name__, self.nominal, self._error(self.first),
-            self.evidence.compared(self.now.squares, self.first, 1), tuple(steps), last, parameters,
-            self.evidence.told, self.candidates, reason,
-        )  # fmt: skip
+            base=self.base.__name__,
+            nominal=self.nominal,
+            before=self._error(self.first),
+            after=self.evidence.compared(self.now.squares, self.first, 1),
+            steps=tuple(steps),
+            last=last,
+            parameters=parameters,
+            evidence=self.evidence.told,
+            candidates=self.candidates,
+            reason=reason,
+        )
 
 
 def _chosen(fitted: Sequence[_Fitted]) -> _Fitted | None:
@@ -917,9 +952,9 @@ def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points:
     problems = []
     for term in own:
         if names.count(term.name) > 1:
-            problems.append(f"term {term.name!r} is there twice; rename one.")
+            problems.append(f"term {term.name!r} is there twice; rename one. [HM-IDENTIFY-013]")
         problems += [
-            f"term {term.name!r}: parameter {name} is there twice; rename one."
+            f"term {term.name!r}: parameter {name} is there twice; rename one. [HM-IDENTIFY-014]"
             for name in term.names
             if parameters.count(name) > 1
         ]
@@ -939,7 +974,7 @@ def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> li
         if lost.min() < -1e-6 * max(np.abs(lost).max(), 1e-300):
             return [
                 f"term {term.name!r} is declared a loss, but supplies to the balance {before.name!r} at some of the "
-                "recordings' points; correct its sign, or leave loss=False."
+                "recordings' points; correct its sign, or leave loss=False. [HM-IDENTIFY-074]"
             ]
     return []
 
@@ -1058,7 +1093,10 @@ class _Pictures:
             own = ca.DM(self._signal(term.of)[1])
             base = named(tuple(p.name for p in self.parameters[: self.n_p]), list(self.values[: self.n_p]))
             given = [float(v) for v, p in zip(values, self.parameters, strict=True) if p.name in term.names]
-            acting = term.law(At(x, u, w, own, None, 0.0, 0.0, None, base), named(term.names, given))
+            acting = term.law(
+                At(x=x, u=u, w=w, own=own, position=None, driven=0.0, resting=0.0, state=None, p=base),
+                named(term.names, given),
+            )
             return np.asarray((acting - own).full().ravel())
         return self._as_force(self._rates(values) - self._rates(zero), term)
 

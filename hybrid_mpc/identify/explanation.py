@@ -266,7 +266,7 @@ class Explanation:
         for term in self.found:
             if term.made is None and term.name not in given:
                 raise InputError(
-                    f"term {term.name!r} was made by own code; give it: explanation.terms([term])"
+                    f"term {term.name!r} was made by own code; give it: explanation.terms([term]) [HM-IDENTIFY-015]"
                 )
             made.append(given[term.name] if term.made is None else again(term.made))
         return tuple(made)

@@ -101,7 +101,10 @@ def _with_weights(program: nn_export.Program, module: nn.Module) -> nn_export.Pr
     held = {n: own[n].detach().numpy().copy() if n in own else w for n, w in program.weights.items()}
     strange = [name for name, value in held.items() if value.shape != program.weights[name].shape]
     if strange:
-        raise InputError(f"{strange[0]} has another shape than in the program to be like; trace the model")
+        raise InputError(
+            f"{strange[0]} has another shape than in the program to be like; trace the model"
+            " [HM-IDENTIFY-016]"
+        )
     return replace(program, weights=held)
 
 

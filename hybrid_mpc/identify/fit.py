@@ -145,7 +145,7 @@ def fit_prior(
     if most_samples(train) < fit.lead + 3:
         raise InputError(
             f"no recording is long enough to fit {type(fit.prior).__name__} to: the longest has {most_samples(train)} "
-            f"samples, {fit.lead + 3} are needed at least"
+            f"samples, {fit.lead + 3} are needed at least [HM-IDENTIFY-017]"
         )
     if length is None:
         length = max(LENGTHS[-1] * unit, SLOWEST * slowest(fit.prior))
@@ -225,7 +225,10 @@ def fit_prior(
     on_progress(total - 1, total, "smoothing by the fitted prior")
 
     if not np.isfinite(min(scores)):
-        raise InputError("the prior diverges with every set of parameters tried; check its signs and units")
+        raise InputError(
+            "the prior diverges with every set of parameters tried; check its signs and units"
+            " [HM-IDENTIFY-018]"
+        )
 
     def smoother_of(found: Fitted) -> Smoother:
         acting = shifted([*train, *valid], fit.delay(found.theta))
@@ -257,10 +260,19 @@ def fit_prior(
         warnings += late_inputs(fit, chosen.theta, guesses, periods, sizes, first_states)
     on_progress(total, total, "done")
     return PriorFit(
-        fit.values(chosen.theta), standard_errors(fit, chosen), warnings, stages,
-        correlations(fit, chosen), fit.delay(chosen.theta), smoother.sigma, smoother.walk, smoother.sizes,
-        smoother.fading, smoother.substeps, chosen.unidentified,
-    )  # fmt: skip
+        values=fit.values(chosen.theta),
+        standard_errors=standard_errors(fit, chosen),
+        warnings=warnings,
+        stages=stages,
+        correlations=correlations(fit, chosen),
+        delay=fit.delay(chosen.theta),
+        sigma=smoother.sigma,
+        walk=smoother.walk,
+        sizes=smoother.sizes,
+        fading=smoother.fading,
+        substeps=smoother.substeps,
+        unidentified=chosen.unidentified,
+    )
 
 
 def refit(
@@ -355,6 +367,7 @@ def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
             f"{type(prior).__name__}: no output tells of {', '.join(unseen)} (outputs: "
             f"{', '.join(s.name for s in prior.outputs)}): nothing that is measured changes with "
             f"{'them' if len(unseen) > 1 else 'it'}. Measure it, leave it out of the states, or check output()"
+            " [HM-IDENTIFY-019]"
         )
 
 

@@ -130,6 +130,7 @@ class Horizon:
         if not np.isfinite(first.min(axis=0)).all():
             raise InputError(
                 "the equations give no number where a smoother starts; see their square roots and logs"
+                " [HM-IDENTIFY-020]"
             )
         lengths = np.diff([*stretches.begins, len(stretches.y)])
         order = np.repeat(np.argsort(first, axis=0, kind="stable"), lengths, axis=1)

@@ -171,17 +171,17 @@ class LinearModel:
         ):
             raise InputError(
                 f"free run: y_past is {y.shape} and u is {v.shape}; needed are (..., warm, {n_y}) and (..., n, {n_u}) "
-                "with the same windows in front (measured disturbances are the last columns of u)"
+                "with the same windows in front (measured disturbances are the last columns of u) [HM-IDENTIFY-021]"
             )
         warm, n = y.shape[-2], v.shape[-2]
         if not 1 <= warm <= n:
             raise InputError(
                 f"free run: y_past has {warm} samples and u has {n}; a warm-up needs at least one, and u "
-                "starts with it and goes on after it"
+                "starts with it and goes on after it [HM-IDENTIFY-022]"
             )
         if not np.isfinite(v).all():
             raise InputError(
-                "free run: an input is not finite; a free run needs every input, fill the gap first"
+                "free run: an input is not finite; a free run needs every input, fill the gap first [HM-IDENTIFY-023]"
             )
         y, v = (y - self.y_centre) / self.y_scale, (v - self.u_centre) / self.u_scale
         windows = math.prod(y.shape[:-2])
@@ -202,7 +202,7 @@ class LinearModel:
         """
         pairs = [_signals(r) for r in recordings]
         refuse([
-            f"recording {i + 1}: {len(y)} samples; a free run after a warm-up of {warm} needs more"
+            f"recording {i + 1}: {len(y)} samples; a free run after a warm-up of {warm} needs more [HM-IDENTIFY-024]"
             for i, (y, _) in enumerate(pairs) if len(y) <= warm
         ])  # fmt: skip
         longest = max((len(y) for y, _ in pairs), default=0)
@@ -375,7 +375,9 @@ def fit_subspace(
     """
     data = _checked(train, valid, dt, warm)
     if weighting not in ("cva", "n4sid"):
-        raise InputError(f"fit_subspace: weighting is {weighting!r}; there are 'cva' and 'n4sid'")
+        raise InputError(
+            f"fit_subspace: weighting is {weighting!r}; there are 'cva' and 'n4sid' [HM-IDENTIFY-025]"
+        )
     states = _naturals(orders, [n for n in ORDERS if n <= MOST_STATES], "orders", 1)
     enough, short = [], []
     for horizon in _naturals(horizons, HORIZONS, "horizons", 2):
@@ -425,7 +427,7 @@ def _signals(recording: Measured) -> tuple[Array, Array]:
         u = np.hstack([u, np.asarray(w, dtype=float)])
     elif w is not None:
         raise InputError(
-            f"measured disturbances w: shape {np.shape(w)}; needed is ({len(u)}, n_w), as long as u"
+            f"measured disturbances w: shape {np.shape(w)}; needed is ({len(u)}, n_w), as long as u [HM-IDENTIFY-026]"
         )
     return np.asarray(recording.y, dtype=float), u
 
@@ -434,13 +436,14 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
     """The training data, scaled; everything that can be said against the input before computing is said."""
     problems = []
     if not positive(dt):
-        problems.append(f"dt is {dt!r:.80}; a period above 0 s is needed")
+        problems.append(f"dt is {dt!r:.80}; a period above 0 s is needed [HM-IDENTIFY-027]")
     if isinstance(warm, bool) or not isinstance(warm, int | np.integer) or warm < 1:
-        problems.append(f"warm is {warm}; a whole number of samples is needed, at least 1")
+        problems.append(f"warm is {warm}; a whole number of samples is needed, at least 1 [HM-IDENTIFY-028]")
     for role, recordings in (("training", train), ("validation", valid)):
         if not len(recordings):
             problems.append(
                 f"there is no {role} recording; models are fitted on some and chosen on others: give both"
+                " [HM-IDENTIFY-029]"
             )
     refuse(problems)
     pairs = {
@@ -452,6 +455,7 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or not y.shape[1] or not u.shape[1]:
             problems.append(
                 f"{name}: y is {y.shape}, u is {u.shape}; needed are (n, n_y) and (n, n_u), a row a sample"
+                " [HM-IDENTIFY-030]"
             )
         elif first[0].ndim == 2 == first[1].ndim and (y.shape[1], u.shape[1]) != (
             first[0].shape[1],
@@ -460,14 +464,18 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
             problems.append(
                 f"{name}: {y.shape[1]} outputs and {u.shape[1]} inputs (with measured disturbances); training "
                 f"recording 1 has {first[0].shape[1]} and {first[1].shape[1]}; give all recordings the same columns"
+                " [HM-IDENTIFY-031]"
             )
         elif not np.isfinite(u).all():
-            problems.append(f"{name}: an input is not finite; cut the recording there or fill the gap")
+            problems.append(
+                f"{name}: an input is not finite; cut the recording there or fill the gap [HM-IDENTIFY-032]"
+            )
         elif np.isinf(y).any():
-            problems.append(f"{name}: an output is infinite; a missing sample is NaN")
+            problems.append(f"{name}: an output is infinite; a missing sample is NaN [HM-IDENTIFY-033]")
         elif name.startswith("valid") and not np.isfinite(y[warm:]).any(axis=0).all():
             problems.append(
                 f"{name}: {len(y)} samples, none of some output measured after a warm-up of {warm}; record longer ones"
+                " [HM-IDENTIFY-034]"
             )
     refuse(problems)
     runs = list(pairs.values())[: len(train)]
@@ -479,10 +487,11 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
         if not len(seen) or is_constant(seen):
             problems.append(
                 f"output {j + 1} never changes in the training recordings; leave it out, or train where it moves"
+                " [HM-IDENTIFY-035]"
             )
     problems += [
         f"input {j + 1} never changes in the training recordings, so nothing says what it does; leave it out, or "
-        "train on recordings where it moves"
+        "train on recordings where it moves [HM-IDENTIFY-036]"
         for j in still if j < n_commanded
     ]  # fmt: skip
     refuse(problems)
@@ -498,7 +507,10 @@ def _naturals(given: Sequence[int] | None, default: Sequence[int], name: str, le
     if not values or any(
         isinstance(v, bool) or not isinstance(v, int | np.integer) or v < least for v in values
     ):
-        raise InputError(f"{name}: {values} given; whole numbers from {least} on are needed, at least one")
+        raise InputError(
+            f"{name}: {values} given; whole numbers from {least} on are needed, at least one"
+            " [HM-IDENTIFY-037]"
+        )
     return sorted({int(v) for v in values})
 
 
@@ -519,7 +531,7 @@ def _long_enough(enough: Sequence[int], short: Sequence[str], default: bool, dat
     told = short[:1] if default else short
     raise InputError(
         f"recordings too short: {'; '.join(told)} without a missing sample in the training recordings "
-        f"(samples: {lengths}). Record longer ones, or ask for less"
+        f"(samples: {lengths}). Record longer ones, or ask for less [HM-IDENTIFY-038]"
     )
 
 
@@ -750,9 +762,24 @@ def _model(
     spread: Array, tried: tuple[int, int, int], doubts: tuple[str, ...],
 ) -> LinearModel:  # fmt: skip
     return LinearModel(
-        name, float(dt), a, b, c, d, k, bias, noise, spread, data.u_centre, data.u_scale, data.y_centre, data.y_scale,
-        Candidate(*tried, math.nan, _radius(a)), (), doubts,
-    )  # fmt: skip
+        name=name,
+        dt=float(dt),
+        A=a,
+        B=b,
+        C=c,
+        D=d,
+        K=k,
+        bias=bias,
+        noise=noise,
+        spread=spread,
+        u_centre=data.u_centre,
+        u_scale=data.u_scale,
+        y_centre=data.y_centre,
+        y_scale=data.y_scale,
+        chosen=Candidate(*tried, math.nan, _radius(a)),
+        candidates=(),
+        warnings=doubts,
+    )
 
 
 def _error(model: LinearModel, recordings: Sequence[Measured], warm: int) -> float:
@@ -777,7 +804,7 @@ def _best(tried: Iterable[LinearModel | Candidate], valid: Sequence[Measured], w
     if not models:
         raise InputError(
             "no candidate became a model: the recordings say nothing of so many states; ask for fewer (orders), or "
-            "train on recordings that move more"
+            "train on recordings that move more [HM-IDENTIFY-039]"
         )
     stable = [m for m in models if m.chosen.stable]
     able = stable or models

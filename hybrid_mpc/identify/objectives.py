@@ -157,7 +157,7 @@ def objectives_of(prior: Prior, names: Sequence[str]) -> dict[str, Objective]:
     if unknown or not wanted:
         raise InputError(
             f"objectives: {', '.join(unknown) or 'there is none'}; choose of: {', '.join([*OBJECTIVES, BALANCES])}, "
-            f"and the balances of {type(prior).__name__}: {', '.join(balances) or 'it has none'}"
+            f"and the balances of {type(prior).__name__}: {', '.join(balances) or 'it has none'} [HM-IDENTIFY-040]"
         )
     return {name: OBJECTIVES.get(name) or balance_objective(name) for name in wanted}
 

@@ -93,9 +93,9 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     """Free run and one-step predictions of a recording, with bands.
 
     The first ``warm_up`` seconds of the recording give the first state, smoothed by the fitted prior, and the networks'
-    memory; they are not predicted. The free run's band is the one that validation calibrated (docs/choice.md); it grows
-    on beyond the longest run that it was calibrated on, where nobody has tried it. One-step predictions are those of
-    ``kit.observer(model)``; their band is what its own covariance says, not calibrated.
+    memory; they are not predicted. The free run's band is the one that validation calibrated (docs/predict.md); it
+    grows on beyond the longest run that it was calibrated on, where nobody has tried it. One-step predictions are those
+    of ``kit.observer(model)``; their band is what its own covariance says, not calibrated.
 
     Args:
         kit: A loaded artifact.
@@ -116,7 +116,7 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     if len(trajectory.t) < lost + warm + 2:
         raise InputError(
             f"{trajectory.name}: {len(trajectory.t) * dt:.4g} s are too short: {(lost + warm + 2) * dt:.4g} s are "
-            f"needed, of which {warm * dt:.4g} s are the warm-up"
+            f"needed, of which {warm * dt:.4g} s are the warm-up [HM-IDENTIFY-041]"
         )
     (acting,) = shifted([trajectory], delay)
     smoother = Smoother(prior, dt, held.sigma, held.walk, held.sizes, held.fading, held.substeps)
@@ -152,16 +152,18 @@ def _checked(kit: Kit, trajectory: Trajectory, model: str) -> tuple[str, Predict
     """Name of the model, and what predictions need."""
     name = model or kit.recommended
     if not isinstance(name, str) or name not in kit.models:
-        raise InputError(f"no model {name!r}; there are: {', '.join(kit.models)}")
+        raise InputError(f"no model {name!r}; there are: {', '.join(kit.models)} [HM-IDENTIFY-042]")
     if kit.predicting is None or "prior" not in kit.models:
         raise InputError(
             f"the model of scenario {kit.name or '(unnamed)'} was saved without what predictions need (columns, "
             "smoother, bands): an older version wrote it, or save_artifact without predicting; run the scenario again"
+            " [HM-IDENTIFY-043]"
         )
     chosen = kit.models[name]
     if abs(trajectory.dt - chosen.dt) > 1e-9 * chosen.dt:
         raise InputError(
             f"{trajectory.name} has a period of {trajectory.dt:g} s, the model one of {chosen.dt:g} s; resample it"
+            " [HM-IDENTIFY-044]"
         )
     return name, kit.predicting
 

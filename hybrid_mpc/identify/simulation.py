@@ -288,7 +288,7 @@ def _substeps(rate: float, dt: float, name: str, where: str) -> int:
         raise InputError(
             f"{name}'s fastest mode {where} is {rate:.3g} 1/s; a period of {dt} s "
             f"would need {rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
-            f"at zero speed) or take a smaller dt."
+            f"at zero speed) or take a smaller dt. [HM-IDENTIFY-049]"
         )
     return substeps
 

@@ -90,12 +90,18 @@ def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) 
         "process noise of state": dict(zip((prior.states[i].name for i in prior.corrected), fit.walk, strict=False)),
     }  # fmt: skip
     for what, values in numbers.items():
-        found += [f"{what} {name} is not finite ({v})" for name, v in values.items() if not math.isfinite(v)]
+        found += [
+            f"{what} {name} is not finite ({v}) [HM-IDENTIFY-075]"
+            for name, v in values.items()
+            if not math.isfinite(v)
+        ]
     for i, (state, low, high) in enumerate(zip(prior.states, *smoother.bounds, strict=True)):
         x = np.concatenate([t.x[:, i] for t in smoothed])
         lost = ~np.isfinite(np.concatenate([t.xdot[:, i] for t in smoothed])) | ~np.isfinite(x)
         if lost.any():
-            found.append(f"{state.label} or its rate is not finite in {lost.sum()} smoothed samples")
+            found.append(
+                f"{state.label} or its rate is not finite in {lost.sum()} smoothed samples [HM-IDENTIFY-076]"
+            )
             continue
         near = NEAR * (high - low) if math.isfinite(high - low) else 0.0
         away = float(np.mean((x <= low + near) | (x >= high - near)))
@@ -103,7 +109,7 @@ def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) 
             found.append(
                 f"{state.label} lies at three times its range [{state.lower:g}, {state.upper:g}] or beyond in "
                 f"{away:.0%} of the smoothed samples ({x.min():.4g} to {x.max():.4g}): no sensor determines it, its "
-                "range is wrong, or an equation that contains it is"
+                "range is wrong, or an equation that contains it is [HM-IDENTIFY-077]"
             )
     return tuple(found)
 

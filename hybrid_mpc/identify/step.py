@@ -361,15 +361,15 @@ class HybridStep(RecurrentStep):
         uncut = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
         averaged = uncut.unflatten(1, (-1, min(SPAN, uncut.shape[1]))).mean(2).reshape(-1, len(rows))
         return Scaling(
-            spread(x),
-            spread(u),
-            rms(predicted),
-            rms(averaged),
-            spread(w),
-            mean(x),
-            mean(u),
-            mean(w),
-            spread(((windows.x[:, 1:] - windows.x[:, :-1]) / dt).flatten(0, 1)),
+            x=spread(x),
+            u=spread(u),
+            rate=rms(predicted),
+            correction=rms(averaged),
+            w=spread(w),
+            centre_x=mean(x),
+            centre_u=mean(u),
+            centre_w=mean(w),
+            xdot=spread(((windows.x[:, 1:] - windows.x[:, :-1]) / dt).flatten(0, 1)),
         )
 
     def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
@@ -509,7 +509,7 @@ class TrainedParameters(nn.Module):
         if not free:
             raise InputError(
                 f"{type(prior).__name__} has no free parameter to train along (all have lower == upper); "
-                "leave prior_parameters 'fixed' or give one of them bounds"
+                "leave prior_parameters 'fixed' or give one of them bounds [HM-IDENTIFY-050]"
             )
         self.networks, start, n_p = networks, prior.values, len(prior.parameters)
         self._spec = {p.name: (start[p.name], p.lower, p.upper) for p in free}
@@ -559,7 +559,7 @@ def shift_to(prior: Prior, values: Mapping[str, float]) -> Tensor:
     if unknown:
         raise InputError(
             f"{type(prior).__name__} has no parameter {', '.join(sorted(unknown))}, which was trained along; "
-            "give the prior of the training"
+            "give the prior of the training [HM-IDENTIFY-051]"
         )
     return torch.tensor(
         [values.get(name, fitted) - fitted for name, fitted in own.items()], dtype=torch.float64

@@ -256,7 +256,7 @@ class TrainingRun:
             check_rates([*training, *validation])
         if s.prior_replay and not form.corrects_prior:
             raise InputError(
-                f"{form.__name__} corrects no prior, so there is none to replay; leave prior_replay 0"
+                f"{form.__name__} corrects no prior, so there is none to replay; leave prior_replay 0 [HM-IDENTIFY-052]"
             )
         training, part = in_parts(training, s.parts, s.shortest)
         without = [[float(own != i) for i in range(s.networks)] for own in part] if s.parts else []
@@ -492,14 +492,16 @@ def load_checkpoint(path: Path, key: str) -> tuple[dict[str, Tensor], dict[str, 
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise InputError(f"checkpoint {path} cannot be read ({error}); delete it to train anew") from error
+        raise InputError(
+            f"checkpoint {path} cannot be read ({error}); delete it to train anew [HM-IDENTIFY-053]"
+        ) from error
     numbers = metadata.get("numbers", "")
     if metadata.get("sha256") != _content_hash(tensors, numbers):
-        raise InputError(f"checkpoint {path} is damaged; delete it to train anew")
+        raise InputError(f"checkpoint {path} is damaged; delete it to train anew [HM-IDENTIFY-054]")
     if metadata.get("key") != key:
         raise InputError(
             f"checkpoint {path} belongs to a training with other settings or data; "
-            f"resume with the same ones or choose another output folder"
+            f"resume with the same ones or choose another output folder [HM-IDENTIFY-055]"
         )
     return tensors, json.loads(numbers)
 

@@ -91,7 +91,9 @@ class SearchSpace:
             if bounds is not None:
                 object.__setattr__(self, field.name, _checked(field.name, bounds))
         if not self.names:
-            raise InputError(f"the search has nothing to vary; give bounds to one of: {', '.join(USUAL)}")
+            raise InputError(
+                f"the search has nothing to vary; give bounds to one of: {', '.join(USUAL)} [HM-IDENTIFY-056]"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -145,9 +147,9 @@ def parsed_space(texts: Sequence[str]) -> SearchSpace:
     for text in texts:
         name, _, given = text.partition("=")
         if name not in USUAL:
-            raise InputError(f"no setting {name!r} to vary; there are: {', '.join(USUAL)}")
+            raise InputError(f"no setting {name!r} to vary; there are: {', '.join(USUAL)} [HM-IDENTIFY-057]")
         if name in found:
-            raise InputError(f"{name} is varied twice; give it once")
+            raise InputError(f"{name} is varied twice; give it once [HM-IDENTIFY-058]")
         found[name] = _parsed_bounds(text, given) if given else USUAL[name]
     return SearchSpace(**(dict.fromkeys(USUAL) | found))
 
@@ -157,18 +159,24 @@ def _parsed_bounds(text: str, given: str) -> tuple[float, float]:
     try:
         return float(low), float(high)
     except ValueError as error:
-        raise InputError(f"{text!r}: the form is NAME=LOW:HIGH, e.g. hidden=8:32") from error
+        raise InputError(
+            f"{text!r}: the form is NAME=LOW:HIGH, e.g. hidden=8:32 [HM-IDENTIFY-059]"
+        ) from error
 
 
 def _checked(name: str, bounds: Sequence[float]) -> tuple[float, float]:
     if len(bounds) != 2 or not 0 < bounds[0] < bounds[1] < float("inf"):
         raise InputError(
             f"{name} is to be varied between {list(bounds)}; needed are two positive numbers, the lower one first"
+            " [HM-IDENTIFY-060]"
         )
     if name not in WHOLE:
         return float(bounds[0]), float(bounds[1])
     if any(b != int(b) for b in bounds):
-        raise InputError(f"{name} is to be varied between {list(bounds)}; its bounds must be whole numbers")
+        raise InputError(
+            f"{name} is to be varied between {list(bounds)}; its bounds must be whole numbers"
+            " [HM-IDENTIFY-061]"
+        )
     return int(bounds[0]), int(bounds[1])
 
 
@@ -279,7 +287,7 @@ def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
     if trials < 1 or seed < 0 or (timeout is not None and not timeout > 0):
         raise InputError(
             f"a search needs trials of 1 or more, a seed of 0 or more and a timeout above 0 s, got "
-            f"{trials}, {seed}, {timeout}"
+            f"{trials}, {seed}, {timeout} [HM-IDENTIFY-062]"
         )
 
 
@@ -349,7 +357,7 @@ def _result(study: optuna.Study, base: TrainingSettings, space: SearchSpace) -> 
     if not complete:
         raise InputError(
             f"all {len(rows)} trainings of the search diverged: no network had a finite validation error; look at "
-            "the data and the fitted prior, or lower the learning rates' bounds"
+            "the data and the fitted prior, or lower the learning rates' bounds [HM-IDENTIFY-063]"
         )
     best = min(complete, key=lambda row: row.value)
     importance: dict[str, float] = {}
@@ -393,7 +401,7 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
     except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
         raise InputError(
             f"{storage} is no journal of a search or is damaged ({type(error).__name__}: {error}); choose another "
-            "file or delete it to search anew"
+            "file or delete it to search anew [HM-IDENTIFY-064]"
         ) from error
     finally:
         optuna.logging.set_verbosity(verbosity)
@@ -402,7 +410,7 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
     elif differ := [name for name in identity if found.get(name) != identity[name]]:
         raise InputError(
             f"{storage} holds another search ({', '.join(differ)} differ); go on with the same ones or choose "
-            "another file"
+            "another file [HM-IDENTIFY-065]"
         )
     for _ in study.get_trials(states=(TrialState.WAITING,)):  # drawn, not begun, when the search was ended
         study.ask()

@@ -60,16 +60,20 @@ class FirstStates:
     def __post_init__(self) -> None:
         problems = []
         if self.kind not in (kinds := ("free", "known", "measured", "shared", "warm_up")):
-            problems.append(f"first states: kind must be one of {', '.join(kinds)}, got {self.kind!r}")
+            problems.append(
+                f"first states: kind must be one of {', '.join(kinds)}, got {self.kind!r} [HM-IDENTIFY-066]"
+            )
         if (self.kind == "known") != bool(self.values):
             problems.append(
                 f"first states: values by name belong to kind 'known' and to it alone, got {self.values}"
+                " [HM-IDENTIFY-067]"
             )
         if not all(math.isfinite(value) for value in self.values.values()):
-            problems.append(f"first states: values must be finite, got {self.values}")
+            problems.append(f"first states: values must be finite, got {self.values} [HM-IDENTIFY-068]")
         if (self.kind == "warm_up") != (0 < self.seconds < math.inf):
             problems.append(
                 f"first states: a positive length [s] belongs to kind 'warm_up' and to it alone, got {self.seconds}"
+                " [HM-IDENTIFY-069]"
             )
         refuse(problems)
 
@@ -85,19 +89,19 @@ class FirstStates:
         """
         names, outputs = ([s.name for s in signals] for signals in (prior.states, prior.outputs))
         problems = [
-            f"first states: {name!r} is no state of {type(prior).__name__} ({', '.join(names)})"
+            f"first states: {name!r} is no state of {type(prior).__name__} ({', '.join(names)}) [HM-IDENTIFY-070]"
             for name in self.values
             if name not in names
         ]
         if self.kind == "measured" and not set(names) & set(outputs):
             problems.append(
                 f"first states: no output of {type(prior).__name__} ({', '.join(outputs)}) is a state "
-                f"({', '.join(names)}); leave them free"
+                f"({', '.join(names)}); leave them free [HM-IDENTIFY-071]"
             )
         if self.kind in ("known", "shared") and largest_delay:
             problems.append(
                 f"first states: a delay costs the first samples of a trajectory, whose state is {self.kind}; leave "
-                "largest_delay 0, or the first states free"
+                "largest_delay 0, or the first states free [HM-IDENTIFY-072]"
             )
         refuse(problems)
 
@@ -136,7 +140,9 @@ class OutputWindows:
             np.concatenate([v] * n) for v in (self.y, self.u, self.w, self.x, self.censored, self.known)
         )
         group = np.concatenate([self.group + i * (self.group.max() + 1) for i in range(n)])
-        return OutputWindows(y, u, w, x, censored, self.lead, known, group, self.warm)
+        return OutputWindows(
+            y=y, u=u, w=w, x=x, censored=censored, lead=self.lead, known=known, group=group, warm=self.warm
+        )
 
 
 def cut_outputs(
@@ -166,7 +172,7 @@ def cut_outputs(
             longest = most_samples(trajectories)
             raise InputError(
                 f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
-                f"{lead} samples before it needs {periods + lead + 1}"
+                f"{lead} samples before it needs {periods + lead + 1} [HM-IDENTIFY-073]"
             )
         chosen = [starts[i] for i in evenly(len(starts), most)]
         if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
@@ -203,9 +209,9 @@ def cut_outputs(
                 there = np.isfinite(y[:, 0, i])
                 known[there, j], guesses[there, j] = True, y[there, 0, i]
     return OutputWindows(
-        y, cut("u", lead), cut("w", 0), guesses,
-        cut("censored", 0), lead, known, group,
-        min(first.samples(trajectories[0].dt), periods - 1),
+        y=y, u=cut("u", lead), w=cut("w", 0), x=guesses,
+        censored=cut("censored", 0), lead=lead, known=known, group=group,
+        warm=min(first.samples(trajectories[0].dt), periods - 1),
     )  # fmt: skip
 
 

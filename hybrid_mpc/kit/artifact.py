@@ -233,34 +233,42 @@ def load(folder: str | Path) -> Kit:
         ``kit = hm.load("runs/mine")``
     """
     if not isinstance(folder, str | Path):
-        raise InputError(f"load: the path of a folder is needed, got {type(folder).__name__}")
+        raise InputError(f"load: the path of a folder is needed, got {type(folder).__name__} [HM-KIT-001]")
     folder = artifact_folder(Path(folder))
     parts = read_parts(folder)
     found = parts.description
     if sha256(folder / PROGRAMS) != found.programs_sha256:
         raise InputError(
             f"{folder}: {PROGRAMS} is not the one that {KIT} was saved with: the stage export ended in between, or a "
-            f"file was changed; {AGAIN}, or take the folder from its run"
+            f"file was changed; {AGAIN}, or take the folder from its run [HM-KIT-002]"
         )
     try:
         programs = nn_export.load_programs(folder / MODELS)
         models = _at_use(found.models, programs, found.model, parts.loop.disturbance_model)
         members = member_models(programs, found.model, found.members)
     except KeyError as error:
-        raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {KIT} names") from error
+        raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {KIT} names [HM-KIT-003]") from error
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
     return Kit(
-        models, parts.watch, found.provenance, found.model.input_delay, parts.loop,
-        found.recommended or (HYBRID if HYBRID in models else found.models[0]),
-        members, found.predicting, found.programs_sha256, read_promises(folder), parts.lacks,
-    )  # fmt: skip
+        models=models,
+        watch=parts.watch,
+        provenance=found.provenance,
+        input_delay=found.model.input_delay,
+        loop=parts.loop,
+        recommended=found.recommended or (HYBRID if HYBRID in models else found.models[0]),
+        members=members,
+        predicting=found.predicting,
+        programs_sha256=found.programs_sha256,
+        promised=read_promises(folder),
+        lacks=parts.lacks,
+    )
 
 
 def _named(name: object, what: str) -> str:
     """A name as somebody gives it; InputError if it is no text."""
     if not isinstance(name, str):
-        raise InputError(f"{what}: a name is needed, got {type(name).__name__}")
+        raise InputError(f"{what}: a name is needed, got {type(name).__name__} [HM-KIT-004]")
     return name
 
 
@@ -391,7 +399,7 @@ class Kit:
         """The kit with other process noise, by estimator (see :meth:`noise`)."""
         if not isinstance(noise, Mapping):
             raise InputError(
-                f"noise: numbers by the name of an estimator are needed, got {type(noise).__name__}"
+                f"noise: numbers by the name of an estimator are needed, got {type(noise).__name__} [HM-KIT-005]"
             )
         return replace(self, loop=replace(self.loop, process_noise=tuples(noise)))
 
@@ -400,7 +408,7 @@ class Kit:
         it names no disturbances, the default ones (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`).
         """
         if not isinstance(scenario, Scenario):
-            raise InputError(f"on: a Scenario is needed, got {type(scenario).__name__}")
+            raise InputError(f"on: a Scenario is needed, got {type(scenario).__name__} [HM-KIT-006]")
         chosen, problem = scenario.disturbance_model, scenario.control
         if chosen is None and problem is not None and problem.n_y:
             name = "prior" if "prior" in self.models else self.recommended
@@ -426,7 +434,7 @@ class Kit:
         if found is None:
             raise InputError(
                 f"{self._whose} was saved without a control problem: define one in the scenario (control=OCP(...)) "
-                f"and run it again{self._lack(TASKS)}"
+                f"and run it again{self._lack(TASKS)} [HM-KIT-007]"
             )
         return found
 
@@ -442,11 +450,13 @@ class Kit:
         if _named(estimator, "estimator") not in self.loop.process_noise:
             raise InputError(
                 f"{self._whose} was saved without process noise for {estimator}; run the scenario again (its stage "
-                f"noise estimates it){self._lack(OBSERVER)}"
+                f"noise estimates it){self._lack(OBSERVER)} [HM-KIT-008]"
             )
         sigma, n_x = np.array(self.loop.process_noise[estimator]), next(iter(self.models.values())).n_x
         if sigma.shape != (n_x,):
-            raise InputError(f"the model's process noise of {estimator} must be {n_x} numbers; train it anew")
+            raise InputError(
+                f"the model's process noise of {estimator} must be {n_x} numbers; train it anew [HM-KIT-009]"
+            )
         return sigma
 
     def limits(self, model: str = "", kind: str = "") -> WatchLimits:
@@ -466,7 +476,7 @@ class Kit:
             lack = self._lack(watch_file(name)) or self._lack(WATCH)
             raise InputError(
                 f"{self._whose} holds no limits of {kind} for the model {name}, which the run's stage watch learns: "
-                f"run the main job again with it, take learn_limits, or {WITHOUT}{lack}"
+                f"run the main job again with it, take learn_limits, or {WITHOUT}{lack} [HM-KIT-010]"
             )
         return own.limits[kind]
 

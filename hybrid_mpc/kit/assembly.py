@@ -204,13 +204,13 @@ def make_estimator(
     control = scenario.control if control is None else control
     if control is None:
         raise InputError(
-            f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...)"
+            f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...) [HM-KIT-011]"
         )
     first, span = first_deviations(model, scenario), disturbance_sizes(model, control)
     if observer and not (found := distinguishable(model, Sizes(model, control).states)).detectable:
         raise InputError(
             f"an observer of model {model.name}: at its operating point {found.why_undetectable}; declare others: "
-            'Scenario(disturbance_model=(Disturbance("output", ...), ...)), no more than there are outputs'
+            'Scenario(disturbance_model=(Disturbance("output", ...), ...)), no more than there are outputs [HM-KIT-012]'
         )
 
     def filter_of(scale: float, step: Array | None) -> ExtendedKalmanFilter:
@@ -252,7 +252,7 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Arr
     raise InputError(
         f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states "
         f"({noise} a period) it takes every load for noise, and a constant one would leave an offset. Correct the "
-        "prior, give Scenario(state_noise={...}), or run the scenario again"
+        "prior, give Scenario(state_noise={...}), or run the scenario again [HM-KIT-013]"
     )
 
 
@@ -293,7 +293,9 @@ def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
     """
     sigma, others = scenario.sensor_sigma, scenario.first_sigma
     if len(sigma) != model.n_y:
-        raise InputError(f"sensor_sigma needs {model.n_y} standard deviations of the outputs, got {sigma}")
+        raise InputError(
+            f"sensor_sigma needs {model.n_y} standard deviations of the outputs, got {sigma} [HM-KIT-014]"
+        )
     found = np.full(model.n_x, np.nan)
     for row, deviation in zip(
         output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full(), sigma, strict=True
@@ -307,7 +309,7 @@ def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
             names = ", ".join(model.states[i].name for i in unseen) or "none"
             raise InputError(
                 f"first_sigma needs {len(unseen)} standard deviations, of the states that no output shows alone "
-                f"({names}), got {others}"
+                f"({names}), got {others} [HM-KIT-015]"
             )
         found[unseen] = others
         return found
@@ -322,7 +324,7 @@ def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
         names = ", ".join(model.states[i].name for i in np.flatnonzero(np.isnan(found)))
         raise InputError(
             f"first_sigma: how uncertain {names} may be at the start nobody can tell; give it, {len(unseen)} standard "
-            "deviations of the states that no output shows alone, or give the states' signals a range"
+            "deviations of the states that no output shows alone, or give the states' signals a range [HM-KIT-016]"
         )
     return found
 
@@ -360,10 +362,10 @@ def make_controller(
     if control.n_y == prior.n_y and 0 < np.count_nonzero(control.q_y) <= prior.n_u:
         found = offset_free(prior, np.flatnonzero(control.q_y).tolist())
         if not found.reachable:
-            raise InputError(f"control problem: at the operating point {found.why_unreachable}")
+            raise InputError(f"control problem: at the operating point {found.why_unreachable} [HM-KIT-017]")
     if iterations is not None and solver == "native":
         raise InputError(
-            "solver native linearizes once a period: leave iterations out, or take rti, sqp or ipopt"
+            "solver native linearizes once a period: leave iterations out, or take rti, sqp or ipopt [HM-KIT-018]"
         )
     options = {} if iterations is None else {"iterations": iterations}
     controller = SOLVERS[known(solver, SOLVERS, "solver")](model, ocp, **options)
@@ -485,7 +487,9 @@ def make_adaptive_guard(
     adaptive = with_parameter_states(model, groups, prior=prior)
     control = scenario.control if control is None else control
     if control is None:
-        raise InputError(f"a guard that adapts needs a control problem; scenario {scenario.name} has none")
+        raise InputError(
+            f"a guard that adapts needs a control problem; scenario {scenario.name} has none [HM-KIT-019]"
+        )
     span = disturbance_sizes(model, control)
     plain = make_ocp(prior, control)
     ocp = plain.changed(terminal=plain.terminal_weight(model))
@@ -514,16 +518,17 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
     if not groups:
         raise InputError(
             'a guard that adapts needs causes: groups of parameters that may change, e.g. {"mass": ("m", "J")}; '
-            "a scenario names them in its field causes"
+            "a scenario names them in its field causes [HM-KIT-020]"
         )
     if not model.n_p:
         raise InputError(
             f"a guard that adapts needs a model that knows its parameters; model {model.name} has none: give its prior "
-            "a parameters and train it anew"
+            "a parameters and train it anew [HM-KIT-021]"
         )
     if model.delay_states:
         raise InputError(
             f"a guard that adapts needs a model whose inputs act at once; those of model {model.name} act later"
+            " [HM-KIT-022]"
         )
     others = {name: names for name, names in groups.items() if not _is_gain(names)}
     return others or groups

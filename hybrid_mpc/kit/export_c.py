@@ -52,12 +52,12 @@ def generate_controller(
     """
     place = Path(folder)
     if place.exists() and not place.is_dir():
-        raise InputError(f"{place} is a file; give a folder")
+        raise InputError(f"{place} is a file; give a folder [HM-KIT-023]")
     if place.is_dir() and any(place.iterdir()) and not (place / "hmpc.h").is_file():
-        raise InputError(f"{place} is not empty; give a new folder")
+        raise InputError(f"{place} is not empty; give a new folder [HM-KIT-024]")
     known(guard or "none", ("none", *REACTIONS[1:]), "guard")
     if guard and not monitor:
-        raise InputError(f"guard {guard!r} acts on alarms; leave monitor=True")
+        raise InputError(f"guard {guard!r} acts on alarms; leave monitor=True [HM-KIT-025]")
     name = model or kit.recommended
     estimator = kit.observer(name, task=task, load=load)
     prior = kit.models["prior"]

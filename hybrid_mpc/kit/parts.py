@@ -208,7 +208,7 @@ class LoopSettings:
             lambda: (
                 self.safe_input is None or all(_within(self.safe_input, p) for p in self.control.values())
             ),
-            f"safe_input {self.safe_input} is outside the limits of a control problem",
+            f"safe_input {self.safe_input} is outside the limits of a control problem [HM-KIT-029]",
         )
         own.refuse()
 
@@ -269,13 +269,16 @@ class Description:
         if not 0 <= self.members <= (MOST_MEMBERS if HYBRID in self.models else 0):
             raise InputError(
                 f"members: 0 to {MOST_MEMBERS} networks beside a model {HYBRID!r} are needed, got {self.members}"
+                " [HM-KIT-030]"
             )
         if self.recommended and self.recommended not in self.models:
             raise InputError(
-                f"recommended: no model {self.recommended!r}; there are: {', '.join(self.models)}"
+                f"recommended: no model {self.recommended!r}; there are: {', '.join(self.models)} [HM-KIT-031]"
             )
         if not 0 < len(set(self.models)) == len(self.models) <= MOST_MODELS:
-            raise InputError(f"models: 1 to {MOST_MODELS} different names are needed, got {len(self.models)}")
+            raise InputError(
+                f"models: 1 to {MOST_MODELS} different names are needed, got {len(self.models)} [HM-KIT-032]"
+            )
 
 
 @dataclass(frozen=True)
@@ -465,7 +468,7 @@ def read_description(folder: Path) -> Description:
     """What ``kit.json`` says; InputError if it is missing, damaged, changed by hand, or of another version."""
     found = _read(folder, KIT, Description)
     if found is None:
-        raise InputError(f"{folder / KIT} is missing")
+        raise InputError(f"{folder / KIT} is missing [HM-KIT-033]")
     return found
 
 
@@ -540,7 +543,7 @@ def _stale(file: str, other: str) -> str:
 
 def _check_models(names: Collection[str], found: Description) -> None:
     if strange := [name for name in names if name not in found.models]:
-        raise InputError(f"watch: no model {strange[0]!r}; there are: {', '.join(found.models)}")
+        raise InputError(f"watch: no model {strange[0]!r}; there are: {', '.join(found.models)} [HM-KIT-034]")
 
 
 def _write(folder: Path, file: str, content: object) -> None:
@@ -571,7 +574,7 @@ def _read(folder: Path, file: str, kind: type[R]) -> R | None:
         remedy = _anew(folder) if version == SPLIT_SCHEMA else "train the models anew"
         raise InputError(
             f"{path} is of version {version!r} of the format (field schema_version); this version of hybrid-mpc reads "
-            f"{SCHEMA_VERSION}: {remedy}"
+            f"{SCHEMA_VERSION}: {remedy} [HM-KIT-035]"
         )
     again = "" if file == KIT else f"; or delete it, and {AGAIN}"
     document = read_document(path, f"take the folder from its run again{again}")
@@ -613,12 +616,14 @@ def artifact_folder(folder: Path) -> Path:
             return place
     for place in (folder, folder / "model"):
         if is_file(place / OLD_FILE):
-            raise InputError(f"{place / OLD_FILE}: this kit has a former format, of one file. {_anew(place)}")
+            raise InputError(
+                f"{place / OLD_FILE}: this kit has a former format, of one file. {_anew(place)} [HM-KIT-036]"
+            )
         if is_file(place / BENCHMARK_NOTE):
             raise InputError(
                 f"{folder} is the folder of a benchmark: its model ({place / BENCHMARK_NOTE}) predicts and has no "
                 f"controller. Evaluate it with: hybrid-mpc benchmark SCENARIO --model {folder} --test FILE. For loops "
-                "make an artifact of the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER"
+                "make an artifact of the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER [HM-KIT-037]"
             )
     try:
         state = f"holds no {KIT}" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
@@ -626,4 +631,5 @@ def artifact_folder(folder: Path) -> Path:
         state = f"cannot be looked into ({reason(error)})"
     raise InputError(
         f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
+        " [HM-KIT-038]"
     )

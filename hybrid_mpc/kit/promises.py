@@ -87,7 +87,7 @@ def read_promises(folder: Path) -> PromiseTable | None:
     if document.pop("schema_version", None) != SCHEMA_VERSION:
         raise InputError(
             f"{path} is no table of schema version {SCHEMA_VERSION} (field schema_version): this version of hybrid-mpc "
-            f"reads no other. {REMEDY}"
+            f"reads no other. {REMEDY} [HM-KIT-039]"
         )
     return record(PromiseTable, document, str(path))
 

@@ -59,7 +59,9 @@ class Fault:
         own = Fields(self, f"fault {self.target}")
         own.need("target", lambda: self.target in SIGNAL_TARGETS or self.on_plant, _unknown(self.target))
         own.need(
-            "start end", lambda: self.start < self.end, f"the interval [{self.start}, {self.end}) s is empty"
+            "start end",
+            lambda: self.start < self.end,
+            f"the interval [{self.start}, {self.end}) s is empty [HM-LOOP-001]",
         )
         own.refuse()
 
@@ -104,7 +106,7 @@ def _unknown(target: object) -> str:
     near = difflib.get_close_matches(str(target), SIGNAL_TARGETS, 1)
     meant = f"; did you mean {near[0]!r}? There are" if near else "; known"
     targets = ", ".join(SIGNAL_TARGETS)
-    return f"fault target {target!r} is unknown{meant}: {targets}, and what a plant knows as plant_..."
+    return f"fault target {target!r} is unknown{meant}: {targets}, and what a plant knows as plant_... [HM-LOOP-052]"
 
 
 def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequence[str]) -> None:
@@ -127,17 +129,17 @@ def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequ
         if fault.on_plant:
             raise InputError(
                 f"fault {fault.target} lies in the plant: build it in with "
-                "plant, faults = install(plant, faults) before simulating"
+                "plant, faults = install(plant, faults) before simulating [HM-LOOP-002]"
             )
         kind, names = ("input", inputs) if fault.on_input else ("output", outputs)
         if not fault.channel and len(names) > 1:
             raise InputError(
                 f"fault {fault.target}: which {kind}? Name one of {', '.join(names)}: "
-                f'channel="{names[0]}", in a text {fault.target}:{names[0]}'
+                f'channel="{names[0]}", in a text {fault.target}:{names[0]} [HM-LOOP-003]'
             )
         if fault.channel and fault.channel not in names:
             raise InputError(
-                f"fault {fault.target}: no {kind} {fault.channel!r}; there are: {', '.join(names)}"
+                f"fault {fault.target}: no {kind} {fault.channel!r}; there are: {', '.join(names)} [HM-LOOP-004]"
             )
 
 
@@ -149,7 +151,9 @@ def check_plant_faults(faults: Sequence[Fault], known: Sequence[str]) -> None:
     """
     for fault in faults:
         if fault.target not in known:
-            raise InputError(f"this plant has no fault {fault.target!r}; it knows: {', '.join(known)}")
+            raise InputError(
+                f"this plant has no fault {fault.target!r}; it knows: {', '.join(known)} [HM-LOOP-005]"
+            )
 
 
 def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]]:
@@ -170,7 +174,7 @@ def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]
     if not hasattr(plant, "with_faults"):
         raise InputError(
             f"fault {inside[0].target}: the plant {type(plant).__name__} takes no faults; it needs a method "
-            "with_faults(faults) that returns the faulty plant"
+            "with_faults(faults) that returns the faulty plant [HM-LOOP-006]"
         )
     return plant.with_faults(inside), outside
 
@@ -248,10 +252,13 @@ def parsed_fault(text: str) -> Fault:
     except ValueError as error:
         raise InputError(
             f"fault {text!r}: {error}; the form is TARGET:CHANNEL=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
+            " [HM-LOOP-007]"
         ) from error
     if math.isnan(numbers[0]) or math.isnan(numbers[1]):
-        raise InputError(f"fault {text!r}: times must be numbers of seconds")
+        raise InputError(f"fault {text!r}: times must be numbers of seconds [HM-LOOP-008]")
     fault = Fault(numbers[0], numbers[1], target, numbers[2], channel)
     if not value and target not in ("measurement_freeze", "measurement_dropout"):
-        raise InputError(f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0")
+        raise InputError(
+            f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0 [HM-LOOP-009]"
+        )
     return fault

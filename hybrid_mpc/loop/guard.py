@@ -104,24 +104,28 @@ class Guard:
         patience: float = 0.0,
     ) -> None:
         if (backup is None) != (backup_estimator is None):
-            raise InputError("guard: backup and backup_estimator belong together; give both or neither")
+            raise InputError(
+                "guard: backup and backup_estimator belong together; give both or neither [HM-LOOP-010]"
+            )
         guarded = backup if backup is None or isinstance(backup, SafeController) else SafeController(backup)
         if on_model is None:
             on_model = Mode.BACKUP if guarded else Mode.LIMITED if limits else Mode.FALLBACK
         if Mode.BACKUP in (on_model, on_sensor) and guarded is None:
             raise InputError(
-                "guard: mode BACKUP needs a controller and its estimator: backup, backup_estimator"
+                "guard: mode BACKUP needs a controller and its estimator: backup, backup_estimator [HM-LOOP-011]"
             )
         if Mode.LIMITED in (on_model, on_sensor) and limits is None:
-            raise InputError("guard: mode LIMITED needs limits, e.g. Limits([-0.2], [0.2])")
+            raise InputError("guard: mode LIMITED needs limits, e.g. Limits([-0.2], [0.2]) [HM-LOOP-012]")
         times = float(dwell), float(quiet), float(patience)
         if not all(0 <= value < math.inf for value in times):
             raise InputError(
                 f"guard: dwell, quiet and patience must be 0 s or more, got {dwell} s, {quiet} s and {patience} s"
+                " [HM-LOOP-013]"
             )
         if patience > 0 and quiet == 0:
             raise InputError(
                 f"guard: patience of {patience} s needs a quiet above 0 s, to tell one alarm from the next"
+                " [HM-LOOP-014]"
             )
         values = on_model, on_sensor, limits, guarded, backup_estimator, *times
         for name, value in zip(self.__dataclass_fields__, values, strict=True):
@@ -162,7 +166,7 @@ class GuardedController:
         if guard is not None and Mode.REST in (guard.on_model, guard.on_sensor) and safe.safe_input is None:
             raise InputError(
                 "guard: mode REST applies the safe input, and none is declared; give Scenario(safe_input=...) or "
-                "SafeController(safe_input=...): the input with which the machine may be left alone"
+                "SafeController(safe_input=...): the input with which the machine may be left alone [HM-LOOP-015]"
             )
         self._backup = safe if guard is None or guard.backup is None else guard.backup
         if guard is not None and guard.backup is not None and guard.backup_estimator is not None:
@@ -276,9 +280,11 @@ def _check_alike(main: Controller, backup: Controller, estimator: Estimator) -> 
     if shapes[0] != shapes[1]:
         raise InputError(
             f"guard: the backup has (n_x, n_u, N, dt) = {shapes[1]}, the controller {shapes[0]}; give both one problem"
+            " [HM-LOOP-016]"
         )
     sizes = [(m.n_x, m.n_h, m.n_u) for m in (backup.model, estimator.model)]
     if sizes[0] != sizes[1]:
         raise InputError(
             f"guard: the backup's model has (n_x, n_h, n_u) = {sizes[0]}, that of its estimator {sizes[1]}"
+            " [HM-LOOP-017]"
         )

@@ -184,13 +184,13 @@ class Loop:
         if monitor is not None:
             check_part(monitor, "monitor", "a monitor", "initial", "update")
         if not isinstance(guard, Guard | None):
-            raise InputError(f"guard: a Guard is needed, got {type(guard).__name__}")
+            raise InputError(f"guard: a Guard is needed, got {type(guard).__name__} [HM-LOOP-018]")
         safe = controller if isinstance(controller, SafeController) else SafeController(controller)
         self.model, self.ocp = estimator.model, safe.controller.ocp
         _check_models(self.model, safe.controller.model)
         _check_monitor(monitor, self.model)
         if guard is not None and monitor is None:
-            raise InputError("a guard acts on a monitor's alarms; give monitor= as well")
+            raise InputError("a guard acts on a monitor's alarms; give monitor= as well [HM-LOOP-019]")
         self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self._control = GuardedController(safe, guard)
         self._delay = whole_periods(input_delay, "input_delay")
@@ -398,14 +398,14 @@ class Loop:
     @mode.setter
     def mode(self, mode: Literal["automatic", "manual"]) -> None:
         if not isinstance(mode, str) or mode not in ("automatic", "manual"):
-            raise InputError(f"mode: 'automatic' or 'manual' needed, got {mode!r:.80}")
+            raise InputError(f"mode: 'automatic' or 'manual' needed, got {mode!r:.80} [HM-LOOP-020]")
         self._state = replace(self.state, mode=mode)
 
     @property
     def state(self) -> LoopState:
         """All that the loop remembers, from :meth:`start` on."""
         if self._state is None:
-            raise InputError("the loop has not begun; call start() with the first sample")
+            raise InputError("the loop has not begun; call start() with the first sample [HM-LOOP-021]")
         return self._state
 
     @property
@@ -455,7 +455,9 @@ class Loop:
             return None
         rows = sampled(w, (None, self.model.n_w), "w, the measured disturbances and their forecast,")
         if not len(rows):
-            raise InputError("w has no rows; give the measured disturbances, or a row for each period ahead")
+            raise InputError(
+                "w has no rows; give the measured disturbances, or a row for each period ahead [HM-LOOP-022]"
+            )
         return rows
 
     def _now_measured(self, measured: Array | None) -> dict[str, Array]:
@@ -480,7 +482,9 @@ class Loop:
         if not self._truth:
             return sample
         if truth is None:
-            raise InputError("this estimator takes the true state; give truth=, or take a filter")
+            raise InputError(
+                "this estimator takes the true state; give truth=, or take a filter [HM-LOOP-023]"
+            )
         return sampled(truth, (None,), "the truth")
 
     def _preview(self, k: int, reference: ArrayLike | None) -> tuple[Array, Array | None]:
@@ -493,7 +497,7 @@ class Loop:
             x_ref = sampled(reference, (None, x_ref.shape[1]), "the reference")
             if not len(x_ref):
                 raise InputError(
-                    "the reference has no rows; give a set-point, or a row for each period ahead"
+                    "the reference has no rows; give a set-point, or a row for each period ahead [HM-LOOP-024]"
                 )
         return x_ref, factors
 
@@ -528,11 +532,12 @@ def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
     if sizes[0] != sizes[1]:
         raise InputError(
             f"the estimator's model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, "
-            f"the controller's model {controlled.name} {sizes[1]}; give both the same model"
+            f"the controller's model {controlled.name} {sizes[1]}; give both the same model [HM-LOOP-025]"
         )
     if abs(controlled.dt - estimated.dt) > 1e-9 * estimated.dt:
         raise InputError(
             f"the estimator's period is {estimated.dt} s, the controller's {controlled.dt} s; they must agree"
+            " [HM-LOOP-026]"
         )
 
 
@@ -544,13 +549,13 @@ def _check_monitor(monitor: Monitor | None, model: HybridModel) -> None:
     if sizes[0] != sizes[1]:
         raise InputError(
             f"the monitor's model {own.name} has (n_x, n_h, n_u, n_y) = {sizes[0]}, the estimator's model {model.name} "
-            f"{sizes[1]}; give both the same model, e.g. kit.monitor({model.name!r})"
+            f"{sizes[1]}; give both the same model, e.g. kit.monitor({model.name!r}) [HM-LOOP-027]"
         )
 
 
 def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monitor | None) -> None:
     if not isinstance(state, LoopState):
-        raise InputError(f"restore: what Loop.state was is needed, got {type(state).__name__}")
+        raise InputError(f"restore: what Loop.state was is needed, got {type(state).__name__} [HM-LOOP-028]")
     plan, estimate = state.decision.solution, state.estimate
     sizes = [
         ("y", state.y, model.n_y),
@@ -569,6 +574,7 @@ def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monito
     if (state.monitor is None) != (monitor is None):
         wrong.append(
             f"its loop had {'no' if state.monitor is None else 'a'} monitor, this one has {'a' if monitor else 'no'}"
+            " [HM-LOOP-029]"
         )
     if wrong:
-        raise InputError(f"restore: the state is of a loop of other parts: {'; '.join(wrong)}")
+        raise InputError(f"restore: the state is of a loop of other parts: {'; '.join(wrong)} [HM-LOOP-030]")

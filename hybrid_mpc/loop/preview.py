@@ -44,7 +44,7 @@ class Previews:
     def _over(self, preview: Preview, times: Array, name: str, columns: int) -> Array:
         values = floats(preview(times), f"what {name} returns")
         if values.shape != (times.size, columns):
-            raise InputError(f"{name} returns {values.shape}, needed: {(times.size, columns)}")
+            raise InputError(f"{name} returns {values.shape}, needed: {(times.size, columns)} [HM-LOOP-031]")
         beyond = (times > self._end + 1e-9) & ~np.all(np.isfinite(values), axis=1)
         if beyond.any():
             last = int(np.argmax(beyond)) - 1
@@ -72,7 +72,7 @@ class Forecast:
 
     def __init__(self, w: Preview | None, ocp: OCP, n_w: int, dt: float) -> None:
         if w is not None and not n_w:
-            raise InputError("w: a forecast of measured disturbances given, the model has none")
+            raise InputError("w: a forecast of measured disturbances given, the model has none [HM-LOOP-032]")
         if w is not None:
             check_function(w, "w")
         self._w = w if ocp.preview_w else None

@@ -68,7 +68,7 @@ class Runner:
     included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
     raised on, or the signal has its effect. Signals reach Python's main thread alone: in another thread ``stop`` ends
     a run. What no program can catch (SIGKILL, a hang in a driver, a power cut) takes a watchdog in the actuator;
-    ``docs/control.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
+    ``docs/watchdog.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
 
     Without a delay the input is assumed to act from the grid's instant on: keep steps short against the period, or
     declare the delay (:class:`~hybrid_mpc.estimate.delay.DelayCompensation`).
@@ -100,7 +100,7 @@ class Runner:
         InputError: If models, deadline, safe input, delays or ``keep`` do not fit, no safe input is declared, the
             monitor has no limits, or the estimator wants the truth.
 
-    Example: see ``docs/control.md``; in short::
+    Example: see ``docs/hardware.md``; in short::
 
         runner = Runner(read_encoder, set_torque, ekf, controller, task.reference, weight=task.weight)
         print(runner.run(duration=6.0).percentiles())
@@ -135,13 +135,19 @@ class Runner:
         if clock is not None:
             check_part(clock, "Runner: clock", "a clock", "now", "sleep_until")
         if sees_truth(estimator):
-            raise InputError("Runner: a machine does not give its true state; give a filter, not TrueState")
+            raise InputError(
+                "Runner: a machine does not give its true state; give a filter, not TrueState [HM-LOOP-033]"
+            )
         if why := getattr(monitor, "cannot_alarm", ""):
-            raise InputError(f"Runner: monitor: {why}; or leave monitor out, then nothing is watched")
+            raise InputError(
+                f"Runner: monitor: {why}; or leave monitor out, then nothing is watched [HM-LOOP-034]"
+            )
         dt = estimator.model.dt
         due = dt if deadline is None else float(sampled(deadline, (), "Runner: deadline"))
         if not 0 < due <= dt * (1 + 1e-9):
-            raise InputError(f"Runner: deadline must lie within the period of {dt} s, got {deadline} s")
+            raise InputError(
+                f"Runner: deadline must lie within the period of {dt} s, got {deadline} s [HM-LOOP-035]"
+            )
         keep = whole(keep, "Runner: keep [periods]", 1, MOST_KEPT)
         self._clock, self._dt, self._deadline, self._keep = (
             RealClock() if clock is None else clock,
@@ -160,7 +166,7 @@ class Runner:
         if declared is None:
             raise InputError(
                 "Runner: no safe input is declared; give safe_input=[...], or Scenario(safe_input=...): the input that "
-                "the machine may be left with. Zero is not safe for every machine, so it is never guessed"
+                "the machine may be left with. Zero is not safe for every machine, so it is never guessed [HM-LOOP-036]"
             )
         self._safe_input = checked_safe_input(declared, loop.ocp)
 
@@ -204,12 +210,14 @@ class Runner:
     def _periods(self, duration: float | None, stop: Callable[[], bool] | None) -> int | None:
         if duration is None:
             if stop is None:
-                raise InputError("Runner: give a duration [s], or a function stop() that ends the run")
+                raise InputError(
+                    "Runner: give a duration [s], or a function stop() that ends the run [HM-LOOP-037]"
+                )
             return None
         dt, duration = self._dt, float(sampled(duration, (), "Runner: duration"))
         if not (math.isfinite(duration) and round(duration / dt) >= 1):
             raise InputError(
-                f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed"
+                f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed [HM-LOOP-038]"
             )
         return round(duration / dt)
 
@@ -220,7 +228,7 @@ def _stops(answer: object) -> bool:
         return bool(answer)
     except ValueError as error:  # several numbers
         raise InputError(
-            f"Runner: stop() must return True or False, it returns {type(answer).__name__}"
+            f"Runner: stop() must return True or False, it returns {type(answer).__name__} [HM-LOOP-039]"
         ) from error
 
 
@@ -261,9 +269,16 @@ class _Run:
         loop.finish()
         spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
         step = RunnerStep(
-            self.k, self.k * self._dt, loop.state.y, loop.estimate, loop.decision, loop.reading, begin - due,
-            acted - due, spent,
-        )  # fmt: skip
+            k=self.k,
+            t=self.k * self._dt,
+            y=loop.state.y,
+            estimate=loop.estimate,
+            decision=loop.decision,
+            reading=loop.reading,
+            lateness=begin - due,
+            applied=acted - due,
+            spent=spent,
+        )
         self._count(step)
         if self._runner._on_step is not None:
             self._runner._on_step(step)
@@ -522,7 +537,7 @@ class SafeEnd:
                 return None
         error = SafeInputError(
             f"the safe input could not be handed over: the actuator failed {len(failures)} times, at last with "
-            f"{failures[-1]!r}. The machine may still follow the last input: cut its power"
+            f"{failures[-1]!r}. The machine may still follow the last input: cut its power [HM-LOOP-053]"
         )
         error.__cause__ = failures[0]
         return error
@@ -589,9 +604,11 @@ class CheckedClock:
         """Time [s], finite and never before the last one."""
         t = float(sampled(self._clock.now(), (), "clock: what now() returns"))
         if not math.isfinite(t):
-            raise InputError(f"clock: now() gives {t}; a finite time [s] needed")
+            raise InputError(f"clock: now() gives {t}; a finite time [s] needed [HM-LOOP-040]")
         if t < self._last:
-            raise InputError(f"clock: now() has gone back from {self._last} to {t}; give one that never does")
+            raise InputError(
+                f"clock: now() has gone back from {self._last} to {t}; give one that never does [HM-LOOP-041]"
+            )
         self._last = t
         return t
 
@@ -602,5 +619,5 @@ class CheckedClock:
             if self.now() >= t - self._early:
                 return
         raise InputError(
-            f"clock: sleep_until({t}) has come back {WAKES} times, at last at {self._last}; it must wait"
+            f"clock: sleep_until({t}) has come back {WAKES} times, at last at {self._last}; it must wait [HM-LOOP-042]"
         )

@@ -129,9 +129,9 @@ def simulate(
         if function is not None:
             check_function(function, name)
     if not isinstance(stage_cost, OCP | None):
-        raise InputError(f"stage_cost: an OCP is needed, got {type(stage_cost).__name__}")
+        raise InputError(f"stage_cost: an OCP is needed, got {type(stage_cost).__name__} [HM-LOOP-043]")
     if isinstance(faults, str | bytes) or not all(isinstance(fault, Fault) for fault in _listed(faults)):
-        raise InputError(f"faults: a list of Faults is needed, got {type(faults).__name__}")
+        raise InputError(f"faults: a list of Faults is needed, got {type(faults).__name__} [HM-LOOP-044]")
     seed = whole(seed, "seed", 0, 2**63 - 1)
     sensor_delay, input_delay = (
         whole_periods(sensor_delay, "sensor_delay"),
@@ -152,7 +152,17 @@ def simulate(
     standing = loop.standing
     acting = Previews(reference, weight, ocp, dt, periods * dt, standing) if input_delay else None
     rest = vector(x0, ocp.n_x, "x0")
-    machine = SimulatedMachine(plant, rest, seed, outputs, inputs, faults, dt, sensor_delay, input_delay)
+    machine = SimulatedMachine(
+        plant=plant,
+        x0=rest,
+        seed=seed,
+        outputs=outputs,
+        inputs=inputs,
+        faults=faults,
+        dt=dt,
+        sensor_delay=sensor_delay,
+        input_delay=input_delay,
+    )
     rows: list[_Row] = []
     for k in range(periods):
         t = k * dt
@@ -194,7 +204,7 @@ def _disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview 
         InputError: If constant ones are of another number, or the model has none.
     """
     if not model.n_w and w is not None:
-        raise InputError(f"w: measured disturbances given, model {model.name} has none")
+        raise InputError(f"w: measured disturbances given, model {model.name} has none [HM-LOOP-045]")
     if not model.n_w:
         return None
     if callable(w):
@@ -283,16 +293,32 @@ COLUMNS = _Row._fields[:11]
 def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, float]) -> _Row:
     e, d = step.estimate, step.decision
     return _Row(
-        step.t, step.x, step.y, d.u, e.x, e.h, e.d, goal.x, stage, e.innovation, e.nis, d.source.name,
-        d.status.name, step.reading, spent, w, goal.y, goal.reached,
-        d.solution.given_way,
-    )  # fmt: skip
+        t=step.t,
+        x=step.x,
+        y=step.y,
+        u=d.u,
+        x_hat=e.x,
+        h=e.h,
+        d=e.d,
+        reference=goal.x,
+        stage_cost=stage,
+        innovation=e.innovation,
+        nis=e.nis,
+        source=d.source.name,
+        status=d.status.name,
+        reading=step.reading,
+        spent=spent,
+        w=w,
+        y_ref=goal.y,
+        reached=goal.reached,
+        given_way=d.solution.given_way,
+    )
 
 
 def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
     if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
         raise InputError(
-            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u}"
+            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u} [HM-LOOP-046]"
         )
     return cost
 
@@ -304,13 +330,17 @@ def _end(dt: float, duration: float, period: float) -> float:
         InputError: If a time is not finite, the period another than the models', or the run shorter than one.
     """
     if not (math.isfinite(duration) and math.isfinite(dt) and dt > 0):
-        raise InputError(f"dt and duration must be finite and dt positive; got {dt} s and {duration} s")
+        raise InputError(
+            f"dt and duration must be finite and dt positive; got {dt} s and {duration} s [HM-LOOP-047]"
+        )
     if not abs(dt - period) <= 1e-9 * period:
-        raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree")
+        raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree [HM-LOOP-048]")
     if duration / dt > MOST_PERIODS:
-        raise InputError(f"duration {duration:g} s: at most {MOST_PERIODS:g} periods of {dt} s are simulated")
+        raise InputError(
+            f"duration {duration:g} s: at most {MOST_PERIODS:g} periods of {dt} s are simulated [HM-LOOP-049]"
+        )
     if round(duration / dt) < 1:
-        raise InputError(f"duration {duration} s is shorter than one period of {dt} s")
+        raise InputError(f"duration {duration} s is shorter than one period of {dt} s [HM-LOOP-050]")
     return round(duration / dt) * dt
 
 
@@ -456,6 +486,6 @@ def _labels(name: str, n: int, model: HybridModel | None) -> list[str]:
     signals = groups.get(name, model.states)
     if len(signals) != n:
         raise InputError(
-            f"to_pandas: the loop has {n} columns of {name}, the model {model.name} {len(signals)}"
+            f"to_pandas: the loop has {n} columns of {name}, the model {model.name} {len(signals)} [HM-LOOP-051]"
         )
     return [f"{name} {s.name} [{s.unit}]" for s in signals]

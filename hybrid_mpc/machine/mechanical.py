@@ -57,7 +57,7 @@ class MechanicalPrior(Prior):
         if len(states) % 2:
             raise InputError(
                 f"{cls.__name__}: states must be [q, v] in pairs, got {len(states)}: "
-                f"{', '.join(s.name for s in states)}"
+                f"{', '.join(s.name for s in states)} [HM-MACHINE-001]"
             )
         if cls.corrects is cls._speeds:  # nobody has chosen others
             cls.corrects = cls._speeds = tuple(s.name for s in states[len(states) // 2 :]) or None
@@ -90,7 +90,7 @@ class MechanicalPrior(Prior):
         if len(self.inputs) != self.n_q:
             raise InputError(
                 f"{type(self).__name__}: {len(self.inputs)} inputs drive {self.n_q} degrees of freedom; define "
-                "force(q, v, u, w, p)"
+                "force(q, v, u, w, p) [HM-MACHINE-002]"
             )
         return tuple(u)
 
@@ -123,14 +123,16 @@ class MechanicalPrior(Prior):
     def _matrix(self, value: Any) -> ca.SX:
         n, found = self.n_q, components(value)
         if any(one is None for one in found):
-            raise InputError(f"{type(self).__name__}.mass_matrix(q, p) gives None; is a 'return' missing?")
+            raise InputError(
+                f"{type(self).__name__}.mass_matrix(q, p) gives None; is a 'return' missing? [HM-MACHINE-003]"
+            )
         entries = [ca.SX(c) for c in found]
         if len(entries) == n:
             return ca.diag(ca.vertcat(*entries))
         if len(entries) != n * n:
             raise InputError(
                 f"{type(self).__name__}.mass_matrix(q, p) must give {n} rows of {n} values, or {n} values of a "
-                f"diagonal; got {len(entries)} values"
+                f"diagonal; got {len(entries)} values [HM-MACHINE-004]"
             )
         return ca.reshape(ca.vertcat(*entries), n, n).T
 

@@ -146,24 +146,29 @@ class Prior:
                 one = kind.__name__
                 raise InputError(
                     f"{cls.__name__}: {role} must be a tuple of {one}, as ({one}(...), {one}(...)), got {given!r:.80}"
+                    " [HM-MACHINE-005]"
                 )
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
         kind = type(self).__name__
         if not isinstance(values, Mapping | None):
-            raise InputError(f"{kind}: values are a mapping (name: number), got {values!r:.80}")
+            raise InputError(
+                f"{kind}: values are a mapping (name: number), got {values!r:.80} [HM-MACHINE-006]"
+            )
         given = dict(values or {})
         if wrong := {k: v for k, v in given.items() if v is None or isinstance(v, bool | str)}:
-            raise InputError(f"{kind}: values must be numbers, got {wrong!r:.80}")
+            raise InputError(f"{kind}: values must be numbers, got {wrong!r:.80} [HM-MACHINE-007]")
         missing = [role for role in ("states", "inputs", "outputs") if not hasattr(self, role)]
         if missing:
             raise InputError(
                 f"{kind} has no {' and no '.join(missing)}; write {missing[0]} = (Signal(name, unit), ...) in the class"
+                " [HM-MACHINE-008]"
             )
         self._values = {p.name: float(given.pop(p.name, p.value)) for p in self.parameters}
         if given:
             raise InputError(
                 f"{kind} has no parameter {', '.join(given)}; it has: {', '.join(self._values) or 'none'}"
+                " [HM-MACHINE-009]"
             )
 
     @property
@@ -188,6 +193,7 @@ class Prior:
             raise InputError(
                 f"{type(self).__name__}: no state is called {', '.join(unknown)}, as the output is; its states are: "
                 f"{', '.join(at)}. Define output(x, u, w, p), or give the output the name of the state it measures"
+                " [HM-MACHINE-010]"
             )
         return tuple(at[output.name] for output in self.outputs)
 
@@ -200,12 +206,14 @@ class Prior:
         """Places in ``x`` of the states whose rates a network may correct; InputError if one is no state."""
         names, kind = [s.name for s in self.states], type(self).__name__
         if isinstance(self.corrects, str):
-            raise InputError(f"{kind}: corrects must be a tuple of names, as ({self.corrects!r},)")
+            raise InputError(
+                f"{kind}: corrects must be a tuple of names, as ({self.corrects!r},) [HM-MACHINE-011]"
+            )
         chosen = names if self.corrects is None else self.corrects
         unknown = [name for name in chosen if name not in names]
         if unknown:
             raise InputError(
-                f"{kind}: corrects names {', '.join(unknown)}; its states are: {', '.join(names)}"
+                f"{kind}: corrects names {', '.join(unknown)}; its states are: {', '.join(names)} [HM-MACHINE-012]"
             )
         return tuple(i for i, name in enumerate(names) if name in chosen)
 
@@ -244,6 +252,7 @@ class Prior:
         if not isinstance(found, tuple | list) or not all(isinstance(b, Balance) for b in found):
             raise InputError(
                 f"{type(self).__name__}.balances(x, u, w, p) must give a tuple of Balance(...), got {found!r:.80}"
+                " [HM-MACHINE-013]"
             )
         return tuple(found)
 
@@ -267,7 +276,7 @@ class Prior:
                 raise
             raise InputError(
                 f"{type(self).__name__}.{method} gets CasADi expressions: {error}. Is it written in torch? Then it "
-                "must be a TorchPrior"
+                "must be a TorchPrior [HM-MACHINE-014]"
             ) from error
 
     def names_of(self, argument: str) -> tuple[str, ...]:
@@ -326,18 +335,20 @@ def column(value: Any, n: int, what: str, names: Sequence[str] = ()) -> ca.SX:
     except (NotImplementedError, TypeError) as error:
         raise InputError(
             f"{what} gives {type(value).__name__}, which is no tuple of scalars: is a 'return' missing, or is it "
-            "written in torch? Then it must be a TorchPrior"
+            "written in torch? Then it must be a TorchPrior [HM-MACHINE-015]"
         ) from error
     if found.shape[0] != n:
         each = f": one for each of {', '.join(names)} is needed" if names else ""
-        raise InputError(f"{what} must give {n} values, got {found.shape[0]}{each}")
+        raise InputError(f"{what} must give {n} values, got {found.shape[0]}{each} [HM-MACHINE-016]")
     return ca.densify(found)
 
 
 @cache
 def _tuple_of(names: tuple[str, ...]) -> Any:
     def missing(_: Any, name: str) -> Any:
-        raise AttributeError(f"nothing is called {name!r} here; there is: {', '.join(names) or 'nothing'}")
+        raise AttributeError(
+            f"nothing is called {name!r} here; there is: {', '.join(names) or 'nothing'} [HM-MACHINE-044]"
+        )
 
     # what is no identifier has its place alone
     bases = (namedtuple("named", names, rename=True),)
@@ -378,7 +389,7 @@ def _equations(alike: _Alike) -> Equations:
     y = column(outputs, len(y_names), f"{kind}.output(x, u, w, p)", y_names)
     names = [b.name for b in balances]
     if len(set(names)) < len(names):
-        raise InputError(f"{kind}.balances(x, u, w, p): two have the same name: {names}")
+        raise InputError(f"{kind}.balances(x, u, w, p): two have the same name: {names} [HM-MACHINE-017]")
     return Equations(
         ca.Function("xdot", point, [ca.cse(xdot)], [*POINT], ["xdot"]),
         ca.Function("output", point, [ca.cse(y)], [*POINT], ["y"]),
@@ -393,7 +404,9 @@ def _balance(prior: Prior, balance: Balance, point: list[ca.SX], xdot: ca.SX) ->
     )
     x, u, w, p = point
     if ca.depends_on(storage, ca.vertcat(u, w)):
-        raise InputError(f"{what}: the storage must be a function of x and p alone, it depends on u or w")
+        raise InputError(
+            f"{what}: the storage must be a function of x and p alone, it depends on u or w [HM-MACHINE-018]"
+        )
     rate = ca.SX.sym("xdot", len(prior.states))
     corrected = set(prior.corrected)
     taken = ca.vertcat(*(rate[i] if i in corrected else xdot[i] for i in range(rate.numel())))

@@ -47,15 +47,18 @@ class Signal:
     def __post_init__(self) -> None:
         own, ends = Fields(self, f"signal {self.label}"), self.saturation
         own.need(
-            "lower upper", lambda: self.lower < self.upper, f"its range [{self.lower}, {self.upper}] is empty"
+            "lower upper",
+            lambda: self.lower < self.upper,
+            f"its range [{self.lower}, {self.upper}] is empty [HM-MACHINE-019]",
         )
         own.need(
             "saturation", lambda: self.saturation is None or self.saturation[0] < self.saturation[1],
-            f"saturation must be (lower, upper) of the sensor with lower < upper, got {ends}",
+            f"saturation must be (lower, upper) of the sensor with lower < upper, got {ends} [HM-MACHINE-020]",
         )  # fmt: skip
         own.need(
             "saturation periodic", lambda: self.saturation is None or not self.periodic,
-            "a periodic signal has no saturation; its sensor begins again at a full turn. Leave one of them out.",
+            "a periodic signal has no saturation; its sensor begins again at a full turn. Leave one of them out."
+            " [HM-MACHINE-021]",
         )  # fmt: skip
         own.refuse()
 
@@ -96,7 +99,7 @@ class Parameter:
         own = Fields(self, f"parameter {self.label}")
         own.need(
             "value lower upper", lambda: self.lower <= self.value <= self.upper,
-            f"value {self.value} is not within its bounds [{self.lower}, {self.upper}]",
+            f"value {self.value} is not within its bounds [{self.lower}, {self.upper}] [HM-MACHINE-022]",
         )  # fmt: skip
         own.refuse()
 

@@ -49,7 +49,9 @@ class Window:
 
     def __post_init__(self) -> None:
         own = Fields(self, f"window {self.start!r} to {self.end!r}")
-        own.need("start end", lambda: self.start < self.end, "its end must come after its start")
+        own.need(
+            "start end", lambda: self.start < self.end, "its end must come after its start [HM-MACHINE-023]"
+        )
         own.refuse()
 
 
@@ -131,11 +133,11 @@ class DataSpec:
             own.distinct(name, lambda name=name: getattr(self, name), f"{name}: column")  # type: ignore[misc]
         own.need(
             "inputs_of", lambda: all(len(set(c)) == len(c) for c in self.inputs_of.values()),
-            "inputs_of: a column stands twice in one recording",
+            "inputs_of: a column stands twice in one recording [HM-MACHINE-024]",
         )  # fmt: skip
         own.need(
             "fractions", lambda: abs(sum(self.fractions) - 1.0) <= 1e-9,
-            f"fractions must sum to 1, got {self.fractions}",
+            f"fractions must sum to 1, got {self.fractions} [HM-MACHINE-025]",
         )  # fmt: skip
         own.refuse()
 
@@ -217,18 +219,19 @@ class BenchmarkSpec:
         own = Fields(self, "benchmark specification")
         own.need(
             "repeated length", lambda: not self.repeated or self.length is not None, "repeated runs need a length"
+            " [HM-MACHINE-026]"
         )  # fmt: skip
         own.need(
             "cycle", lambda: not self.cycle or {"train", "valid"} <= set(self.cycle),
-            f"cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle}",
+            f"cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle} [HM-MACHINE-027]",
         )  # fmt: skip
         own.need(
             "valid_every cycle", lambda: not self.valid_every or (self.valid_every >= 2 and not self.cycle),
             "valid_every must be 2 or more (or 0 for never), and there must be no cycle beside it; got "
-            f"{self.valid_every} and cycle {self.cycle}",
+            f"{self.valid_every} and cycle {self.cycle} [HM-MACHINE-028]",
         )  # fmt: skip
         own.need(
             "fractions", lambda: self.fractions is None or abs(sum(self.fractions) - 1.0) <= 1e-9,
-            f"fractions must sum to 1, got {self.fractions}",
+            f"fractions must sum to 1, got {self.fractions} [HM-MACHINE-029]",
         )  # fmt: skip
         own.refuse()

@@ -71,7 +71,9 @@ def again(made: Made) -> Term:
         'viscous friction of v'
     """
     if made.maker not in EXPLANATIONS:
-        raise InputError(f"no law {made.maker!r} of a term; there are {', '.join(EXPLANATIONS)}")
+        raise InputError(
+            f"no law {made.maker!r} of a term; there are {', '.join(EXPLANATIONS)} [HM-MACHINE-030]"
+        )
     term: Term = globals()[made.maker](made.of, *made.parameters, **made.options)
     return term
 
@@ -145,9 +147,11 @@ class Term:
     def __post_init__(self) -> None:
         own = Fields(self, f"term {self.name!r}")
         own.need(
-            "place", lambda: self.place in PLACES, f"place {self.place!r} is none of {', '.join(PLACES)}"
+            "place",
+            lambda: self.place in PLACES,
+            f"place {self.place!r} is none of {', '.join(PLACES)} [HM-MACHINE-031]",
         )
-        own.need("parameters", lambda: len(self.parameters) > 0, "a term needs a parameter")
+        own.need("parameters", lambda: len(self.parameters) > 0, "a term needs a parameter [HM-MACHINE-032]")
         own.refuse()
 
     @property
@@ -215,6 +219,7 @@ def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]
     if unknown := sorted(set(values) - set(names)):
         raise InputError(
             f"{prior.__name__} has no parameter {', '.join(unknown)}; there are {', '.join(names) or 'none'}"
+            " [HM-MACHINE-033]"
         )
     own: Any = prior
     terms: tuple[Term, ...] = getattr(own, "terms", ())
@@ -272,7 +277,17 @@ def _expressions(
     def at(own: Any, term: Term, position: Any = None, driven: Any = 0.0, resting: Any = 0.0) -> At:
         x_named, u_named, w_named = (named(prior.names_of(k), ca.vertsplit(v)) for k, v in parts.items())
         p_named = named(prior.names_of("p"), ca.vertsplit(of_base))
-        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term), p_named)
+        return At(
+            x=x_named,
+            u=u_named,
+            w=w_named,
+            own=own,
+            position=position,
+            driven=driven,
+            resting=resting,
+            state=states.get(term),
+            p=p_named,
+        )
 
     def applied(term: Term, point: At) -> Any:
         value = term.law(point, given[term])
@@ -404,13 +419,17 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
         where = f"term {term.name!r} for {base.__name__}"
         names = [s.name for s in signals.get(term.place, base.states)]
         if term.of not in names:
-            problems.append(f"{where}: there is no {term.of!r}; choose of {', '.join(names)}.")
+            problems.append(
+                f"{where}: there is no {term.of!r}; choose of {', '.join(names)}. [HM-MACHINE-034]"
+            )
         elif term.place in ("force", "potential") and not issubclass(base, MechanicalPrior):
-            problems.append(f"{where}: a {term.place} needs a MechanicalPrior; take a rate.")
+            problems.append(f"{where}: a {term.place} needs a MechanicalPrior; take a rate. [HM-MACHINE-035]")
         elif term.place in ("force", "potential") and term.of not in moving:
-            problems.append(f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}.")
+            problems.append(
+                f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}. [HM-MACHINE-036]"
+            )
         if term.state is not None and term.place in ("force", "potential"):
-            problems.append(f"{where}: a {term.place} cannot have a state of its own.")
+            problems.append(f"{where}: a {term.place} cannot have a state of its own. [HM-MACHINE-037]")
     if not problems:
         problems = [problem for term in terms for problem in _misfits(base, prior, term)]
     for what, every in (
@@ -420,7 +439,7 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
         twice = sorted({name for name in every if every.count(name) > 1})
         if twice:
             problems.append(
-                f"{base.__name__} with terms: {what} {', '.join(twice)} is there twice; rename one."
+                f"{base.__name__} with terms: {what} {', '.join(twice)} is there twice; rename one. [HM-MACHINE-038]"
             )
     refuse(problems)
 
@@ -461,20 +480,20 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
     state = None if term.state is None else ca.SX.sym(term.state.name)
     if term.state is not None:
         inputs.append((state, term.state.unit))
-    point = At(x, u, w, own, position, driven, resting, state, p)
+    point = At(x=x, u=u, w=w, own=own, position=position, driven=driven, resting=resting, state=state, p=p)
     value = _uneven(term).law(point, named(term.names, given))
     parts = [(value, wanted)]
     if term.state is not None:
         parts = [(value[0], wanted), (value[1], term_units.per_second(term_units.of(term.state.unit)))]
     for one, needed in parts:
         if said := term_units.clash(one, inputs, needed):
-            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law."
+            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law. [HM-MACHINE-042]"
     if term.place == "potential":
         free = [
             v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not position
         ]
         if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
-            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force."
+            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force [HM-MACHINE-043]"
 
 
 def _uneven(term: Term) -> Term:
@@ -523,7 +542,18 @@ def _added(
     if state is not None:
         options["state"] = state
     made = Made(maker, of, parameters, {**options, **({"place": place} if by_rate else {})})
-    return Term(f"{title} of {of}", place, of, parameters, law, text, loss, state, EXPLANATIONS[maker], made)
+    return Term(
+        name=f"{title} of {of}",
+        place=place,
+        of=of,
+        parameters=parameters,
+        law=law,
+        text=text,
+        loss=loss,
+        state=state,
+        explanation=EXPLANATIONS[maker],
+        made=made,
+    )
 
 
 # Friction: against the motion of one axis.
@@ -541,9 +571,16 @@ def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") 
         place: ``"rate"`` for a prior that is not mechanical.
     """
     return _added(
-        "coulomb", "Coulomb friction", place, of, (level,), lambda at, p: -p[0] * _sign(at.own, width),
-        f"-{level.name} sign({of})", loss=True, width=width,
-    )  # fmt: skip
+        "coulomb",
+        "Coulomb friction",
+        place,
+        of,
+        (level,),
+        lambda at, p: -p[0] * _sign(at.own, width),
+        f"-{level.name} sign({of})",
+        loss=True,
+        width=width,
+    )
 
 
 def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force") -> Term:
@@ -793,7 +830,7 @@ def _signal(at: At, name: str) -> Any:
     for group in (at.x, at.u, at.w):
         if name in getattr(group, "_fields", ()):
             return getattr(group, name)
-    raise InputError(f"there is no state, input or disturbance {name!r}")
+    raise InputError(f"there is no state, input or disturbance {name!r} [HM-MACHINE-039]")
 
 
 # Inputs.
@@ -950,29 +987,29 @@ BY_RATE = frozenset({
 })  # fmt: skip
 """Laws that take ``place="rate"``."""
 EXPLANATIONS: Mapping[str, str] = {
-    "coulomb": "Dry friction: constant, against the motion.",
+    "coulomb": "Constant dry friction against the motion.",
     "asymmetric": "Dry friction is larger in one direction than in the other.",
     "viscous": "Friction proportional to the speed.",
     "viscous_by_direction": "Friction proportional to the speed is larger in one direction than in the other.",
     "quadratic": "Drag proportional to the square of the speed, as in air.",
     "stribeck": "Dry friction is larger near rest than in motion.",
     "loaded": "Dry friction grows with the load of a gear or bearing.",
-    "coulomb_by_position": "Dry friction changes along the way.",
+    "coulomb_by_position": "Dry friction depends on the position.",
     "offset": "A constant force or rate acts all the time.",
     "gravity_error": "The weight, its lever arm or its angle differs from the prior's.",
-    "cogging": "A torque periodic in the position: magnets on teeth, or a shaft that is not round.",
+    "cogging": "A torque is periodic in the position: cogging, or a shaft that is not round.",
     "spring": "A spring, such as a cable or hose, pulls towards one position.",
-    "elastic_end": "An elastic stop acts near the end of the way.",
+    "elastic_end": "An elastic stop acts near the end of the travel.",
     "loss": "A loss to the surroundings or to another state.",
     "radiation": "Heat is lost by radiation.",
-    "storage": "A second capacity, such as a wall, takes up and gives back with its own time constant.",
-    "overflow": "Above an edge, material runs off.",
+    "storage": "A second capacity, such as a wall, stores and releases with its own time constant.",
+    "overflow": "Above an edge, material overflows.",
     "coupling": "Another signal acts on the state.",
-    "product": "Two signals act on the state by their product.",
+    "product": "The product of two signals acts on the state.",
     "input_gain": "The input's gain differs from the prior's.",
     "input_offset": "The input has an offset.",
     "gain_by_direction": "The input's gain depends on its sign.",
-    "input_curve": "The input's characteristic is bent.",
+    "input_curve": "The input's characteristic is curved.",
     "saturation": "The input's effect levels off at large values.",
     "dead_zone": "Small inputs have no effect.",
     "input_lag": "The actuator follows its command with a time constant.",
@@ -982,7 +1019,7 @@ EXPLANATIONS: Mapping[str, str] = {
     "disturbance_lag": "The measured disturbance acts with a time constant.",
     "output_gain": "The sensor's gain is wrong.",
     "output_offset": "The sensor has an offset.",
-    "output_curve": "The sensor's characteristic is bent.",
+    "output_curve": "The sensor's characteristic is curved.",
     "output_lag": "The sensor, or its filter, follows with a time constant.",
 }
 """What each law of this module is, in one sentence."""

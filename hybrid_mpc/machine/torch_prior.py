@@ -53,7 +53,7 @@ class TorchPrior(Prior):
                 raise
             raise InputError(
                 f"{what} gets torch's tensors: {str(error).splitlines()[0]} Is it written in "
-                "CasADi? Then it must be a Prior"
+                "CasADi? Then it must be a Prior [HM-MACHINE-040]"
             ) from error
         scalars = _scalars(shape, what)
         if not any(isinstance(s, Tensor) for s in scalars):
@@ -106,7 +106,7 @@ def _scalars(value: Any, what: str) -> list[Any]:
     if not isinstance(value, Tensor | float | int):
         raise InputError(
             f"{what} of a TorchPrior must give tensors or numbers in tuples, it gives {type(value).__name__}; is a "
-            "'return' missing, or is it written in CasADi? Then it must be a Prior"
+            "'return' missing, or is it written in CasADi? Then it must be a Prior [HM-MACHINE-041]"
         )
     return [value]
 

@@ -54,16 +54,20 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
         (5.0, 8.0)
     """
     if not (delay > 0 and math.isfinite(delay)):
-        raise InputError(f"model {model.name}: the input's delay must be positive, got {delay} s")
+        raise InputError(
+            f"model {model.name}: the input's delay must be positive, got {delay} s [HM-MODEL-001]"
+        )
     periods = delay / model.dt
     if not periods * model.n_u <= MOST_DELAY_STATES:
         raise InputError(
             f"model {model.name}: an input's delay of {delay:g} s is {periods:.4g} periods of {model.dt:g} s, so that "
             f"{periods * model.n_u:.4g} delay states would be needed, at most {MOST_DELAY_STATES} can be; give it in "
-            "seconds, or take a model of a longer period"
+            "seconds, or take a model of a longer period [HM-MODEL-002]"
         )
     if model.delay_states:
-        raise InputError(f"model {model.name} has delay states already; give the one without delay")
+        raise InputError(
+            f"model {model.name} has delay states already; give the one without delay [HM-MODEL-003]"
+        )
     queue = _Queue(periods, model.n_u)
     x, _, u, w, p = step_symbols(model)
     h = ca.MX.sym("h", queue.size + model.n_h)

@@ -44,7 +44,7 @@ class Disturbance:
         own.need(
             "at size", lambda: self.at == "input" or self.size > 0,
             f"size {self.size} given; needed: how large it may be, a positive number (an input's may be left out: its "
-            "range)",
+            "range) [HM-MODEL-004]",
         )  # fmt: skip
         own.refuse()
 
@@ -68,16 +68,21 @@ def disturbance_matrices(
         raise InputError(
             "disturbance model: none is given; leave disturbance_model out for one at each input, or name at least one "
             "(as many as there are outputs leave no offset): an estimator without would take every load for a motion"
+            " [HM-MODEL-005]"
         )
     places = {"input": (inputs, 1.0), "rate": (states, dt), "output": (outputs, 1.0)}
     if len({(d.at, d.signal) for d in chosen}) < len(chosen):
-        raise InputError(f"disturbance model: two are the same: {[(d.at, d.signal) for d in chosen]}")
+        raise InputError(
+            f"disturbance model: two are the same: {[(d.at, d.signal) for d in chosen]} [HM-MODEL-006]"
+        )
     found = {at: np.zeros((len(signals), len(chosen))) for at, (signals, _) in places.items()}
     for j, d in enumerate(chosen):
         signals, factor = places[d.at]
         names = [s.name for s in signals]
         if d.signal not in names:
             what = "state" if d.at == "rate" else d.at
-            raise InputError(f"disturbance model: no {what} {d.signal!r}; there are: {', '.join(names)}")
+            raise InputError(
+                f"disturbance model: no {what} {d.signal!r}; there are: {', '.join(names)} [HM-MODEL-007]"
+            )
         found[d.at][names.index(d.signal), j] = factor
     return found["input"], found["rate"], found["output"]

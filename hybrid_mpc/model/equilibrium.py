@@ -558,6 +558,7 @@ def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[A
         raise InputError(
             f"model {model.name}: no fixed point found from x = {x0.tolist()} under u = {u0.tolist()} "
             f"(residual {size:.2g}, needed {RESIDUAL:g}); give a nearer x_guess or an input it can rest under"
+            " [HM-MODEL-008]"
         )
     return found.v[: model.n_x], found.v[model.n_x : model.n_x + model.n_h]
 
@@ -605,6 +606,7 @@ def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
     if not found.steady or size > RESIDUAL:
         raise InputError(
             f"model {model.name}: the hidden state finds no rest at x = {x0.tolist()} (residual {size:.2g}); give h"
+            " [HM-MODEL-009]"
         )
     return found.v[n_x:n_z]
 
@@ -654,7 +656,7 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     n_q = positions_of(model)
     if model.n_u != n_q:
         raise InputError(
-            f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them"
+            f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them [HM-MODEL-010]"
         )
     x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
     guess = np.zeros(model.n_u) if u_guess is None else vector(u_guess, model.n_u, "u_guess")
@@ -675,6 +677,7 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
         if not held:
             raise InputError(
                 f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})"
+                " [HM-MODEL-011]"
             )
         found = min(held, key=lambda u: float(np.linalg.norm((u - guess) / input_sizes(model))))
     return found

@@ -22,10 +22,10 @@ def input_limits(u_min: ArrayLike, u_max: ArrayLike, n_u: int) -> tuple[Array, A
     """Checked limits ``(n_u,)`` of the inputs; ``-inf`` and ``inf`` for none."""
     lower, upper = (numbers(v, name, most=LARGEST) for v, name in ((u_min, "u_min"), (u_max, "u_max")))
     if lower.shape != (n_u,) or upper.shape != (n_u,):
-        raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed")
+        raise InputError(f"u_min has {lower.size} and u_max {upper.size} values, {n_u} needed [HM-MODEL-012]")
     if not np.all(lower < upper):
         raise InputError(
-            f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max"
+            f"input bounds cross: u_min {lower}, u_max {upper}; every u_min must be below its u_max [HM-MODEL-013]"
         )
     return lower, upper
 
@@ -40,11 +40,15 @@ def numbers(values: ArrayLike, name: str, *, most: float = np.inf) -> Array:
         given = np.array(values)
         array = np.array(values, dtype=float).ravel() if given.dtype.kind in "iufO" else None
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{name}: numbers needed, got {type(values).__name__} {values!r:.80}") from error
+        raise InputError(
+            f"{name}: numbers needed, got {type(values).__name__} {values!r:.80} [HM-MODEL-014]"
+        ) from error
     if array is None or _not_numbers(values):
-        raise InputError(f"{name}: numbers needed, got {values!r:.80}")
+        raise InputError(f"{name}: numbers needed, got {values!r:.80} [HM-MODEL-015]")
     if np.any(np.isfinite(array) & (np.abs(array) > most)):
-        raise InputError(f"{name}: numbers of at most {most:g} in size are needed, got {values!r:.80}")
+        raise InputError(
+            f"{name}: numbers of at most {most:g} in size are needed, got {values!r:.80} [HM-MODEL-016]"
+        )
     return array
 
 
@@ -52,9 +56,9 @@ def vector(value: ArrayLike, size: int, name: str) -> Array:
     """``value`` as a finite float vector ``(size,)``."""
     array = numbers(value, name)
     if array.shape != (size,):
-        raise InputError(f"{name}: {array.size} values given, {size} needed")
+        raise InputError(f"{name}: {array.size} values given, {size} needed [HM-MODEL-017]")
     if not np.all(np.isfinite(array)):
-        raise InputError(f"{name}: values must be finite, got {array}")
+        raise InputError(f"{name}: values must be finite, got {array} [HM-MODEL-018]")
     return array
 
 
@@ -86,7 +90,7 @@ def sampled(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Arra
         array = array.reshape((1,) * (len(shape) - array.ndim) + array.shape)
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         needed = f"({', '.join('m' if n is None else str(n) for n in shape)}{',' * (len(shape) == 1)})"
-        raise InputError(f"{name} has shape {np.shape(array)}, needed is {needed}")
+        raise InputError(f"{name} has shape {np.shape(array)}, needed is {needed} [HM-MODEL-019]")
     return array
 
 
@@ -101,8 +105,10 @@ def floats(values: ArrayLike, name: str) -> Array:
         if given.dtype.kind == "O" and all(isinstance(v, Real) for v in given.flat):
             return np.array([_float(v) for v in given.flat], dtype=np.float64).reshape(given.shape)
     except Exception as error:  # whatever an object of anybody's raises where it is asked for its numbers
-        raise InputError(f"{name}: numbers needed, got {type(values).__name__} ({error})") from error
-    raise InputError(f"{name}: numbers needed, got {type(values).__name__} {values!r:.80}")
+        raise InputError(
+            f"{name}: numbers needed, got {type(values).__name__} ({error}) [HM-MODEL-020]"
+        ) from error
+    raise InputError(f"{name}: numbers needed, got {type(values).__name__} {values!r:.80} [HM-MODEL-021]")
 
 
 def _float(value: Real) -> float:
@@ -142,10 +148,9 @@ def check_part(value: object, name: str, what: str, *needed: str) -> None:
     """
     lacking = [attribute for attribute in needed if not hasattr(value, attribute)]
     if lacking or isinstance(value, type):
-        raise InputError(
-            f"{name}: {what} is needed, got {value.__name__ if isinstance(value, type) else type(value).__name__}"
-            + (f", which has no {lacking[0]!r}" if lacking else ", a class")
-        )
+        got = value.__name__ if isinstance(value, type) else type(value).__name__
+        why = f"which has no {lacking[0]!r}" if lacking else "a class"
+        raise InputError(f"{name}: {what} is needed, got {got}, {why} [HM-MODEL-044]")
 
 
 def check_function(value: object, name: str) -> None:
@@ -161,9 +166,9 @@ def check_function(value: object, name: str) -> None:
         hybrid_mpc.errors.InputError: weight: a function is needed, got the class float
     """
     if isinstance(value, type):
-        raise InputError(f"{name}: a function is needed, got the class {value.__name__}")
+        raise InputError(f"{name}: a function is needed, got the class {value.__name__} [HM-MODEL-022]")
     if not callable(value):
-        raise InputError(f"{name}: a function is needed, got {type(value).__name__}")
+        raise InputError(f"{name}: a function is needed, got {type(value).__name__} [HM-MODEL-023]")
 
 
 def check_flag(value: object, name: str) -> None:
@@ -173,7 +178,7 @@ def check_flag(value: object, name: str) -> None:
         InputError: Naming the argument.
     """
     if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name}: True or False is needed, got {type(value).__name__}")
+        raise InputError(f"{name}: True or False is needed, got {type(value).__name__} [HM-MODEL-024]")
 
 
 def whole(value: object, name: str, least: int, most: int) -> int:
@@ -190,7 +195,9 @@ def whole(value: object, name: str, least: int, most: int) -> int:
         value, bool | np.bool_
     )
     if not kind or not least <= value <= most or value != int(value):  # type: ignore[operator, call-overload]
-        raise InputError(f"{name}: a whole number from {least} to {most:g} is needed, got {_shortly(value)}")
+        raise InputError(
+            f"{name}: a whole number from {least} to {most:g} is needed, got {_shortly(value)} [HM-MODEL-025]"
+        )
     return int(value)  # type: ignore[call-overload]
 
 

@@ -128,7 +128,9 @@ class HybridModel:
     def __post_init__(self) -> None:
         for name in ("dt", "time_unit"):
             if not getattr(self, name) > 0:
-                raise InputError(f"model {self.name}: {name} must be positive, got {getattr(self, name)}")
+                raise InputError(
+                    f"model {self.name}: {name} must be positive, got {getattr(self, name)} [HM-MODEL-026]"
+                )
         x, h, u, y = (self.n_x, 1), (self.n_h, 1), (self.n_u, 1), (self.n_y, 1)
         w, p = (self.n_w, 1), (self.n_p, 1)
         _check(self.name, "step", self.step, [x, h, u, w, p], [x, h])
@@ -222,7 +224,7 @@ class HybridModel:
             except RuntimeError as error:
                 raise InputError(
                     f"model {name}: {key} must be an expression of the symbols given (x, u; h, w, p, rate where there "
-                    f"are any): {str(error).strip().splitlines()[-1]}"
+                    f"are any): {str(error).strip().splitlines()[-1]} [HM-MODEL-027]"
                 ) from error
 
         return cls(
@@ -351,7 +353,9 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
         (3.0, 2.75)
     """
     if not isinstance(periods, int) or periods < 1:
-        raise InputError(f"model {model.name}: periods must be a whole number of at least 1, got {periods}")
+        raise InputError(
+            f"model {model.name}: periods must be a whole number of at least 1, got {periods} [HM-MODEL-028]"
+        )
     point = step_symbols(model)
     assert model.with_jacobian is not None
     by_value, by_jacobian, held = point[:2], point[:2], point[2:]
@@ -378,14 +382,14 @@ def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> 
         if model.n_h > model.delay_states:
             raise InputError(
                 f"model {model.name} has a network, and its parameters are those of its prior: give prior=, the model "
-                'of the prior alone, e.g. kit.models["prior"]'
+                'of the prior alone, e.g. kit.models["prior"] [HM-MODEL-029]'
             )
         prior = model
     if prior.parameters != model.parameters or not model.n_p:
         own, other = ([p.name for p in m.parameters] for m in (model, prior))
         raise InputError(
             f"model {model.name} has the parameters {own} and its prior {prior.name} {other}: parameters, the same of "
-            "both, are needed, as models have that are made of programs of one artifact (hybrid-mpc run)"
+            "both, are needed, as models have that are made of programs of one artifact (hybrid-mpc run) [HM-MODEL-030]"
         )
     n_q, point = prior.n_x // 2, step_symbols(prior)
     x, _, u, w, p = point
@@ -440,7 +444,7 @@ def positions_of(model: HybridModel) -> int:
     if not n_q or kinematics(model) != {i: n_q + i for i in range(n_q)} or model.n_x != 2 * n_q:
         raise InputError(
             f"model {model.name}: its states ({', '.join(s.name for s in model.states)}) are not positions and then "
-            "their speeds, so there is no friction of a motion and no working speed"
+            "their speeds, so there is no friction of a motion and no working speed [HM-MODEL-031]"
         )
     return n_q
 
@@ -457,7 +461,9 @@ def incidence(model: HybridModel, groups: Mapping[str, Sequence[str]], what: str
     for j, names in enumerate(groups.values()):
         for name in names:
             if name not in known:
-                raise InputError(f"{what}: no parameter {name!r}; there are: {', '.join(known)}")
+                raise InputError(
+                    f"{what}: no parameter {name!r}; there are: {', '.join(known)} [HM-MODEL-032]"
+                )
             matrix[known.index(name), j] = 1.0
     return matrix
 
@@ -494,24 +500,31 @@ def _check_numbers(model: HybridModel) -> None:
     for name, size in (("nominal_x", model.n_x), ("nominal_u", model.n_u), ("nominal_w", model.n_w)):
         values = getattr(model, name)
         if len(values) != size or not all(map(math.isfinite, values)):
-            raise InputError(f"model {model.name}: {name} needs {size} finite values, got {values}")
+            raise InputError(
+                f"model {model.name}: {name} needs {size} finite values, got {values} [HM-MODEL-033]"
+            )
     for name, size in (("state_spread", model.n_x), ("output_spread", model.n_y)):
         values = getattr(model, name)
         if values and (len(values) != size or not all(math.isfinite(v) and v >= 0 for v in values)):
             raise InputError(
                 f"model {model.name}: {name} needs {size} finite values that are not negative, or none, got {values}"
+                " [HM-MODEL-034]"
             )
     if model.covariance and [len(row) for row in model.covariance] != [n_p] * n_p:
-        raise InputError(f"model {model.name}: covariance needs {n_p} rows of {n_p} values, one a parameter")
+        raise InputError(
+            f"model {model.name}: covariance needs {n_p} rows of {n_p} values, one a parameter [HM-MODEL-035]"
+        )
     for what, names in (
         ("parameters", [p.name for p in model.parameters]), ("balances", [b.name for b in model.balances])
     ):  # fmt: skip
         if len(set(names)) < len(names):
-            raise InputError(f"model {model.name}: {what} need different names, got {', '.join(names)}")
+            raise InputError(
+                f"model {model.name}: {what} need different names, got {', '.join(names)} [HM-MODEL-036]"
+            )
     if not 0 <= model.delay_states <= model.n_h or model.delay_states % model.n_u:
         raise InputError(
             f"model {model.name}: delay_states must be whole inputs within the {model.n_h} entries of h, "
-            f"got {model.delay_states}"
+            f"got {model.delay_states} [HM-MODEL-037]"
         )
 
 
@@ -522,5 +535,5 @@ def _check(
     if given != (ins, outs):
         raise InputError(
             f"model {model}: {name} takes {given[0]} and returns {given[1]}, "
-            f"its signals need {ins} and {outs}"
+            f"its signals need {ins} and {outs} [HM-MODEL-038]"
         )

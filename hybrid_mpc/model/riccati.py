@@ -52,7 +52,7 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
     a, b, q, r = (np.atleast_2d(floats(m, f"Riccati equation: {name}")) for name, m in given.items())
     hint = "check the pair (A, B), give every undamped state a positive q and every input a positive r"
     if not all(np.all(np.isfinite(m)) for m in (a, b, q, r)):
-        raise InputError("Riccati equation: A, B, Q or R holds a NaN or an infinite value")
+        raise InputError("Riccati equation: A, B, Q or R holds a NaN or an infinite value [HM-MODEL-039]")
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # looked at below
             p = _doubled(a, b, q, r)
@@ -65,9 +65,13 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
             k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
             radius = float(np.max(np.abs(np.linalg.eigvals(a - b @ k))))
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise InputError(f"the Riccati equation has no stabilising solution ({error}); {hint}") from error
+        raise InputError(
+            f"the Riccati equation has no stabilising solution ({error}); {hint} [HM-MODEL-040]"
+        ) from error
     if not radius < 1.0:
-        raise InputError(f"not stabilisable: spectral radius {radius:.6f} in closed loop; {hint}")
+        raise InputError(
+            f"not stabilisable: spectral radius {radius:.6f} in closed loop; {hint} [HM-MODEL-041]"
+        )
     return p, np.asarray(k, dtype=np.float64)
 
 
@@ -77,7 +81,7 @@ def _doubled(a: Array, b: Array, q: Array, r: Array) -> Array:
     """
     size = np.sqrt(np.diag(r))
     if not np.all(size > 0):
-        raise ValueError("R is not positive definite")
+        raise ValueError("R is not positive definite [HM-MODEL-042]")
     scaled = b / size
     g, h, eye = scaled @ np.linalg.solve(r / np.outer(size, size), scaled.T), q, np.eye(len(a))
     for _ in range(DOUBLINGS):

@@ -176,5 +176,5 @@ def _compiled(stage: ca.Function) -> ca.Function:
     except (RuntimeWarning, CompileError) as error:
         raise InputError(
             f"compiled=True given, but the model could not be compiled: {error}; needed: a C compiler (cc, gcc, "
-            "clang or the one that the variable CC names); leave compiled out to do without"
+            "clang or the one that the variable CC names); leave compiled out to do without [HM-MODEL-043]"
         ) from error

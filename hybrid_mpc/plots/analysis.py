@@ -64,7 +64,7 @@ def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | 
     values = {m: np.ravel(np.asarray(p, dtype=complex)) for m, p in poles.items()}
     nulls = {m: np.ravel(np.asarray(z, dtype=complex)) for m, z in (zeros or {}).items()}
     if not dt > 0 or not any(len(p) for p in values.values()):
-        raise InputError(f"pole map: needs at least one pole and a positive dt, got dt = {dt}")
+        raise InputError(f"pole map: needs at least one pole and a positive dt, got dt = {dt} [HM-PLOTS-001]")
     figure, axes = new_figure(1, 2, size=(10, 5.4))
     extent = max(1.08, *(1.05 * float(np.abs(p).max()) for p in values.values() if len(p)))
     near = np.concatenate([p[np.abs(p - 1.0) < 0.35] for p in values.values()])
@@ -168,7 +168,7 @@ def bode(
         2
     """
     if not responses:
-        raise InputError("Bode plot: there is no model to draw")
+        raise InputError("Bode plot: there is no model to draw [HM-PLOTS-002]")
     figure, axes = new_figure(2, 1, sharex=True, size=(9, 5.4))
     magnitude_ax, phase_ax = axes[:, 0]
     lowest, phases = np.inf, []
@@ -219,7 +219,7 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, NDArray[Any]]]) -> Fi
         2
     """
     if not loops:
-        raise InputError("sensitivity functions: there is no loop to draw")
+        raise InputError("sensitivity functions: there is no loop to draw [HM-PLOTS-003]")
     figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2))
     texts = ("S: what is left of a load", "T: what the input takes of it")
     looks = _looks(loops)
@@ -274,7 +274,7 @@ def nyquist(loops: Mapping[str, NDArray[np.complex128]], *, modulus: float | Non
         1
     """
     if not loops:
-        raise InputError("Nyquist plot: there is no loop to draw")
+        raise InputError("Nyquist plot: there is no loop to draw [HM-PLOTS-004]")
     figure, axes = new_figure(1, 1, size=(6.4, 5.6))
     ax = axes[0, 0]
     angle = np.linspace(0, 2 * np.pi, 361)
@@ -322,7 +322,7 @@ def gain_schedules(
         2
     """
     if not schedules:
-        raise InputError("gain schedule: there is nothing to draw")
+        raise InputError("gain schedule: there is nothing to draw [HM-PLOTS-005]")
     figure, axes = new_figure(1, len(states), sharex=True, size=(4.8 * len(states), 3.8))
     for name, points in schedules.items():
         for point, (q, gain) in points.items():
@@ -366,7 +366,7 @@ def measured_bode(
         3
     """
     if not responses:
-        raise InputError("measured response: there is nothing to draw")
+        raise InputError("measured response: there is nothing to draw [HM-PLOTS-006]")
     figure, axes = new_figure(3, 1, sharex=True, size=(9, 7.2), heights=(3, 2, 1.2))
     upper, middle, lower = axes[:, 0]
     doubtful = False
@@ -429,7 +429,7 @@ def step_responses(
         1
     """
     if not curves:
-        raise InputError("step responses: there is nothing to draw")
+        raise InputError("step responses: there is nothing to draw [HM-PLOTS-007]")
     figure, axes = new_figure(1, len(curves), size=(3.4 * len(curves) + 1, 3.6))
     for ax, (point, models) in zip(axes[0], curves.items(), strict=True):
         for name, (t, y) in models.items():
@@ -459,7 +459,7 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
         1
     """
     if not curves:
-        raise InputError("friction: there is nothing to draw")
+        raise InputError("friction: there is nothing to draw [HM-PLOTS-008]")
     figure, axes = new_figure(1, len(curves), size=(5.0 * len(curves), 4.4), sharey=True)
     kinds = (
         ("secant", "--", "secant"),
@@ -513,7 +513,7 @@ def sensitivities(
         2
     """
     if not relative or not names:
-        raise InputError("sensitivities: there is nothing to draw")
+        raise InputError("sensitivities: there is nothing to draw [HM-PLOTS-009]")
     figure, axes = new_figure(
         (len(names) + 1) // 2, 2, sharex=True, size=(10, 1.7 * ((len(names) + 1) // 2) + 1)
     )

@@ -315,19 +315,23 @@ def animate(
     """
     path = Path(path)
     if path.suffix != ".gif":
-        raise InputError(f"animation {path}: animations are written as GIF; end the name in .gif")
+        raise InputError(
+            f"animation {path}: animations are written as GIF; end the name in .gif [HM-PLOTS-010]"
+        )
     if not dt > 0 or not fps > 0:
-        raise InputError(f"animation {path}: dt and fps must be positive, got {dt} and {fps}")
+        raise InputError(f"animation {path}: dt and fps must be positive, got {dt} and {fps} [HM-PLOTS-011]")
     loop = _checked(path, t, x, plans, dt, draw, u)
     n_u = loop.u.shape[1]
     signals = tuple(inputs) if inputs is not None else tuple(Signal(f"u_{i}", "-") for i in range(n_u))
     if len(signals) != n_u or (limits is not None and {len(bound) for bound in limits} != {n_u}):
-        raise InputError(f"animation {path}: needs a signal and both limits for each of the {n_u} inputs")
+        raise InputError(
+            f"animation {path}: needs a signal and both limits for each of the {n_u} inputs [HM-PLOTS-012]"
+        )
     if curves is None:
         curves = [(i, Signal(f"x_{i}", "-")) for i in range(loop.x.shape[1])]
     if not curves or not all(0 <= column < loop.x.shape[1] for column, _ in curves):
         raise InputError(
-            f"animation {path}: curves are of states 0 to {loop.x.shape[1] - 1}, got {list(curves)}"
+            f"animation {path}: curves are of states 0 to {loop.x.shape[1] - 1}, got {list(curves)} [HM-PLOTS-013]"
         )
     target = None if reference is None else checked("reference", reference, len(loop.t), len(curves))
     if alarm is not None:
@@ -350,15 +354,20 @@ def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw
     if not fits or plans.shape[2] != x.shape[1] or plans.shape[1] == 0:
         raise InputError(
             f"animation {path}: needs t (n,), x (n, n_x), u (n, n_u), plans (n, N + 1, n_x) with n > 0, got "
-            f"{t.shape}, {x.shape}, {u.shape}, {plans.shape}"
+            f"{t.shape}, {x.shape}, {u.shape}, {plans.shape} [HM-PLOTS-014]"
         )
     if not np.all(np.isfinite(x)) or not np.all(np.diff(t) > 0) or not np.all(np.isfinite(t)):
-        raise InputError(f"animation {path}: times must increase and the true states be finite; cut the loop")
+        raise InputError(
+            f"animation {path}: times must increase and the true states be finite; cut the loop"
+            " [HM-PLOTS-015]"
+        )
     first = draw(x[0])
     ends = plans[:, -1][np.all(np.isfinite(plans[:, -1]), axis=1)]
     others = [draw(state) for states in (x, ends) for state in states[:: max(1, n // 50)]]
     if any(len(lines) != len(first) for lines in others):
-        raise InputError(f"animation {path}: draw must return the same number of lines for every state")
+        raise InputError(
+            f"animation {path}: draw must return the same number of lines for every state [HM-PLOTS-016]"
+        )
     moving = tuple(any(not np.array_equal(o[i], line) for o in others) for i, line in enumerate(first))
     return AnimatedLoop(t, x, u, plans, dt, draw, moving)
 

@@ -136,7 +136,7 @@ def coverage(
         (1, 2)
     """
     if not trajectories:
-        raise InputError("plot of the coverage: there is no recording to draw")
+        raise InputError("plot of the coverage: there is no recording to draw [HM-PLOTS-017]")
     shown = [piece for role in ("train", "test") for piece in trajectories if piece.role == role]
     if pairs:
         size = (6.8 if len(pairs) == 1 else 5.0 * len(pairs), 4.6)
@@ -174,7 +174,7 @@ def _wrapped(angle: Array) -> Array:
 
 def _chosen(trajectories: Sequence[Recording], limit: int) -> dict[str, list[Recording]]:
     if not trajectories:
-        raise InputError("plot of the recordings: there is no recording to draw")
+        raise InputError("plot of the recordings: there is no recording to draw [HM-PLOTS-018]")
     files: dict[str, list[Recording]] = {}
     for piece in trajectories:
         files.setdefault(piece.name.split("#")[0], []).append(piece)

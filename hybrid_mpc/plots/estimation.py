@@ -63,7 +63,9 @@ def innovations(
     from scipy.stats import chi2
 
     if not nis or not dt > 0:
-        raise InputError("plot of the innovations: needs at least one recording and a positive period")
+        raise InputError(
+            "plot of the innovations: needs at least one recording and a positive period [HM-PLOTS-019]"
+        )
     lags, n_y = len(autocorrelation), len(outputs)
     r = checked("autocorrelation", autocorrelation, lags, n_y)
     values = np.concatenate([np.asarray(v, dtype=float) for v in nis])

@@ -71,7 +71,7 @@ def error_steps(
     """
     finite = [v for v in errors if math.isfinite(v)]
     if not finite:
-        raise InputError("plot of the steps: there is no finite error")
+        raise InputError("plot of the steps: there is no finite error [HM-PLOTS-020]")
     figure, axes = new_figure(1, 1, size=(10.0, 1.3 + 0.42 * len(labels)))
     ax, top = axes[0, 0], max(finite)
     for k, (value, before) in enumerate(zip(errors, [math.inf, *errors], strict=False)):

@@ -189,7 +189,7 @@ def errors_bar(
     """
     shown = [m for m in metrics if any(values.get(m) is not None for values in errors.values())]
     if not shown:
-        raise InputError(f"plot of the errors: no model has any of {', '.join(metrics)}")
+        raise InputError(f"plot of the errors: no model has any of {', '.join(metrics)} [HM-PLOTS-021]")
     columns = min(len(shown), ABREAST)
     rows = math.ceil(len(shown) / columns)
     figure, axes = new_figure(rows, columns, size=(max(5.0, 3.4 * columns), 0.6 + 3.6 * rows))
@@ -254,7 +254,7 @@ def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figu
         1
     """
     if not errors:
-        raise InputError("plot of the parity: there is no difference to draw")
+        raise InputError("plot of the parity: there is no difference to draw [HM-PLOTS-022]")
     figure, axes = new_figure(1, 1, size=(8, 3.6))
     ax = axes[0, 0]
     palette = ("#0072B2", "#D55E00", "#009E73", "#E69F00")
@@ -446,7 +446,7 @@ def curves(
         2
     """
     if not training:
-        raise InputError("plot of the training: there is no model to draw")
+        raise InputError("plot of the training: there is no model to draw [HM-PLOTS-023]")
     every = dict.fromkeys(
         k.removeprefix("loss_") for data in training.values() for k in data if k.startswith("loss_")
     )
@@ -457,7 +457,9 @@ def curves(
     )
     for column, (model, data) in zip(axes.T, training.items(), strict=True):
         if "step" not in data:
-            raise InputError(f"plot of the training of {model}: no array 'step'; it has {', '.join(data)}")
+            raise InputError(
+                f"plot of the training of {model}: no array 'step'; it has {', '.join(data)} [HM-PLOTS-024]"
+            )
         step = np.asarray(data["step"], dtype=float)
         for ax, (loss, bound, _, _) in zip(column, rows, strict=True):
             _curve(ax, model, step, data.get(loss), loss)

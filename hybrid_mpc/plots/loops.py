@@ -115,7 +115,7 @@ def closed_loops(
         5
     """
     if not results:
-        raise InputError(f"plot of the closed loops {title!r}: there is no controller to draw")
+        raise InputError(f"plot of the closed loops {title!r}: there is no controller to draw [HM-PLOTS-025]")
     t = np.asarray(t, dtype=float)
     measured = all(loop.y is not None for loop in results.values())
     x_ref = None if reference is None else checked("reference", reference, len(t), len(states))
@@ -214,11 +214,15 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
         2
     """
     if not times_ms or not period_ms > 0:
-        raise InputError("plot of the solve times: needs at least one controller and a positive period")
+        raise InputError(
+            "plot of the solve times: needs at least one controller and a positive period [HM-PLOTS-026]"
+        )
     data = {name: np.sort(np.ravel(np.asarray(v, dtype=float))) for name, v in times_ms.items()}
     for name, values in data.items():
         if len(values) == 0 or not values[0] > 0:
-            raise InputError(f"plot of the solve times of {name}: needs positive durations [ms]")
+            raise InputError(
+                f"plot of the solve times of {name}: needs positive durations [ms] [HM-PLOTS-027]"
+            )
     figure, axes = new_figure(1, 2, size=(10, 4.0))
     left, right = axes[0]
     low = min(v[0] for v in data.values())
@@ -275,6 +279,7 @@ def costs(table: Costs) -> Figure:
     if not points:
         raise InputError(
             f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of 'oracle' to compare with"
+            " [HM-PLOTS-028]"
         )
     present = _ordered({name for row in relative.values() for name in row})
     height = 0.25 + 0.11 * len(present)

@@ -63,7 +63,7 @@ def distributions(values: Values, label: str) -> Figure:
         _rows(ax, [name_of(level) for level in finite])
         title_axes(ax, plain(group))
     if not any(_finite(v).size for row in values.values() for v in row.values()):
-        raise InputError(f"plot of {label}: there is no finite value")
+        raise InputError(f"plot of {label}: there is no finite value [HM-PLOTS-029]")
     figure.supxlabel(f"{label}: median, quartiles, 5 to 95 %", fontsize=10)
     return figure
 
@@ -84,7 +84,7 @@ def differences(rows: Mapping[str, Mapping[str, tuple[float, float, float]]], la
         1
     """
     if not any(math.isfinite(v[0]) for row in rows.values() for v in row.values()):
-        raise InputError(f"plot of {label}: there is no finite value")
+        raise InputError(f"plot of {label}: there is no finite value [HM-PLOTS-030]")
     figure, panels = _panels(rows, 0.45)
     for ax, (group, row) in zip(panels, rows.items(), strict=False):
         ax.axvline(0.0, color=INK, linewidth=0.8)
@@ -118,7 +118,7 @@ def pareto(points: Mapping[str, Mapping[str, tuple[float, float]]], cost: str) -
         for group, row in points.items()
     }
     if not any(finite.values()):
-        raise InputError(f"plot of {cost} against time: there is no finite point")
+        raise InputError(f"plot of {cost} against time: there is no finite point [HM-PLOTS-031]")
     figure, panels = _panels(finite, 0.0, least=2.8)
     for ax, (group, row) in zip(panels, finite.items(), strict=False):
         front = _front(list(row.values()))

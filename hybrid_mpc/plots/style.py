@@ -279,7 +279,9 @@ def checked(name: str, values: Any, length: int, columns: int | None = None) -> 
         array = array[:, None]
     needed = (length,) if columns is None else (length, columns)
     if array.shape != needed:
-        raise InputError(f"plot: {name} has shape {array.shape}, its time axis and signals need {needed}")
+        raise InputError(
+            f"plot: {name} has shape {array.shape}, its time axis and signals need {needed} [HM-PLOTS-032]"
+        )
     return array
 
 
@@ -301,7 +303,7 @@ def save(figure: Figure, path: str | Path) -> Path:
     """
     path = Path(path)
     if path.suffix != ".png":
-        raise InputError(f"figure {path}: figures are written as PNG; end the name in .png")
+        raise InputError(f"figure {path}: figures are written as PNG; end the name in .png [HM-PLOTS-033]")
     drawn = io.BytesIO()
     with warnings.catch_warnings():
         # names of anybody's may have characters that the font lacks; the warning would print them as they are

@@ -65,7 +65,7 @@ def history(trials: Sequence[Trial], *, base: float | None = None) -> Figure:
 def settings(trials: Sequence[Trial], names: Sequence[str]) -> Figure:
     """Validation error over each searched setting, one panel a setting."""
     if not names:
-        raise InputError("plot of a search: no setting to draw; give the searched ones")
+        raise InputError("plot of a search: no setting to draw; give the searched ones [HM-PLOTS-034]")
     figure, axes = new_figure(1, len(names), sharey=True)
     for ax, name in zip(axes[0], names, strict=True):
         at = [float(trial.values[name]) for trial in trials]
@@ -82,7 +82,10 @@ def _points(ax: Axes, trials: Sequence[Trial], at: Sequence[float]) -> None:
     """One point a trial on a logarithmic axis; an infinite value lies at the upper edge."""
     finite = [trial.value for trial in trials if math.isfinite(trial.value) and trial.value > 0]
     if not finite:
-        raise InputError("plot of a search: no trial has a finite validation error; there is nothing to draw")
+        raise InputError(
+            "plot of a search: no trial has a finite validation error; there is nothing to draw"
+            " [HM-PLOTS-035]"
+        )
     low, high = min(finite) / 1.08, max(finite) * 1.08
     ax.set_yscale("log")
     ax.set_ylim(low, high)

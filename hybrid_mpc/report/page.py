@@ -67,7 +67,7 @@ class Table:
             if len(row) != len(self.columns):
                 raise InputError(
                     f"table {self.caption!r}: row {i} has {len(row)} cells, "
-                    f"its {len(self.columns)} columns need one each"
+                    f"its {len(self.columns)} columns need one each [HM-REPORT-001]"
                 )
 
     def filled(self) -> Table:
@@ -222,13 +222,15 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise InputError(
-            f"report, section {section.title!r}: no figure {path}; draw it first, or leave it out"
+            f"report, section {section.title!r}: no figure {path}; draw it first, or leave it out [HM-REPORT-002]"
         )
     try:
         with Image.open(path, formats=("PNG", "GIF")) as image:
             kind, (width, height) = str(image.format).lower(), image.size
     except UnidentifiedImageError:
-        raise InputError(f"report, section {section.title!r}: figure {path} is no PNG or GIF file") from None
+        raise InputError(
+            f"report, section {section.title!r}: figure {path} is no PNG or GIF file [HM-REPORT-003]"
+        ) from None
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     live = path.with_suffix(".json")
     return {

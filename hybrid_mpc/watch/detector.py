@@ -61,14 +61,17 @@ class ChannelLimit:
         if self.scale and not (all(math.isfinite(a) and a >= 0 for a in self.scale) and any(self.scale)):
             raise InputError(
                 f"limit of {self.channel}: scale needs numbers, not negative, not all 0; got {self.scale}"
+                " [HM-WATCH-001]"
             )
         if not 0 < self.release <= self.threshold:
             raise InputError(
                 f"limit of {self.channel}: need 0 < release <= threshold, got {self.release} and {self.threshold}"
+                " [HM-WATCH-002]"
             )
         if not (self.length >= 0 and 0 <= self.drift < math.inf):
             raise InputError(
                 f"limit of {self.channel}: length {self.length} and drift {self.drift} must not be negative"
+                " [HM-WATCH-003]"
             )
 
     def words(self, dt: float) -> str:
@@ -123,9 +126,13 @@ class WatchLimits:
 
     def __post_init__(self) -> None:
         if not (self.dt > 0 and self.time_unit > 0):
-            raise InputError(f"limits: dt {self.dt} and time_unit {self.time_unit} must be positive")
+            raise InputError(
+                f"limits: dt {self.dt} and time_unit {self.time_unit} must be positive [HM-WATCH-004]"
+            )
         if len(self.travel) != len(self.repeats) or not all(far > 0 for far in self.travel):
-            raise InputError(f"limits: travels must be positive, one an output, got {self.travel}")
+            raise InputError(
+                f"limits: travels must be positive, one an output, got {self.travel} [HM-WATCH-005]"
+            )
 
     def of(self, channel: str) -> tuple[ChannelLimit, ...]:
         """Limits of a channel, the shortest first."""
@@ -140,10 +147,12 @@ class WatchLimits:
         if kind != self.kind or strange:
             raise InputError(
                 f"limits: they are of {', '.join(strange) or self.kind}, the readings are of {kind}: "
-                f"{', '.join(c.name for c in channels)}; learn them anew with learn_limits"
+                f"{', '.join(c.name for c in channels)}; learn them anew with learn_limits [HM-WATCH-006]"
             )
         if wrong := [one.channel for one in self.channels if len(one.scale) not in (0, n_terms)]:
-            raise InputError(f"limits: the scale of {wrong[0]} needs {n_terms} numbers; learn them anew")
+            raise InputError(
+                f"limits: the scale of {wrong[0]} needs {n_terms} numbers; learn them anew [HM-WATCH-007]"
+            )
         for what, own, given in (
             ("a period", self.dt, dt),
             ("a machine's second", self.time_unit, time_unit),
@@ -151,6 +160,7 @@ class WatchLimits:
             if abs(own - given) > 1e-9 * own:
                 raise InputError(
                     f"limits: learned at {what} of {own:g} s, the model's is {given:g} s; learn them anew"
+                    " [HM-WATCH-008]"
                 )
 
 
@@ -200,7 +210,9 @@ class Detector:
         ]  # fmt: skip
         self.longest = max((one.length for _, _, one in means), default=0)
         if any(one.scale for _, _, one in means):
-            raise InputError("detector: a mean of scaled values is not known; give a limit of length 0 or 1")
+            raise InputError(
+                "detector: a mean of scaled values is not known; give a limit of length 0 or 1 [HM-WATCH-009]"
+            )
         self._bounds = [(one.threshold, one.release) for one in limits]
 
     def initial(self) -> DetectorState:

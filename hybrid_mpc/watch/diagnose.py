@@ -150,6 +150,7 @@ class Diagnoser:
             if not all(of):
                 raise InputError(
                     "diagnosis: the limits have no free runs of this model's outputs; give its residuals'"
+                    " [HM-WATCH-010]"
                 )
             self._scale = np.array([shortest[0].threshold for shortest in of])
         gains = {f"gain of {s.name}" for s in model.inputs}

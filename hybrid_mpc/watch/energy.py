@@ -178,12 +178,15 @@ class EnergyReadings:
         if free_run is None:
             free_run = max(seconds(FREE_RUN_S, model), 2 * window * model.dt)
         if window < 5 or window % 2 == 0:
-            raise InputError(f"energy: window must be an odd number of at least 5 samples, got {window}")
+            raise InputError(
+                f"energy: window must be an odd number of at least 5 samples, got {window} [HM-WATCH-011]"
+            )
         check_model(model)
         self.layout = Layout(model, window, round(free_run / model.dt))
         if free_run and self.layout.length < 2 * window:
             raise InputError(
                 f"energy: a free run of {free_run} s given; two windows, {2 * window * model.dt:g} s, needed"
+                " [HM-WATCH-012]"
             )
         self.model, self.window = model, window
         self.rest_speed = checked_rest(
@@ -238,7 +241,7 @@ class EnergyReadings:
         if (x.size, h.size, u_prev.size, y.size) != self._sizes:
             raise InputError(
                 f"monitor of model {self.model.name}: x, h, u_prev, y have {(x.size, h.size, u_prev.size, y.size)} "
-                f"entries, the model needs {self._sizes}"
+                f"entries, the model needs {self._sizes} [HM-WATCH-013]"
             )
         ins, outs = self._function.inputs, self._function.outputs
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
@@ -301,7 +304,7 @@ def _spans(model: HybridModel, given: ArrayLike | None) -> Array:
         return np.array([s.upper - s.lower for s in model.inputs])
     spans = np.asarray(given, dtype=float).ravel()
     if spans.shape != (model.n_u,) or not np.all(spans > 0):
-        raise InputError(f"energy: input_range needs {model.n_u} positive ranges, got {spans}")
+        raise InputError(f"energy: input_range needs {model.n_u} positive ranges, got {spans} [HM-WATCH-014]")
     return spans
 
 
@@ -335,7 +338,7 @@ def _energy_of(model: HybridModel) -> Balance:
     known = ", ".join(b.name for b in model.balances) or "none"
     raise InputError(
         f"energy: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
-        "watched; give its prior one (a MechanicalPrior has it), and export it again, or take no monitor"
+        "watched; give its prior one (a MechanicalPrior has it), and export it again, or take no monitor [HM-WATCH-015]"
     )
 
 
@@ -538,10 +541,11 @@ def check_model(model: HybridModel) -> None:
         raise InputError(
             f"energy: the outputs of model {model.name} must be its positions "
             f"{[s.name for s in model.states[:n_q]]}; it measures {[s.name for s in model.outputs]}. "
-            "Give a model whose output is x[:n_q]."
+            "Give a model whose output is x[:n_q]. [HM-WATCH-016]"
         )
     if not np.all(np.diag(ca.Function("M", [x, u], [inertia_of(model, x, u)])(0, 0).full()) > 0):
         raise InputError(
             f"energy: the energy balance of model {model.name} does not grow with its acceleration, so it "
             "says nothing of its motion; check the mass matrix of its prior, or the storage of its balance"
+            " [HM-WATCH-017]"
         )

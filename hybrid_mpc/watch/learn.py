@@ -125,7 +125,7 @@ def limits_of(
     if not seconds:
         raise InputError(
             f"limits: no nominal stretch is longer than the {settling_samples(model) * model.dt:g} s that the "
-            "estimator settles in"
+            "estimator settles in [HM-WATCH-018]"
         )
     tests = [
         ChannelLimit(
@@ -159,9 +159,19 @@ def limits_of(
     )
     rest = tuple(getattr(readings, "rest_speed", ()))
     return WatchLimits(
-        readings.kind, model.dt, tuple(found), travel, repeats, rate, seconds / 3600, method, not short, rest,
-        data_hash, model.time_unit,
-    )  # fmt: skip
+        kind=readings.kind,
+        dt=model.dt,
+        channels=tuple(found),
+        travel=travel,
+        repeats=repeats,
+        false_alarms_per_hour=rate,
+        hours=seconds / 3600,
+        method=method,
+        rated=not short,
+        rest_speed=rest,
+        data_hash=data_hash,
+        time_unit=model.time_unit,
+    )
 
 
 def settled(mask: ArrayLike, first: int) -> Mask:
@@ -218,11 +228,12 @@ def calibrate(
     if not dt > 0 or not false_alarms_per_hour > 0 or not block_s > 0:
         raise InputError(
             f"calibration: dt, rate and block must be positive, got {dt} s, {false_alarms_per_hour}/h, {block_s} s"
+            " [HM-WATCH-019]"
         )
     rate = false_alarms_per_hour * block_s / 3600.0
     if rate > 0.5:
         raise InputError(
-            f"calibration: {false_alarms_per_hour}/h is too many; ask for at most {1800 / block_s:g}/h"
+            f"calibration: {false_alarms_per_hour}/h is too many; ask for at most {1800 / block_s:g}/h [HM-WATCH-020]"
         )
     maxima, finite = block_maxima(levels, max(round(block_s / dt), 1))
     needed = max(MIN_BLOCKS, int(np.ceil(1.0 / (rate * MAX_EXTRAPOLATION) - 1e-9)))
@@ -230,14 +241,14 @@ def calibrate(
         raise InputError(
             f"{maxima.size * block_s / 60:.1f} min of nominal data in whole blocks of {block_s:g} s; "
             f"{false_alarms_per_hour:.3g} false alarms an hour need {needed * block_s / 60:.1f} min. "
-            "Record more, or ask for a higher rate."
+            "Record more, or ask for a higher rate. [HM-WATCH-021]"
         )
     location, scale = gumbel(maxima)
     threshold = location - scale * float(np.log(rate))
     if not threshold > 0:
         raise InputError(
             "calibration: the nominal levels are zero throughout, so nothing tells how large an ordinary one is; "
-            "record the machine in motion"
+            "record the machine in motion [HM-WATCH-022]"
         )
     return threshold, _release(threshold, finite)
 
@@ -281,6 +292,7 @@ def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
         raise InputError(
             f"nominal data of {what} hold an alarm: blocks of {block_s:g} s from {places} s stand out "
             f"(up to {maxima.max():.3g}, nominal blocks stay below {limit:.3g}); cut them out, or find the cause"
+            " [HM-WATCH-023]"
         )
 
 
@@ -297,7 +309,7 @@ def _thresholds(
             if not test.may_be_zero:
                 raise InputError(
                     f"limits: {limit.channel} is zero or missing throughout the nominal data; record the machine in "
-                    "motion"
+                    "motion [HM-WATCH-024]"
                 )
             threshold, release = math.inf, math.inf
         else:
@@ -326,6 +338,7 @@ def _scale_of(
     if not squares.size or not np.mean(squares) > 0:
         raise InputError(
             f"limits: {names[channel]} is zero or missing throughout the nominal data; record the machine in motion"
+            " [HM-WATCH-025]"
         )
     from scipy.optimize import nnls  # slow to import, and a running monitor does without
 
@@ -379,7 +392,7 @@ def _freezing(
         changes = np.concatenate([np.abs(np.diff(y[:, i])) for y in ys])
         changes = changes[changes > 0]
         if not changes.size:
-            raise InputError(f"limits: {signal.name} never changes in the nominal data")
+            raise InputError(f"limits: {signal.name} never changes in the nominal data [HM-WATCH-026]")
         step, moved = max(math.sqrt(12.0) * noise[i], float(changes.min())), travel[:, i]
         if resolution is not None:
             step = max(step, float(np.ravel(resolution)[i]))

@@ -93,7 +93,7 @@ def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[floa
     if not long:
         raise InputError(
             f"rest speeds: no recording has the {2 * half + 1} samples ({(2 * half + 1) * model.dt:g} s) of the "
-            "guard's window; give longer ones"
+            "guard's window; give longer ones [HM-WATCH-027]"
         )
     speeds = np.abs(np.concatenate([speeds_of(r, model.dt, half) for r in long]))
     least = DEVIATIONS * noise_of(long) * speed_gain(model.dt, half)
@@ -104,7 +104,7 @@ def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[floa
     if not min(found) > 0:
         names = [s.name for s, rest in zip(model.outputs, found, strict=True) if not rest > 0]
         raise InputError(
-            f"rest speeds: {', '.join(names)} never moves in the recordings; give some in motion"
+            f"rest speeds: {', '.join(names)} never moves in the recordings; give some in motion [HM-WATCH-028]"
         )
     return tuple(found)
 
@@ -115,6 +115,6 @@ def checked_rest(rest_speed: ArrayLike, n_q: int, what: str) -> tuple[float, ...
     if values.size not in (1, n_q) or not (np.all(np.isfinite(values)) and np.all(values > 0)):
         raise InputError(
             f"{what}: rest_speed must be {n_q} positive speeds, one a degree of freedom (or one for all); got "
-            f"{values.tolist()}"
+            f"{values.tolist()} [HM-WATCH-029]"
         )
     return tuple(np.broadcast_to(values, n_q).tolist())

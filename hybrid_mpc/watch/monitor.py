@@ -110,7 +110,7 @@ class Monitor:
             limits.check(readings.kind, readings.channels, readings.n_terms, model.dt, model.time_unit)
             if len(limits.travel) != n_y:
                 raise InputError(
-                    f"limits: {len(limits.travel)} travels, model {model.name} has {n_y} outputs"
+                    f"limits: {len(limits.travel)} travels, model {model.name} has {n_y} outputs [HM-WATCH-030]"
                 )
             self.detector = Detector(limits.channels, self.channels)
             travel, repeats = np.array(limits.travel), np.array(limits.repeats)
@@ -118,7 +118,7 @@ class Monitor:
             steps = np.asarray(resolution, dtype=float).ravel()
             if steps.shape != (n_y,) or not (np.all(np.isfinite(steps)) and np.all(steps > 0)):
                 raise InputError(
-                    f"monitor: resolution needs {n_y} positive steps of the sensors, got {steps}"
+                    f"monitor: resolution needs {n_y} positive steps of the sensors, got {steps} [HM-WATCH-031]"
                 )
             least = FROZEN_STEPS * steps
             travel = least if readings.kind == ENERGY or limits is None else np.maximum(travel, least)
@@ -224,7 +224,7 @@ def make_readings(
     if kind == RESIDUALS:
         return ResidualReadings(model)
     if kind != ENERGY:
-        raise InputError(f"readings: no kind {kind!r}; there are {ENERGY!r} and {RESIDUALS!r}")
+        raise InputError(f"readings: no kind {kind!r}; there are {ENERGY!r} and {RESIDUALS!r} [HM-WATCH-032]")
     return EnergyReadings(model, rest_speed=rest_speed, input_range=input_range)
 
 

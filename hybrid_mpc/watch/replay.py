@@ -263,11 +263,11 @@ def stretches(on: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
 def _check(t: Array, y: Array, u: Array, dt: float) -> None:
     if not t.size or not t.size == len(y) == len(u):
         raise InputError(
-            f"replay: t, y, u have {t.size}, {len(y)}, {len(u)} samples; need equally many, not 0"
+            f"replay: t, y, u have {t.size}, {len(y)}, {len(u)} samples; need equally many, not 0 [HM-WATCH-033]"
         )
     off = float(np.max(np.abs(np.diff(t) - dt))) if t.size > 1 else 0.0
     if off > 1e-3 * dt:
         raise InputError(
             f"replay: the sampling period is off the model's {dt} s by up to {off:.3g} s; "
-            "resample, or cut the recording at its gaps"
+            "resample, or cut the recording at its gaps [HM-WATCH-034]"
         )

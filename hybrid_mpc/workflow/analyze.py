@@ -48,7 +48,9 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     kit = load(folder)
     scenario = scenario_of(kit.provenance.scenario, folder / KIT, settings.scenario)
     if scenario is None and settings.data:
-        raise InputError("--data needs --scenario, which names the columns of the recordings")
+        raise InputError(
+            "--data needs --scenario, which names the columns of the recordings [HM-WORKFLOW-001]"
+        )
     model = next(iter(kit.models.values()))
     if scenario is not None:
         kit = kit.on(scenario)
@@ -66,19 +68,27 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
         notes.append(f"filters' noise: {source}")
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
-        kit.models, load_programs(folder / MODELS), state_range(model, control), input_range(model, control), speed,
-        ocp, filters, plant, _recordings(settings.data, scenario, model), state_range(model),
-    ), tuple(notes)  # fmt: skip
+        models=kit.models,
+        programs=load_programs(folder / MODELS),
+        x_range=state_range(model, control),
+        u_range=input_range(model, control),
+        speed=speed,
+        ocp=ocp,
+        filters=filters,
+        plant=plant,
+        recordings=_recordings(settings.data, scenario, model),
+        region=state_range(model),
+    ), tuple(notes)
 
 
 def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Array:
     if given is not None and not (np.isfinite(given) and given > 0):
-        raise InputError(f"--speed must be positive, got {given}")
+        raise InputError(f"--speed must be positive, got {given} [HM-WORKFLOW-002]")
     try:
         n_q = positions_of(model)
     except InputError as none:
         if given is not None:
-            raise InputError(f"--speed: {none}") from None
+            raise InputError(f"--speed: {none} [HM-WORKFLOW-003]") from None
         return np.zeros(0)
     if given is not None:
         return np.full(n_q, given)

@@ -146,14 +146,21 @@ class BenchmarkResults:
 
 
 def benchmark(
-    settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None
+    settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None, cluster: Any = None
 ) -> BenchmarkResults:
     """Fit, train and evaluate; or evaluate a model made before. The same command goes on where it was interrupted.
 
     ``out`` gets ``results.json`` and, if something is trained, ``model/`` and ``checkpoints/``.
 
+    Args:
+        settings: Machine, files and effort.
+        out: The folder to make, or one that an interrupted benchmark left.
+        progress: What shows the progress. Default: nothing.
+        cluster: Address of a dask scheduler or a ``distributed.Client``, whose workers train the networks. They must
+            reach the files and ``out`` under the same paths. Default: processes of this machine.
+
     Raises:
-        InputError: If a file, the model, the budget or the folder does not fit.
+        InputError: If a file, the model, the budget or the folder does not fit, or the scheduler cannot be reached.
     """
     progress, scenario = progress or Progress(), load_scenario(settings.scenario)
     _check(settings, scenario)
@@ -168,7 +175,7 @@ def benchmark(
             assert settings.model is not None
             model = load_model(settings.model, scenario.name)
         else:
-            model = _make(settings, scenario, data, out, progress)
+            model = _make(settings, scenario, data, out, progress, cluster)
             tests = tests or ({"held back": data.held_back} if data.held_back else {})
         for warning in model.fit.warnings:
             progress.warn(f"fit of the prior: {warning}")
@@ -190,20 +197,25 @@ def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
     if settings.budget not in budgets:
         raise InputError(
             f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"
+            " [HM-WORKFLOW-004]"
         )
     if settings.model is None and not settings.data:
         raise InputError(
-            "give recordings to train on with --data FILE, or a model made before with --model DIR"
+            "give recordings to train on with --data FILE, or a model made before with --model DIR [HM-WORKFLOW-005]"
         )
     if settings.model is not None and settings.data:
         raise InputError(
-            "--model is evaluated as it is: leave --data out, or leave --model out to train anew"
+            "--model is evaluated as it is: leave --data out, or leave --model out to train anew [HM-WORKFLOW-006]"
         )
     if settings.model is not None and not settings.test:
-        raise InputError("a model made before needs recordings to be evaluated on: --test FILE")
+        raise InputError(
+            "a model made before needs recordings to be evaluated on: --test FILE [HM-WORKFLOW-007]"
+        )
     names = [path.name for path in settings.test]
     if len(set(names)) < len(names):
-        raise InputError(f"two test files have the same name: {', '.join(sorted(names))}; rename one")
+        raise InputError(
+            f"two test files have the same name: {', '.join(sorted(names))}; rename one [HM-WORKFLOW-008]"
+        )
 
 
 def _read(
@@ -233,7 +245,12 @@ def _read(
 
 
 def _make(
-    settings: BenchmarkSettings, scenario: Scenario, data: Recordings, out: Path, progress: Progress
+    settings: BenchmarkSettings,
+    scenario: Scenario,
+    data: Recordings,
+    out: Path,
+    progress: Progress,
+    cluster: Any,
 ) -> BenchmarkModel:
     _claim(out, settings, data)
     spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
@@ -247,7 +264,7 @@ def _make(
     whole = train_kinds(
         settings.scenario, fit.values, train, valid,
         {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in kinds_of(scenario.prior())},
-        out / "checkpoints", workers=settings.workers, on_progress=progress.update,
+        out / "checkpoints", workers=settings.workers, on_progress=progress.update, cluster=cluster,
     )  # fmt: skip
     progress.finish("")
     progress.start("fitting the linear baselines")
@@ -262,7 +279,17 @@ def _make(
         *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=choice.sure
     )
     model = BenchmarkModel(
-        scenario.name, dt, fit, hybrid, validation, long, tuple(networks), linear, no_linear, choice, networks
+        scenario=scenario.name,
+        dt=dt,
+        fit=fit,
+        hybrid=hybrid,
+        validation=validation,
+        long=long,
+        kinds=tuple(networks),
+        linear=linear,
+        no_linear=no_linear,
+        choice=choice,
+        networks=networks,
     )
     save_model(out / "model", model)
     return model
@@ -408,15 +435,17 @@ def load_model(folder: Path, scenario: str) -> BenchmarkModel:
     if not path.is_file():
         raise InputError(
             f"{folder.parent} holds no model of a benchmark; give the folder that 'hybrid-mpc benchmark {scenario} "
-            "--data FILE --out DIR' has made"
+            "--data FILE --out DIR' has made [HM-WORKFLOW-009]"
         )
     document = read_document(path, "make the benchmark anew")
     schema = document.pop("schema", None)
     if schema != SCHEMA:
-        raise InputError(f"{path}: schema {schema}, this version reads {SCHEMA}; train anew")
+        raise InputError(
+            f"{path}: schema {schema}, this version reads {SCHEMA}; train anew [HM-WORKFLOW-010]"
+        )
     found = record(_Description, document, str(path))
     if found.scenario != scenario:
-        raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario}")
+        raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario} [HM-WORKFLOW-011]")
     return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in found.kinds})
 
 
@@ -475,7 +504,7 @@ def refitted(
     if n >= len(trajectory.t) - 1 or seconds < least:
         raise InputError(
             f"{trajectory.name}: {seconds:g} s are to be fitted; that takes at least {least:g} s and a recording that "
-            f"is longer than it ({len(trajectory.t) * dt:g} s)"
+            f"is longer than it ({len(trajectory.t) * dt:g} s) [HM-WORKFLOW-012]"
         )
     index = np.arange(len(trajectory.t))
     first = trajectory.part(index < n, trajectory.name, trajectory.role)

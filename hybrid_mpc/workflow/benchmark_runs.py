@@ -57,6 +57,7 @@ def benchmark_of(scenario: Scenario) -> BenchmarkSpec:
     if scenario.benchmark is None:
         raise InputError(
             f"scenario {scenario.name} has no benchmark: give it one with Scenario(benchmark=BenchmarkSpec(...))"
+            " [HM-WORKFLOW-013]"
         )
     return scenario.benchmark
 
@@ -74,7 +75,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     if uncut and named:
         raise InputError(
             f"{named[0]} has windows in the data specification, and the benchmark's valid_every={spec.valid_every} "
-            "gives whole files their roles; leave out one of the two"
+            "gives whole files their roles; leave out one of the two [HM-WORKFLOW-014]"
         )
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
     data = replace(scenario.data, fractions=spec.fractions or scenario.data.fractions)  # and checked as given
@@ -87,7 +88,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
         raise InputError(
             f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings"
-            + (f". Cut out:{cut}" if cut else "")
+            f"{f'. Cut out:{cut}' if cut else ''} [HM-WORKFLOW-047]"
         )
     in_order = not (spec.cycle or uncut) and spec.length is None
     long = until_validated(dataset, scenario.data.windows) if in_order else ()
@@ -105,7 +106,7 @@ def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory
     if any(len(p.t) * p.dt < shortest for p in parts):
         raise InputError(
             f"a recording is too short to be cut into {len(spec.cycle)} pieces of {shortest:.3g} s and more, which "
-            "training and validation need; give longer ones"
+            "training and validation need; give longer ones [HM-WORKFLOW-015]"
         )
     return parts
 
@@ -168,7 +169,7 @@ def read_test(
     dataset = load_trajectories([path], prior, spec, needed=())
     if not dataset.whole:
         raise InputError(
-            f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given"
+            f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given [HM-WORKFLOW-016]"
         )
     for finding in dataset.findings:
         warn(str(finding))

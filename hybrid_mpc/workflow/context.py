@@ -87,7 +87,7 @@ class Context:
         if self.settings.budget not in budgets:
             raise InputError(
                 f"scenario {self.scenario.name} has no budget {self.settings.budget!r}; "
-                f"it has: {', '.join(budgets)}"
+                f"it has: {', '.join(budgets)} [HM-WORKFLOW-017]"
             )
         return budgets[self.settings.budget]
 
@@ -239,7 +239,7 @@ class Context:
         """Result of a stage; InputError with the reason if there is none."""
         found = self.find(stage)
         if isinstance(found, Absent):
-            raise InputError(found.reason)
+            raise InputError(f"{found.reason} [HM-WORKFLOW-048]")
         return found
 
     def digest_of(self, stage: Stage[Any]) -> str:

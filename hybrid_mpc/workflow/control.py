@@ -1,4 +1,4 @@
-"""``hybrid-mpc control``: closed loops of a model that exists, their results.json (docs/control.md) and figures."""
+"""``hybrid-mpc control``: closed loops of a trained model, results.json (docs/control-results.md), figures."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class ControlResults:
-    """What ``results.json`` of ``hybrid-mpc control`` holds (docs/control.md): what was run, every loop, and means.
+    """``results.json`` of ``hybrid-mpc control`` (docs/control-results.md): what was run, every loop, and means.
 
     ``guard`` are the limits of the monitor that a guard listens to, ``reaction`` what it does; ``step_ms`` are
     percentiles of the durations of steps by controller, ``summary`` is by task and controller. ``on_model`` names the

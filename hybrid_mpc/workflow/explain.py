@@ -63,7 +63,7 @@ def explain(
         ['Coulomb friction of phi_dot']
     """
     if most < 1:
-        raise InputError(f"most: a search of at least one step is needed, got {most}")
+        raise InputError(f"most: a search of at least one step is needed, got {most} [HM-WORKFLOW-018]")
     scenario = load_scenario(settings.scenario)
     chosen = chosen_terms(scenario, terms)
     context = Context(settings, scenario, out, progress or Progress())
@@ -71,6 +71,7 @@ def explain(
     if not settings.data and scenario.make_data is None:
         raise InputError(
             f"scenario {scenario.name} is a real machine: give its recordings with --data FILE.csv (once for each file)"
+            " [HM-WORKFLOW-019]"
         )
     make = prior_class(scenario)
     # bad recordings leave no folder behind

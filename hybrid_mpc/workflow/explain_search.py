@@ -49,7 +49,7 @@ def prior_class(scenario: Scenario) -> type[Prior]:
     except TypeError as error:
         raise InputError(
             f"scenario {scenario.name}: {made.__name__}() raised TypeError: {error}. Terms are added to a prior that "
-            "is made of parameter values alone; make the other arguments class attributes"
+            "is made of parameter values alone; make the other arguments class attributes [HM-WORKFLOW-020]"
         ) from error
     return made
 
@@ -74,7 +74,7 @@ class ChosenTerms:
             apply = ", ".join(dict.fromkeys(_law(one) for one in every)) or "none"
             raise InputError(
                 f"terms: {', '.join(self.laws) or 'no law'} cannot apply to {type(prior).__name__}; "
-                f"laws that can: {apply}"
+                f"laws that can: {apply} [HM-WORKFLOW-021]"
             )
         return found
 

@@ -112,7 +112,7 @@ def prepared(
     if scenario is not None and scenario.control is None:
         raise InputError(
             f"scenario {scenario.name} defines no control problem, so the estimator knows no input range; give the "
-            "scenario control=OCP(...)"
+            "scenario control=OCP(...) [HM-WORKFLOW-022]"
         )
     folder = artifact_folder(model)
     kit = load(folder)
@@ -123,19 +123,19 @@ def prepared(
     else:
         raise InputError(
             f"{folder} does not say how its recordings are read: an older version wrote it; give --scenario, or run "
-            "the scenario again"
+            "the scenario again [HM-WORKFLOW-023]"
         )
     watched = kit.models[kit.recommended]
     if abs(watched.dt - spec.dt) > 1e-9:
         raise InputError(
-            f"the model's period is {watched.dt} s, scenario {kit.name} resamples to {spec.dt} s"
+            f"the model's period is {watched.dt} s, scenario {kit.name} resamples to {spec.dt} s [HM-WORKFLOW-024]"
         )
     # all of a recording is watched: nothing warms up, and no part of it has a role
     spec = replace(spec, windows={}, warm_up=spec.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(recordings, watched, spec, needed=())
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
-        raise InputError(f"no part of the recordings is long enough to be watched: {cut}")
+        raise InputError(f"no part of the recordings is long enough to be watched: {cut} [HM-WORKFLOW-025]")
     if scenario is not None:
         kit = kit.with_noise(find_noise(scenario, kit, (f"{kit.recommended}_observer",), 0)[0])
     kind = RESIDUALS if residuals or not reads_energy(watched) else ENERGY
@@ -151,7 +151,10 @@ def read_limits(path: Path, kind: str) -> WatchLimits:
     """Limits of a kind in a ``calibration.json`` that :func:`learn` wrote; InputError if there are none."""
     stored = read_object(path)
     if stored.get(kind) is None:
-        raise InputError(f"{path} holds no limits of {kind}; make them with hybrid-mpc monitor ... --learn 1")
+        raise InputError(
+            f"{path} holds no limits of {kind}; make them with hybrid-mpc monitor ... --learn 1"
+            " [HM-WORKFLOW-026]"
+        )
     return record(WatchLimits, stored[kind], f"{path}: {kind}")
 
 

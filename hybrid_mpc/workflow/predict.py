@@ -50,11 +50,13 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
     if kit.predicting is None:
         raise InputError(
             f"the model of scenario {kit.name or '(unnamed)'} does not say how its recordings are read: an older "
-            "version wrote it; run the scenario again"
+            "version wrote it; run the scenario again [HM-WORKFLOW-027]"
         )
     spec, problems, found, doubts = kit.predicting.data, [], [], []
     if twice := sorted({p.name for p in paths if [q.stem for q in paths].count(p.stem) > 1}):
-        raise InputError(f"recordings need different names, got {', '.join(twice)} more than once")
+        raise InputError(
+            f"recordings need different names, got {', '.join(twice)} more than once [HM-WORKFLOW-028]"
+        )
     whole = replace(spec, fractions=(1.0, 0.0, 0.0))
     for path in paths:
         try:
@@ -66,7 +68,7 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
         if data.sampling[0] > COARSE * spec.dt:
             problems.append(
                 f"{path}: sampled every {data.sampling[0]:.3g} s, the model's period is {spec.dt:g} s: what lies "
-                "between would be made up; record at least once a period"
+                "between would be made up; record at least once a period [HM-WORKFLOW-029]"
             )
         late = lost_samples(kit.input_delay, spec.dt) * spec.dt
         least = spec.warm_up + MIN_SCORED * spec.dt + late
@@ -76,7 +78,7 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
             parts += [c.end - c.start for c in data.cuts if not c.why.startswith("gap")]
             problems.append(
                 f"{path}: too short: its longest part without a gap has {max(parts, default=0.0):.4g} s, the warm-up "
-                f"of {spec.warm_up:g} s and {MIN_SCORED} periods need {least:.4g} s"
+                f"of {spec.warm_up:g} s and {MIN_SCORED} periods need {least:.4g} s [HM-WORKFLOW-030]"
             )
         found += long
     refuse(problems)

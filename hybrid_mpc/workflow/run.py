@@ -161,6 +161,7 @@ def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
     if needed:
         raise InputError(
             f"--skip {needed[0]}: without it there is no model; what can be left out: {', '.join(optional)}"
+            " [HM-WORKFLOW-031]"
         )
 
 
@@ -181,7 +182,9 @@ def _end(context: Context, only: Sequence[str]) -> Stage[Any] | None:
         later = [s.name for s in STAGES[i:] if s.name in only and s is not REPORT]
         if later:
             why = f"has not run in {context.out}" if stored is None else f"must run again: {stored.unfit}"
-            raise InputError(f"stage {stage.name} {why}, and {later[0]} needs it; leave --only out")
+            raise InputError(
+                f"stage {stage.name} {why}, and {later[0]} needs it; leave --only out [HM-WORKFLOW-032]"
+            )
         return stage
     return None
 
@@ -202,7 +205,7 @@ def _as_it_is(context: Context, stage: Stage[Any], only: Sequence[str] = ()) -> 
         if needing:
             raise InputError(
                 f"stage {stage.name} is out of date: {differ}, and {needing[0]} needs it; add --only {stage.name}, "
-                "or leave --only out"
+                "or leave --only out [HM-WORKFLOW-033]"
             )
     why = changed(stored.keys, keys)
     if not why and not isinstance(stored.result, Absent):

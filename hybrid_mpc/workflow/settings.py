@@ -84,7 +84,9 @@ def read_network(path: Path) -> dict[str, Any]:
     held = read_json(path)
     if not isinstance(held, dict) or (unknown := sorted(set(held) - set(NETWORK))):
         what = "no JSON object" if not isinstance(held, dict) else f"also {', '.join(unknown)}"
-        raise InputError(f"{path} holds {what}; network settings are any of: {', '.join(NETWORK)}")
+        raise InputError(
+            f"{path} holds {what}; network settings are any of: {', '.join(NETWORK)} [HM-WORKFLOW-034]"
+        )
     for name, value in held.items():
         numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
         kinds = (int,) if name in WHOLE else (int, float)
@@ -93,7 +95,7 @@ def read_network(path: Path) -> dict[str, Any]:
         if not positive or (name == "learning_rates" and len(numbers) != 4):
             needed = f"a whole number from 1 to {MOST[name]}" if name in WHOLE else "a number of 0 or more"
             needed = "four positive numbers of at most 1" if name == "learning_rates" else needed
-            raise InputError(f"{path}: {name} is {str(value)[:40]}; it must be {needed}")
+            raise InputError(f"{path}: {name} is {str(value)[:40]}; it must be {needed} [HM-WORKFLOW-035]")
     return {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
 
 
@@ -114,5 +116,5 @@ def check_device(device: str) -> None:
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:  # torch raises any of them
         reason = str(error).strip().splitlines()[0]
         raise InputError(
-            f"--device {device}: torch cannot compute there ({reason}); leave it out to use cpu"
+            f"--device {device}: torch cannot compute there ({reason}); leave it out to use cpu [HM-WORKFLOW-036]"
         ) from error

@@ -38,9 +38,13 @@ class TuneSettings(RunSettings):
     def __post_init__(self) -> None:
         kinds = [name for name in MODELS if not name.startswith("phy")]
         if self.kind not in kinds:
-            raise InputError(f"kind: unknown {self.kind!r}; choose one of: {', '.join(kinds)}")
+            raise InputError(
+                f"kind: unknown {self.kind!r}; choose one of: {', '.join(kinds)} [HM-WORKFLOW-045]"
+            )
         if self.kind == "rnn" and self.space.prior_replay is not None:
-            raise InputError("an rnn has no prior to replay; leave prior_replay out of what is varied")
+            raise InputError(
+                "an rnn has no prior to replay; leave prior_replay out of what is varied [HM-WORKFLOW-046]"
+            )
 
 
 def run_tuning(

@@ -132,7 +132,7 @@ def gelu(self: Value, *, approximate: str = "none") -> Value:
     if approximate == "none":
         return apply(lambda x: 0.5 * x * (1 + ca.erf(x / math.sqrt(2))), self)
     if approximate != "tanh":
-        raise ValueError(f"approximate={approximate!r}")
+        raise ValueError(f"approximate={approximate!r} [NN-051]")
     k = math.sqrt(2 / math.pi)
     return apply(lambda x: 0.5 * x * (1 + ca.tanh(k * (x + 0.044715 * x * x * x))), self)
 
@@ -166,7 +166,7 @@ def copy(self: Value, *, dtype: str | None = None) -> Value:
         return apply(trunc, self)
     if dtype in (None, "float64", "float32"):
         return self
-    raise ValueError(f"dtype={dtype!r}")
+    raise ValueError(f"dtype={dtype!r} [NN-052]")
 
 
 def _round(x: ca.MX) -> ca.MX:  # half to even, as torch does

@@ -16,7 +16,7 @@ from nn_export.operators.value import Value, arrange, concatenate, from_matrix, 
 def matmul(a: Value, b: Value) -> Value:
     """Product of two matrices, or of two equally long stacks of matrices."""
     if a.shape[:-2] != b.shape[:-2] or a.shape[-1] != b.shape[-2]:
-        raise ValueError(f"product of shapes {a.shape} and {b.shape}")
+        raise ValueError(f"product of shapes {a.shape} and {b.shape} [NN-053]")
     room(*a.shape[:-1], b.shape[-1])
     stacks = []
     for value in (a, b):

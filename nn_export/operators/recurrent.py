@@ -84,13 +84,13 @@ def _sequence(
     batch_first: bool,
 ) -> tuple[Value, ...]:
     if train and dropout:
-        raise ValueError("dropout in training mode; use eval()")
+        raise ValueError("dropout in training mode; use eval() [NN-054]")
     directions = 2 if bidirectional else 1
     unrolled(num_layers * max(x.shape, default=1))  # whichever axis is time
     size, left = divmod(len(params), num_layers * directions)
     whole = 4 if has_biases else 2
     if left or size not in (whole, whole + 1):
-        raise ValueError(f"{len(params)} weights for {num_layers} layers of {directions} directions")
+        raise ValueError(f"{len(params)} weights for {num_layers} layers of {directions} directions [NN-055]")
     swap = (1, 0, 2)
     x = move(x, x.positions.transpose(swap)) if batch_first else x
     finals: list[list[Value]] = [[] for _ in states]

@@ -137,7 +137,7 @@ def norm(self: Value, ord: float = 2, dim: Sequence[int] | None = None, keepdim:
         return reduced(lambda x: _smallest(ca.fabs(x)), self, dim, keepdim)
     if ord > 1:
         return reduced(lambda x: _power(ca.sum2(ca.fabs(x) ** ord), 1 / ord), self, dim, keepdim)
-    raise ValueError(f"norm of order {ord}; known are -infinity, 1 and what is above 1")
+    raise ValueError(f"norm of order {ord}; known are -infinity, 1 and what is above 1 [NN-056]")
 
 
 def std_dim(self: Value, dim: Sequence[int] | None, unbiased: bool = True, keepdim: bool = False) -> Value:
@@ -199,7 +199,7 @@ def logsumexp(self: Value, dim: Sequence[int], keepdim: bool = False) -> Value:
 def log_softmax(self: Value, dim: int, half_to_float: bool) -> Value:
     """Logarithm of the softmax of an axis."""
     if half_to_float:
-        raise ValueError("half_to_float=True")
+        raise ValueError("half_to_float=True [NN-057]")
     return apply(lambda x, s: x - s, self, logsumexp(self, [dim], True))
 
 
@@ -208,7 +208,7 @@ def softmax(self: Value, dim: int, half_to_float: bool) -> Value:
     top = amax(self, [dim], True)
     e = apply(lambda x, m: ca.exp(x - m), self, top)
     if half_to_float:
-        raise ValueError("half_to_float=True")
+        raise ValueError("half_to_float=True [NN-058]")
     return apply(lambda a, s: a / s, e, sum_(e, [dim], True))
 
 

@@ -124,7 +124,7 @@ def pad(self: Value, pad: Sequence[int], value: float = 0.0) -> Value:
     axes = list(zip(pad[::2], pad[1::2], strict=True))[::-1]
     widths = [(0, 0)] * (len(self.shape) - len(axes)) + axes
     if min(pad) < 0:
-        raise ValueError(f"negative pad {list(pad)}")
+        raise ValueError(f"negative pad {list(pad)} [NN-059]")
     room(*(n + sum(width) for n, width in zip(self.shape, widths, strict=False)))
     border = self.mx.numel()
     positions = np.pad(self.positions, widths, constant_values=border)
@@ -170,7 +170,7 @@ def _places(self: Value) -> np.ndarray:
 
 def _each_once(where: np.ndarray) -> np.ndarray:
     if np.unique(where).size < where.size:
-        raise ValueError("a position is written twice; the result would depend on the order")
+        raise ValueError("a position is written twice; the result would depend on the order [NN-060]")
     return where
 
 
@@ -235,7 +235,7 @@ def arange(start: float, end: float, step: float = 1, *, dtype: str = "float64")
     room(max(0, math.ceil((end - start) / step)))
     values = np.arange(start, end, step)
     if dtype == "float32" and np.any(values.astype(np.float32) != values):
-        raise ValueError("arange in float32; use dtype=torch.float64 there")
+        raise ValueError("arange in float32; use dtype=torch.float64 there [NN-061]")
     return constant(values)
 
 

@@ -24,7 +24,9 @@ def each(f: Callable[..., Any], *values: Value) -> Value:
     """A function of matrices, applied to each of equally long stacks of them."""
     lead = values[0].shape[:-2]
     if any(v.shape[:-2] != lead for v in values):
-        raise ValueError(f"matrices of shapes {[v.shape for v in values]}: as many of each are needed")
+        raise ValueError(
+            f"matrices of shapes {[v.shape for v in values]}: as many of each are needed [NN-062]"
+        )
     found = [f(*parts) for parts in zip(*map(stacks, values), strict=True)]
     joined = concatenate([from_matrix(m, (1, *m.shape)) for m in found], 0)
     return move(joined, joined.positions.reshape((*lead, *found[0].shape)))
@@ -33,9 +35,9 @@ def each(f: Callable[..., Any], *values: Value) -> Value:
 def _rows(value: Value) -> int:
     n = value.shape[-1]
     if len(value.shape) < 2 or value.shape[-2] != n:
-        raise ValueError(f"a square matrix is needed, got one of shape {value.shape}")
+        raise ValueError(f"a square matrix is needed, got one of shape {value.shape} [NN-063]")
     if not 0 < n <= MOST:
-        raise ValueError(f"a matrix of {n} rows; 1 to {MOST} can be exported")
+        raise ValueError(f"a matrix of {n} rows; 1 to {MOST} can be exported [NN-064]")
     return n
 
 

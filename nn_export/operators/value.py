@@ -31,7 +31,7 @@ def matrix_shape(shape: Shape) -> tuple[int, int]:
     """Rows and columns of the matrix that holds a tensor of this shape."""
     if sum(n != 1 for n in shape) > 2:
         raise ShapeError(
-            f"shape {shape} has more than two axes longer than 1; export one sample, not a batch"
+            f"shape {shape} has more than two axes longer than 1; export one sample, not a batch [NN-065]"
         )
     return layout(shape)
 
@@ -68,7 +68,7 @@ def room(*shape: int) -> None:
         ValueError: If it has more than ``LARGEST`` numbers.
     """
     if (size := size_of(shape)) > LARGEST:
-        raise ValueError(f"it would make {size:.3g} numbers, at most {LARGEST} can be exported")
+        raise ValueError(f"it would make {size:.3g} numbers, at most {LARGEST} can be exported [NN-066]")
 
 
 def unrolled(steps: int) -> None:
@@ -78,7 +78,9 @@ def unrolled(steps: int) -> None:
         ValueError: If there are more than ``UNROLLED``.
     """
     if steps > UNROLLED:
-        raise ValueError(f"it would go along an axis in {steps} steps, at most {UNROLLED} can be exported")
+        raise ValueError(
+            f"it would go along an axis in {steps} steps, at most {UNROLLED} can be exported [NN-067]"
+        )
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Value:
 
     def __post_init__(self) -> None:
         if self.mx.shape != layout(self.shape):
-            raise ShapeError(f"shape {self.shape} does not fit a {self.mx.shape} matrix")
+            raise ShapeError(f"shape {self.shape} does not fit a {self.mx.shape} matrix [NN-068]")
         if not self.mx.is_dense():
             object.__setattr__(self, "mx", ca.densify(self.mx))
 
@@ -113,7 +115,7 @@ def lift(value: Value | float) -> Value:
     if isinstance(value, Value):
         return value
     if not isinstance(value, bool | int | float):
-        raise TypeError(f"expected a tensor or a number, got {value!r}")
+        raise TypeError(f"expected a tensor or a number, got {value!r} [NN-069]")
     return constant(float(value))
 
 
@@ -158,7 +160,7 @@ def broadcast_shape(shapes: Sequence[Sequence[int]]) -> Shape:
             if result[-i] == 1:
                 result[-i] = shape[-i]
             elif shape[-i] not in (1, result[-i]):
-                raise ValueError(f"shapes {[tuple(s) for s in shapes]} cannot be broadcast together")
+                raise ValueError(f"shapes {[tuple(s) for s in shapes]} cannot be broadcast together [NN-070]")
     return tuple(result)
 
 
@@ -184,5 +186,5 @@ def concatenate(values: list[Value], axis: int) -> Value:
 def numbers(value: Value) -> np.ndarray:
     """The numbers of a constant value, in its shape."""
     if ca.symvar(value.mx):
-        raise ValueError("an index or size depends on an input; only constant ones can be exported")
+        raise ValueError("an index or size depends on an input; only constant ones can be exported [NN-071]")
     return np.array(ca.evalf(value.mx)).flatten(order="F")[value.positions]

@@ -120,7 +120,7 @@ class DoublePendulumPlant:
         if abs(steps * TIMESTEP - dt) > 1e-9 or steps <= before:
             raise InputError(
                 f"the double pendulum's plant was given a period of {dt:g} s; needed: a multiple of {TIMESTEP:g} s, "
-                f"longer than the {self.late:g} s after which a command acts"
+                f"longer than the {self.late:g} s after which a command acts [HM-SCENARIOS-002]"
             )
         mujoco, model, data = simulation(self)
         mujoco.mj_setState(model, data, state.z, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -157,7 +157,7 @@ def simulation(plant: DoublePendulumPlant) -> tuple[Any, Any, Any]:
     except ImportError as missing:
         raise InputError(
             f"the double pendulum's closed loops run in MuJoCo ({missing}); install it with: pip install "
-            "'hybrid-mpc[mujoco]'"
+            "'hybrid-mpc[mujoco]' [HM-SCENARIOS-003]"
         ) from None
     model = mujoco.MjModel.from_xml_string(MODEL.format(TIMESTEP=TIMESTEP, **vars(plant)))
     return mujoco, model, mujoco.MjData(model)

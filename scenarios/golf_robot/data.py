@@ -39,7 +39,9 @@ def stems(budget: str, data_set: str = "b") -> list[str]:
     """Names of the recordings of a budget, e.g. ``train_01_sine``."""
     sizes = sizes_of("golf_robot", budget, SIZES)
     if data_set not in TRAIN:
-        raise InputError(f"golf_robot: no data set {data_set!r}; it has: {', '.join(TRAIN)}")
+        raise InputError(
+            f"golf_robot: no data set {data_set!r}; it has: {', '.join(TRAIN)} [HM-SCENARIOS-004]"
+        )
     names = []
     for role, n in sizes.items():
         kinds = TRAIN[data_set] if role == "train" else TEST_KINDS

@@ -28,7 +28,9 @@ def draw(x: Array) -> list[Array]:
     """
     x = np.ravel(np.asarray(x, dtype=float))
     if x.size == 0 or not np.isfinite(x[0]):
-        raise InputError(f"drawing of the golf robot: needs a state with a finite angle first, got {x}")
+        raise InputError(
+            f"drawing of the golf robot: needs a state with a finite angle first, got {x} [HM-SCENARIOS-005]"
+        )
     sine, cosine = np.sin(x[0]), np.cos(x[0])
     turn = np.array([[cosine, sine], [-sine, cosine]])  # rows rotate counter-clockwise: right for phi > 0
     shaft = np.array([[0.0, 0.0], [0.0, -SHAFT]])

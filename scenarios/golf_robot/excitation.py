@@ -34,7 +34,9 @@ def excitation(kind: str, rng: np.random.Generator, t: Array) -> Array:
     =============  ==========================================================================
     """
     if kind not in KINDS:
-        raise InputError(f"golf_robot: no excitation {kind!r}; there are: {', '.join(KINDS)}")
+        raise InputError(
+            f"golf_robot: no excitation {kind!r}; there are: {', '.join(KINDS)} [HM-SCENARIOS-006]"
+        )
     return KINDS[kind](rng, t)
 
 

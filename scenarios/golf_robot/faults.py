@@ -32,7 +32,9 @@ def catalogue(start: float = 2.0, end: float = inf, drift_time: float = 60.0) ->
     themselves; ``drift_time`` [s] is that in which ageing friction changes by 10 %: days on a rig.
     """
     if not start < end:
-        raise InputError(f"fault catalogue: end must be later than start, got {start} s and {end} s")
+        raise InputError(
+            f"fault catalogue: end must be later than start, got {start} s and {end} s [HM-SCENARIOS-007]"
+        )
 
     def one(name: str, title: str, target: str, value: float = 0.0, ramp: float = 0.0) -> FaultCase:
         nominal = name.startswith("friction_ageing")
@@ -64,5 +66,5 @@ def fault_case(name: str, start: float = 2.0, end: float = inf) -> FaultCase:
     """The case of that name."""
     cases = {case.name: case for case in catalogue(start, end)}
     if name not in cases:
-        raise InputError(f"golf_robot: no fault {name!r}; there are: {', '.join(cases)}")
+        raise InputError(f"golf_robot: no fault {name!r}; there are: {', '.join(cases)} [HM-SCENARIOS-008]")
     return cases[name]

@@ -64,14 +64,21 @@ class Rig:
 
     def __post_init__(self) -> None:
         if not self.sub_step > 0:
-            raise InputError(f"rig: sub_step must be positive, got {self.sub_step}; 0.5e-3 is the default")
+            raise InputError(
+                f"rig: sub_step must be positive, got {self.sub_step}; 0.5e-3 is the default"
+                " [HM-SCENARIOS-017]"
+            )
         if not self.delay >= 0:
-            raise InputError(f"rig: delay must be 0 s or more, got {self.delay}; 0.02 is one period")
+            raise InputError(
+                f"rig: delay must be 0 s or more, got {self.delay}; 0.02 is one period [HM-SCENARIOS-018]"
+            )
         check_plant_faults(self.faults, tuple(PLANT_FAULTS))
         for fault in self.faults:
             signed, zero = fault.target == "plant_push", fault.target != "plant_mass"
             if not (signed or fault.value > 0 or (zero and fault.value == 0)):
-                raise InputError(f"fault {fault.target}: value must be positive, got {fault.value}")
+                raise InputError(
+                    f"fault {fault.target}: value must be positive, got {fault.value} [HM-SCENARIOS-019]"
+                )
         chunk = BufferedFunction(steps(self.parameters, CHUNK, faulty=self._faulty))
         object.__setattr__(self, "_chunk", chunk)
 

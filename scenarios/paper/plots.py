@@ -43,7 +43,7 @@ def errors_over_sequences(panels: Mapping[str, Mapping[str, Mapping[str, Any]]],
     ``networks``, one entry an amount of data. The linear axis ends where all but the nominal prior do.
     """
     if not panels or not all(panels.values()):
-        raise InputError("plot of errors: there is no data set, or one without a model")
+        raise InputError("plot of errors: there is no data set, or one without a model [HM-SCENARIOS-020]")
     figure, axes = new_figure(2, len(panels), sharex=True, sharey="row", size=(4.2 + 3.4 * len(panels), 6.4))
     tops, lows = [], []
     for column, (title, curves) in zip(axes.T, panels.items(), strict=True):
@@ -111,7 +111,9 @@ def shown_free_run(
 ) -> Figure:
     """A test free run with input, energy balances and violation (the paper's Fig. 6, whose joules are watts)."""
     if model not in runs:
-        raise InputError(f"plot of a free run: there is none of {model}; there are: {', '.join(runs)}")
+        raise InputError(
+            f"plot of a free run: there is none of {model}; there are: {', '.join(runs)} [HM-SCENARIOS-021]"
+        )
     own = runs[model]
     t, rows = np.asarray(own["t"], float), len(states) + len(inputs) + 1
     figure, axes = new_figure(rows, 1, sharex=True, title=title, size=(10, 2.0 * rows))

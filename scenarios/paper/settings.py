@@ -42,14 +42,16 @@ class ReproductionSettings:
         if self.budget not in experiment.efforts:
             raise InputError(
                 f"no budget {self.budget!r} to reproduce with; there are: {', '.join(experiment.efforts)}"
+                " [HM-SCENARIOS-024]"
             )
         if self.form not in FORMS:
-            raise InputError(f"no form {self.form!r}; there are: {', '.join(FORMS)}")
+            raise InputError(f"no form {self.form!r}; there are: {', '.join(FORMS)} [HM-SCENARIOS-025]")
         effort = experiment.efforts[self.budget]
         networks = effort.networks if self.networks is None else self.networks
         if networks < 1:
             raise InputError(
                 f"{networks} networks cannot be evaluated; give --networks at least 1 (the paper has 16)"
+                " [HM-SCENARIOS-026]"
             )
         return replace(effort, networks=networks, sequences=self._sequences(experiment, effort))
 
@@ -67,7 +69,7 @@ class ReproductionSettings:
         if not chosen or chosen[0] < 1 or chosen[-1] > experiment.most:
             raise InputError(
                 f"--sequences {','.join(map(str, chosen)) or '(none)'}: {self.scenario} has {experiment.most} "
-                f"training runs; give numbers between 1 and {experiment.most}, e.g. 3,6,9,12,15"
+                f"training runs; give numbers between 1 and {experiment.most}, e.g. 3,6,9,12,15 [HM-SCENARIOS-027]"
             )
         return chosen
 
@@ -78,7 +80,7 @@ def parsed_sequences(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
         raise InputError(
-            f"--sequences {text!r} is no list of whole numbers; write e.g. --sequences 3,6,9,12,15"
+            f"--sequences {text!r} is no list of whole numbers; write e.g. --sequences 3,6,9,12,15 [HM-SCENARIOS-028]"
         ) from None
 
 
@@ -88,6 +90,7 @@ def experiment_of(scenario: Scenario) -> Experiment:
         names = [name for name in registered_scenarios() if isinstance(load_scenario(name), PaperScenario)]
         raise InputError(
             f"scenario {scenario.name} has no experiment to reproduce; there is one for: {', '.join(names)}"
+            " [HM-SCENARIOS-029]"
         )
     return scenario.experiment
 

@@ -54,9 +54,14 @@ class Factor:
 
     def __post_init__(self) -> None:
         if self.function not in _FUNCTIONS:
-            raise InputError(f"a term has no function {self.function!r}; there are: {', '.join(_FUNCTIONS)}")
+            raise InputError(
+                f"a term has no function {self.function!r}; there are: {', '.join(_FUNCTIONS)}"
+                " [HM-SCENARIOS-030]"
+            )
         if not isinstance(self.power, int) or self.power < 1:
-            raise InputError(f"a power must be a whole number of at least 1, got {self.power}")
+            raise InputError(
+                f"a power must be a whole number of at least 1, got {self.power} [HM-SCENARIOS-031]"
+            )
 
     @property
     def label(self) -> str:
@@ -115,7 +120,7 @@ class SindyStep(Step):
         if coefficients.shape[-2:] != (len(library.terms), prior.n_q):
             raise InputError(
                 f"library {library.name}: coefficients are {tuple(coefficients.shape)}, its terms and the "
-                f"accelerations need {(len(library.terms), prior.n_q)}"
+                f"accelerations need {(len(library.terms), prior.n_q)} [HM-SCENARIOS-032]"
             )
         self.register_buffer("coefficients", coefficients)
         self.substeps = substeps or self._required_substeps()
@@ -129,7 +134,7 @@ class SindyStep(Step):
         if substeps > MAX_SUBSTEPS:
             raise InputError(
                 f"SINDy with the library {self.library.name}: the model's fastest mode at rest is {rate:.3g} 1/s, too "
-                f"fast for a period of {self.dt} s"
+                f"fast for a period of {self.dt} s [HM-SCENARIOS-033]"
             )
         return substeps
 
@@ -204,7 +209,10 @@ def signal_names(prior: MechanicalPrior, library: Library) -> dict[str, int]:
     unknown = {factor.signal for term in library.terms for factor in term} - set(names)
     if unknown or not library.terms:
         what = f"names no signal {', '.join(sorted(unknown))}" if unknown else "has no term"
-        raise InputError(f"library {library.name} {what}; {type(prior).__name__} has: {', '.join(names)}")
+        raise InputError(
+            f"library {library.name} {what}; {type(prior).__name__} has: {', '.join(names)}"
+            " [HM-SCENARIOS-034]"
+        )
     return names
 
 
@@ -286,9 +294,14 @@ def fit_sindy(
     pysindy = _pysindy()
     _check(training, validation, prior, dt)
     if target not in get_args(Target):
-        raise InputError(f"target has no {target!r}; there are: {', '.join(get_args(Target))}")
+        raise InputError(
+            f"target has no {target!r}; there are: {', '.join(get_args(Target))} [HM-SCENARIOS-035]"
+        )
     if not thresholds or min(thresholds) < 0.0:
-        raise InputError(f"thresholds must be at least one number, none below 0, got {tuple(thresholds)}")
+        raise InputError(
+            f"thresholds must be at least one number, none below 0, got {tuple(thresholds)}"
+            " [HM-SCENARIOS-036]"
+        )
     windows = cut_windows(training, 0, 1, 1)
     if target == "derivative":
         check_rates(training)
@@ -420,7 +433,9 @@ def _check(
     training: Sequence[Trajectory], validation: Sequence[Trajectory], prior: MechanicalPrior, dt: float
 ) -> None:
     if not training or not validation:
-        raise InputError("SINDy needs training and validation trajectories, at least one of each")
+        raise InputError(
+            "SINDy needs training and validation trajectories, at least one of each [HM-SCENARIOS-037]"
+        )
     sizes = {"x": len(prior.states), "u": len(prior.inputs)}
     for trajectory in (*training, *validation):
         for name, size in sizes.items():
@@ -428,17 +443,19 @@ def _check(
             if columns != size:
                 raise InputError(
                     f"{trajectory.name}: {name} has {columns} columns, {type(prior).__name__} has {size}"
+                    " [HM-SCENARIOS-038]"
                 )
         if abs(trajectory.dt - dt) > 1e-9 * dt:
             raise InputError(
                 f"{trajectory.name}: its period is {trajectory.dt} s, the model's {dt} s; resample it"
+                " [HM-SCENARIOS-039]"
             )
     for j, signal in enumerate(prior.inputs):
         u = np.concatenate([t.u[:, j] for t in training])
         if np.ptp(u) == 0.0:
             raise InputError(
                 f"input {signal.name} is {u[0]:g} {signal.unit} in all training runs: nothing tells what it does. "
-                "Record runs that excite it."
+                "Record runs that excite it. [HM-SCENARIOS-040]"
             )
 
 
@@ -447,5 +464,5 @@ def _pysindy() -> Any:
         return importlib.import_module("pysindy")
     except ImportError as missing:
         raise InputError(
-            "SINDy needs pysindy, which is not installed: pip install 'hybrid-mpc[sindy]'"
+            "SINDy needs pysindy, which is not installed: pip install 'hybrid-mpc[sindy]' [HM-SCENARIOS-041]"
         ) from missing

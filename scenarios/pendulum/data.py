@@ -66,9 +66,9 @@ def exact_runs(role: Role, count: int, *, seed: int = 0, dt: float = HELD * RECO
     """
     every = round(dt / RECORD)
     if abs(every * RECORD - dt) > 1e-9 or every < 1 or HELD % every:
-        raise InputError(f"pendulum: dt must be 0.001, 0.002, 0.005 or 0.01 s, got {dt}")
+        raise InputError(f"pendulum: dt must be 0.001, 0.002, 0.005 or 0.01 s, got {dt} [HM-SCENARIOS-042]")
     if role not in ROLES:
-        raise InputError(f"pendulum: no role {role!r}; there are: {', '.join(ROLES)}")
+        raise InputError(f"pendulum: no role {role!r}; there are: {', '.join(ROLES)} [HM-SCENARIOS-043]")
     plant, out = DampedPendulum(noise=0.0), []
     for number in range(1, count + 1):
         t, u, x = (values[::every] for values in run(plant, role, number, seed))

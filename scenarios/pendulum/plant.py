@@ -83,10 +83,13 @@ class DampedPendulum:
     def __post_init__(self) -> None:
         if not (self.sub_step > 0 and isfinite(self.sub_step)):
             raise InputError(
-                f"pendulum: sub_step must be positive, got {self.sub_step}; 0.5e-3 is the default"
+                f"pendulum: sub_step must be positive, got {self.sub_step}; 0.5e-3 is the default [HM-SCENARIOS-044]"
             )
         if not self.noise >= 0:
-            raise InputError(f"pendulum: noise must be 0 rad or more, got {self.noise}; 1e-4 is the default")
+            raise InputError(
+                f"pendulum: noise must be 0 rad or more, got {self.noise}; 1e-4 is the default"
+                " [HM-SCENARIOS-045]"
+            )
 
     def reset(self, x0: Array, seed: int) -> PendulumState:
         """State at ``x0`` ``(2,)`` with new books. Nothing inside is random, so ``seed`` changes nothing."""

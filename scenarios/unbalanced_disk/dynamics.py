@@ -69,10 +69,11 @@ class DiskParameters:
                 or (name in ("delay", "noise") and value < 0)
             ):
                 needed = "positive" if name in positive else "finite and not negative"
-                raise InputError(f"disk: {name} must be {needed}, got {value}")
+                raise InputError(f"disk: {name} must be {needed}, got {value} [HM-SCENARIOS-046]")
         if not (self.stiction >= 1 and abs(self.eccentric) < 1):
             raise InputError(
                 f"disk: stiction must be 1 or more and eccentric below 1, got {self.stiction}, {self.eccentric}"
+                " [HM-SCENARIOS-047]"
             )
 
 

@@ -57,7 +57,10 @@ class DiskPlant:
 
     def __post_init__(self) -> None:
         if not self.sub_step > 0:
-            raise InputError(f"disk: sub_step must be positive, got {self.sub_step}; 0.4e-3 is the default")
+            raise InputError(
+                f"disk: sub_step must be positive, got {self.sub_step}; 0.4e-3 is the default"
+                " [HM-SCENARIOS-048]"
+            )
         object.__setattr__(self, "_chunk", BufferedFunction(steps(self.parameters, CHUNK)))
 
     def __reduce__(self) -> tuple[type[DiskPlant], tuple[object, ...]]:

@@ -154,16 +154,16 @@ def test_the_command_of_the_page_repeats_the_analysis(tmp_path):
 
 def test_without_python_control_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(InputError, match=r"hybrid-mpc\[analysis\]"):
+    with pytest.raises(InputError, match=r"analysis.*HM-ERRORS-001"):
         control_toolbox()
 
 
 def test_what_does_not_fit_is_refused(golf_artifact, tmp_path):
-    with pytest.raises(InputError, match="needed is an artifact folder"):
+    with pytest.raises(InputError, match="HM-KIT-038"):
         analysis_input(AnalysisSettings(tmp_path))
-    with pytest.raises(InputError, match="--scenario"):
+    with pytest.raises(InputError, match="HM-WORKFLOW-001"):
         analysis_input(AnalysisSettings(golf_artifact, data=(tmp_path / "a.csv",)))
-    with pytest.raises(InputError, match="positive"):
+    with pytest.raises(InputError, match="HM-WORKFLOW-002"):
         analysis_input(AnalysisSettings(golf_artifact, speed=0.0))
 
 
@@ -247,9 +247,7 @@ def test_machines_without_positions_are_analyzed_around_their_operating_point(ma
 
 
 def test_a_working_speed_is_refused_where_nothing_moves():
-    with pytest.raises(
-        InputError, match=r"--speed: model two tanks: its states \(upper, lower\) are not positions"
-    ):
+    with pytest.raises(InputError, match=r"two tanks.*upper, lower.*HM-MODEL-031"):
         _speed(two_tanks(), None, 0.5)
 
 

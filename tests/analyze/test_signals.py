@@ -85,9 +85,9 @@ def test_a_response_is_trusted_where_there_is_one():
 
 
 def test_too_little_data_is_said():
-    with pytest.raises(InputError, match="at least 4"):
+    with pytest.raises(InputError, match="HM-ANALYZE-034"):
         welch_response([(np.zeros(50), np.zeros(50))], 0.1, length=3.0)
-    with pytest.raises(InputError, match="periods"):
+    with pytest.raises(InputError, match="HM-ANALYZE-035"):
         multisine_response(lambda u: u, 0.1, amplitude=1.0, band=(0.1, 1.0), periods=1)
 
 
@@ -95,10 +95,10 @@ def test_too_little_data_is_said():
 def test_a_signal_that_diverges_is_refused(last):
     u = np.random.default_rng(0).normal(size=2000)
     y = np.append(u[:-1], last)
-    with pytest.raises(InputError, match="diverges, sample 1999"):
+    with pytest.raises(InputError, match=r"1999.*HM-ANALYZE-038"):
         welch_response([(u, y)], 0.1, length=20.0)
     driven = {"amplitude": 1.0, "band": (0.1, 1.0), "period": 10.0}
-    with pytest.raises(InputError, match="diverges"):
+    with pytest.raises(InputError, match="HM-ANALYZE-038"):
         multisine_response(lambda u: np.append(u[:-1], last), 0.1, **driven)
 
 
@@ -120,9 +120,9 @@ def test_interval_bounds_hold_and_are_tight_where_each_variable_appears_once():
 
 def test_interval_refuses_what_it_cannot_bound():
     x = ca.SX.sym("x")
-    with pytest.raises(InputError, match="zero"):
+    with pytest.raises(InputError, match="HM-ANALYZE-041"):
         interval_bounds(ca.Function("f", [x], [1 / x]), [-1.0], [1.0])
-    with pytest.raises(InputError, match="not known"):
+    with pytest.raises(InputError, match="HM-ANALYZE-039"):
         interval_bounds(ca.Function("f", [x], [ca.erf(x)]), [-1.0], [1.0])
 
 
@@ -190,7 +190,7 @@ def test_weights_and_features_are_read_from_an_artifact(golf_artifact):
     for s in ([-0.5, -1.0, -0.1], [0.5, 2.0, 0.3]):
         after = f(s[:2], h, s[2], [], np.zeros(8))[1].full().ravel()
         assert np.all(np.abs(after) <= contraction(cell, low, high).reach)
-    with pytest.raises(InputError, match="0 GRU cells"):
+    with pytest.raises(InputError, match="HM-ANALYZE-046"):
         gru_weights(nn_export.load_programs(golf_artifact / "models")["prior/step"])
 
 
@@ -212,7 +212,7 @@ def test_exponent_of_a_linear_run_is_its_slowest_pole_s():
     u = np.random.default_rng(0).normal(size=(500, 1))
     assert abs(lyapunov_exponent(model, [0.0, 0.0], u).value - np.log(0.99) / 0.1) < 1e-6
     assert abs(lyapunov_exponent(model, [0.0, 0.0], u, part="hidden").value - np.log(0.5) / 0.1) < 1e-9
-    with pytest.raises(InputError, match="no hidden state"):
+    with pytest.raises(InputError, match="HM-ANALYZE-047"):
         lyapunov_exponent(pendulum_model(), [0.0, 0.0], u, part="hidden")
 
 
@@ -240,10 +240,10 @@ def test_parameters_that_a_run_does_not_tell_apart_are_named(golf_artifact):
     u = 0.25 * np.sin(0.1 * np.arange(300))[:, None]
     found = parameter_sensitivities(model, [0.0, 0.0], u)
     sigma = [1e-3, np.inf]
-    with pytest.raises(InputError, match="apart"):
+    with pytest.raises(InputError, match="HM-ANALYZE-055"):
         found.correlation(sigma)  # r and mu are one product
     apart = found.apart(sigma)
     assert not {"r", "mu"} <= set(apart.names)
     assert np.allclose(np.diag(apart.correlation(sigma)), 1.0)
-    with pytest.raises(InputError, match=r"\['nothing'\] of model prior asked for; it has: m, g,"):
+    with pytest.raises(InputError, match=r"\['nothing'\].*prior.*m, g,.*HM-ANALYZE-056"):
         parameter_sensitivities(model, [0.0, 0.0], u, names=["nothing"])

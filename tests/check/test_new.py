@@ -148,17 +148,17 @@ def test_without_a_column_of_time(tmp_path):
 def test_what_cannot_be_is_refused(tmp_path):
     file = oven(tmp_path / "a.csv")
     (tmp_path / "there.py").write_text("mine")
-    for path, words in ((tmp_path / "there.py", "is there already"), (tmp_path / "a.txt", "ends with .py")):
+    for path, words in ((tmp_path / "there.py", "HM-CHECK-010"), (tmp_path / "a.txt", "HM-CHECK-009")):
         with pytest.raises(InputError, match=words):
             write_scenario(path, file)
     assert (tmp_path / "there.py").read_text() == "mine"
-    with pytest.raises(InputError, match="no column 'volt'"):
+    with pytest.raises(InputError, match="HM-DATA-085"):
         write_scenario(tmp_path / "b.py", file, inputs=("volt",))
     still = write_csv(tmp_path / "still.csv", {"t": np.arange(50.0), "u": np.zeros(50)})
-    with pytest.raises(InputError, match=r"no column is left for an input; it has t, u\. Say which"):
+    with pytest.raises(InputError, match=r"(?s)an input.*t, u.*HM-CHECK-014"):
         write_scenario(tmp_path / "b.py", still)
     short = write_csv(tmp_path / "short.csv", {"t": np.arange(5.0), "u": np.arange(5.0)})
-    with pytest.raises(InputError, match="no column has 20 numbers that move"):
+    with pytest.raises(InputError, match=r"20.*HM-CHECK-004"):
         write_scenario(tmp_path / "b.py", short)
     assert not (tmp_path / "b.py").exists()
 
@@ -401,15 +401,15 @@ BROKEN = stamps(rows=150) + stamps(rows=150, start=1.0)
 @pytest.mark.parametrize(
     ("time", "match"),
     [
-        (REPEATED, "row 102, column 't': time repeats"),
-        (BROKEN, "row 152, column 't': time decreases"),
-        (stamps()[::-1], "time decreases"),
-        (["1.5"] * 300, "time repeats"),
-        (["", *stamps()[1:]], "row 2, column 't' is empty"),
-        ([*stamps()[:299], "Mean"], "row 301, column 't' is 'Mean'"),
-        ([f"10:{k // 60:02d}" for k in range(300)], "hours and minutes|minutes and seconds"),
-        (["s", *stamps(rows=299)], "row 2, column 't' is 's'"),
-        ([f"{0.02 * k:.2f} {'s' if k else 'V'}" for k in range(300)], "a number with a unit"),
+        (REPEATED, r"row 102, column 't': time repeats.*HM-CHECK-006"),
+        (BROKEN, r"row 152, column 't': time decreases.*HM-CHECK-006"),
+        (stamps()[::-1], r"time decreases.*HM-CHECK-006"),
+        (["1.5"] * 300, r"time repeats.*HM-CHECK-006"),
+        (["", *stamps()[1:]], r"row 2, column 't' is empty.*HM-CHECK-006"),
+        ([*stamps()[:299], "Mean"], r"row 301, column 't' is 'Mean'.*HM-CHECK-006"),
+        ([f"10:{k // 60:02d}" for k in range(300)], "HM-CHECK-006"),
+        (["s", *stamps(rows=299)], r"row 2, column 't' is 's'.*HM-CHECK-006"),
+        ([f"{0.02 * k:.2f} {'s' if k else 'V'}" for k in range(300)], "HM-CHECK-006"),
     ],
 )
 @pytest.mark.parametrize("asked", ["", "t"])
@@ -438,7 +438,7 @@ def test_dates_units_in_cells_and_restarts_are_a_time(tmp_path, time, period):
 
 @pytest.mark.parametrize("name", ["Time [ticks]", "time [V]", "Date", "Datum"])
 def test_a_time_in_units_that_nobody_knows_is_refused(tmp_path, name):
-    with pytest.raises(InputError, match=r"unit .* is none of time|dates count is not known"):
+    with pytest.raises(InputError, match="HM-CHECK-006"):
         write_scenario(tmp_path / "m.py", logged(tmp_path / "a.csv", stamps(start=45000.0), name))
 
 
@@ -515,8 +515,8 @@ def test_a_single_number_is_the_sampling_time(tmp_path, name, ending):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda rows: [*rows[:50], "1,2", *rows[50:]], "row 51 has 2 cells, the header"),
-        (lambda rows: ["t,u,u", *rows[1:]], "the name stands 2 times"),
+        (lambda rows: [*rows[:50], "1,2", *rows[50:]], r"51.*the header.*HM-DATA-093"),
+        (lambda rows: ["t,u,u", *rows[1:]], r"the name stands 2 times.*HM-CHECK-014"),
     ],
 )
 def test_the_readers_reason_is_passed_on(tmp_path, change, match):
@@ -529,12 +529,12 @@ def test_the_readers_reason_is_passed_on(tmp_path, change, match):
 @pytest.mark.parametrize(
     ("more", "match"),
     [
-        ({"y": np.ones((300, 65))}, r"the shape \(300, 65\)"),
-        ({"y": np.ones(299)}, "299 values, the others have 300"),
-        ({"y": csc_array(np.eye(3))}, "sparse matrices"),
-        ({"y": "text"}, "holds text"),
-        ({"t": "2024"}, "column 't' says that it is the time and cannot be used: .*holds text"),
-        ({"t": np.ones((300, 65))}, "column 't' says that it is the time and cannot be used: .*shape"),
+        ({"y": np.ones((300, 65))}, r"\(300, 65\).*HM-DATA-112"),
+        ({"y": np.ones(299)}, r"(?s)299.*300.*HM-CHECK-014"),
+        ({"y": csc_array(np.eye(3))}, r"sparse matrices.*HM-CHECK-014"),
+        ({"y": "text"}, r"text.*HM-DATA-111"),
+        ({"t": "2024"}, r"text.*HM-DATA-111"),
+        ({"t": np.ones((300, 65))}, "HM-DATA-112"),
     ],
 )
 def test_the_readers_reason_for_vectors(tmp_path, more, match):

@@ -300,13 +300,13 @@ def test_columns_that_move_in_one_recording_alone(tmp_path):
 
 def test_recordings_that_do_not_fit_together(tmp_path):
     files = [written(tmp_path / "a.csv", 0), written(tmp_path / "b.csv", 1, ("stamp_s", "valve", "level_m"))]
-    with pytest.raises(InputError, match=r"b\.csv: column 'time_s', the time, cannot be used"):
+    with pytest.raises(InputError, match=r"b\.csv.*'time_s'.*HM-CHECK-005"):
         write_scenario(tmp_path / "m.py", files)
-    with pytest.raises(InputError, match="no column is left for an input"):
+    with pytest.raises(InputError, match=r"(?s)an input.*HM-CHECK-014"):
         write_scenario(
             tmp_path / "m.py", [files[0], written(tmp_path / "c.csv", 1, ("time_s", "v", "level_m"))]
         )
-    with pytest.raises(InputError, match="no recordings given"):
+    with pytest.raises(InputError, match="HM-CHECK-011"):
         write_scenario(tmp_path / "m.py", [])
     assert not (tmp_path / "m.py").exists()
 
@@ -315,7 +315,7 @@ def test_a_recording_that_diverges_is_refused(tmp_path):
     grown = np.sin(np.arange(900) / 20)
     grown[700:] *= np.logspace(0, 57, 200)
     file = written(tmp_path / "a.csv", 0, more={"x": grown})
-    with pytest.raises(InputError, match=r"a\.csv: row \d+, column 'x'.*diverged"):
+    with pytest.raises(InputError, match=r"a\.csv.*'x'.*HM-CHECK-003"):
         write_scenario(tmp_path / "m.py", [written(tmp_path / "b.csv", 1, more={"x": grown / 2e57}), file])
     # a code for missing values is one number, a wide range no divergence
     coded = np.where(np.arange(900) > 800, 9.96921e36, np.sin(np.arange(900) / 20))

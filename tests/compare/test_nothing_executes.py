@@ -40,7 +40,7 @@ def test_a_model_folder_executes_nothing(call, model, trap, tmp_path, command):
     data = [recording(tmp_path)] if command == "monitor" else []
     code, _, message = call(command, model, *data, "--out", tmp_path / "out")
     assert code == 2
-    assert "not registered" in message
+    assert "HM-SCENARIO-004" in message
     assert "--scenario FILE.py" in message
     assert not trap[1].exists()
     assert not (tmp_path / "out").exists()
@@ -77,7 +77,7 @@ def test_a_study_folder_executes_nothing(call, monkeypatch, trap, tmp_path, comm
 def test_a_study_file_executes_nothing(call, trap, tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(f"scenario: {trap[0]}\nmodels: model\n")
-    with pytest.raises(InputError, match="not registered"):
+    with pytest.raises(InputError, match="HM-SCENARIO-004"):
         read_study(path)
     code, _, message = call("study", "run", path, "--out", tmp_path / "out")
     assert code == 2

@@ -228,32 +228,32 @@ def test_ranges_are_the_tighter_of_soft_and_hard_bounds():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: HardBound("z", [0.0], [1.0]), "'x', 'y', or a function"),
-        (lambda: HardBound(ca.Function("f", [X], [X]), [0.0] * 2, [1.0] * 2), "'x', 'y', or a function"),
+        (lambda: HardBound("z", [0.0], [1.0]), "HM-CONTROL-045"),
+        (lambda: HardBound(ca.Function("f", [X], [X]), [0.0] * 2, [1.0] * 2), "HM-CONTROL-045"),
         (lambda: HardBound("x", [1.0, 1.0], [0.0, 2.0]), "cross"),
-        (lambda: HardBound("x", [1.0], [2.0, 2.0]), "1 needed"),
-        (lambda: HardBound("x", [0.0], [1.0], 0.5), "whole number"),
-        (lambda: problem(HardBound("x", [0.0], [1.0])), "hard bound on x: 1 values given, 2 needed"),
+        (lambda: HardBound("x", [1.0], [2.0, 2.0]), "HM-CONTROL-052"),
+        (lambda: HardBound("x", [0.0], [1.0], 0.5), "HM-CONTROL-046"),
+        (lambda: problem(HardBound("x", [0.0], [1.0])), "HM-CONTROL-015"),
         (lambda: problem("x"), r"HardBound\(what"),
-        (lambda: CondensedController(MODEL, problem(HardBound("y", [0.0] * 2, [1.0] * 2))), "has 1 outputs"),
+        (lambda: CondensedController(MODEL, problem(HardBound("y", [0.0] * 2, [1.0] * 2))), "HM-CONTROL-037"),
         (
             lambda: CondensedController(
                 MODEL, problem(HardBound(ca.Function("none", [X, U], [ca.MX(1.0)]), [0.0], [2.0]))
             ),
-            "none: no input of the plan reaches it",
+            r"none.*HM-CONTROL-030",
         ),
         (
             lambda: CondensedController(
                 with_input_delay(MODEL, 3.0), problem(HardBound("x", [-1.0, -np.inf], [1.0, np.inf]))
             ),
-            "x0: no input",
+            r"x0.*HM-CONTROL-030",
         ),
         (
             lambda: problem(
                 HardBound(ca.Function("a", [X, U, W, P], [P]), [0.0], [2.0]),
                 soft=[SoftBound(ca.Function("b", [X, U, W, TWO], [X[0]]), [0.0], [2.0], [1.0], [1.0])],
             ),
-            "share them",
+            "HM-CONTROL-016",
         ),
     ],
 )  # fmt: skip

@@ -85,12 +85,12 @@ def test_a_nonlinear_machine_with_hidden_state():
 @pytest.mark.parametrize(
     ("target", "options", "words"),
     [
-        (HardBound("x", [0.9, -0.1], [1.1, 0.1]), {}, r"needed: a HardBound\(..., at_end=True\)"),
-        (HardBound("y", [0.9], [1.1], at_end=True), {}, "give a row of it"),
+        (HardBound("x", [0.9, -0.1], [1.1, 0.1]), {}, "HM-CONTROL-004"),
+        (HardBound("y", [0.9], [1.1], at_end=True), {}, "HM-CONTROL-005"),
         (
             rest_at(0.1, 1e-2),
             {"longest": 8},
-            r"no move of 8 periods \(0.4 s\) ends within the target; .* misses x0 by",
+            r"0\.4.*x0 by.*HM-CONTROL-006",
         ),
     ],
 )

@@ -39,27 +39,27 @@ GOOD = {
         ({"horizon": np.nan}, "horizon"),
         ({"horizon": np.inf}, "horizon"),
         ({"horizon": "10"}, "horizon"),
-        ({"q": "heavy"}, "q: numbers needed"),
-        ({"q": np.eye(2)}, "the diagonal alone"),
+        ({"q": "heavy"}, "HM-MODEL-015"),
+        ({"q": np.eye(2)}, "HM-CONTROL-020"),
         ({"soft": [3]}, "SoftBound"),
         ({"economic": 3}, "economic"),
-        ({"blocks": (np.nan, 10)}, "whole numbers"),
-        ({"q": [-1.0, 0.1]}, "q: weights"),
-        ({"q": [np.nan, 0.1]}, "q: weights"),
-        ({"r": [0.0]}, "not determined"),
-        ({"r_delta": [0.0, 0.0]}, "r_delta: 2 values"),
+        ({"blocks": (np.nan, 10)}, "HM-CONTROL-026"),
+        ({"q": [-1.0, 0.1]}, "HM-CONTROL-022"),
+        ({"q": [np.nan, 0.1]}, "HM-CONTROL-022"),
+        ({"r": [0.0]}, "HM-CONTROL-023"),
+        ({"r_delta": [0.0, 0.0]}, r"r_delta.*HM-MODEL-017"),
         ({"u_min": [3.0]}, "cross"),
         ({"u_min": [np.nan]}, "cross"),
-        ({"u_max": [1.0, 1.0]}, "1 needed"),
-        ({"du_max": [0.0]}, "du_max must be positive"),
+        ({"u_max": [1.0, 1.0]}, "HM-MODEL-012"),
+        ({"du_max": [0.0]}, "HM-CONTROL-018"),
         ({"terminal": "lyapunov"}, "riccati"),
-        ({"terminal": np.eye(3)}, r"\(2, 2\)"),
-        ({"terminal": -np.eye(2)}, "negative eigenvalue"),
-        ({"blocks": (1, 2, 4)}, "sum to the horizon of 10"),
-        ({"blocks": (5, 5, 5)}, "sum to the horizon of 10"),
-        ({"blocks": (10, 0)}, "at least 1"),
-        ({"blocks": (2.5, 7.5)}, "whole numbers"),
-        ({"blocks": ()}, "sum to the horizon"),
+        ({"terminal": np.eye(3)}, "HM-CONTROL-028"),
+        ({"terminal": -np.eye(2)}, "HM-CONTROL-029"),
+        ({"blocks": (1, 2, 4)}, r"10.*HM-CONTROL-026"),
+        ({"blocks": (5, 5, 5)}, r"10.*HM-CONTROL-026"),
+        ({"blocks": (10, 0)}, "HM-CONTROL-026"),
+        ({"blocks": (2.5, 7.5)}, "HM-CONTROL-026"),
+        ({"blocks": ()}, "HM-CONTROL-026"),
     ],
 )
 def test_bad_problems_are_refused(change, words):
@@ -159,7 +159,7 @@ def test_an_expression_without_plain_form_is_the_same_as_itself_alone():
     ocp = full(economic=cost)
     assert ocp == full(economic=cost)
     assert ocp != full(economic=ca.Function("cost", [x, u], [solve(0.0, x) ** 2 + u**2]))
-    with pytest.raises(InputError, match=r"cost: no scalar operations stand for root \(Newton\)"):
+    with pytest.raises(InputError, match=r"cost.*root \(Newton\).*NN-024"):
         plain(ocp)
 
 
@@ -175,7 +175,9 @@ def test_arrays_cannot_be_written_into_nor_seen_through():
 
 
 def test_a_changed_problem_takes_what_was_given_not_what_followed_from_it():
-    with pytest.raises(InputError, match="no field of a control problem 'horizn'; did you mean 'horizon'"):
+    with pytest.raises(
+        InputError, match=r"field.*of a control problem 'horizn'.*did you mean 'horizon'.*HM-RECORDS-011"
+    ):
         OCP(**GOOD).changed(horizn=30)
     ocp = OCP(5, [4.0], [1.0], [0.0], [-1.0], [1.0], x_max=[1.0])
     np.testing.assert_array_equal(ocp.changed(q=[16.0]).penalties, [[4000.0], [16000.0]])
@@ -272,5 +274,5 @@ def test_another_number_of_states_needs_no_new_bounds_where_none_bound_anything(
     ocp = OCP(10, [1.0, 2.0], [0.1], [0.0], [-1.0], [1.0])
     wider = ocp.changed(q=(1.0, 2.0, 3.0))
     assert (wider.n_x, wider.x_max.size) == (3, 3)
-    with pytest.raises(InputError, match="3 needed"):
+    with pytest.raises(InputError, match="HM-CONTROL-052"):
         ocp.changed(x_max=[1.0, np.inf]).changed(q=(1.0, 2.0, 3.0))

@@ -141,12 +141,12 @@ def test_a_nonlinear_model_keeps_its_bounds_when_iterated():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"x_min": [0.0]}, "lower has 1 values, 2 needed"),
+        ({"x_min": [0.0]}, r"lower.*HM-CONTROL-052"),
         ({"x_min": [1.0, 0.0], "x_max": [0.0, 1.0]}, "cross"),
         ({"x_max": [np.nan, 1.0]}, "cross"),
-        ({"slack_linear": [-1.0, 1.0]}, "linear penalties"),
+        ({"slack_linear": [-1.0, 1.0]}, "HM-CONTROL-049"),
         ({"slack_quadratic": [0.0, 1.0]}, "positive"),
-        ({"slack_quadratic": [np.inf, 1.0]}, "finite and positive"),
+        ({"slack_quadratic": [np.inf, 1.0]}, "HM-CONTROL-050"),
     ],
 )
 def test_bad_bounds_are_refused(change, words):
@@ -156,11 +156,11 @@ def test_bad_bounds_are_refused(change, words):
 
 def test_bad_expressions_are_refused():
     x, u = ca.MX.sym("x", 3), ca.MX.sym("u")
-    with pytest.raises(InputError, match="function \\(x, u\\)"):
+    with pytest.raises(InputError, match=r"\(x, u\).*HM-CONTROL-044"):
         SoftBound(ca.Function("e", [x], [x]), [0.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
-    with pytest.raises(InputError, match="needed"):
+    with pytest.raises(InputError, match="HM-CONTROL-052"):
         SoftBound(ca.Function("e", [x, u], [x]), [0.0], [1.0], [1.0], [1.0])
     three = SoftBound(ca.Function("e", [x, u], [x]), [0.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
     model, ocp = double_integrator(soft=[three])
-    with pytest.raises(InputError, match="2 states"):
+    with pytest.raises(InputError, match="HM-CONTROL-033"):
         CondensedController(model, ocp)

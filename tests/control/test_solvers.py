@@ -220,12 +220,12 @@ def test_a_rivals_plan_is_a_start():
         (lambda m, o: SQPController(m, o, tolerance=0.0), "tolerance"),
         (lambda m, o: SQPController(m, o, iterations=0), "iterations"),
         (lambda m, o: IpoptController(m, o, tolerance=-1.0), "tolerance"),
-        (lambda m, o: BestOf(SQPController(m, o)), "starts or rivals"),
-        (lambda m, o: BestOf(SQPController(m, o), starts=[np.zeros((2, 1))]), r"start: .*\(10, 1\)"),
-        (lambda m, o: BestOf(SQPController(m, o), starts=[np.zeros((10, 1))], most=0), "most: 1 or more"),
+        (lambda m, o: BestOf(SQPController(m, o)), "HM-CONTROL-003"),
+        (lambda m, o: BestOf(SQPController(m, o), starts=[np.zeros((2, 1))]), r"start.*10.*HM-CONTROL-024"),
+        (lambda m, o: BestOf(SQPController(m, o), starts=[np.zeros((10, 1))], most=0), "HM-CONTROL-001"),
         (
             lambda m, o: BestOf(SQPController(m, o), rivals=[SQPController(m, o.changed(horizon=5))]),
-            r"needed: \(2, 1, 10\)",
+            r"\(2, 1, 10\).*HM-CONTROL-002",
         ),
     ],
 )

@@ -126,7 +126,7 @@ def test_without_a_compiler_compiled_is_refused_and_the_default_works(monkeypatc
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     model = pendulum_model()
-    with pytest.raises(InputError, match="leave compiled out"):
+    with pytest.raises(InputError, match="HM-MODEL-043"):
         CondensedController(model, OCP_, compiled=True)
     assert CondensedController(model, OCP_).ocp is OCP_
 

@@ -150,11 +150,11 @@ def test_disturbances_of_rates_and_outputs_are_made_good():
 
 def test_what_does_not_fit_is_refused():
     model = two_tanks()
-    with pytest.raises(InputError, match="give a weight each"):
+    with pytest.raises(InputError, match="HM-CONTROL-054"):
         Targets(model, OCP(5, **{**TANKS, "q_y": [1.0, 1.0]}))
-    with pytest.raises(InputError, match="finite where q_y weighs them"):
+    with pytest.raises(InputError, match="HM-CONTROL-055"):
         Targets(model, OCP(5, **TANKS)).at([np.nan])
-    with pytest.raises(InputError, match="y_min has 2 values"):
+    with pytest.raises(InputError, match=r"y_min.*HM-CONTROL-036"):
         CondensedController(model, OCP(5, **{**TANKS, "q_y": ()}, y_max=[1.0, 1.0]))
 
 
@@ -260,7 +260,7 @@ def test_what_is_safe_is_declared_or_the_last_input_stays():
             decisions.append(safe.decide(decisions[-1], lost, np.array([[0.3]])))
         assert [d.source.name for d in decisions[1:]] == [name] * 3
         assert all(d.u[0] == pytest.approx(u) for d in decisions[1:])
-    with pytest.raises(InputError, match="outside the limits"):
+    with pytest.raises(InputError, match="HM-CONTROL-042"):
         SafeController(CondensedController(model, ocp), safe_input=[-1e-5])
 
 

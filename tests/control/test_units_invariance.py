@@ -319,7 +319,7 @@ def test_what_nothing_tells_the_size_of_is_refused():
         )  # fmt: skip
 
     ocp = OCP(5, [1.0, 0.0], [1.0], [0.0], [-1.0], [1.0], terminal=np.eye(2))
-    with pytest.raises(InputError, match="b"):
+    with pytest.raises(InputError, match="HM-CONTROL-043"):
         CondensedController(model(), ocp)
     assert Sizes(model(0.0, 4.0), ocp).states[1] == 2.0
     assert Sizes(replace(model(), state_spread=(0.0, 3.0)), ocp).states.tolist() == [1.0, 3.0]

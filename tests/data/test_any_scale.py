@@ -152,5 +152,5 @@ def test_stamps_far_from_zero(origin):
 @pytest.mark.parametrize("k", [1e-4, 3600.0])
 def test_too_short_a_recording_is_told_so_in_any_unit(k):
     columns = {name: column[:60] for name, column in recording(4).items()}
-    with pytest.raises(InputError, match="is left for train and valid and test"):
+    with pytest.raises(InputError, match="HM-DATA-114"):
         read({**columns, "t": k * columns["t"]}, in_time(SPEC, k), MOTION, needed=("train", "valid", "test"))

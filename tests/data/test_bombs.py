@@ -49,7 +49,7 @@ def test_bombs_are_refused_in_little_memory_and_time(tmp_path):
 
 def test_a_large_array_that_nobody_names_is_left_alone(tmp_path):
     content = bombs.npz_bomb(bombs.header((2**26,)), 512).replace(b"phi.npy", b"log.npy")
-    with pytest.raises(ValueError, match=r"536.9 MB, more than the 1 MB"):
+    with pytest.raises(ValueError, match=r"536\.9.*HM-FILES-006"):
         check_npz(content, 10**6)
     check_npz(content, 10**6, ("time_s", "tau"))
     with pytest.raises(KeyError, match="phi"):
@@ -84,28 +84,26 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path, ending):
     pipe = tmp_path / f"pipe.{ending}"
     os.mkfifo(pipe)
     done = []
-    reader = threading.Thread(
-        target=lambda: done.append(refused(pipe, "cannot be read .is a named pipe, not a file")), daemon=True
-    )
+    reader = threading.Thread(target=lambda: done.append(refused(pipe, "HM-DATA-026")), daemon=True)
     reader.start()
     reader.join(10.0)
     assert done == [None], "opening a pipe waited for a writer, or was not refused"
     device = tmp_path / f"zero.{ending}"
     device.symlink_to("/dev/zero")
-    refused(device, "cannot be read .is a device, not a file")
+    refused(device, "HM-DATA-026")
     folder = tmp_path / f"folder.{ending}"
     folder.mkdir()
-    refused(folder, "cannot be read .is a directory")
+    refused(folder, r"is a directory.*HM-DATA-026")
     loop = tmp_path / f"loop.{ending}"
     loop.symlink_to(loop)
-    refused(loop, "cannot be read .Too many levels")
-    refused(tmp_path / f"{5000 * 'a'}.{ending}", "cannot be read .File name too long")
-    refused(tmp_path / f"a\0b.{ending}", "cannot be read .is no name of a file .embedded null byte")
-    refused(tmp_path / "none" / f"run.{ending}", "there is no such file. Check")
-    refused(Path(f"/proc/self/clear_refs.{ending}") / "x", "there is no such file")
+    refused(loop, "HM-DATA-026")
+    refused(tmp_path / f"{5000 * 'a'}.{ending}", "HM-DATA-026")
+    refused(tmp_path / f"a\0b.{ending}", "HM-DATA-026")
+    refused(tmp_path / "none" / f"run.{ending}", "HM-DATA-025")
+    refused(Path(f"/proc/self/clear_refs.{ending}") / "x", "HM-DATA-025")
     empty = tmp_path / f"empty.{ending}"
     empty.touch()
-    refused(empty, "is empty")
+    refused(empty, r"is empty.*HM-DATA-027")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")

@@ -157,7 +157,7 @@ def test_speeds_beyond_what_is_plausible(tmp_path):
         assert words in str(one)
     # degrees that a wide range of the position lets pass
     free = {**SIGNALS, "outputs": (Signal("phi", "rad"),)}
-    match = r"run.csv: column 'phi', differentiated, reaches .* so is its mean, .*\(rms\)"
+    match = r"run\.csv.*HM-DATA-100"
     with pytest.raises(InputError, match=match):
         findings(tmp_path, np.rad2deg(SWING), signals=free)
     other = (PHI, Signal("n", "rpm", -1, 1))  # no rate of a radian: nothing to compare with
@@ -273,12 +273,12 @@ def test_bursts_of_samples_are_not_frozen(tmp_path):
 @pytest.mark.parametrize("code", [-9999.0, 9999.0, -999.9, 65535.0, 1e30])
 def test_a_code_for_missing_values_is_refused_by_name(tmp_path, code):
     y = np.where(np.arange(len(T)) % 9 == 0, code, SWING)
-    with pytest.raises(InputError, match="phi"):
+    with pytest.raises(InputError, match=r"phi.*HM-DATA-072"):
         findings(tmp_path, y, signals={**SIGNALS, "outputs": (Signal("phi", "rad"),), "states": ()})
 
 
 def test_the_same_recording_twice_is_refused(tmp_path):
     one = write_csv(tmp_path / "a.csv", {"t": T, "tau": TAU, "phi": SWING})
     np.savez(tmp_path / "b.npz", t=T, tau=TAU, phi=SWING)
-    with pytest.raises(InputError, match=r"b.npz.*a.csv"):
+    with pytest.raises(InputError, match=r"b\.npz.*a\.csv.*HM-DATA-064"):
         load_trajectories([one, tmp_path / "b.npz"], machine(**SIGNALS), SPEC)

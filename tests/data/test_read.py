@@ -92,15 +92,15 @@ def test_a_bad_number_is_named_as_the_files_own_tools_count(tmp_path, kind, name
 
 def test_bad_columns(tmp_path, kind):
     path = wrote(tmp_path, kind, {"time_s": T, "tau": T, "ph": T, "note": T})
-    refused(path, "no column 'phi'; it has .*'ph'.* Did you mean 'ph'")
+    refused(path, "HM-DATA-085")
     refused(wrote(tmp_path, kind, {name: np.zeros(0) for name in GOOD}), "0 row")
-    refused(wrote(tmp_path, kind, {name: column[:30] for name, column in GOOD.items()}), "fewer than")
+    refused(wrote(tmp_path, kind, {name: column[:30] for name, column in GOOD.items()}), "HM-DATA-074")
     path = wrote(tmp_path, kind, GOOD)
-    refused(path, "sampling is 0.01 s, declared max_gap", replace(SPEC, max_gap=0.005))
+    refused(path, r"0\.01.*HM-DATA-073", replace(SPEC, max_gap=0.005))
     late = replace(SPEC, windows={"run": (Window(0, 9, "train"),)})
     refused(path, "window 0 to 9 s is not within the recording", late)
     path.rename(tmp_path / "walk.csv")
-    refused(path, "no such file; that folder has: walk.csv")
+    refused(path, "HM-DATA-025")
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,9 @@ def test_bad_rows_of_csv(tmp_path):
 
     refused(with_rows({11: "0.1,1,abc,0"}), "row 12, column 'phi' is 'abc'")
     refused(with_rows({11: "0.1,,1,0"}), "row 12, column 'tau' is empty")
-    refused(with_rows({0: "time_s,tau,phi,phi"}), "appears 2 times")
-    refused(with_rows({5: "1,2", 6: "1,2"}), r"row 6 has 2 cells, .* has 4 \(2 such rows\)")
-    refused(with_rows({0: "time_s,ta,ph,note"}), r"2 problems:\n.*no column 'tau'.*\n.*no column 'phi'")
+    refused(with_rows({0: "time_s,tau,phi,phi"}), "HM-DATA-083")
+    refused(with_rows({5: "1,2", 6: "1,2"}), r"4 \(2 such rows\).*HM-DATA-093")
+    refused(with_rows({0: "time_s,ta,ph,note"}), "HM-DATA-085")
     several = {5: "0.04,broken,0.1,0", 11: "0.1,0.9,none,0", 12: "0.11,0.9,?,0", 20: "0.19,77,0.1,0"}
     refused(
         with_rows(several),
@@ -150,11 +150,11 @@ def test_bad_rows_of_csv(tmp_path):
 
 def test_bad_vectors(tmp_path, vectors):
     for columns, match in (
-        ({**GOOD, "phi": T[:-1]}, "differ in length: 'time_s' 60, 'tau' 60, 'phi' 59"),
-        ({**GOOD, "phi": np.ones((60, 2))}, "phi.*shape" if vectors == "npz" else "no column 'phi'"),
-        ({**GOOD, "phi": T + 1j}, "'phi' holds complex numbers"),
-        ({**GOOD, "phi": "text"}, "'phi' holds text"),
-        ({**GOOD, "time_s": 0.0}, "as a sampling time .* must be positive"),
+        ({**GOOD, "phi": T[:-1]}, r"'time_s' 60, 'tau' 60, 'phi' 59.*HM-DATA-110"),
+        ({**GOOD, "phi": np.ones((60, 2))}, "phi.*shape" if vectors == "npz" else "HM-DATA-085"),
+        ({**GOOD, "phi": T + 1j}, r"'phi'.*complex numbers.*HM-DATA-111"),
+        ({**GOOD, "phi": "text"}, r"'phi'.*text.*HM-DATA-111"),
+        ({**GOOD, "time_s": 0.0}, "HM-DATA-113"),
     ):
         refused(wrote(tmp_path, vectors, columns), match)
 
@@ -174,8 +174,8 @@ def test_objects_are_refused_and_never_loaded(tmp_path):
 
     path, trap = tmp_path / "run.npz", np.array([Trap()], dtype=object)
     np.savez(path, allow_pickle=True, **{**GOOD, "phi": trap})
-    refused(path, "column 'phi' cannot be read .*objects are refused")
-    for array, match in ((trap, "is no .npz file"), (T, "one array without a name")):
+    refused(path, r"'phi'.*HM-DATA-107")
+    for array, match in ((trap, "HM-DATA-105"), (T, "HM-DATA-105")):
         with path.open("wb") as file:
             np.save(file, array, allow_pickle=True)
         refused(path, match)
@@ -190,13 +190,13 @@ def test_fields_of_structs(tmp_path):
     savemat(path, {"run": run})
     assert read_recording(path, SIGNALS, SPEC).y.shape == (60, 1)
     savemat(path, {"run": run, "old": {"phi": T}})
-    refused(path, "column 'phi' may be 'run.phi' or 'old.phi'")
+    refused(path, r"'phi'.*'run\.phi' or 'old\.phi'.*HM-DATA-084")
     table = read_recording(path, SIGNALS, replace(SPEC, outputs=("old.phi",)))
     np.testing.assert_array_equal(table.y[:, 0], T)
     assert read_recording(path, SIGNALS, replace(SPEC, outputs=("deep.phi",))).y.shape == (60, 1)
     many = np.array([(1.0,)] * 101, dtype=[("phi", object)])
     savemat(path, {"time_s": T, "tau": T, "runs": many, "sparse": csc_array(np.eye(3))})
-    refused(path, r"no column 'phi'.*arrays of structs \('runs'\).*sparse matrices \('sparse'\)")
+    refused(path, "HM-DATA-085")
 
 
 def test_no_such_format(tmp_path, vectors):
@@ -243,7 +243,7 @@ def test_numbers_of_every_kind_of_mat(tmp_path, packed):
     for name, values in given.items():
         np.testing.assert_array_equal(source.read(None, [name], ()).values[:, 0], values.astype(float))
     np.testing.assert_array_equal(source.read(None, ["grid(:,2)"], ()).values[:, 0], 2 * np.arange(70) + 1)
-    with pytest.raises(InputError, match="'z' holds complex numbers"):
+    with pytest.raises(InputError, match=r"'z'.*complex numbers.*HM-DATA-111"):
         source.read(None, ["z"], ())
 
 
@@ -366,6 +366,6 @@ def test_vectors_beside_objects_are_read_and_the_objects_named(tmp_path):
     path = tmp_path / "run.mat"
     savemat(path, {"time_s": T, "tau": np.cos(T)})
     path.write_bytes(path.read_bytes() + opaque("phi") + opaque("stamp"))
-    refused(path, r"no column 'phi'; it has 'time_s', 'tau'.*timeseries \('phi', 'stamp'\).*t = phi.Time")
+    refused(path, "HM-DATA-085")
     table = read_recording(path, SIGNALS, replace(SPEC, inputs=("time_s",), time=0.01, outputs=("tau",)))
     np.testing.assert_array_equal(table.y[:, 0], np.cos(T))

@@ -10,6 +10,7 @@ import pytest
 
 from hybrid_mpc import InputError, load_scenario
 from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.errors import CODE
 
 ROOT = Path(__file__).parents[2]
 
@@ -74,7 +75,7 @@ def test_what_is_refused_is_refused_in_the_words_of_the_guide(machines):
     for wrong in (Root, Sign):
         with pytest.raises(InputError) as told:
             check_scenario(replace(machines["scenario"], prior=wrong))
-        assert str(told.value) in page
+        assert CODE.sub("", str(told.value)).strip() in page
 
 
 @pytest.mark.full
@@ -111,7 +112,7 @@ def test_every_prior_of_ones_own_machine_passes_the_preflight(own):
         dt = 0.02 if prior is own["Crane"] else 5.0
         data = replace(own["data"], **columns, dt=dt, warm_up=12 * dt)
         check_scenario(replace(own["tank"], prior=prior, data=data))
-    with pytest.raises(InputError, match="operating_point is no equilibrium"):
+    with pytest.raises(InputError, match="HM-CHECK-015"):
         check_scenario(replace(own["tank"], prior=own["Wrong"]))
     leaking = replace(own["scenario"], disturbance_model=own["leak"], data=own["delayed"])
     check_scenario(leaking)

@@ -86,7 +86,7 @@ def test_the_site_builds_and_a_broken_link_stops_it(tmp_path):
     )  # it needs nothing from elsewhere
     if shutil.which("chromium"):
         found = searched(tmp_path / "site", "offset disturbance")
-        assert any("mpc.html" in link for link in found)
+        assert any("disturbances.html" in link for link in found)
         assert not searched(tmp_path / "site", "xyzzyplugh")
         for name, width in itertools.product(("machines", "mpc", "data", "results/explain"), (1280, 500)):
             assert widest(tmp_path / "site" / f"{name}.html", width) <= width, name

@@ -116,23 +116,23 @@ def test_true_state_passes_the_truth_on():
     e = oracle.update(oracle.start([0.0, 0, 0, 0, 0]), [1.0, 2, 3, 4, 5], [0.0])
     np.testing.assert_array_equal(np.concatenate([e.x, e.h]), [1.0, 2, 3, 4, 5])
     assert e.t == model.dt
-    with pytest.raises(InputError, match="needs 5"):
+    with pytest.raises(InputError, match="HM-ESTIMATE-009"):
         oracle.start([1.0, 2.0])
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"sigma_y": [0.0]}, "sigma_y must be positive"),
-        ({"sigma_x": [0.1]}, "sigma_x: 1 values given, 2 needed"),
-        ({"sigma_d": [-1.0]}, "sigma_d must not be negative"),
+        ({"sigma_y": [0.0]}, "HM-ESTIMATE-006"),
+        ({"sigma_x": [0.1]}, r"sigma_x.*HM-MODEL-017"),
+        ({"sigma_d": [-1.0]}, r"sigma_d.*HM-ESTIMATE-008"),
         ({"sigma_x0": [np.nan, 1.0]}, "finite"),
     ],
 )
 def test_bad_deviations_and_shapes_are_refused(change, words):
     with pytest.raises(InputError, match=words):
         make_filter(pendulum_model(), **change)
-    with pytest.raises(InputError, match="needed"):
+    with pytest.raises(InputError, match="HM-MODEL-019"):
         make_filter(pendulum_model()).run(np.zeros((5, 1)), np.zeros((4, 1)))
 
 

@@ -75,7 +75,7 @@ def test_process_noise_is_the_error_of_one_period():
     half = SimpleNamespace(u=u[:100], y=x[:100, :1], x=x[:100])
     # the second one is not looked at
     assert np.array_equal(process_noise(model, [half, half], most=50), process_noise(model, [half]))
-    with pytest.raises(InputError, match="two samples"):
+    with pytest.raises(InputError, match="HM-ESTIMATE-022"):
         process_noise(model, [])
 
 

@@ -106,12 +106,12 @@ def test_outputs_of_other_units_have_a_score_each():
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 1.5])
 def test_a_share_that_is_none_is_refused(share):
-    with pytest.raises(InputError, match="between 0 and 1"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-002"):
         fit_bands([RunParts(np.ones((10, 1)), np.ones((10, 1, 1)))], share)
 
 
 def test_without_runs_there_is_no_band():
-    with pytest.raises(InputError, match="no validation run"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-001"):
         fit_bands([])
 
 

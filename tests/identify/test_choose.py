@@ -93,7 +93,7 @@ def test_the_user_overrules():
     assert choice.reason.startswith("pgrnn is deployed as asked for. mopgrnn is recommended")
     kept = recommend(errors, deploy="phy")
     assert (kept.recommended, kept.hybrid) == ("phy", "mopgrnn")
-    with pytest.raises(InputError, match=r"no candidate 'rnn'; choose of: phy, pgrnn, mopgrnn"):
+    with pytest.raises(InputError, match=r"'rnn'.*HM-IDENTIFY-003"):
         recommend(errors, deploy="rnn")
 
 
@@ -107,7 +107,7 @@ def test_few_runs_are_cut_into_blocks_that_hang_together(n, length, samples, blo
 
 
 def test_without_runs_nothing_is_chosen():
-    with pytest.raises(InputError, match="no validation run"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-004"):
         recommend({"phy": [], "pgrnn": []})
 
 
@@ -158,6 +158,21 @@ def test_the_bound_is_that_of_the_mean_over_recordings_and_both_must_be_better()
     assert own.error > choice.candidates["phy"].error  # over all together it is worse: the rule is no looser
     assert choice.recommended == "phy"
     assert "over all of them together the prior's is no larger" in choice.reason
+
+
+def test_of_two_sure_hybrids_the_one_of_the_lower_ratio_is_taken():
+    """One recording has nearly all of the error: there ``mopgrnn`` is better, in all seven others ``pgrnn`` is."""
+    prior = [np.full(60, 100.0 if i == 0 else 1.0) for i in range(8)]
+    factors = {"pgrnn": [0.7] + [0.3] * 7, "mopgrnn": [0.6] + [0.6] * 7}
+    errors = {"phy": prior} | {
+        name: [f * own for f, own in zip(by, prior, strict=True)] for name, by in factors.items()
+    }
+    choice = recommend(errors, recordings=[f"file{i}" for i in range(8)])
+    found = choice.candidates
+    assert choice.sure == ("pgrnn", "mopgrnn")
+    assert found["pgrnn"].error > found["mopgrnn"].error
+    assert found["pgrnn"].ratio < found["mopgrnn"].ratio
+    assert choice.recommended == choice.hybrid == "pgrnn"
 
 
 def test_runs_of_a_single_recording_are_cut_into_blocks():

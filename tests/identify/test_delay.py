@@ -110,10 +110,10 @@ def test_an_input_acts_as_its_mean_over_the_period(delay):
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("inf")])
 def test_a_delay_that_is_none_is_refused(bad):
-    with pytest.raises(InputError, match="delay must be positive"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-008"):
         delayed(record(0, seconds=0.2), bad)
 
 
 def test_a_delay_longer_than_the_recording_is_refused():
-    with pytest.raises(InputError, match="leaves nothing"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-007"):
         delayed(record(0, seconds=0.2), 1.0)

@@ -85,7 +85,7 @@ def test_a_missing_sample_is_no_error_and_a_constant_output_has_no_fit():
     assert figures.rmse["phi [rad]"] == pytest.approx(0.5)
     assert list(figures.fit_percent) == ["phi [rad]"]
     run.y[:, 1] = np.nan
-    with pytest.raises(InputError, match=r"level \[m\] was never measured"):
+    with pytest.raises(InputError, match=r"level \[m\].*HM-IDENTIFY-010"):
         score([run], Two())
 
 

@@ -161,11 +161,11 @@ def test_only_a_recordings_own_first_sample_is_known(runs):
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    ({"kind": "guessed"}, "free, known"),
-    ({"kind": "known"}, "values by name belong"),
+    ({"kind": "guessed"}, r"free, known.*HM-IDENTIFY-066"),
+    ({"kind": "known"}, "HM-IDENTIFY-067"),
     ({"kind": "free", "values": {"phi": 0.0}}, "to it alone"),
     ({"kind": "known", "values": {"phi": np.nan}}, "finite"),
-    ({"kind": "warm_up"}, "positive length"),
+    ({"kind": "warm_up"}, "HM-IDENTIFY-069"),
     ({"kind": "shared", "seconds": 1.0}, "to it alone"),
 ])  # fmt: skip
 def test_what_does_not_belong_to_a_kind_is_refused(options, words):
@@ -175,5 +175,5 @@ def test_what_does_not_belong_to_a_kind_is_refused(options, words):
 
 def test_what_does_not_fit_to_the_prior_is_refused(runs):
     first = FirstStates("known", {"speed": 0.0})
-    with pytest.raises(InputError, match=r"'speed' is no state of Pendulum[\s\S]*costs the first samples"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-072"):
         fit_prior(Pendulum, runs, runs, dt=DT, first_states=first, largest_delay=0.1)

@@ -418,28 +418,28 @@ def nan_at(array):
 
 
 REFUSED = {
-    "no training": ("train", lambda r: [], "no training recording"),
-    "no validation": ("valid", lambda r: [], "no validation recording"),
+    "no training": ("train", lambda r: [], r"training.*HM-IDENTIFY-029"),
+    "no validation": ("valid", lambda r: [], r"validation.*HM-IDENTIFY-029"),
     "an input that rests": (
-        "train", lambda r: [replace(x, u=constant(x.u, 1)) for x in r], "input 2 never changes",
+        "train", lambda r: [replace(x, u=constant(x.u, 1)) for x in r], "HM-IDENTIFY-036",
     ),
     "an output that rests": (
-        "train", lambda r: [replace(x, y=constant(x.y, 0)) for x in r], "output 1 never changes",
+        "train", lambda r: [replace(x, y=constant(x.y, 0)) for x in r], "HM-IDENTIFY-035",
     ),
     "an output that is nowhere": (
-        "train", lambda r: [replace(x, y=np.full_like(x.y, np.nan)) for x in r], "output 1 never changes",
+        "train", lambda r: [replace(x, y=np.full_like(x.y, np.nan)) for x in r], "HM-IDENTIFY-035",
     ),
     "a column less": (
         "valid", lambda r: [replace(r[0], u=r[0].u[:, :1])],
-        "validation recording 1: 2 outputs and 1 inputs .* training recording 1 has 2 and 2",
+        r"validation recording 1.*HM-IDENTIFY-031",
     ),
-    "a vector": ("train", lambda r: [Run(r[0].y[:, 0], r[0].u)], r"y is \(300,\), u is \(300, 2\)"),
-    "different lengths": ("train", lambda r: [Run(r[0].y[:-1], r[0].u)], r"y is \(299, 2\), u is \(300, 2\)"),
-    "a missing input": ("train", lambda r: [replace(r[0], u=nan_at(r[0].u)), r[1]], "1: an input is not finite"),
-    "an infinite output": ("train", lambda r: [replace(r[0], y=1 / (r[0].y * 0 + [0, 1])), r[1]], "output is infinite"),
-    "a short validation": ("valid", lambda r: [Run(r[0].y[:10], r[0].u[:10])], "10 samples, .* warm-up of 10"),
+    "a vector": ("train", lambda r: [Run(r[0].y[:, 0], r[0].u)], r"\(300,\).*\(300, 2\).*HM-IDENTIFY-030"),
+    "different lengths": ("train", lambda r: [Run(r[0].y[:-1], r[0].u)], r"\(299, 2\).*\(300, 2\).*HM-IDENTIFY-030"),
+    "a missing input": ("train", lambda r: [replace(r[0], u=nan_at(r[0].u)), r[1]], "HM-IDENTIFY-032"),
+    "an infinite output": ("train", lambda r: [replace(r[0], y=1 / (r[0].y * 0 + [0, 1])), r[1]], "HM-IDENTIFY-033"),
+    "a short validation": ("valid", lambda r: [Run(r[0].y[:10], r[0].u[:10])], r"10.*10.*HM-IDENTIFY-034"),
     "a disturbance of another length": (
-        "train", lambda r: [Disturbed(r[0].y, r[0].u, np.zeros((5, 1)))], r"shape \(5, 1\); needed is \(300, n_w\)",
+        "train", lambda r: [Disturbed(r[0].y, r[0].u, np.zeros((5, 1)))], r"\(5, 1\).*300.*HM-IDENTIFY-026",
     ),
 }  # fmt: skip
 
@@ -457,12 +457,12 @@ def test_what_cannot_be_used_is_refused(fit, case):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"warm": 0}, "warm is 0"),
-        ({"warm": 2.5}, "warm is 2.5"),
-        ({"dt": 0.0}, "dt is 0.0"),
-        ({"dt": float("nan")}, "dt is nan"),
-        ({"orders": []}, "orders: \\[\\] given"),
-        ({"orders": [2, 0]}, "whole numbers from 1 on"),
+        ({"warm": 0}, "HM-IDENTIFY-028"),
+        ({"warm": 2.5}, r"2\.5.*HM-IDENTIFY-028"),
+        ({"dt": 0.0}, r"0\.0.*HM-IDENTIFY-027"),
+        ({"dt": float("nan")}, r"nan.*HM-IDENTIFY-027"),
+        ({"orders": []}, r"orders.*\[\].*HM-IDENTIFY-037"),
+        ({"orders": [2, 0]}, "HM-IDENTIFY-037"),
     ],
 )
 def test_numbers_without_sense_are_refused(fit, options, message):
@@ -491,16 +491,16 @@ def test_the_length_that_is_asked_for_is_enough(fit):
     options = {"dt": 0.1, "warm": 10}
     valid = [run(system(), 100, 1)]
     assert fit([run(system(), needed, 0, noise=0.3)], valid, **options).candidates
-    with pytest.raises(InputError, match="too short"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-038"):
         fit([run(system(), needed - 1, 0, noise=0.3)], valid, **options)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"weighting": "moesp"}, "weighting is 'moesp'"),
-        ({"horizons": [1]}, "whole numbers from 2 on"),
-        ({"orders": [8]}, "say nothing of so many states"),  # the data have four, and no noise
+        ({"weighting": "moesp"}, r"'moesp'.*HM-IDENTIFY-025"),
+        ({"horizons": [1]}, "HM-IDENTIFY-037"),
+        ({"orders": [8]}, "HM-IDENTIFY-039"),  # the data have four, and no noise
     ],
 )
 def test_options_of_a_subspace_model_that_cannot_be(options, message):
@@ -511,21 +511,21 @@ def test_options_of_a_subspace_model_that_cannot_be(options, message):
 @pytest.mark.parametrize(
     ("y", "u", "message"),
     [
-        ((5, 2), (20, 3), "needed are"),
-        ((5, 1), (20, 2), "needed are"),
-        ((4, 5, 2), (3, 20, 2), "same windows in front"),
-        ((2,), (20, 2), "needed are"),
-        ((21, 2), (20, 2), "y_past has 21 samples and u has 20"),
-        ((0, 2), (20, 2), "at least one"),
+        ((5, 2), (20, 3), "HM-IDENTIFY-021"),
+        ((5, 1), (20, 2), "HM-IDENTIFY-021"),
+        ((4, 5, 2), (3, 20, 2), "HM-IDENTIFY-021"),
+        ((2,), (20, 2), "HM-IDENTIFY-021"),
+        ((21, 2), (20, 2), r"21.*20.*HM-IDENTIFY-022"),
+        ((0, 2), (20, 2), "HM-IDENTIFY-022"),
     ],
 )
 def test_a_free_run_of_other_shapes_is_refused(y, u, message):
     model = fit_arx(*recordings(system()), 0.1, warm=10, orders=[2])
     with pytest.raises(InputError, match=message):
         model.free_run(np.zeros(y), np.zeros(u))
-    with pytest.raises(InputError, match="not finite"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-023"):
         model.free_run(np.zeros((5, 2)), np.full((20, 2), np.nan))
-    with pytest.raises(InputError, match="recording 1: 10 samples"):
+    with pytest.raises(InputError, match=r"10.*HM-IDENTIFY-024"):
         model.free_runs([Run(np.zeros((10, 2)), np.zeros((10, 2)))], 10)
 
 

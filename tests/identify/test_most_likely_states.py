@@ -153,7 +153,7 @@ def test_each_trajectory_for_itself_in_any_order():
 
 def test_equations_without_a_number_at_the_start_are_told():
     own = stretch(1)
-    with pytest.raises(InputError, match="no number"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-020"):
         problem().solve(own, [np.full((N, 3), np.nan)])
 
 

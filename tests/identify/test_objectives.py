@@ -197,10 +197,10 @@ def test_balances_stands_for_all_of_the_prior():
         (
             Tanks,
             ("error", "energy"),
-            r"objectives: energy; .* error, output, balances, .* balances of Tanks: volume",
+            r"energy.*Tanks.*volume.*HM-IDENTIFY-040",
         ),
-        (Observed, ("balances",), r"objectives: there is none; .* Observed: it has none"),
-        (Observed, ("position", "power"), "position, power"),
+        (Observed, ("balances",), r"Observed.*HM-IDENTIFY-040"),
+        (Observed, ("position", "power"), r"position, power.*HM-IDENTIFY-040"),
     ],
 )
 def test_objectives_that_are_none_are_refused_with_what_there_is(prior, names, words):

@@ -61,7 +61,7 @@ def test_pieces_of_a_recording_are_cut_where_the_recording_is(data):
 
 
 def test_one_part_is_refused():
-    with pytest.raises(InputError, match="parts must be 0, or 2 and more, got 1"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-048"):
         replace(SETTINGS, parts=1)
 
 

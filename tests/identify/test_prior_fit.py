@@ -290,7 +290,7 @@ def test_it_says_what_smooths_states(noisy_runs, fit):
     truth, found = record(0, seconds=3.0), smoothed(Pendulum, fit, noisy_runs[:1], DT)[0]
     assert np.sqrt(np.mean((found.x - truth.x)[:, 0] ** 2)) < NOISE
     assert np.sqrt(np.mean((found.x - truth.x)[:, 1] ** 2)) < 0.01 * np.std(truth.x[:, 1])
-    with pytest.raises(InputError, match="not made by fit_prior"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-045"):
         PriorFit(TRUTH, {}, (), ()).smoother(Pendulum(), DT)
 
 
@@ -415,19 +415,15 @@ class Odometer(Prior):
 
 def test_a_state_that_no_output_sees_is_refused_by_name():
     run = record(0, seconds=1.0)
-    with pytest.raises(
-        InputError, match=r"Odometer: no output tells of way \(outputs: speed\).*Measure it, leave it out"
-    ):
+    with pytest.raises(InputError, match=r"Odometer.*way.*speed.*HM-IDENTIFY-019"):
         fit_prior(Odometer, [run], [run], dt=DT)
 
 
 def test_no_recording_and_too_short_ones_are_refused():
     run = record(0, seconds=1.0)
-    with pytest.raises(
-        InputError, match="long enough to fit Pendulum to: the longest has 0 samples, 3 are needed"
-    ):
+    with pytest.raises(InputError, match=r"Pendulum.*HM-IDENTIFY-017"):
         fit_prior(Pendulum, [], [run], dt=DT)
-    with pytest.raises(InputError, match="the longest has 2 samples"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-017"):
         fit_prior(Pendulum, [run.part(slice(2))], [run], dt=DT)
 
 
@@ -439,7 +435,7 @@ def test_a_prior_that_diverges_with_all_parameters_is_refused():
             return u.torque + 1e3 * v.phi_dot * (1 + v.phi_dot**2 + q.phi**2)
 
     run = record(0, seconds=1.0)
-    with pytest.raises(InputError, match=r"diverges|stiff|smaller dt"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-049"):
         fit_prior(Running, [run], [run], dt=DT)
 
 
@@ -460,7 +456,7 @@ def test_windows_lie_one_behind_the_other():
     few = cut_outputs([record(k, seconds=3.0) for k in range(4)], 25, 0, 10)
     assert len(few.y) == 10  # evenly chosen: the first and the last are there
     np.testing.assert_array_equal(few.y[-1], record(3, seconds=3.0).y[100:126])
-    with pytest.raises(InputError, match="a free run of 400 periods with 2 samples before it needs 403"):
+    with pytest.raises(InputError, match=r"400.*403.*HM-IDENTIFY-073"):
         cut_outputs(runs, 400, 2, 10)
 
 

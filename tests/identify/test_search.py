@@ -173,17 +173,17 @@ def test_a_journal_of_another_search_is_refused_by_what_differs(whole, data):
     training, validation = data
     other = [training[0], replace(training[1], u=training[1].u + 1.0)]
     for arguments, names in (
-        ({"base": replace(BASE, horizon=19)}, "base settings differ"),
-        ({"space": SearchSpace(batch=(8, 129))}, "space differ"),
-        ({"seed": 4}, "seed differ"),
-        ({"data": (other, validation)}, "data differ"),
-        ({"data": (validation, training), "seed": 4}, "data, seed differ"),
+        ({"base": replace(BASE, horizon=19)}, r"base settings.*HM-IDENTIFY-065"),
+        ({"space": SearchSpace(batch=(8, 129))}, r"space.*HM-IDENTIFY-065"),
+        ({"seed": 4}, r"seed.*HM-IDENTIFY-065"),
+        ({"data": (other, validation)}, r"data.*HM-IDENTIFY-065"),
+        ({"data": (validation, training), "seed": 4}, r"data, seed.*HM-IDENTIFY-065"),
     ):
         before = storage.read_bytes()
         with pytest.raises(InputError, match=names):
             run(**({"data": data} | arguments), storage=storage)
         assert storage.read_bytes() == before
-    with pytest.raises(InputError, match=r"\(prior differ\)"):
+    with pytest.raises(InputError, match=r"prior.*HM-IDENTIFY-065"):
         tune(Pendulum(TRUTH | {"d": 0.06}), *data, BASE, SPACE, trials=2, storage=storage)
 
 
@@ -191,7 +191,7 @@ def test_a_journal_of_another_search_is_refused_by_what_differs(whole, data):
 def test_what_is_no_journal_is_refused(data, tmp_path, content):
     storage = tmp_path / "search.jsonl"
     storage.write_text(content)
-    with pytest.raises(InputError, match="no journal of a search or is damaged"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-064"):
         run(data, storage)
 
 
@@ -219,7 +219,7 @@ def test_a_diverged_training_is_recorded_and_the_search_goes_on(whole, data, tmp
 
 def test_a_search_in_which_all_diverge_says_so(data, tmp_path, monkeypatch):
     diverging(monkeypatch, {0, 1})
-    with pytest.raises(InputError, match="all 2 trainings of the search diverged"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-063"):
         run(data, tmp_path / "search.jsonl", 2)
 
 
@@ -246,7 +246,7 @@ def test_a_base_outside_the_space_is_no_trial(quick, data, tmp_path):
 
 @pytest.mark.parametrize("options", [{"trials": 0}, {"seed": -1}, {"timeout": 0.0}, {"timeout": math.nan}])
 def test_numbers_that_are_too_small_are_refused(data, tmp_path, options):
-    with pytest.raises(InputError, match="a search needs trials of 1 or more"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-062"):
         run(data, tmp_path / "search.jsonl", **options)
     assert not list(tmp_path.iterdir())
 
@@ -254,12 +254,12 @@ def test_numbers_that_are_too_small_are_refused(data, tmp_path, options):
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
-        ({"hidden": (8, 4)}, "hidden is to be varied between"),
-        ({"hidden": (4.5, 8)}, "whole numbers"),
-        ({"decay": (0.0, 8.0)}, "two positive numbers"),
-        ({"decay": (1.0, math.inf)}, "two positive numbers"),
-        ({"learning_rate": (1e-3, math.nan)}, "two positive numbers"),
-        (dict.fromkeys(("hidden", "learning_rate", "free_run_learning_rate", "decay")), "nothing to vary"),
+        ({"hidden": (8, 4)}, r"hidden.*HM-IDENTIFY-060"),
+        ({"hidden": (4.5, 8)}, "HM-IDENTIFY-061"),
+        ({"decay": (0.0, 8.0)}, "HM-IDENTIFY-060"),
+        ({"decay": (1.0, math.inf)}, "HM-IDENTIFY-060"),
+        ({"learning_rate": (1e-3, math.nan)}, "HM-IDENTIFY-060"),
+        (dict.fromkeys(("hidden", "learning_rate", "free_run_learning_rate", "decay")), "HM-IDENTIFY-056"),
     ],
 )
 def test_bounds_that_are_none_are_refused(bounds, message):
@@ -270,7 +270,7 @@ def test_bounds_that_are_none_are_refused(bounds, message):
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["units=4:8"], "no setting 'units'"),
+        (["units=4:8"], r"'units'.*HM-IDENTIFY-057"),
         (["hidden=4:8", "hidden"], "twice"),
         (["hidden=4"], "NAME=LOW:HIGH"),
         (["hidden=a:b"], "NAME=LOW:HIGH"),

@@ -161,21 +161,21 @@ def test_the_runner_does_the_same():
 
 def test_bad_input_is_refused():
     for words, arguments, times in (
-        ("belong together", (), {"backup": make_safe(pendulum_model())}),
-        ("needs a controller", (Mode.BACKUP,), {}),
-        ("needs limits", (Mode.LIMITED,), {}),
-        ("0 s or more", (), {"dwell": -1.0}),
-        ("patience must be 0 s or more", (), {"patience": -1.0}),
-        ("needs a quiet above 0 s", (), {"quiet": 0.0, "patience": 0.5}),
+        ("HM-LOOP-010", (), {"backup": make_safe(pendulum_model())}),
+        ("HM-LOOP-011", (Mode.BACKUP,), {}),
+        ("HM-LOOP-012", (Mode.LIMITED,), {}),
+        ("HM-LOOP-013", (), {"dwell": -1.0}),
+        ("HM-LOOP-013", (), {"patience": -1.0}),
+        ("HM-LOOP-014", (), {"quiet": 0.0, "patience": 0.5}),
     ):
         with pytest.raises(InputError, match=words):
             Guard(*arguments, **times)
-    with pytest.raises(InputError, match="give monitor="):
+    with pytest.raises(InputError, match="HM-LOOP-019"):
         guarded(Guard(), None)
     model, prior = pendulum_model(3), pendulum_model()
     shorter = Guard(backup=make_safe(prior, horizon=10), backup_estimator=make_ekf(prior))
-    with pytest.raises(InputError, match="give both one problem"):
+    with pytest.raises(InputError, match="HM-LOOP-016"):
         run(model, make_safe(model), guard=shorter, monitor=ScriptedMonitor())
     mixed = Guard(backup=make_safe(prior), backup_estimator=make_ekf(model))
-    with pytest.raises(InputError, match="that of its estimator"):
+    with pytest.raises(InputError, match="HM-LOOP-017"):
         run(model, make_safe(model), guard=mixed, monitor=ScriptedMonitor())

@@ -134,7 +134,7 @@ def test_true_state_is_handed_the_truth(model, safe):
     result = run(model, safe, plant=Inner(), estimator=oracle, faults=[fault])
     np.testing.assert_array_equal(result.x_hat, result.x)
     np.testing.assert_array_equal(result.h, np.tile([0.25, -0.5], (30, 1)))
-    with pytest.raises(InputError, match="needs 4"):
+    with pytest.raises(InputError, match="HM-ESTIMATE-009"):
         run(model, safe, estimator=oracle)  # a plant without hidden states
 
 

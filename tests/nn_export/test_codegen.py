@@ -262,22 +262,22 @@ class Callback(ca.Callback):
 def test_named_errors(tmp_path):
     x = ca.MX.sym("x")
     f = ca.Function("f", [x], [x])
-    with pytest.raises(CompileError, match="no such command"):
+    with pytest.raises(CompileError, match="NN-007"):
         compile_function(f, folder=tmp_path, compiler="no-such-compiler")
-    with pytest.raises(CompileError, match="unrecognized"):
+    with pytest.raises(CompileError, match=r"(?s)unrecognized.*NN-015"):
         compile_function(f, folder=tmp_path, flags=["-fno-such-flag"])
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
-    with pytest.raises(CompileError, match="anyone may write"):
+    with pytest.raises(CompileError, match="NN-013"):
         compile_function(f, folder=tmp_path / "open")
-    with pytest.raises(CompileError, match="longer timeout"):
+    with pytest.raises(CompileError, match="NN-014"):
         compile_function(f, folder=tmp_path, timeout=1e-4)
     callback = Callback()
     for write in (compile_function, generate_c):
-        with pytest.raises(CompileError, match="CallbackInternal"):
+        with pytest.raises(CompileError, match=r"CallbackInternal.*NN-011"):
             write(callback, folder=tmp_path)
     inner = compile_function(f, folder=tmp_path, flags=["-O0"])
-    with pytest.raises(CompileError, match="undefined reference"):
+    with pytest.raises(CompileError, match=r"(?s)undefined reference.*NN-015"):
         compile_function(ca.Function("outer", [x], [inner(x) + 1]), folder=tmp_path, flags=["-O0"])
     assert len(list(tmp_path.glob("*.so"))) == 1
     assert not list(tmp_path.glob(".build*"))
@@ -355,7 +355,7 @@ def test_names_of_arguments_carry_no_code(tmp_path):
     inner = ca.Function("inner", [x], [x * x], ["a*/b"], ["c"], {"never_inline": True})
     for f in (inner, ca.Function("outer", [x], [inner(x)])):
         for write in (compile_function, generate_c):
-            with pytest.raises(CompileError, match="inner"):
+            with pytest.raises(CompileError, match=r"inner.*NN-009"):
                 write(f, folder=tmp_path / "there")
 
 

@@ -111,7 +111,7 @@ class Counter(nn.Module):
 
 def test_hidden_state_is_refused_and_the_module_unchanged():
     module = Counter()
-    with pytest.raises(HiddenStateError, match="count"):
+    with pytest.raises(HiddenStateError, match=r"count.*NN-018"):
         trace(module, (X,))
     assert torch.equal(module.count, torch.zeros(4))
 
@@ -119,15 +119,15 @@ def test_hidden_state_is_refused_and_the_module_unchanged():
 @pytest.mark.parametrize(
     ("module", "inputs", "words"),
     [
-        (nn.Linear(3, 2), (X,), r"\(4,\).*right shape"),
-        (nn.Linear(4, 2), (X, X), r"does not run"),
-        (nn.GRUCell(3, 2), (torch.zeros(3), torch.zeros(5)), "right shape"),
-        (nn.Linear(4, 2), (X.long(),), "real numbers"),
-        (nn.Linear(4, 2), (torch.zeros(4, dtype=torch.complex128),), "real numbers"),
-        (nn.LSTMCell(4, 2), (X, (torch.zeros(2), 3)), "input 1_1"),
-        (nn.Linear(4, 2), X, "tuple of tensors"),
+        (nn.Linear(3, 2), (X,), "NN-114"),
+        (nn.Linear(4, 2), (X, X), "NN-114"),
+        (nn.GRUCell(3, 2), (torch.zeros(3), torch.zeros(5)), "NN-114"),
+        (nn.Linear(4, 2), (X.long(),), "NN-110"),
+        (nn.Linear(4, 2), (torch.zeros(4, dtype=torch.complex128),), "NN-110"),
+        (nn.LSTMCell(4, 2), (X, (torch.zeros(2), 3)), r"1_1.*NN-110"),
+        (nn.Linear(4, 2), X, "NN-109"),
         (torch.sin, (X,), "Module"),
-        (Call(lambda x: (x, 3)), (X,), "output 1"),
+        (Call(lambda x: (x, 3)), (X,), "NN-022"),
         (Call(lambda x: {"a b__": x, "a_b": x}), (X,), "differ"),
     ],
 )
@@ -137,9 +137,9 @@ def test_inputs_that_do_not_fit(module, inputs, words):
 
 
 def test_three_axes_are_refused_by_name_outside_and_allowed_inside():
-    with pytest.raises(ShapeError, match="input x"):
+    with pytest.raises(ShapeError, match="NN-065"):
         to_casadi(Call(torch.sin), (torch.zeros(2, 3, 4),))
-    with pytest.raises(ShapeError, match="output"):
+    with pytest.raises(ShapeError, match="NN-065"):
         to_casadi(Call(lambda x: x[:, :, None].expand(2, 2, 3)), (torch.zeros(2, 2),))
     function = to_casadi(Call(lambda x: x[:, :, None].expand(2, 2, 3).sum(0)), (torch.zeros(2, 2),))
     assert function(np.array([[1, 2], [3, 4]])).full().tolist() == [[4, 4, 4], [6, 6, 6]]
@@ -166,10 +166,10 @@ def test_arguments_that_are_not_known_are_refused_in_programs_too():
     node = Node(
         "n", "aten.gelu.default", [{"input": "x"}], {"approximate": "cubic"}, ((2,),), "m.py:3: gelu(x)"
     )
-    with pytest.raises(ProgramError, match=r"m\.py:3.*cubic"):
+    with pytest.raises(ProgramError, match="NN-051"):
         build(Program(*ports, (node,)))
     node = Node("n", "aten.tanh.default", [{"input": "x"}], {"inplace": True}, ((2,),))
-    with pytest.raises(ProgramError, match="inplace"):
+    with pytest.raises(ProgramError, match=r"inplace.*NN-041"):
         build(Program(*ports, (node,)))
 
 

@@ -109,17 +109,15 @@ def test_what_cannot_be_stated_is_refused_by_name():
     x, p = ca.MX.sym("x"), ca.MX.sym("p")
     root = ca.rootfinder("root", "newton", {"x": x, "p": p, "g": x**3 - p})
     inner = ca.Function("inner", [p], [root(1.0, p)])
-    with pytest.raises(
-        UnsupportedOperatorError, match=r"cost: no scalar operations stand for root \(Newton\)"
-    ):
+    with pytest.raises(UnsupportedOperatorError, match=r"cost.*root \(Newton\).*NN-024"):
         program_of(ca.Function("cost", [p], [inner(p) ** 2]))
     s = ca.SX.sym("s")
-    with pytest.raises(UnsupportedOperatorError, match="OP_ERFINV"):
+    with pytest.raises(UnsupportedOperatorError, match=r"OP_ERFINV.*NN-028"):
         program_of(ca.Function("cost", [s], [ca.erfinv(s)]))
-    with pytest.raises(SignatureError, match=r"a casadi\.Function is needed, got function"):
+    with pytest.raises(SignatureError, match=r"function.*NN-026"):
         program_of(lambda x, u: x)
     free = ca.Function("free", [s], [s * ca.SX.sym("price")], {"allow_free": True})
-    with pytest.raises(SignatureError, match="depends on price"):
+    with pytest.raises(SignatureError, match=r"price.*NN-027"):
         program_of(free)
 
 
@@ -130,13 +128,13 @@ def test_an_expression_within_the_budget_of_programs():
         long = ca.sin(long)
     f = ca.Function("long", [s], [long])
     assert isinstance(program_of(f), Program)
-    with pytest.raises(ProgramError, match="long: more than 1000 scalar operations"):
+    with pytest.raises(ProgramError, match=r"long.*1000.*NN-025"):
         program_of(f, Limits(nodes=12_000))
-    with pytest.raises(ProgramError, match="operations of CasADi's graph"):
+    with pytest.raises(ProgramError, match="NN-112"):
         program_of(f, Limits(nodes=12_100))
     a, b = ca.MX.sym("a", 400, 400), ca.MX.sym("b", 400)
     dense = ca.Function("dense", [a, b], [a @ (a @ (a @ b))])
-    with pytest.raises(ProgramError, match="export a network as a module"):  # at once: it is not written out
+    with pytest.raises(ProgramError, match="NN-025"):  # at once: it is not written out
         program_of(dense)
 
 

@@ -135,7 +135,7 @@ def test_what_has_no_scalar_form_is_trained_with_too():
     assert torch.allclose(y, torch.tensor([[2.0], [3.0]], **f64), rtol=1e-9)  # Newton's tolerance
     (slope,) = torch.autograd.grad(y.sum(), p)
     assert torch.allclose(slope, torch.tensor([[1 / 12], [1 / 27]], **f64), rtol=1e-9)
-    with pytest.raises(ExportError, match="no form in torch operators"):
+    with pytest.raises(ExportError, match="NN-001"):
         to_casadi(module, (torch.zeros(1),))
 
 
@@ -191,18 +191,18 @@ class NoDerivative(ca.Callback):
 
 def test_named_errors():
     module, (x, u, J) = from_casadi(pendulum()), samples((3,))
-    with pytest.raises(SignatureError, match="3 tensors"):
+    with pytest.raises(SignatureError, match="NN-102"):
         module(x, u)
-    with pytest.raises(SignatureError, match=r"x must have the shape \(..., 2\), got \(3, 1\)"):
+    with pytest.raises(SignatureError, match=r"\(3, 1\).*NN-105"):
         module(u, u, J)
-    with pytest.raises(SignatureError, match="broadcast"):
+    with pytest.raises(SignatureError, match="NN-103"):
         module(x, u[:2], J)
-    with pytest.raises(DtypeError, match="int64"):
+    with pytest.raises(DtypeError, match=r"int64.*NN-104"):
         module(x, u, torch.tensor(1))
-    with pytest.raises(SignatureError, match=r"casadi\.Function"):
+    with pytest.raises(SignatureError, match="NN-100"):
         from_casadi(lambda x: x)
     callback = NoDerivative()
     y = from_casadi(callback)(torch.ones(1, **f64, requires_grad=True))
     assert y.item() == 2.0
-    with pytest.raises(DerivativeError, match="no_derivative has no derivative"):
+    with pytest.raises(DerivativeError, match=r"no_derivative.*NN-003"):
         y.sum().backward()

@@ -132,13 +132,13 @@ def test_graphs_grow_linearly_and_folds_hardly_at_all(program):
 @pytest.mark.parametrize(
     ("n", "settings", "words"),
     [
-        (0, {}, "at least 1"),
-        (2.0, {}, "whole number"),
-        (3, {"states": {"q": "x_next"}}, "no q"),
-        (3, {"states": {"x": "nothing"}}, "no nothing"),
-        (3, {"held": ["x"]}, "x cannot be"),
-        (3, {"states": {"x": "h_next"}}, "make them equal"),
-        (3, {"states": {"x": "x_next", "u": "x_next"}}, "same next value"),
+        (0, {}, "NN-044"),
+        (2.0, {}, "NN-044"),
+        (3, {"states": {"q": "x_next"}}, "NN-046"),
+        (3, {"states": {"x": "nothing"}}, r"nothing.*NN-046"),
+        (3, {"held": ["x"]}, "NN-047"),
+        (3, {"states": {"x": "h_next"}}, "NN-049"),
+        (3, {"states": {"x": "x_next", "u": "x_next"}}, "NN-048"),
         (3, {"states": {}}, "states="),
     ],
 )

@@ -94,5 +94,5 @@ def test_a_singular_matrix_gives_no_number():
 
 def test_a_large_matrix_is_refused_with_the_limit():
     a = torch.eye(9).double()
-    with pytest.raises(ExportError, match=r"9 rows.* 8 can be exported"):
+    with pytest.raises(ExportError, match="NN-064"):
         to_casadi(Of(torch.linalg.solve), (a, a))

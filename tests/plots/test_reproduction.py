@@ -65,7 +65,7 @@ def test_models_differ_in_colour_and_marker():
 
 
 def test_bad_input():
-    with pytest.raises(InputError, match="data set"):
+    with pytest.raises(InputError, match="HM-SCENARIOS-020"):
         errors_over_sequences({}, "E_sim [s]")
-    with pytest.raises(InputError, match="mopgrnn"):
+    with pytest.raises(InputError, match=r"mopgrnn.*HM-SCENARIOS-021"):
         shown_free_run({"phy": {}}, [], [])

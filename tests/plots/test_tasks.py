@@ -81,7 +81,7 @@ def test_an_unknown_controller_is_drawn_under_its_name():
     "table", [{}, {"a": {}}, {"a": {"prior": (1.0, 0.1)}}, {"a": {"oracle": (0.0, 0.0)}}]
 )
 def test_costs_without_an_oracle_are_refused(table):
-    with pytest.raises(InputError, match="oracle"):
+    with pytest.raises(InputError, match="HM-PLOTS-028"):
         costs(table)
 
 

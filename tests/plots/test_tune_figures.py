@@ -39,7 +39,7 @@ def test_a_panel_a_setting():
 
 
 def test_what_cannot_be_drawn_is_refused():
-    with pytest.raises(InputError, match="no trial has a finite"):
+    with pytest.raises(InputError, match="HM-PLOTS-035"):
         history(ROWS[1:2])
-    with pytest.raises(InputError, match="no setting to draw"):
+    with pytest.raises(InputError, match="HM-PLOTS-034"):
         settings(ROWS, [])

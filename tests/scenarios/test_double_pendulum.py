@@ -47,7 +47,7 @@ def closed(name, delay=DELAY):
 def test_without_mujoco_the_plant_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)  # an import of it fails
     simulation.cache_clear()
-    with pytest.raises(hm.InputError, match=r"pip install 'hybrid-mpc\[mujoco\]'"):
+    with pytest.raises(hm.InputError, match="HM-SCENARIOS-003"):
         scenario.plant().reset(np.zeros(4), 0)
     check_scenario(replace(scenario, plant=None))  # what benchmark, tune and the like ask for
     simulation.cache_clear()
@@ -88,7 +88,7 @@ def test_commands_act_late_and_sensors_have_steps(mujoco):
     y = plant.measure(then, np.random.default_rng(0))
     steps = y / np.repeat([plant.step_q, plant.step_v], 2)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    with pytest.raises(hm.InputError, match=r"period of 0\.003 s"):
+    with pytest.raises(hm.InputError, match=r"0\.003.*HM-SCENARIOS-002"):
         plant.step(first, np.zeros(2), 0.003)
 
 

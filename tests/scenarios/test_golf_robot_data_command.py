@@ -77,7 +77,7 @@ def test_a_machine_with_one_data_set_takes_no_set(tmp_path):
         return [write_csv(folder / "one.csv", {"time_s": t, "u_nm": 0 * t, "phi_rad": np.sin(t)})]
 
     mine = replace(scenario, name="mine", make_data=make)
-    with pytest.raises(InputError, match="one data set"):
+    with pytest.raises(InputError, match="HM-CLI-003"):
         write_data(mine, tmp_path / "x", 0, "quick", "a")
     files = write_data(mine, tmp_path / "y", 0, "quick")
     assert "first 60 % training, next 20 % validation" in (tmp_path / "y" / "README.md").read_text()

@@ -187,9 +187,9 @@ def test_names_are_unique_and_faults_end():
     assert all(fault.end <= 3.0 for case in catalogue(2.0, 3.0) for fault in case.faults)
     for k in range(60, 160):  # 0.5 s later in the middle of a row of dropouts, up to rounding
         assert all(f.start < f.end for case in catalogue(0.02 * k, 0.02 * k + 0.5) for f in case.faults)
-    with pytest.raises(InputError, match="push"):
+    with pytest.raises(InputError, match=r"push.*HM-SCENARIOS-008"):
         fault_case("pusch")
-    with pytest.raises(InputError, match="later than start"):
+    with pytest.raises(InputError, match="HM-SCENARIOS-007"):
         catalogue(2.0, 2.0)
 
 
@@ -197,7 +197,7 @@ def test_names_are_unique_and_faults_end():
     ("fault", "words"),
     [
         (Fault(0.0, 1.0, "plant_fire", 1.0), "plant_friction"),
-        (Fault(0.0, 1.0, "input_gain", 1.0), "no fault"),
+        (Fault(0.0, 1.0, "input_gain", 1.0), "HM-LOOP-005"),
         (Fault(0.0, 1.0, "plant_mass", 0.0), "positive"),
         (Fault(0.0, 1.0, "plant_delay", -0.1), "positive"),
     ],

@@ -219,7 +219,7 @@ def test_sub_steps_follow_the_speed():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"), [({"sub_step": 0.0}, "sub_step"), ({"delay": -0.02}, "delay must be")]
+    ("arguments", "words"), [({"sub_step": 0.0}, "sub_step"), ({"delay": -0.02}, "HM-SCENARIOS-018")]
 )
 def test_bad_options_are_refused(arguments, words):
     with pytest.raises(InputError, match=words):

@@ -199,7 +199,7 @@ def test_any_file_of_the_disks_columns_is_read(tmp_path):
     (whole,) = read_test(disk, tmp_path / "another.npz")
     assert len(whole.t) == len(t) - 1  # the last input is held for no known time
     np.savez(tmp_path / "short.npz", u=t[:60], th=t[:60], dt=0.025)
-    with pytest.raises(InputError, match="too short to be cut into 7 pieces"):
+    with pytest.raises(InputError, match="HM-WORKFLOW-015"):
         read_training(disk, [tmp_path / "short.npz"])
 
 

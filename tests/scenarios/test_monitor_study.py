@@ -145,7 +145,7 @@ def test_budgets_and_numbers():
     assert monitor_study("m").nominal_hours >= 10  # what the bound of one false alarm an hour asks for
     assert monitor_study("m", "quick").size < monitor_study("m").size
     assert len({case.name for case in CASES}) == len(CASES)
-    with pytest.raises(InputError, match="nominal_hours = -1"):
+    with pytest.raises(InputError, match=r"nominal_hours = -1.*HM-SCENARIOS-011"):
         MonitorStudy("golf_robot", "m", nominal_hours=-1)
 
 

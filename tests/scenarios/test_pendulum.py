@@ -192,11 +192,11 @@ def test_exact_runs_are_the_plant_s_motion(dt):
 
 
 def test_bad_requests_are_refused():
-    with pytest.raises(InputError, match=r"0\.01 s"):
+    with pytest.raises(InputError, match="HM-SCENARIOS-042"):
         exact_runs("test", 1, dt=0.003)
-    with pytest.raises(InputError, match="train, valid, test"):
+    with pytest.raises(InputError, match="HM-SCENARIOS-043"):
         exact_runs("nominal", 1)
-    with pytest.raises(InputError, match="quick, full"):
+    with pytest.raises(InputError, match=r"quick, full.*HM-SCENARIOS-001"):
         stems("none")
 
 

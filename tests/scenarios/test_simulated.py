@@ -210,7 +210,7 @@ def random_faults(scenario, rng, dt):
 
 
 def test_a_plant_refuses_faults_and_parameters_that_it_does_not_have():
-    with pytest.raises(hm.InputError, match="plant_edge"):
+    with pytest.raises(hm.InputError, match=r"plant_edge.*HM-LOOP-005"):
         two_tanks.TwoTanks().with_faults([hm.Fault(0.0, 1.0, "plant_hole", 2.0)])
     wider = hm.varied(two_tanks.TwoTanks(), [("area", 2.0)])
     assert wider.area == 2 * two_tanks.TwoTanks().area

@@ -86,7 +86,7 @@ def test_bad_parameters_are_refused():
     for change in ({"L": 0.0}, {"stiction": 0.5}, {"eccentric": 1.0}, {"delay": -0.1}, {"J": np.nan}):
         with pytest.raises(InputError, match="disk"):
             DiskParameters(**change)
-    with pytest.raises(InputError, match="sub_step"):
+    with pytest.raises(InputError, match="HM-SCENARIOS-048"):
         DiskPlant(sub_step=0.0)
 
 

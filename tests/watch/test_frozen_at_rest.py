@@ -114,7 +114,7 @@ def test_the_range_can_be_given():
     free = energy(pendulum(), resolution=[STEP], rest_speed=REST, input_range=[2 * LIMIT])
     u, y = pulling(0.1, 0.7)
     assert frozen(u, y, free) == frozen(u, y, monitor())
-    with pytest.raises(InputError, match="input_range needs 1 positive"):
+    with pytest.raises(InputError, match="HM-WATCH-014"):
         energy(pendulum(), input_range=[0.0])
 
 

@@ -162,25 +162,25 @@ def test_calibration_recovers_a_gumbel_quantile():
 
 
 def test_bad_input_speaks():
-    with pytest.raises(InputError, match=r"need 3\.0 min"):
+    with pytest.raises(InputError, match=r"3\.0.*HM-WATCH-021"):
         calibrate([np.ones(100)], 0.02)
-    with pytest.raises(InputError, match="odd"):
+    with pytest.raises(InputError, match="HM-WATCH-011"):
         energy(window=10)
     model = pendulum()
     x, _, u, w, p = step_symbols(model)
-    with pytest.raises(InputError, match="positions"):
+    with pytest.raises(InputError, match="HM-WATCH-016"):
         energy(replace(model, output=ca.Function("o", [x, u, w, p], [x[1]])))
     run = simulate(10)
     monitor = energy(model)
-    with pytest.raises(InputError, match="resample"):
+    with pytest.raises(InputError, match="HM-WATCH-034"):
         replay(monitor, Exact(run), replace(run, t=2 * run.t))
-    with pytest.raises(InputError, match="entries"):
+    with pytest.raises(InputError, match="HM-WATCH-013"):
         monitor.update(
             monitor.initial(), np.zeros(2), np.zeros(1), Estimate(np.zeros(2), np.zeros(0), np.zeros(1))
         )
-    with pytest.raises(InputError, match="release <= threshold"):
+    with pytest.raises(InputError, match="HM-WATCH-002"):
         of_force(1.0, 2.0)
-    with pytest.raises(InputError, match="rest_speed"):
+    with pytest.raises(InputError, match="HM-WATCH-029"):
         energy(model, rest_speed=0.0)
 
 

@@ -101,9 +101,9 @@ def test_bad_input_speaks(folder, noisy_artifact, tmp_path):
     done = command(folder, noisy_artifact, tmp_path / "out", "--calibration", str(tmp_path / "empty.json"))
     assert "holds no limits of energy" in str(done.exception)
     files, scenario = [folder / "pushed.csv"], load_scenario("golf_robot")
-    with pytest.raises(InputError, match="no control problem"):
+    with pytest.raises(InputError, match="HM-WORKFLOW-022"):
         prepared(replace(scenario, control=None), noisy_artifact, files)
-    with pytest.raises(InputError, match=r"resamples to 0\.01 s"):
+    with pytest.raises(InputError, match=r"0\.01.*HM-WORKFLOW-024"):
         prepared(replace(scenario, data=replace(scenario.data, dt=0.01)), noisy_artifact, files)
 
 

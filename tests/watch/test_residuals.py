@@ -176,13 +176,13 @@ def test_what_does_not_fit_is_refused():
     assert "1.5 x the highest nominal level" in limits.method  # for one an hour 3.5 s are too short
     with pytest.raises(
         InputError,
-        match=r"they are of current, current, speed, .* the readings are of residuals: ",
+        match=r"residuals.*HM-WATCH-006",
     ):
         Monitor(ResidualReadings(model), limits)
-    with pytest.raises(InputError, match="resolution needs 1 positive steps"):
+    with pytest.raises(InputError, match="HM-WATCH-031"):
         Monitor(ResidualReadings(model), resolution=[0.0])
     short = recording(make, swing, sigma, 20, 0)
-    with pytest.raises(InputError, match="no nominal stretch is longer than the"):
+    with pytest.raises(InputError, match="HM-WATCH-018"):
         learn_limits(ResidualReadings(dc_motor()), observer(dc_motor(), sigma, step), [short])
     trace = replay(Monitor(ResidualReadings(dc_motor()), limits), observer(dc_motor(), sigma, step), short)
     assert trace.levels.shape == (20, 8)

@@ -40,5 +40,5 @@ def test_finished_networks_are_taken_for_their_own_settings_only(kept):
     folder, settings = kept
     assert is_trained(folder, settings)
     assert not is_trained(folder, replace(settings, kind="mopgrnn"))
-    with pytest.raises(InputError, match=r"prior_replay 2.0 instead of 5.0.*choose another --out"):
+    with pytest.raises(InputError, match=r"prior_replay 2\.0 instead of 5\.0.*HM-WORKFLOW-039"):
         is_trained(folder, replace(settings, prior_replay=5.0))

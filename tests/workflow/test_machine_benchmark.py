@@ -78,7 +78,7 @@ def test_a_file_is_judged_by_all_runs_that_fit_in(machine, made, tmp_path):
     # a run takes 10 given periods, 50 judged ones and a sample at either end: six of them fit into 400 samples
     assert [run.t[0] for run in row.runs] == pytest.approx([1.1 + 6.2 * i for i in range(6)])
     assert {len(run.t) for run in row.runs} == {50}
-    with pytest.raises(InputError, match="repeated runs need a length"):
+    with pytest.raises(InputError, match="HM-MACHINE-026"):
         BenchmarkSpec({}, repeated=True)
 
 
@@ -195,7 +195,7 @@ def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp
     assert 7.0 < values["k"] < 7.75  # the cubic spring counts as at most 3 * 0.5 * 0.7^2 more
     for name in ("phy", "hybrid"):
         assert found.after[name].rmse["s [mm]"] < 0.25 * found.before[name].rmse["s [mm]"]
-    with pytest.raises(InputError, match="longer than it"):
+    with pytest.raises(InputError, match="HM-WORKFLOW-012"):
         benchmark(
             BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=50.0), tmp_path / "no"
         )
@@ -266,7 +266,7 @@ def test_a_folder_whose_pieces_had_other_roles_is_refused(machine, made):
         made[0] / "benchmark.json", note | {"settings": note["settings"] | {"pieces": "of another version"}}
     )
     try:
-        with pytest.raises(InputError, match="pieces differ"):
+        with pytest.raises(InputError, match=r"pieces.*HM-FOLDER-005"):
             benchmark(BenchmarkSettings(str(scenario), (train,)), made[0])
     finally:
         write_document(made[0] / "benchmark.json", note)
@@ -279,3 +279,18 @@ def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
     code, _, told = call("golf_robot", "--data", machine[2], "--out", made[0])
     assert code == 2
     assert "has no benchmark" in told
+
+
+def test_a_scheduler_s_workers_train_the_networks(machine, tmp_path, monkeypatch):
+    """The jobs go to the engine with the scheduler's address; tests of the engine say what it does with them."""
+    scenario, train, test = machine
+    asked = []
+
+    def engine(jobs, on_progress, workers, *, cluster):
+        asked.append((sorted(jobs), cluster))
+        raise InputError("no worker")
+
+    monkeypatch.setattr("hybrid_mpc.workflow.stages.identify.run_jobs", engine)
+    with pytest.raises(InputError, match="no worker"):
+        benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), tmp_path, cluster="tcp://127.0.0.1:9")
+    assert asked == [(["mopgrnn", "pgrnn", "rnn"], "tcp://127.0.0.1:9")]

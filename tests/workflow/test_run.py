@@ -233,5 +233,5 @@ def test_a_benchmark_s_folder_is_told_from_an_artifact(tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / BENCHMARK_NOTE).write_text("{}")
     for folder in (tmp_path, tmp_path / "model"):
-        with pytest.raises(InputError, match="hybrid-mpc benchmark"):
+        with pytest.raises(InputError, match="HM-KIT-037"):
             load(folder)

@@ -202,7 +202,7 @@ def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(s
     assert _watch_words(found)[0].startswith("No alarms here: no rest speeds")
     kit = load(short.out / "model")
     assert kit.rest_speed is None
-    with pytest.raises(InputError, match="holds no limits of energy"):
+    with pytest.raises(InputError, match="HM-WATCH-027"):
         kit.monitor()
 
 

@@ -146,5 +146,5 @@ def test_a_run_stops_where_a_constant_is_better(call, words, checked, tmp_path):
     for text in (checked["wrong torque"].no_gain, checked["wrong torque"].in_doubt[0]):
         assert " ".join(text.split()) in " ".join(told.split())
     assert not list((tmp_path / "run").glob("checkpoints/prior*"))
-    with pytest.raises(InputError, match=r"docs/prior-wrong\.md"):
+    with pytest.raises(InputError, match="HM-WORKFLOW-049"):
         run(settings(words["wrong torque"]), tmp_path / "other")

@@ -182,7 +182,7 @@ def check_data(context: Context) -> None:
     elif context.scenario.make_data is None:
         raise InputError(
             f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
-            f"(once for each file)"
+            f"(once for each file) [HM-WORKFLOW-037]"
         )
 
 
@@ -276,7 +276,7 @@ def stops(found: PriorResult, *, cause: bool = True) -> tuple[str, ...]:
     if not found.no_gain:
         return ()
     why = f". In doubt: {found.in_doubt[0]}" if found.in_doubt and cause else ""
-    return (f"fit of the prior: {found.no_gain}{why}. {REMEDY}",)
+    return (f"fit of the prior: {found.no_gain}{why}. {REMEDY} [HM-WORKFLOW-049]",)
 
 
 def examined_prior(context: Context) -> PriorResult:
@@ -356,17 +356,19 @@ def examined_prior(context: Context) -> PriorResult:
         context.progress.warn(f"{IN_DOUBT}: {doubt}")
     one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
     return PriorResult(
-        fit,
-        make().values,
-        {p.name: p.unit for p in make().parameters},
-        baselines,
-        bounds,
-        in_doubt,
-        errors,
-        "" if follows else no_gain(own, training),
-        {s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)},
-        longest_run,
-        {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
+        fit=fit,
+        nominal=make().values,
+        units={p.name: p.unit for p in make().parameters},
+        baselines=baselines,
+        bounds=bounds,
+        in_doubt=in_doubt,
+        errors=errors,
+        no_gain="" if follows else no_gain(own, training),
+        error_correlation={
+            s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)
+        },
+        longest_run=longest_run,
+        arrays={f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )
 
 
@@ -627,7 +629,7 @@ def is_trained(folder: Path, settings: TrainingSettings) -> bool:
     if changed:
         raise InputError(
             f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
-            "version or scenario; choose another --out"
+            "version or scenario; choose another --out [HM-WORKFLOW-039]"
         )
     return True
 

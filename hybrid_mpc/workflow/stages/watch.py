@@ -85,6 +85,7 @@ class RecordedAlarm:
         if not self.start_s <= self.end_s:
             raise InputError(
                 f"an alarm on {self.file} ends at {self.end_s} s, before it starts at {self.start_s} s"
+                " [HM-WORKFLOW-043]"
             )
 
 
@@ -248,7 +249,7 @@ def watch_stage(context: Context) -> WatchResult | Absent:
             try:
                 limits[kind], sources[kind] = _learned(context, kit, name, kind, rest or kit.known_rest, data)
             except InputError as none:
-                missing.append(f"no limits of {kind} could be learned: {none}")
+                missing.append(f"no limits of {kind} could be learned: {none} [HM-WORKFLOW-044]")
         watch[name] = WatchFile(limits, "; ".join(missing), rest, parts.observer(name))
     write_watch(context.out / "model", watch)
     kit = context.kit
@@ -397,10 +398,17 @@ def _faulted(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
         before, seen = begun(alarms, start)
         loops.append(
             FaultedLoop(
-                case.name, case.title, task.name, start, seen[0].start_s - start if seen else None,
-                seen[0].channels if seen else (), seen[0].diagnosis if seen else "", len(before), tuple(row.switches),
+                fault=case.name,
+                title=case.title,
+                task=task.name,
+                start_s=start,
+                delay_s=seen[0].start_s - start if seen else None,
+                channels=seen[0].channels if seen else (),
+                diagnosis=seen[0].diagnosis if seen else "",
+                false_alarms=len(before),
+                switches=tuple(row.switches),
             )
-        )  # fmt: skip
+        )
         arrays |= trace_arrays(case.name, trace, result.y)
     return replace(found, faults=tuple(loops), arrays=arrays)
 
@@ -414,9 +422,17 @@ def read_trace(arrays: Mapping[str, Any], name: str, found: WatchResult, outputs
     """The trace that :func:`trace_arrays` kept; what the report does not show is empty."""
     own, none = {key: arrays[f"{name}/{key}"] for key in KEPT}, np.zeros((0, 0))
     return Trace(
-        channels=found.channels, outputs=tuple(outputs), terms=none, travel=none, repeats=none.astype(int),
-        inside=none > 0, settled=none > 0, validity=none.astype(int), blind=none > 0, **own,
-    )  # fmt: skip
+        channels=found.channels,
+        outputs=tuple(outputs),
+        terms=none,
+        travel=none,
+        repeats=none.astype(int),
+        inside=none > 0,
+        settled=none > 0,
+        validity=none.astype(int),
+        blind=none > 0,
+        **own,
+    )
 
 
 def clean_alarms(

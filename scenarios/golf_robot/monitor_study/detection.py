@@ -80,7 +80,9 @@ class Detectors:
     def __post_init__(self) -> None:
         known = {part for parts in METHODS.values() for part in parts} - {"freeze"}
         if not set(self.tails) <= known:
-            raise InputError(f"detectors: tails of {sorted(self.tails)}, known are {sorted(known)}")
+            raise InputError(
+                f"detectors: tails of {sorted(self.tails)}, known are {sorted(known)} [HM-SCENARIOS-009]"
+            )
 
     @property
     def block_s(self) -> float:
@@ -200,7 +202,7 @@ def learn_detectors(
     if blocks < needed:
         raise InputError(
             f"learning: {blocks * block_s / 60:.1f} min of nominal loops in whole blocks of {block_s:g} s; a rate "
-            f"of {rate:g}/h, of which a part gets {share:g}, needs {needed * block_s / 60:.1f} min"
+            f"of {rate:g}/h, of which a part gets {share:g}, needs {needed * block_s / 60:.1f} min [HM-SCENARIOS-010]"
         )
     limits = limits_of(
         readings, [trace.travel for trace in traces], [cast(Any, trace) for trace in traces],

@@ -163,10 +163,12 @@ class MonitorStudy:
         }
         numbers |= {"fault_s": self.fault_s, "rates": min(self.rates, default=0.0)}
         if wrong := [f"{k} = {v}" for k, v in numbers.items() if not (math.isfinite(v) and v > 0)]:
-            raise InputError(f"study monitor: positive numbers needed, got {', '.join(wrong)}")
+            raise InputError(
+                f"study monitor: positive numbers needed, got {', '.join(wrong)} [HM-SCENARIOS-011]"
+            )
         if not 0 <= self.guard_seeds <= self.seeds:
             raise InputError(
-                f"study monitor: guard_seeds {self.guard_seeds} must be 0 to {self.seeds}, the seeds"
+                f"study monitor: guard_seeds {self.guard_seeds} must be 0 to {self.seeds}, the seeds [HM-SCENARIOS-012]"
             )
 
     def jobs(self) -> Iterator[MonitorJob]:
@@ -217,7 +219,9 @@ BUDGETS = {
 def monitor_study(model: str, budget: str = "full") -> MonitorStudy:
     """The golf robot's study."""
     if budget not in BUDGETS:
-        raise InputError(f"study monitor: no budget {budget!r}; there are: {', '.join(BUDGETS)}")
+        raise InputError(
+            f"study monitor: no budget {budget!r}; there are: {', '.join(BUDGETS)} [HM-SCENARIOS-013]"
+        )
     chosen: dict[str, Any] = dict(BUDGETS[budget])
     return MonitorStudy("golf_robot", str(model), **chosen)
 

@@ -32,7 +32,7 @@ def method_name(method: str) -> str:
 def delays(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     """Share of faults found up to a delay, one panel a fault; what is missed never comes."""
     if not any(len(values) for row in cases.values() for values in row.values()):
-        raise InputError("plot of delays: there is none")
+        raise InputError("plot of delays: there is none [HM-SCENARIOS-014]")
     figure, panels = _panels(len(cases))
     for ax, (case, row) in zip(panels, cases.items(), strict=False):
         for method, values in row.items():
@@ -60,7 +60,7 @@ def operating_curves(
     """Share of faults found within a second against false alarms an hour, one panel a fault."""
     rates = [r for row in cases.values() for per_hour, _ in row.values() for r in per_hour if r > 0]
     if not rates:
-        raise InputError("plot of operating curves: there is none")
+        raise InputError("plot of operating curves: there is none [HM-SCENARIOS-015]")
     left = min(*rates, wanted) / 2
     figure, panels = _panels(len(cases))
     for ax, (case, row) in zip(panels, cases.items(), strict=False):

@@ -127,6 +127,6 @@ def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Kit
     if failed and not all(path.is_file() for path in paths):
         raise InputError(
             f"{out}: a nominal loop to learn from has failed: {failed[-1].error.strip().splitlines()[-1]}; "
-            "--resume --retry-failed runs it again"
+            "--resume --retry-failed runs it again [HM-SCENARIOS-016]"
         )
     write_json(out / DETECTORS, learn(study, paths, artifact))

@@ -38,7 +38,7 @@ def test_all_runs_and_their_table(here, tmp_path):
     assert results.note.engine == "here"
     for run in study.runs():
         assert results.table.set_index("id").loc[run.id, "cost"] == trivial_runs.trivial(run)["cost"]
-    with pytest.raises(InputError, match="--resume"):
+    with pytest.raises(InputError, match="HM-FOLDER-004"):
         run_study(study, tmp_path / "s")
     again = run_study(study, tmp_path / "s", resume=True)
     assert len(again.table) == 100
@@ -83,12 +83,12 @@ def test_batches_grow_with_the_workers(workers, size):
 def test_the_folder_of_another_study(here, tmp_path):
     here(trivial_runs.trivial)
     run_study(trivial_runs.study(3), tmp_path / "s")
-    with pytest.raises(InputError, match=r"holds a study with other settings \(seeds differ\)"):
+    with pytest.raises(InputError, match=r"study.*seeds.*HM-FOLDER-005"):
         run_study(trivial_runs.study(4), tmp_path / "s", resume=True)
     path = tmp_path / "s" / "study.json"
     note = read_document(path)
     write_document(path, note | {"settings": note["settings"] | {"the content of model model": "1"}})
-    with pytest.raises(InputError, match="content of model model"):
+    with pytest.raises(InputError, match="HM-FOLDER-005"):
         run_study(trivial_runs.study(3), tmp_path / "s", resume=True)
     machine = tmp_path / "machine.py"
     machine.write_text("from scenarios.golf_robot import scenario\n")
@@ -96,15 +96,15 @@ def test_the_folder_of_another_study(here, tmp_path):
     run_study(own, tmp_path / "own")
     run_study(replace(own, name="another name"), tmp_path / "own", resume=True)
     machine.write_text("from scenarios.golf_robot import scenario  # another\n")
-    with pytest.raises(InputError, match="content of the scenario's file"):
+    with pytest.raises(InputError, match=r"content of the scenario's file.*HM-FOLDER-005"):
         run_study(own, tmp_path / "own", resume=True)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(InputError, match="something else"):
+    with pytest.raises(InputError, match="HM-FOLDER-002"):
         run_study(trivial_runs.study(3), tmp_path / "mine")
-    with pytest.raises(InputError, match="no study to resume"):
+    with pytest.raises(InputError, match=r"study.*HM-FOLDER-003"):
         run_study(trivial_runs.study(3), tmp_path / "none", resume=True)
-    with pytest.raises(InputError, match="no study"):
+    with pytest.raises(InputError, match="HM-COMPARE-043"):
         StudyResults.load(tmp_path / "mine")
 
 
@@ -121,7 +121,7 @@ def test_a_full_disk_stops_the_study_and_it_goes_on_later(here, tmp_path, monkey
         real(file)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match="No space left"):
+    with pytest.raises(InputError, match=r"No space left.*HM-COMPARE-045"):
         run_study(trivial_runs.study(40), tmp_path / "s")
     monkeypatch.setattr(os, "fsync", real)
     kept = values(tmp_path / "s")

@@ -173,7 +173,7 @@ def test_results_of_another_schema_are_refused(finished, tmp_path):
     path = Path(tmp_path) / "results.json"
     results = json.loads((finished / "results.json").read_text())
     for change, word in (
-        ({"schema": "other"}, "no results"),
+        ({"schema": "other"}, "HM-SCENARIOS-022"),
         ({"schema_version": SCHEMA_VERSION + 1}, "version"),
     ):
         path.write_text(json.dumps(results | change))
