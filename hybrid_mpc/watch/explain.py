@@ -79,8 +79,8 @@ def begun(alarms: Sequence[Alarm], start: float) -> tuple[list[Alarm], list[Alar
 
 
 def table(trace: Trace, y: Array, outputs: Sequence[Signal], monitor: Monitor) -> str:
-    """The trace as CSV, one row for each sample: measurements ``y`` ``(n, n_y)``, values of the channels with units, levels of
-    their limits, alarms.
+    """The trace as CSV, one row for each sample: measurements ``y`` ``(n, n_y)``, values of the channels with units,
+    levels of their limits, alarms.
     """
     columns: dict[str, Any] = {"t_s": trace.t}
     columns |= {f"{s.name}_{s.unit}": y[:, i] for i, s in enumerate(outputs)}
