@@ -130,7 +130,8 @@ def files(results: dict[str, Any]) -> list[str]:
 
 def rest(results: dict[str, Any]) -> list[str]:
     """Export, timing and monitor in a line each."""
-    export, timing, monitor = results["export"], results["timing"], results["monitor"]
+    export, timing = results["export"], results["timing"]
+    monitor = results.get("watch") or results["monitor"]
     gap = results["control"]["gap_closed"]
     ms, clean = timing["controller_step_ms"], monitor["details"]["clean"]
     return [

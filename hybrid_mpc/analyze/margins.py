@@ -438,16 +438,16 @@ class LinearLoop:
         disk, _, _ = control.disk_margins(broken, omega, skew=0.0)
         size = min(float(disk), 2.0)
         return Margins(
-            float(min((k for k in gains if k > 1), default=np.inf)),
-            float(max((k for k in gains if k < 1), default=0.0)),
-            float(np.abs(phases).min(initial=np.inf)),
-            float(min(delays, default=np.inf)),
-            self._delay_periods(input),
-            float(at.max()) if at.size else float("nan"),
-            float(np.abs(1 + g).min()),
-            float(disk),
-            (1 + size / 2) / (1 - size / 2) if size < 2 else float("inf"),
-            2 * float(np.arctan(size / 2)),
+            gain_up=float(min((k for k in gains if k > 1), default=np.inf)),
+            gain_down=float(max((k for k in gains if k < 1), default=0.0)),
+            phase=float(np.abs(phases).min(initial=np.inf)),
+            delay=float(min(delays, default=np.inf)),
+            delay_periods=self._delay_periods(input),
+            crossover=float(at.max()) if at.size else float("nan"),
+            modulus=float(np.abs(1 + g).min()),
+            disk=float(disk),
+            disk_gain=(1 + size / 2) / (1 - size / 2) if size < 2 else float("inf"),
+            disk_phase=2 * float(np.arctan(size / 2)),
         )
 
     def _delay_periods(self, input: int) -> int:

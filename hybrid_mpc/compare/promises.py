@@ -554,7 +554,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
         return Promise(
             name, "not promised", f"{'; '.join(lacks)}; {within}",
             "Weight at most as many outputs as there are inputs, and declare as many disturbances as outputs "
-            "(docs/mpc.md#set-points).",
+            "(docs/disturbances.md).",
         )  # fmt: skip
     if worst.why:
         return Promise(name, "doubted", within, remedy_of(worst.why))
@@ -574,7 +574,7 @@ def remedy_of(why: str) -> str:
     if "weight r" in why:
         return "Set r = 0."
     if "friction" in why:
-        return "Model the friction in the prior (docs/control.md#loads-and-stiction), or reduce it in the machine."
+        return "Model the friction in the prior (docs/disturbances.md#dry-friction), or reduce it in the machine."
     return (
         "Declare a disturbance where the error enters (Scenario(disturbance_model=...)). Look at friction, and at the "
         "task's loops in the report."

@@ -303,10 +303,24 @@ hybrid, hybrid_observer, oracle, oracle_state
             for draw, (parameters, some, late) in enumerate(drawn):
                 for seed in self.loop_seeds:
                     yield LoopSpec(
-                        self.scenario, model, task, controller, solver, horizon, monitor,
-                        faults, some, late, parameters, draw, seed, self.duration, self.guard, self.run_seed,
+                        scenario=self.scenario,
+                        model=model,
+                        task=task,
+                        controller=controller,
+                        solver=solver,
+                        horizon=horizon,
+                        monitor=monitor,
+                        faults=faults,
+                        drawn_faults=some,
+                        late=late,
+                        parameters=parameters,
+                        draw=draw,
+                        seed=seed,
+                        duration=self.duration,
+                        guard=self.guard,
+                        run_seed=self.run_seed,
                         number=next(number),
-                    )  # fmt: skip
+                    )
 
     def identity(self) -> dict[str, Any]:
         """The study as plain data, without the folders of its models."""

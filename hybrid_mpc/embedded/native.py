@@ -133,11 +133,20 @@ class NativeController(SplitController):
         z, plan, n_x = view["plan_z"][:, : m.n_x + m.n_h].copy(), view["plan_u"].copy(), m.n_x
         n_w, d = m.n_w, estimate.d if status.ok else prepared.previous.d
         return Solution(
-            plan, z[:, :n_x], z[:, n_x:], d, float(view["cost"][0]), status, float(view["kkt"][0]),
-            float(view["defect"][0]), {"prepare": prepared.milliseconds, "feedback": spent},
-            float(view["excess"][0]), w=view["plan_w"][:, :n_w].copy(),
-            steady=self._steady() if status.ok else prepared.previous.steady, given_way=self._given_way(),
-        )  # fmt: skip
+            u=plan,
+            x=z[:, :n_x],
+            h=z[:, n_x:],
+            d=d,
+            cost=float(view["cost"][0]),
+            status=status,
+            kkt=float(view["kkt"][0]),
+            defect=float(view["defect"][0]),
+            timing={"prepare": prepared.milliseconds, "feedback": spent},
+            excess=float(view["excess"][0]),
+            w=view["plan_w"][:, :n_w].copy(),
+            steady=self._steady() if status.ok else prepared.previous.steady,
+            given_way=self._given_way(),
+        )
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,

@@ -308,9 +308,19 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
         for point in ((x, xdot), (x_hat[:n], xdot_hat))
     )
     return FreeRun(
-        trajectory.name, trajectory.t[part], u, x, x_hat[:n], trajectory.y[part], y_hat, xdot, xdot_hat,
-        measured, model, w,
-    )  # fmt: skip
+        name=trajectory.name,
+        t=trajectory.t[part],
+        u=u,
+        x=x,
+        x_hat=x_hat[:n],
+        y=trajectory.y[part],
+        y_hat=y_hat,
+        xdot=xdot,
+        xdot_hat=xdot_hat,
+        balances=measured,
+        balances_hat=model,
+        w=w,
+    )
 
 
 def measured_as(prior: Prior, y: Array) -> Array:

@@ -259,10 +259,19 @@ def fit_prior(
         warnings += late_inputs(fit, chosen.theta, guesses, periods, sizes, first_states)
     on_progress(total, total, "done")
     return PriorFit(
-        fit.values(chosen.theta), standard_errors(fit, chosen), warnings, stages,
-        correlations(fit, chosen), fit.delay(chosen.theta), smoother.sigma, smoother.walk, smoother.sizes,
-        smoother.fading, smoother.substeps, chosen.unidentified,
-    )  # fmt: skip
+        values=fit.values(chosen.theta),
+        standard_errors=standard_errors(fit, chosen),
+        warnings=warnings,
+        stages=stages,
+        correlations=correlations(fit, chosen),
+        delay=fit.delay(chosen.theta),
+        sigma=smoother.sigma,
+        walk=smoother.walk,
+        sizes=smoother.sizes,
+        fading=smoother.fading,
+        substeps=smoother.substeps,
+        unidentified=chosen.unidentified,
+    )
 
 
 def refit(

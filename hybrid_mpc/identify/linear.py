@@ -765,9 +765,24 @@ def _model(
     spread: Array, tried: tuple[int, int, int], doubts: tuple[str, ...],
 ) -> LinearModel:  # fmt: skip
     return LinearModel(
-        name, float(dt), a, b, c, d, k, bias, noise, spread, data.u_centre, data.u_scale, data.y_centre, data.y_scale,
-        Candidate(*tried, math.nan, _radius(a)), (), doubts,
-    )  # fmt: skip
+        name=name,
+        dt=float(dt),
+        A=a,
+        B=b,
+        C=c,
+        D=d,
+        K=k,
+        bias=bias,
+        noise=noise,
+        spread=spread,
+        u_centre=data.u_centre,
+        u_scale=data.u_scale,
+        y_centre=data.y_centre,
+        y_scale=data.y_scale,
+        chosen=Candidate(*tried, math.nan, _radius(a)),
+        candidates=(),
+        warnings=doubts,
+    )
 
 
 def _error(model: LinearModel, recordings: Sequence[Measured], warm: int) -> float:

@@ -93,9 +93,9 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     """Free run and one-step predictions of a recording, with bands.
 
     The first ``warm_up`` seconds of the recording give the first state, smoothed by the fitted prior, and the networks'
-    memory; they are not predicted. The free run's band is the one that validation calibrated (docs/choice.md); it grows
-    on beyond the longest run that it was calibrated on, where nobody has tried it. One-step predictions are those of
-    ``kit.observer(model)``; their band is what its own covariance says, not calibrated.
+    memory; they are not predicted. The free run's band is the one that validation calibrated (docs/predict.md); it
+    grows on beyond the longest run that it was calibrated on, where nobody has tried it. One-step predictions are those
+    of ``kit.observer(model)``; their band is what its own covariance says, not calibrated.
 
     Args:
         kit: A loaded artifact.

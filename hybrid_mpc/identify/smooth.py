@@ -165,11 +165,19 @@ class Smoother:
         exact = SLACK * quiet * math.sqrt(seconds) * np.array(sizes.x)
         walk = np.maximum(self.walk, QUIETEST * QUIETEST * rate)
         return Horizon(
-            self.prior.equations, self.prior.corrected, self.prior.p, self.dt,
-            self.substeps or required_substeps(self.prior, self.dt), self.fading, np.array(self.sigma),
-            np.concatenate([exact, walk]), self._ignorance(np.array(self.walk)), np.concatenate([sizes.x, rate]),
-            np.concatenate([low, -unknown]), np.concatenate([high, unknown]),
-        )  # fmt: skip
+            equations=self.prior.equations,
+            corrected=self.prior.corrected,
+            p=self.prior.p,
+            dt=self.dt,
+            substeps=self.substeps or required_substeps(self.prior, self.dt),
+            fading=self.fading,
+            sigma=np.array(self.sigma),
+            process=np.concatenate([exact, walk]),
+            spread=self._ignorance(np.array(self.walk)),
+            size=np.concatenate([sizes.x, rate]),
+            lower=np.concatenate([low, -unknown]),
+            upper=np.concatenate([high, unknown]),
+        )
 
     def _ignorance(self, walk: Array) -> Array:
         """Standard deviations ``(..., n_z)`` of the first ``(x, d)``, by the walk ``(..., n_d)``."""

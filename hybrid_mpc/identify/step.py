@@ -361,15 +361,15 @@ class HybridStep(RecurrentStep):
         uncut = residual[:, : residual.shape[1] // SPAN * SPAN] if residual.shape[1] >= SPAN else residual
         averaged = uncut.unflatten(1, (-1, min(SPAN, uncut.shape[1]))).mean(2).reshape(-1, len(rows))
         return Scaling(
-            spread(x),
-            spread(u),
-            rms(predicted),
-            rms(averaged),
-            spread(w),
-            mean(x),
-            mean(u),
-            mean(w),
-            spread(((windows.x[:, 1:] - windows.x[:, :-1]) / dt).flatten(0, 1)),
+            x=spread(x),
+            u=spread(u),
+            rate=rms(predicted),
+            correction=rms(averaged),
+            w=spread(w),
+            centre_x=mean(x),
+            centre_u=mean(u),
+            centre_w=mean(w),
+            xdot=spread(((windows.x[:, 1:] - windows.x[:, :-1]) / dt).flatten(0, 1)),
         )
 
     def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:

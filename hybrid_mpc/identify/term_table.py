@@ -17,22 +17,19 @@ from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter, Signal
 
-AXIS, ENDS = (
-    "axes: states whose position is a state, too",
-    "axes of a `MechanicalPrior` that do not turn round",
-)
+AXIS, ENDS = "axes", "axes of a `MechanicalPrior` that do not turn fully"
 TURNING = "turning axes of a `MechanicalPrior`"
-OTHER = "rates of other states, if a network may correct them"
+OTHER = "other rates"
 INPUT, BOTH = "inputs that change", "inputs of both signs"
 GROUPS: Mapping[str, Mapping[str, str]] = {
     "Axes": {
         "coulomb": AXIS, "asymmetric": AXIS, "viscous": AXIS, "viscous_by_direction": AXIS, "quadratic": AXIS,
-        "stribeck": AXIS, "loaded": AXIS, "coulomb_by_position": AXIS, "offset": "axes, and rates of other states",
+        "stribeck": AXIS, "loaded": AXIS, "coulomb_by_position": AXIS, "offset": "axes, other rates",
         "gravity_error": TURNING, "cogging": TURNING, "spring": ENDS, "elastic_end": ENDS,
     },
     "Processes": {
-        "loss": f"{OTHER}, no angles", "storage": f"{OTHER}, no angles", "radiation": "temperatures",
-        "overflow": "states that are never negative, no temperatures", "coupling": OTHER, "product": OTHER,
+        "loss": f"{OTHER}, not of angles", "storage": f"{OTHER}, not of angles", "radiation": "temperatures",
+        "overflow": "states that are never negative, not temperatures", "coupling": OTHER, "product": OTHER,
     },
     "Inputs": {
         "input_gain": INPUT, "input_offset": INPUT, "input_curve": INPUT, "saturation": INPUT, "input_lag": INPUT,
@@ -49,14 +46,23 @@ UNITS = 3
 """Units of a parameter that a cell shows at most."""
 HEAD = """# Terms
 
-The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search to some of them, and
-`hm.terms.LAW(...)` makes one for a prior of your own ([machines](machines.md)).
+The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search to some of them.
+`hm.terms.LAW(...)` makes one for a prior of your own
+([mechanical machines and terms](mechanical-priors.md#friction-and-other-terms)).
 
-Units are those of examples: an axis that turns (rad) or slides (m), a level in m, a temperature in degC, inputs in V.
-Angles have no unit within a term. Symbols: v speed, q its position, x state, u input, w measured disturbance, y output,
-s state of the term itself. A potential acts as the force `-dV/dq`. Bounds and scales follow from the recordings.
+| symbol | meaning |
+| --- | --- |
+| `q`, `v` | position and its speed |
+| `x`, `u`, `w`, `y` | state, input, measured disturbance, output |
+| `s` | state of the term itself |
 
-This page is made from the code: `python -m hybrid_mpc.identify.term_table > docs/terms.md`.
+An *axis* is a pair of states, a position and its speed. *Other rates* are those of other states that a network may
+correct. A potential acts as the force `-dV/dq`. Bounds and scales of the parameters follow from the recordings.
+
+The units are examples: a turning axis (rad), a sliding axis (m), a level (m), a temperature (degC), inputs in V. Angles
+have no unit within a term.
+
+This page is generated: `python -m hybrid_mpc.identify.term_table > docs/terms.md`.
 """
 
 

@@ -141,7 +141,9 @@ class OutputWindows:
             np.concatenate([v] * n) for v in (self.y, self.u, self.w, self.x, self.censored, self.known)
         )
         group = np.concatenate([self.group + i * (self.group.max() + 1) for i in range(n)])
-        return OutputWindows(y, u, w, x, censored, self.lead, known, group, self.warm)
+        return OutputWindows(
+            y=y, u=u, w=w, x=x, censored=censored, lead=self.lead, known=known, group=group, warm=self.warm
+        )
 
 
 def cut_outputs(
@@ -208,9 +210,9 @@ def cut_outputs(
                 there = np.isfinite(y[:, 0, i])
                 known[there, j], guesses[there, j] = True, y[there, 0, i]
     return OutputWindows(
-        y, cut("u", lead), cut("w", 0), guesses,
-        cut("censored", 0), lead, known, group,
-        min(first.samples(trajectories[0].dt), periods - 1),
+        y=y, u=cut("u", lead), w=cut("w", 0), x=guesses,
+        censored=cut("censored", 0), lead=lead, known=known, group=group,
+        warm=min(first.samples(trajectories[0].dt), periods - 1),
     )  # fmt: skip
 
 

@@ -252,10 +252,18 @@ def load(folder: str | Path) -> Kit:
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
     return Kit(
-        models, parts.watch, found.provenance, found.model.input_delay, parts.loop,
-        found.recommended or (HYBRID if HYBRID in models else found.models[0]),
-        members, found.predicting, found.programs_sha256, read_promises(folder), parts.lacks,
-    )  # fmt: skip
+        models=models,
+        watch=parts.watch,
+        provenance=found.provenance,
+        input_delay=found.model.input_delay,
+        loop=parts.loop,
+        recommended=found.recommended or (HYBRID if HYBRID in models else found.models[0]),
+        members=members,
+        predicting=found.predicting,
+        programs_sha256=found.programs_sha256,
+        promised=read_promises(folder),
+        lacks=parts.lacks,
+    )
 
 
 def _named(name: object, what: str) -> str:

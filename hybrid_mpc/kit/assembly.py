@@ -20,7 +20,7 @@ from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
-from hybrid_mpc.estimate.tuning import FOUND, load_left, most_likely
+from hybrid_mpc.estimate.tuning import FOUND, choose_most_likely, remaining_load
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 from hybrid_mpc.records import known
@@ -176,7 +176,7 @@ def tuned_noise(
     def filter_of(scale: float) -> Filter:
         return make_estimator(model, scenario, scaled(scale), observer=observer)
 
-    return scaled(most_likely(filter_of, parts, SCALES))
+    return scaled(choose_most_likely(filter_of, parts, SCALES))
 
 
 def make_estimator(
@@ -245,7 +245,7 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Arr
     the states' ``sizes`` ``(n_x,)``, where rounding dominates.
     """
     model, sigma = modes[0].model, np.sqrt(modes[0].noise[0])
-    left = np.array([load_left(one, periods) for one in modes])
+    left = np.array([remaining_load(one, periods) for one in modes])
     drowned = bool(np.any(sigma[: model.n_x] > sizes))
     unsettled = np.all(np.isnan(left), axis=0)
     lost = np.flatnonzero(~np.any(left <= FOUND, axis=0) & (drowned | ~unsettled))
@@ -271,7 +271,7 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: in
     """
     shares = np.full(n_d, QUIET_SHARE)
     for _ in range(MOST_DOUBLED):
-        slow = load_left(filter_of(shares), periods) > FOUND
+        slow = remaining_load(filter_of(shares), periods) > FOUND
         if not slow.any():
             break
         shares = np.where(slow, 2.0 * shares, shares)

@@ -90,9 +90,19 @@ class OldDetector:
             )
         far = tuple(FROZEN_STEPS * step for step in sensor_steps(sensor_sigma)) or (math.inf,) * n_q
         return WatchLimits(
-            ENERGY, self.dt, tuple(channels), far, (0,) * n_q, self.false_alarms_per_hour, self.hours, self.method,
-            True, self.rest_speed, self.data_hash, self.time_unit,
-        )  # fmt: skip
+            kind=ENERGY,
+            dt=self.dt,
+            channels=tuple(channels),
+            travel=far,
+            repeats=(0,) * n_q,
+            false_alarms_per_hour=self.false_alarms_per_hour,
+            hours=self.hours,
+            method=self.method,
+            rated=True,
+            rest_speed=self.rest_speed,
+            data_hash=self.data_hash,
+            time_unit=self.time_unit,
+        )
 
 
 @dataclass(frozen=True)
@@ -140,9 +150,17 @@ class OldResidualLimits:
             for length, most, least in zip(lengths, tops, ends, strict=True)
         )
         return WatchLimits(
-            RESIDUALS, self.dt, channels, self.travel, self.repeats, self.false_alarms_per_hour, self.hours,
-            self.method, self.rated, time_unit=info.time_unit,
-        )  # fmt: skip
+            kind=RESIDUALS,
+            dt=self.dt,
+            channels=channels,
+            travel=self.travel,
+            repeats=self.repeats,
+            false_alarms_per_hour=self.false_alarms_per_hour,
+            hours=self.hours,
+            method=self.method,
+            rated=self.rated,
+            time_unit=info.time_unit,
+        )
 
 
 @dataclass(frozen=True)
@@ -314,9 +332,17 @@ def _split(folder: Path) -> OldDescription:
         m: own for m, own in channels.limits.items() if channels.of.get(m, "") in ("", parts.observer(m))
     }
     return OldDescription(
-        known.models, known.programs_sha256, known.model, calibration, known.provenance, loop, known.recommended,
-        residuals, known.members, known.predicting,
-    )  # fmt: skip
+        models=known.models,
+        programs_sha256=known.programs_sha256,
+        model=known.model,
+        calibration=calibration,
+        provenance=known.provenance,
+        loop=loop,
+        recommended=known.recommended,
+        residuals=residuals,
+        members=known.members,
+        predicting=known.predicting,
+    )
 
 
 def _read(folder: Path, file: str, kind: type[R]) -> R | None:

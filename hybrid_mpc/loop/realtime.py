@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.problem import Controller, Status
-from hybrid_mpc.control.safeguard import Decision, SafeController, checked_safe_input
+from hybrid_mpc.control.safeguard import Decision, SafeController, check_safe_input
 from hybrid_mpc.errors import InputError, SafeInputError
 from hybrid_mpc.estimate.delay import sees_truth
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
@@ -69,7 +69,7 @@ class Runner:
     or by a signal (Ctrl-C, SIGTERM, SIGHUP, ...), the safe input is applied first (:class:`SafeEnd`); then the
     exception is raised, or the signal takes effect. Only Python's main thread receives signals: in another thread,
     end a run by ``stop``. Events that no program can catch (SIGKILL, a hanging driver, a power failure) need a
-    watchdog in the actuator; ``docs/control.md`` shows one. A signal may interrupt ``actuate``, which is then called
+    watchdog in the actuator; ``docs/watchdog.md`` shows one. A signal may interrupt ``actuate``, which is then called
     with the safe input.
 
     Without a delay, an input is assumed to act from the grid's time on: steps must be short compared with the period,
@@ -102,7 +102,7 @@ class Runner:
         InputError: If models, deadline, safe input, delays or ``keep`` are invalid, no safe input is declared, the
             monitor has no limits, or the estimator needs the truth.
 
-    Example: see ``docs/control.md``; in short::
+    Example: see ``docs/hardware.md``; in short::
 
         runner = Runner(read_encoder, set_torque, ekf, controller, task.reference, weight=task.weight)
         print(runner.run(duration=6.0).percentiles())
@@ -171,7 +171,7 @@ class Runner:
                 "safe_input=[...], or Scenario(safe_input=...). There is no default, since zero is not safe for every "
                 "machine [HM-LOOP-036]"
             )
-        self._safe_input = checked_safe_input(declared, loop.ocp)
+        self._safe_input = check_safe_input(declared, loop.ocp)
 
     @property
     def safe_input(self) -> Array:
@@ -272,9 +272,16 @@ class _Run:
         loop.finish()
         spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
         step = RunnerStep(
-            self.k, self.k * self._dt, loop.state.y, loop.estimate, loop.decision, loop.reading, begin - due,
-            acted - due, spent,
-        )  # fmt: skip
+            k=self.k,
+            t=self.k * self._dt,
+            y=loop.state.y,
+            estimate=loop.estimate,
+            decision=loop.decision,
+            reading=loop.reading,
+            lateness=begin - due,
+            applied=acted - due,
+            spent=spent,
+        )
         self._count(step)
         if self._runner._on_step is not None:
             self._runner._on_step(step)

@@ -150,7 +150,17 @@ def simulate(
     standing = loop.standing
     acting = Previews(reference, weight, ocp, dt, periods * dt, standing) if input_delay else None
     rest = vector(x0, ocp.n_x, "x0")
-    machine = SimulatedMachine(plant, rest, seed, outputs, inputs, faults, dt, sensor_delay, input_delay)
+    machine = SimulatedMachine(
+        plant=plant,
+        x0=rest,
+        seed=seed,
+        outputs=outputs,
+        inputs=inputs,
+        faults=faults,
+        dt=dt,
+        sensor_delay=sensor_delay,
+        input_delay=input_delay,
+    )
     rows: list[_Row] = []
     for k in range(periods):
         t = k * dt
@@ -281,10 +291,26 @@ COLUMNS = _Row._fields[:11]
 def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, float]) -> _Row:
     e, d = step.estimate, step.decision
     return _Row(
-        step.t, step.x, step.y, d.u, e.x, e.h, e.d, goal.x, stage, e.innovation, e.nis, d.source.name,
-        d.status.name, step.reading, spent, w, goal.y, goal.reached,
-        d.solution.given_way,
-    )  # fmt: skip
+        t=step.t,
+        x=step.x,
+        y=step.y,
+        u=d.u,
+        x_hat=e.x,
+        h=e.h,
+        d=e.d,
+        reference=goal.x,
+        stage_cost=stage,
+        innovation=e.innovation,
+        nis=e.nis,
+        source=d.source.name,
+        status=d.status.name,
+        reading=step.reading,
+        spent=spent,
+        w=w,
+        y_ref=goal.y,
+        reached=goal.reached,
+        given_way=d.solution.given_way,
+    )
 
 
 def _checked_cost(ocp: OCP, cost: OCP) -> OCP:

@@ -28,6 +28,8 @@ Place: TypeAlias = Literal["force", "potential", "rate", "input", "disturbance",
 PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "disturbance", "output")
 REPLACED: tuple[Place, ...] = ("input", "disturbance", "output")
 """Places whose signal a term replaces."""
+LEAST_SHARE = 1e-4
+"""Square of the distance from a reference, over its scale, that keeps a loss' slope finite where both are equal."""
 Option: TypeAlias = Signal | tuple[float, ...] | bool | float | str
 
 
@@ -275,7 +277,17 @@ def _expressions(
     def at(own: Any, term: Term, position: Any = None, driven: Any = 0.0, resting: Any = 0.0) -> At:
         x_named, u_named, w_named = (named(prior.names_of(k), ca.vertsplit(v)) for k, v in parts.items())
         p_named = named(prior.names_of("p"), ca.vertsplit(of_base))
-        return At(x_named, u_named, w_named, own, position, driven, resting, states.get(term), p_named)
+        return At(
+            x=x_named,
+            u=u_named,
+            w=w_named,
+            own=own,
+            position=position,
+            driven=driven,
+            resting=resting,
+            state=states.get(term),
+            p=p_named,
+        )
 
     def applied(term: Term, point: At) -> Any:
         value = term.law(point, given[term])
@@ -468,7 +480,7 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
     state = None if term.state is None else ca.SX.sym(term.state.name)
     if term.state is not None:
         inputs.append((state, term.state.unit))
-    point = At(x, u, w, own, position, driven, resting, state, p)
+    point = At(x=x, u=u, w=w, own=own, position=position, driven=driven, resting=resting, state=state, p=p)
     value = _uneven(term).law(point, named(term.names, given))
     parts = [(value, wanted)]
     if term.state is not None:
@@ -530,7 +542,18 @@ def _added(
     if state is not None:
         options["state"] = state
     made = Made(maker, of, parameters, {**options, **({"place": place} if by_rate else {})})
-    return Term(f"{title} of {of}", place, of, parameters, law, text, loss, state, EXPLANATIONS[maker], made)
+    return Term(
+        name=f"{title} of {of}",
+        place=place,
+        of=of,
+        parameters=parameters,
+        law=law,
+        text=text,
+        loss=loss,
+        state=state,
+        explanation=EXPLANATIONS[maker],
+        made=made,
+    )
 
 
 # Friction: against the motion of one axis.
@@ -548,9 +571,16 @@ def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") 
         place: ``"rate"`` for a prior that is not mechanical.
     """
     return _added(
-        "coulomb", "Coulomb friction", place, of, (level,), lambda at, p: -p[0] * _sign(at.own, width),
-        f"-{level.name} sign({of})", loss=True, width=width,
-    )  # fmt: skip
+        "coulomb",
+        "Coulomb friction",
+        place,
+        of,
+        (level,),
+        lambda at, p: -p[0] * _sign(at.own, width),
+        f"-{level.name} sign({of})",
+        loss=True,
+        width=width,
+    )
 
 
 def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force") -> Term:
@@ -723,27 +753,31 @@ def _power(x: str, exponent: float) -> str:
     return f"{x} |{x.removeprefix('(').removesuffix(')')}|{more}"
 
 
-def loss(of: str, k: Parameter, *, exponent: float, reference: str | float = 0.0) -> Term:
-    """A loss to what surrounds it: ``-k sign(x - r) |x - r|^exponent``.
+def loss(of: str, k: Parameter, n: Parameter, *, scale: float, reference: str | float = 0.0) -> Term:
+    """A loss to what surrounds it: ``-k (x - r) |(x - r) / scale|^(n - 1)``.
 
-    ``exponent`` is 1 for conduction, 1.25 for free convection, 0.5 for an outlet. ``reference`` is the state or
-    measured disturbance of the same unit on the other side, or a number.
+    Args:
+        of: State.
+        k: Loss rate [1/s] where the state is ``scale`` away from the reference.
+        n: Exponent: 1 for conduction, 1.25 to 1.33 for free convection, 0.5 for an outlet.
+        scale: Distance from the reference [unit of the state], that of the recordings.
+        reference: The state or measured disturbance of the same unit on the other side, or a number.
 
-    Source: Incropera, DeWitt, *Fundamentals of Heat and Mass Transfer*, 6th edition (2007), section 9.3, for 1.25.
+    Source: Incropera, DeWitt, *Fundamentals of Heat and Mass Transfer*, 6th edition (2007), section 9.3, for free
+    convection.
     """
 
     def law(at: At, p: Any) -> Any:
-        other = reference if not isinstance(reference, str) else _signal(at, reference)
-        far = at.own - other
-        if exponent == 1.0:
-            return -p[0] * far
-        # finite slope where both are equal
-        return -p[0] * far * (far * far + 1e-4) ** (0.5 * (exponent - 1.0))
+        far = at.own - (_signal(at, reference) if isinstance(reference, str) else reference)
+        share = far / scale
+        return -p[0] * far * (share * share + LEAST_SHARE) ** (0.5 * (p[1] - 1.0))
 
     to = reference if isinstance(reference, str) else f"{reference:.3g}"
+    far_off = _from(of, to)
     return _added(
-        "loss", f"loss to {to} by {exponent:g}", "rate", of, (k,), law, f"-{k.name} {_power(_from(of, to), exponent)}",
-        exponent=exponent, reference=reference,
+        "loss", f"loss to {to}", "rate", of, (k, n), law,
+        f"-{k.name} {far_off} |{far_off} / {scale:.3g}|^({n.name} - 1)",
+        scale=scale, reference=reference,
     )  # fmt: skip
 
 
@@ -765,12 +799,12 @@ def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:
     )  # fmt: skip
 
 
-def overflow(of: str, k: Parameter, *, edge: float, width: float) -> Term:
+def overflow(of: str, k: Parameter, edge: Parameter, *, width: float) -> Term:
     """What runs over an edge: ``-k max(x - edge, 0)``, smooth over ``width``."""
     return _added(
-        "overflow", f"overflow at {edge:.3g}", "rate", of, (k,),
-        lambda at, p: -0.5 * p[0] * (at.own - edge + ca.sqrt((at.own - edge) ** 2 + width**2)),
-        f"-{k.name} max({of} - {edge:.3g}, 0)", loss=True, edge=edge, width=width,
+        "overflow", "overflow", "rate", of, (k, edge),
+        lambda at, p: -0.5 * p[0] * (at.own - p[1] + ca.sqrt((at.own - p[1]) ** 2 + width**2)),
+        f"-{k.name} max({of} - {edge.name}, 0)", loss=True, width=width,
     )  # fmt: skip
 
 
@@ -953,29 +987,29 @@ BY_RATE = frozenset({
 })  # fmt: skip
 """Laws that take ``place="rate"``."""
 EXPLANATIONS: Mapping[str, str] = {
-    "coulomb": "Dry friction: constant, against the motion.",
+    "coulomb": "Constant dry friction against the motion.",
     "asymmetric": "Dry friction is larger in one direction than in the other.",
     "viscous": "Friction proportional to the speed.",
     "viscous_by_direction": "Friction proportional to the speed is larger in one direction than in the other.",
     "quadratic": "Drag proportional to the square of the speed, as in air.",
     "stribeck": "Dry friction is larger near rest than in motion.",
     "loaded": "Dry friction grows with the load of a gear or bearing.",
-    "coulomb_by_position": "Dry friction changes along the way.",
+    "coulomb_by_position": "Dry friction depends on the position.",
     "offset": "A constant force or rate acts all the time.",
     "gravity_error": "The weight, its lever arm or its angle differs from the prior's.",
-    "cogging": "A torque periodic in the position: magnets on teeth, or a shaft that is not round.",
+    "cogging": "A torque is periodic in the position: cogging, or a shaft that is not round.",
     "spring": "A spring, such as a cable or hose, pulls towards one position.",
-    "elastic_end": "An elastic stop acts near the end of the way.",
+    "elastic_end": "An elastic stop acts near the end of the travel.",
     "loss": "A loss to the surroundings or to another state.",
     "radiation": "Heat is lost by radiation.",
-    "storage": "A second capacity, such as a wall, takes up and gives back with its own time constant.",
-    "overflow": "Above an edge, material runs off.",
+    "storage": "A second capacity, such as a wall, stores and releases with its own time constant.",
+    "overflow": "Above an edge, material overflows.",
     "coupling": "Another signal acts on the state.",
-    "product": "Two signals act on the state by their product.",
+    "product": "The product of two signals acts on the state.",
     "input_gain": "The input's gain differs from the prior's.",
     "input_offset": "The input has an offset.",
     "gain_by_direction": "The input's gain depends on its sign.",
-    "input_curve": "The input's characteristic is bent.",
+    "input_curve": "The input's characteristic is curved.",
     "saturation": "The input's effect levels off at large values.",
     "dead_zone": "Small inputs have no effect.",
     "input_lag": "The actuator follows its command with a time constant.",
@@ -985,7 +1019,7 @@ EXPLANATIONS: Mapping[str, str] = {
     "disturbance_lag": "The measured disturbance acts with a time constant.",
     "output_gain": "The sensor's gain is wrong.",
     "output_offset": "The sensor has an offset.",
-    "output_curve": "The sensor's characteristic is bent.",
+    "output_curve": "The sensor's characteristic is curved.",
     "output_lag": "The sensor, or its filter, follows with a time constant.",
 }
 """What each law of this module is, in one sentence."""

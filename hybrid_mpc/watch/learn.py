@@ -159,9 +159,19 @@ def limits_of(
     )
     rest = tuple(getattr(readings, "rest_speed", ()))
     return WatchLimits(
-        readings.kind, model.dt, tuple(found), travel, repeats, rate, seconds / 3600, method, not short, rest,
-        data_hash, model.time_unit,
-    )  # fmt: skip
+        kind=readings.kind,
+        dt=model.dt,
+        channels=tuple(found),
+        travel=travel,
+        repeats=repeats,
+        false_alarms_per_hour=rate,
+        hours=seconds / 3600,
+        method=method,
+        rated=not short,
+        rest_speed=rest,
+        data_hash=data_hash,
+        time_unit=model.time_unit,
+    )
 
 
 def settled(mask: ArrayLike, first: int) -> Mask:

@@ -163,7 +163,9 @@ class ResidualReadings:
         travel = np.where(still, state.travel + moved, 0.0)
         repeats = np.where(still, state.repeats + 1, 0)
         inside = (y > self.sensor_ends[0]) & (y < self.sensor_ends[1])
-        following = ResidualState(x, h, w, y, travel, repeats, runs, age, seen)
+        following = ResidualState(
+            x=x, h=h, w=w, y=y, travel=travel, repeats=repeats, runs=runs, age=age, seen=seen
+        )
         validity = self._validity(residual[: -m.n_y], y, u_prev, seen)
         return following, Sample(residual, (), travel, repeats, inside, settled, validity)
 

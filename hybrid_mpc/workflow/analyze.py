@@ -75,9 +75,17 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
         notes.append(f"observers' noise: {source}")
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
-        kit.models, load_programs(folder / MODELS), state_range(model, control), input_range(model, control), speed,
-        ocp, filters, plant, _recordings(settings.data, scenario, model), state_range(model),
-    ), tuple(notes)  # fmt: skip
+        models=kit.models,
+        programs=load_programs(folder / MODELS),
+        x_range=state_range(model, control),
+        u_range=input_range(model, control),
+        speed=speed,
+        ocp=ocp,
+        filters=filters,
+        plant=plant,
+        recordings=_recordings(settings.data, scenario, model),
+        region=state_range(model),
+    ), tuple(notes)
 
 
 def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Array:

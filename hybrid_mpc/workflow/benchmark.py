@@ -150,14 +150,22 @@ class BenchmarkResults:
 
 
 def benchmark(
-    settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None
+    settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None, cluster: Any = None
 ) -> BenchmarkResults:
     """Fit, train and evaluate, or evaluate an existing model. The same command continues an interrupted benchmark.
 
     ``out`` gets ``results.json`` and, after a training, ``model/`` and ``checkpoints/``.
 
+    Args:
+        settings: Machine, files and effort.
+        out: The folder to make, or one that an interrupted benchmark left.
+        progress: What shows the progress. Default: nothing.
+        cluster: Address of a dask scheduler or a ``distributed.Client``, whose workers train the networks. They must
+            reach the files and ``out`` under the same paths. Default: processes of this machine.
+
     Raises:
-        InputError: If a file is bad, or model, budget or folder belong to something else.
+        InputError: If a file is bad, if model, budget or folder belong to something else, or if the scheduler cannot
+            be reached.
     """
     progress, scenario = progress or Progress(), load_scenario(settings.scenario)
     _check(settings, scenario)
@@ -172,7 +180,7 @@ def benchmark(
             assert settings.model is not None
             model = load_model(settings.model, scenario.name)
         else:
-            model = _make(settings, scenario, data, out, progress)
+            model = _make(settings, scenario, data, out, progress, cluster)
             tests = tests or ({"held back": data.held_back} if data.held_back else {})
         for warning in model.fit.warnings:
             progress.warn(f"fit of the prior: {warning}")
@@ -244,7 +252,12 @@ def _read(
 
 
 def _make(
-    settings: BenchmarkSettings, scenario: Scenario, data: Recordings, out: Path, progress: Progress
+    settings: BenchmarkSettings,
+    scenario: Scenario,
+    data: Recordings,
+    out: Path,
+    progress: Progress,
+    cluster: Any,
 ) -> BenchmarkModel:
     _claim(out, settings, data)
     spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
@@ -258,7 +271,7 @@ def _make(
     whole = train_kinds(
         settings.scenario, fit.values, train, valid,
         {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in kinds_of(scenario.prior())},
-        out / "checkpoints", workers=settings.workers, on_progress=progress.update,
+        out / "checkpoints", workers=settings.workers, on_progress=progress.update, cluster=cluster,
     )  # fmt: skip
     progress.finish("")
     progress.start("fitting the linear baselines")
@@ -273,7 +286,17 @@ def _make(
         *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=choice.sure
     )
     model = BenchmarkModel(
-        scenario.name, dt, fit, hybrid, validation, long, tuple(networks), linear, no_linear, choice, networks
+        scenario=scenario.name,
+        dt=dt,
+        fit=fit,
+        hybrid=hybrid,
+        validation=validation,
+        long=long,
+        kinds=tuple(networks),
+        linear=linear,
+        no_linear=no_linear,
+        choice=choice,
+        networks=networks,
     )
     save_model(out / "model", model)
     return model

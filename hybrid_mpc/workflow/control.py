@@ -1,4 +1,4 @@
-"""``hybrid-mpc control``: closed loops of an existing model, their results.json (docs/control.md) and figures."""
+"""``hybrid-mpc control``: closed loops of a model, their results.json (docs/control-results.md) and figures."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class ControlResults:
-    """Content of ``results.json`` of ``hybrid-mpc control`` (docs/control.md): settings, every loop, and means.
+    """Content of ``results.json`` of ``hybrid-mpc control`` (docs/control-results.md): settings, every loop, and means.
 
     ``guard`` are the limits of the monitor that triggers the guard, ``reaction`` is the guard's reaction; ``step_ms``
     are percentiles of step durations by controller, ``summary`` is by task and controller. For a scenario without plant

@@ -167,7 +167,7 @@ def trials_table(explanation: Explanation) -> Table:
     return Table(
         ("step", "candidate", "ratio [-]", "outcome", "why"),
         rows,
-        "Candidates that were fitted in every fold and not added.",
+        "Candidates that were fitted and not added.",
     )
 
 

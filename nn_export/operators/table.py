@@ -19,8 +19,10 @@ GROUPS: dict[str, Mapping[str, Any]] = {
 }
 HEAD = """# Operators
 
-Made from the code: `python -m nn_export.operators.table > docs/operators.md`. A module exports if `torch.export`
-reduces it to these. What is not here is refused by name, and so is any argument that is not in the third column.
+A torch module exports if `torch.export` reduces it to the operators below. Other operators, and arguments that are not
+in the third column, are refused by name.
+
+This page is generated: `python -m nn_export.operators.table > docs/operators.md`.
 """
 
 

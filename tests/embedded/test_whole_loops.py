@@ -67,11 +67,6 @@ def prior_takes_over(periods=300):
     return golden("golf_robot", "heavy", periods, guard=guard)
 
 
-def by_levels(periods=300):
-    """The disk's monitor with thresholds on its levels; no detector, no free runs, no test for freezing."""
-    return golden("unbalanced_disk", "weak", periods, monitor=machine("unbalanced_disk").level_monitor())
-
-
 @cache
 def tanks():
     """The tanks' case; its limits are learned once."""
@@ -83,7 +78,6 @@ CASES = {
     "golf robot, frozen": (lambda: golden("golf_robot", "frozen"), {"NORMAL", "REST", "BACKUP"}),
     "golf robot, prior takes over": (prior_takes_over, {"NORMAL", "BACKUP"}),
     "disk, weak": (lambda: golden("unbalanced_disk", "weak"), {"NORMAL", "LIMITED", "REST"}),
-    "disk, levels": (by_levels, {"NORMAL", "LIMITED"}),
     "arm": (lambda: replays.arm_case(400), {"NORMAL", "LIMITED", "REST"}),
     "tanks": (tanks, {"NORMAL", "FALLBACK", "REST"}),
     "heaters": (lambda: replays.heaters_case(400), {"NORMAL", "LIMITED", "REST"}),

@@ -205,7 +205,7 @@ def after_an_error(machine):
 
 
 def stopped_thread(machine):
-    """The way of docs/control.md."""
+    """The way of docs/hardware.md."""
     asked = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: asked.set())
     thread = threading.Thread(

@@ -72,7 +72,7 @@ def test_nearly_all_periods_are_solved_but_those_whose_solve_is_late(loops):
         forced.update(s for k, s in enumerate(result.source) if k in late)
     assert forced.total() > 0
     assert forced["MPC"] == 0
-    assert free["MPC"] >= 0.9 * free.total()  # 0.9997 of the 1000 loops in docs/control.md
+    assert free["MPC"] >= 0.9 * free.total()  # 0.9997 of the 1000 loops in docs/results/loops.md
 
 
 def test_faults_begin_in_motion(loops):

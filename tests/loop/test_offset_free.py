@@ -105,7 +105,7 @@ def test_with_stiction_a_load_is_held_within_the_dead_zone(golf_artifact):
         duration=duration, x0=np.array([angle, 0.0]), seed=0, faults=[Fault(1.0, np.inf, "input_offset", -0.08)],
     )  # fmt: skip
     error = (result.x[result.t >= duration / 2, 0] - angle) / (2 * np.pi / 4096)  # counts of the encoder
-    # The load alone moves the club by u 4 / (m g a) = 0.13 rad = 86 counts; two are the goal (docs/control.md).
+    # The load alone moves the club by u 4 / (m g a) = 0.13 rad = 86 counts; two are the goal (docs/results/loops.md).
     assert np.abs(error).max() < 2.0
     assert swings(error, 2.0) == 0
     assert set(result.source) == {"MPC"}

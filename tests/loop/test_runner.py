@@ -203,8 +203,9 @@ def test_in_real_time():
 
 
 def test_the_example_of_the_page_runs(capsys):
-    page = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    docs = Path(__file__).parents[2] / "docs"
+    text = "".join((docs / page).read_text() for page in ("hardware.md", "watchdog.md"))
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict[str, object] = {}
     exec(blocks[0], names)
     report = names["report"]

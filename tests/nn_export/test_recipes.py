@@ -1,22 +1,24 @@
-"""The code in docs/export.md runs, from top to bottom."""
+"""The code in docs/export.md and docs/program-files.md runs, from top to bottom."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).parents[2] / "docs" / "export.md"
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = DOCS / "export.md", DOCS / "program-files.md"
 
 
 @pytest.mark.full
 def test_the_recipes_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    text = "".join(page.read_text() for page in PAGES)
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     assert len(blocks) == 6  # the introduction, three recipes, expressions, limits
     namespace = {}
     for block in blocks:
-        exec(compile(block, str(PAGE), "exec"), namespace)
+        exec(compile(block, "docs", "exec"), namespace)
     printed = capsys.readouterr().out
     assert "Hessian-vector products" in printed
     assert "(1, 20)" in printed

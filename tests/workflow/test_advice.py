@@ -73,12 +73,16 @@ def test_each_finding_is_told_with_what_to_do(results):
     poor = changed(follows, prior_parameters=replace(found.details.prior_parameters, stages=stages))
     assert bad(poor) == ["The fitted prior has a FIT of 41 % on phi: the prior is too coarse."]
     bands = found.details.bands
-    thin = changed(results, bands={**bands, "pgrnn": replace(bands["pgrnn"], coverage=0.6)})
-    assert bad(thin) == ["The 90% band of PGRNN contains 60% of the test data: it is too narrow."]
+    own = found.details.choice.recommended
+    thin = changed(results, bands={**bands, own: replace(bands[own], coverage=0.6)})
+    assert bad(thin) == [f"The 90% band of {own.upper()} contains 60% of the test data: it is too narrow."]
     arx = found.details.baselines["ARX"]
     assert arx.errors is not None
     linear = changed(results, baselines={"ARX": replace(arx, errors=replace(arx.errors, error=0.02))})
-    assert bad(linear) == ["On test data the linear model ARX has an error of 0.02, PGRNN 0.0231."]
+    error = found.error[own]
+    assert bad(linear) == [
+        f"On test data the linear model ARX has an error of 0.02, {own.upper()} {error:.3g}."
+    ]
     control = results.control
     assert control.details is not None
     for ratio, said_of in ((Comparison(1.5, 1.2, 1.9, 6), ["has 1.5 (1.2 to 1.9) times the cost of prior_observer."]),
@@ -134,7 +138,7 @@ def test_an_error_that_is_the_sensor_s_noise_is_told(results):
     }
     assert said[2.0] == []
     (text,) = said[1.2]
-    assert text.startswith("The free-run error of phi is 0.0084 rad: 1.2 times its sensor noise")
+    assert text.startswith(f"The free-run error of phi is {error:.2g} rad: 1.2 times its sensor noise")
 
 
 @pytest.mark.parametrize(

@@ -231,7 +231,7 @@ def test_the_folder_must_be_empty(call, run_folder, tmp_path):
     (tmp_path / "mine.txt").write_text("keep")
     code, _, error = call("golf_robot", "--model", run_folder, "--out", tmp_path)
     assert code == 2
-    assert "something else than a control" in error
+    assert "not the folder of a control" in error
     assert (tmp_path / "mine.txt").read_text() == "keep"
 
 

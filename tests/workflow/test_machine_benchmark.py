@@ -247,7 +247,7 @@ def test_the_command_judges_a_model_and_draws_it(call, machine, made, tmp_path):
         (("--data", "a.csv", "--model", "m"), "HM-WORKFLOW-006"),
         (("--model", "nowhere"), "--test FILE"),
         (("--data", "a.csv", "--budget", "huge"), "'huge'; choose one of: quick [HM-WORKFLOW-004]"),
-        (("--data", "missing.csv"), "there is no such file"),
+        (("--data", "missing.csv"), "HM-DATA-025"),
         (("--model", "nowhere", "--test", "TEST"), "HM-WORKFLOW-009"),
     ],
 )
@@ -279,3 +279,18 @@ def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
     code, _, told = call("golf_robot", "--data", machine[2], "--out", made[0])
     assert code == 2
     assert "HM-WORKFLOW-013" in told
+
+
+def test_a_scheduler_s_workers_train_the_networks(machine, tmp_path, monkeypatch):
+    """The jobs go to the engine with the scheduler's address; tests of the engine say what it does with them."""
+    scenario, train, test = machine
+    asked = []
+
+    def engine(jobs, on_progress, workers, *, cluster):
+        asked.append((sorted(jobs), cluster))
+        raise InputError("no worker")
+
+    monkeypatch.setattr("hybrid_mpc.workflow.stages.identify.run_jobs", engine)
+    with pytest.raises(InputError, match="no worker"):
+        benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), tmp_path, cluster="tcp://127.0.0.1:9")
+    assert asked == [(["mopgrnn", "pgrnn", "rnn"], "tcp://127.0.0.1:9")]

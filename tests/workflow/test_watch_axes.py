@@ -218,6 +218,6 @@ def test_the_command_watches_with_a_kit_without_limits(short, tmp_path, monkeypa
               "--out", str(tmp_path / "out")],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
-    assert "the kit holds no limits of energy" in done.output
+    assert "the kit has no limits of energy" in done.output
     warm_up = 2 * round(0.1 * short.time_unit / QUICK.dt) * QUICK.dt
     assert f"long: 0.9 s, 0 alarms; no valid reading for {warm_up:.2f} s warm-up" in done.output

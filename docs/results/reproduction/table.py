@@ -1,4 +1,4 @@
-"""Keep the results of reproductions beside this file, small, and print them as tables for docs/reproduction.md.
+"""Keep the results of reproductions beside this file, small, and print them as tables for docs/results/reproduction.md.
 
 ``python docs/results/reproduction/table.py`` prints the tables of all that are here;
 ``python docs/results/reproduction/table.py --take runs/reproduce_pendulum`` first takes the results of a folder that

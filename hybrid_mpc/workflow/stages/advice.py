@@ -45,7 +45,7 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
             Hint(
                 "good",
                 "No problem found: the controller is ready for a first test on the machine.",
-                "Close the loop with hm.Runner (docs/control.md), or export the controller as C (docs/embedded.md).",
+                "Close the loop with hm.Runner (docs/hardware.md), or export the controller as C (docs/embedded.md).",
             )
         )
     return sorted(found, key=lambda hint: hint.verdict != "bad")
@@ -87,7 +87,7 @@ def _doubt(found: Identification) -> Iterator[Hint]:
 
 def _prior(found: Identification, explained: bool) -> Iterator[Hint]:
     for warning in found.details.prior_parameters.warnings[:MOST]:
-        yield Hint("plain", f"Fit of the prior: {warning}", "Look the warning up in docs/prior-fit.md.")
+        yield Hint("plain", f"Fit of the prior: {warning}", "Look the warning up in docs/fit-trouble.md.")
     windows = min(
         (row["validation_error"] for row in found.details.prior_parameters.stages), default=math.inf
     )

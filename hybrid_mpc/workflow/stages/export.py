@@ -131,9 +131,16 @@ def predicting(context: Context, phy: Prior) -> Predicting | None:
         return None
     bands = {name: chosen.bands[key] for name, key in (("prior", "phy"), ("hybrid", chosen.deployed))}
     return Predicting(
-        replace(context.spec, windows={}), tuple(phy.states[i].name for i in phy.corrected), fit.sigma, fit.walk,
-        fit.sizes, fit.fading, fit.substeps, bands, chosen.longest,
-    )  # fmt: skip
+        data=replace(context.spec, windows={}),
+        corrects=tuple(phy.states[i].name for i in phy.corrected),
+        sigma=fit.sigma,
+        walk=fit.walk,
+        sizes=fit.sizes,
+        fading=fit.fading,
+        substeps=fit.substeps,
+        bands=bands,
+        longest=chosen.longest,
+    )
 
 
 def artifact_is_there(context: Context, found: ExportResult) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from hybrid_mpc.check.preflight import rests_no_more
+from hybrid_mpc.check.preflight import warn_of_drift
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
@@ -307,7 +307,7 @@ def examined_prior(context: Context) -> PriorResult:
     context.progress.update("free runs", 1, 1, "comparing with simpler models")
     trial = trial_length(make, fit, every, spec.dt, longest, context.time_unit)
     bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)
-    ranges = *beyond_ranges(fitted, every), *rests_no_more(fitted, max(10 * spec.dt, spec.warm_up))
+    ranges = *beyond_ranges(fitted, every), *warn_of_drift(fitted, max(10 * spec.dt, spec.warm_up))
     fit = replace(fit, warnings=(*fit.warnings, *(str(one) for one in bounds if one.costs), *ranges))
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
@@ -359,17 +359,19 @@ def examined_prior(context: Context) -> PriorResult:
         context.progress.warn(f"{IN_DOUBT}: {doubt}")
     one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
     return PriorResult(
-        fit,
-        make().values,
-        {p.name: p.unit for p in make().parameters},
-        baselines,
-        bounds,
-        in_doubt,
-        errors,
-        "" if follows else no_gain(own, training),
-        {s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)},
-        longest_run,
-        {f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
+        fit=fit,
+        nominal=make().values,
+        units={p.name: p.unit for p in make().parameters},
+        baselines=baselines,
+        bounds=bounds,
+        in_doubt=in_doubt,
+        errors=errors,
+        no_gain="" if follows else no_gain(own, training),
+        error_correlation={
+            s.label: float(r) for s, r in zip(fitted.outputs, correlation_of_errors(one_step), strict=True)
+        },
+        longest_run=longest_run,
+        arrays={f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
     )
 
 

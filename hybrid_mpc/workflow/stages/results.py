@@ -400,21 +400,21 @@ def _check_values(values: Mapping[str, Any], path: str, where: str) -> None:
 def collect(context: Context) -> Results:
     """Results of all stages."""
     return Results(
-        SCHEMA_VERSION,
-        context.scenario.name,
-        context.settings.seed,
-        context.settings.budget,
-        context.versions,
-        recordings(context),
-        identification(context),
-        Export(context.read(EXPORT).parity_max_abs_error, context.read(EXPORT).jacobian_max_abs_error),
-        _control(context),
-        _on_model(context),
-        _estimation(context),
-        promises(context),
-        _timing(context),
-        _watch(context),
-        _analysis(context),
+        schema_version=SCHEMA_VERSION,
+        scenario=context.scenario.name,
+        seed=context.settings.seed,
+        budget=context.settings.budget,
+        versions=context.versions,
+        data=recordings(context),
+        identification=identification(context),
+        export=Export(context.read(EXPORT).parity_max_abs_error, context.read(EXPORT).jacobian_max_abs_error),
+        control=_control(context),
+        on_model=_on_model(context),
+        estimation=_estimation(context),
+        promises=promises(context),
+        timing=_timing(context),
+        watch=_watch(context),
+        analysis=_analysis(context),
     )
 
 
@@ -437,7 +437,7 @@ def identification(context: Context) -> Identification:
     error = {name: finite(scores.error) for name, scores in model.items()}
     e_sim = {name: finite(scores.e_sim) for name, scores in model.items()}
     details = IdentificationDetails(
-        FittedPrior(
+        prior_parameters=FittedPrior(
             prior.fit.values,
             prior.fit.standard_errors,
             prior.nominal,
@@ -445,17 +445,17 @@ def identification(context: Context) -> Identification:
             prior.fit.stages,
             prior.in_doubt,
         ),
-        {name: scores.networks for name, scores in found.scores.items()},
-        {
+        scores_of_all_networks={name: scores.networks for name, scores in found.scores.items()},
+        by_file={
             stem: {m: _all_finite(by[stem].rmse) for m, by in found.by_file.items()}
             for stem in found.by_file["phy"]
         },
-        SmootherNoise(prior.fit.sigma, prior.fit.walk),
-        {
+        smoother=SmootherNoise(prior.fit.sigma, prior.fit.walk),
+        hybrid_over_phy={
             "error": ratio(error[chosen.hybrid], error["phy"]),
             "e_sim": ratio(e_sim[chosen.hybrid], e_sim["phy"]),
         },
-        ModelChoice(
+        choice=ModelChoice(
             chosen.recommended,
             chosen.hybrid,
             chosen.reason,
@@ -464,9 +464,9 @@ def identification(context: Context) -> Identification:
                 for name, c in chosen.candidates.items()
             },
         ),
-        found.bands,
-        prior.baselines,
-        network or None,
+        bands=found.bands,
+        baselines=prior.baselines,
+        network_settings=network or None,
     )
     return Identification(
         _with_reasons(error),

@@ -394,10 +394,17 @@ def _faulted(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
         before, seen = begun(alarms, start)
         loops.append(
             FaultedLoop(
-                case.name, case.title, task.name, start, seen[0].start_s - start if seen else None,
-                seen[0].channels if seen else (), seen[0].diagnosis if seen else "", len(before), tuple(row.switches),
+                fault=case.name,
+                title=case.title,
+                task=task.name,
+                start_s=start,
+                delay_s=seen[0].start_s - start if seen else None,
+                channels=seen[0].channels if seen else (),
+                diagnosis=seen[0].diagnosis if seen else "",
+                false_alarms=len(before),
+                switches=tuple(row.switches),
             )
-        )  # fmt: skip
+        )
         arrays |= trace_arrays(case.name, trace, result.y)
     return replace(found, faults=tuple(loops), arrays=arrays)
 
@@ -411,9 +418,17 @@ def read_trace(arrays: Mapping[str, Any], name: str, found: WatchResult, outputs
     """The trace that :func:`trace_arrays` kept; fields that the report does not show are empty."""
     own, none = {key: arrays[f"{name}/{key}"] for key in KEPT}, np.zeros((0, 0))
     return Trace(
-        channels=found.channels, outputs=tuple(outputs), terms=none, travel=none, repeats=none.astype(int),
-        inside=none > 0, settled=none > 0, validity=none.astype(int), blind=none > 0, **own,
-    )  # fmt: skip
+        channels=found.channels,
+        outputs=tuple(outputs),
+        terms=none,
+        travel=none,
+        repeats=none.astype(int),
+        inside=none > 0,
+        settled=none > 0,
+        validity=none.astype(int),
+        blind=none > 0,
+        **own,
+    )
 
 
 def clean_alarms(
