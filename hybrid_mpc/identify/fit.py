@@ -355,16 +355,17 @@ def parameter_variance(
 
 
 def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
-    """Refuse a prior with states that no output tells of.
+    """Refuse a prior with unobservable states.
 
     Raises:
         InputError: Naming the states.
     """
     unseen = unseen_states(prior, dt, time_unit)
     if unseen:
+        are, them = ("are", "them") if len(unseen) > 1 else ("is", "it")
         raise InputError(
-            f"{type(prior).__name__}: {', '.join(unseen)} {'are' if len(unseen) > 1 else 'is'} not observable: no "
-            f"output ({', '.join(s.name for s in prior.outputs)}) depends on it. Measure it, remove it from the "
+            f"{type(prior).__name__}: {', '.join(unseen)} {are} not observable: no output "
+            f"({', '.join(s.name for s in prior.outputs)}) depends on {them}. Measure {them}, remove {them} from the "
             "states, or check output() [HM-IDENTIFY-019]"
         )
 

@@ -125,7 +125,7 @@ PLANTED = {
     # what is measured
     "a state that no output sees": (
         lambda: replace(kettle(outputs=Kettle.outputs[:1])(), data=replace(KETTLE.data, outputs=("level",))),
-        ["no output tells of warmth (outputs: level)", "Measure it, remove it from the states"],
+        ["warmth is not observable: no output (level)", "Measure it, remove it from the states"],
     ),
     "outputs of another number": (
         kettle(output=lambda self, x, u, w, p: (x.level,)),
@@ -372,7 +372,7 @@ def test_numbers_are_looked_at_whatever_else_is_wrong():
     problems = told(replace(scenario, data=replace(KETTLE.data, outputs=("level",))))
     for word in (
         "balance one [m^3]: dS/dt", "balance one: the rate of", "balance other [W]: dS/dt",
-        "no output tells of warmth", "did you mean 'disturbances'?",
+        "warmth is not observable", "did you mean 'disturbances'?",
     ):  # fmt: skip
         assert sum(word in problem for problem in problems) == 1, (word, problems)
 
