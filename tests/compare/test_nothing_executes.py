@@ -50,7 +50,7 @@ def test_what_the_user_types_is_run(call, model, trap, tmp_path):
     """With another name than the model's it is refused, but it was the user's own word to run it."""
     code, _, message = call("analyze", model, "--scenario", trap[0], "--out", tmp_path / "out")
     assert code == 2
-    assert "not for 'golf_robot'" in message
+    assert "HM-SCENARIO-003" in message
     assert trap[1].exists()
 
 
