@@ -130,7 +130,7 @@ class OutputFit:
         y, by = simulation.by_all(*given)
         if slopes == "all":
             with np.errstate(over="ignore"):  # what runs away is left out where it is used
-                by[..., : len(self.unit)] *= self.unit
+                by[..., : len(self._free)] *= self.unit[: len(self._free)]
         return y, by
 
     def _every(self, thetas: Array) -> list[list[float]]:

@@ -7,7 +7,7 @@ state and the parameters; each of its operations runs over all windows at once.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from typing import Any, TypeAlias
 
@@ -94,16 +94,49 @@ class Simulation:
         n_u, n_w = self._xdot.size1_in(1), self._xdot.size1_in(2)
         sizes = {"z": (self.n_x, 1 + columns), "u": (n_u, 1), "w": (n_w, 1), "p": (self.n_p, 1)}
         z, u, w, p = (ca.SX.sym(name, *size) for name, size in sizes.items())
-        x = z[:, 0]
+        n = len(self.free) if columns else 0
+        given = ca.horzcat(z[:, 0], ca.SX(self.n_x, n), ca.SX.eye(self.n_x)) if columns else z
+        rate = _with_slopes(self._xdot, self.free, columns > 0)
+        output, correct = (
+            None if f is None else _with_slopes(f, self.free, columns > 0)
+            for f in (self._output, self._correct)
+        )
+        y = given if output is None else output(given, u, w, p)
+        begin = given if correct is None else correct(given, u, w, p)
         found = []
-        y = x if self._output is None else self._output(x, u, w, p)
-        begin = x if self._correct is None else self._correct(x, u, w, p)
-        for value in (stepped(self._xdot, begin, u, w, p, self.dt, substeps), y):
-            slopes = ca.jacobian(value, x) @ z[:, 1:]
-            if columns:
-                slopes[:, : len(self.free)] += ca.jacobian(value, p)[:, self.free]
-            found.append(ca.densify(ca.horzcat(value, slopes)))
+        for value in (stepped(rate, begin, u, w, p, self.dt, substeps), y):
+            if columns:  # by the first state of the run: what this period does to the columns
+                slopes = value[:, 1 + n :] @ z[:, 1:]
+                slopes[:, :n] += value[:, 1 : 1 + n]
+                value = ca.horzcat(value[:, 0], slopes)
+            found.append(ca.densify(value))
         return ca.Function("period", [z, u, w, p], ca.cse(found))
+
+
+def _with_slopes(f: ca.Function, free: Sequence[int], wanted: bool) -> Callable[..., ca.SX]:
+    """``f(x, u, w, p)`` of ``z = [x, derivatives by free parameters, derivatives by a first state]``, in the same form.
+
+    A Runge-Kutta step of these rates is the step of ``x`` and its exact derivative. The Jacobians are expressions of
+    one stage, and sparse: most steps have fewer operations than one that is differentiated as a whole.
+
+    Args:
+        f: The function.
+        free: Places of the free parameters in ``p``.
+        wanted: Whether there are derivatives; ``z`` is ``x`` otherwise.
+    """
+    x, u, w, p = (ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4))
+    value, n = f(x, u, w, p), len(free)
+    by_p = ca.jacobian(value, p[list(free)]) if n else ca.SX(value.numel(), 0)
+    parts = ca.Function("parts", [x, u, w, p], [value, ca.jacobian(value, x), by_p])
+
+    def found(z: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
+        if not wanted:
+            return f(z, u, w, p)
+        value, by_x, by_p = parts(z[:, 0], u, w, p)
+        slopes = by_x @ z[:, 1:]
+        return ca.horzcat(value, slopes[:, :n] + by_p, slopes[:, n:])
+
+    return found
 
 
 @lru_cache(maxsize=32)
@@ -183,7 +216,9 @@ def _chained(one: ca.Function) -> ca.Function:
     return ca.Function(one.name(), [z, signals, constants], results)
 
 
-def stepped(xdot: ca.Function, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int) -> ca.SX:
+def stepped(
+    xdot: Callable[..., ca.SX], x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int
+) -> ca.SX:
     """The state a period later, by Runge-Kutta of order 4 in equal sub-steps; ``u`` and ``w`` are held."""
     s = dt / substeps
     for _ in range(substeps):

@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.fit import LENGTHS, QUIET, check_observable, with_states
-from hybrid_mpc.identify.output_fit import GROWN, OutputFit
+from hybrid_mpc.identify.output_fit import GROWN, OutputFit, Slopes
 from hybrid_mpc.identify.shooting import Shooting, Trial
 from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, Points, required_substeps, visited
 from hybrid_mpc.identify.smooth import rough_smoother
 from hybrid_mpc.identify.sound import shooting
 from hybrid_mpc.identify.starts import POOR
+from hybrid_mpc.identify.windows import OutputWindows
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 
 Array = NDArray[np.float64]
@@ -376,19 +377,46 @@ class _FactorFit(_Lenient):
         super().__init__(with_factor(make), dt)
         self.term_names = terms_of(make())
         self.chosen: Sequence[int] = ()
+        self.held = False
+        self._needed: dict[tuple[bytes, int], int] = {}
 
-    def choosing(self, chosen: Sequence[int]) -> _FactorFit:
-        """The same fit for as many ``theta`` with these terms."""
+    def visiting(self, known: Sequence[Trajectory]) -> _FactorFit:
+        """The same fit where these recordings with states go."""
         other = copy.copy(self)
-        other.chosen = chosen
+        other.points, other._needed = visited(known), {}
         return other
+
+    def choosing(self, chosen: Sequence[int], held: bool = False) -> _FactorFit:
+        """The same fit for as many ``theta`` with these terms; slopes by a factor that is held are zero."""
+        other = copy.copy(self)
+        other.chosen, other.held = chosen, held
+        return other
+
+    @property
+    def _free(self) -> list[int]:
+        """Places of what is fitted: the factor is the last of the free parameters."""
+        places = super()._free
+        return places[:-1] if self.held else places
+
+    def outputs(
+        self, theta: Array, x: Array, windows: OutputWindows, substeps: int, slopes: Slopes
+    ) -> tuple[Array, Array]:
+        """With a column for the factor, held or not."""
+        y, by = super().outputs(theta, x, windows, substeps, slopes)
+        if self.held and slopes == "all":
+            by = np.insert(by, len(self.unit) - 1, 0.0, axis=-1)
+        return y, by
 
     def most_substeps(self, thetas: Array) -> int:
         """With each factor on its term."""
-        return max(
-            self._enough({**self.values(theta), **({f"chosen {k}": 1.0} if k >= 0 else {})})
-            for theta, k in zip(thetas, self.chosen, strict=True)
-        )
+        return max(self._substeps_with(theta, k) for theta, k in zip(thetas, self.chosen, strict=True))
+
+    def _substeps_with(self, theta: Array, term: int) -> int:
+        key = theta.tobytes(), term
+        if key not in self._needed:
+            values = {**self.values(theta), **({f"chosen {term}": 1.0} if term >= 0 else {})}
+            self._needed[key] = self._enough(values)
+        return self._needed[key]
 
     def _every(self, thetas: Array) -> list[list[float]]:
         terms = len(self.term_names)
@@ -450,8 +478,7 @@ def causes(
         time_unit: The machine's second [s].
     """
     known, sizes, noise = _smoothed(make, recorded, dt, time_unit)
-    fit = _FactorFit(make, dt)
-    fit.points = visited(known)
+    fit = _FactorFit(make, dt).visiting(known)
     thetas = [fit.nominal, fit.scaled({**fit.prior.values, **values})]
     lengths = _lengths(fit, thetas, longest)
 
@@ -575,7 +602,7 @@ def causes_of_refusal(
             usable = [usable[one.start] for one in tried[:TRIED]]
             best = _with_mended(make, usable[0].term, float(usable[0].theta[-1]))
             known = _smoothed(best, recorded, dt, time_unit)
-        fit.points = visited(known[0])
+        fit = fit.visiting(known[0])
         short = shooting(fit, known[0], known[1], min(LENGTHS[1] * time_unit, longest), TRIALS)
         tried = sorted(_tried(fit, short, usable, steps, held=True), key=lambda one: one.error)
     alike = [one for one in tried if one.error <= min(GUESSED, ALIKE * tried[0].error)]
@@ -638,7 +665,7 @@ def _tried(
     for own in groups.values():
         every = problem.several(
             np.stack([begun[i].theta for i in own]),
-            lambda numbers, own=own: fit.choosing([begun[own[i]].term for i in numbers]),  # type: ignore[misc]
+            lambda numbers, own=own: fit.choosing([begun[own[i]].term for i in numbers], held),  # type: ignore[misc]
             [len(own)] * steps,
             -1 if held else None,
         )

@@ -18,7 +18,7 @@ from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.machine.terms import Place, Term
-from hybrid_mpc.machine.units import parsed
+from hybrid_mpc.machine.units import parse_unit
 
 Array = NDArray[np.float64]
 WIDEST, NARROWEST = 0.05, 0.005
@@ -197,7 +197,7 @@ class _Library:
 
     def _process(self, i: int, state: Signal) -> Iterator[Candidate]:
         own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
-        temperature = (parsed(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
+        temperature = (parse_unit(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
 
         def weight(key: str, size: float, per: Sequence[str] = (), words: str = "") -> Parameter:
             return self._weight(f"{key}_{own}", i, size, over(unit, *per), words=words)

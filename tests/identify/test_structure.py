@@ -10,6 +10,7 @@ from simulated_pendulum import DT, Pendulum, record
 from hybrid_mpc import InputError, MechanicalPrior, Parameter, Prior, Signal, fit_prior
 from hybrid_mpc.identify.structure import (
     Cause,
+    _FactorFit,
     causes,
     causes_of_refusal,
     named,
@@ -17,6 +18,7 @@ from hybrid_mpc.identify.structure import (
     terms_of,
     with_factor,
 )
+from hybrid_mpc.identify.windows import cut_outputs
 
 SECONDS = 1.0
 
@@ -229,6 +231,28 @@ def test_a_signal_that_is_counted_the_other_way_is_named(runs, key):
     found = found_of(Pendulum, [replace(t, **{key: -getattr(t, key)}) for t in runs])
     assert any("torque" in one.what or "phi" in one.what for one in found)
     assert all("sign" in one.why or "other way" in one.why for one in found[:1])
+
+
+def test_slopes_by_a_held_factor_are_left_out(runs):
+    """Outputs and the other slopes are those with a free factor, whose column is zero where it is held."""
+    windows = cut_outputs(runs, 20, 0, 3, Pendulum.states)
+    fit = _FactorFit(Pendulum, DT)
+    theta = np.append(fit.nominal[:-1], -1.0)
+    free, held = (
+        fit.choosing([2], held).outputs(theta, windows.x, windows, 2, "all") for held in (False, True)
+    )
+    factor = len(theta) - 1
+    np.testing.assert_array_equal(held[0], free[0])
+    np.testing.assert_allclose(
+        np.delete(held[1], factor, axis=-1), np.delete(free[1], factor, axis=-1), rtol=1e-9, atol=1e-12
+    )
+    assert np.all(held[1][..., factor] == 0.0)
+    step = 1e-6
+    more, less = (
+        fit.choosing([2]).outputs(theta + way * np.eye(len(theta))[factor], windows.x, windows, 2, "")[0]
+        for way in (step, -step)
+    )
+    np.testing.assert_allclose(free[1][..., factor], (more - less) / (2 * step), rtol=1e-4, atol=1e-7)
 
 
 def test_equal_explanations_are_named_together():
