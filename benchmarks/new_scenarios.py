@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc import DataSpec, InputError, load_scenario
-from hybrid_mpc.check.new import Draft, drafted
+from hybrid_mpc.check.new import Draft, draft_scenario
 from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.names import said_by
 
@@ -94,7 +94,7 @@ def row_of(name: str, group: Group, files: Sequence[Path], names: Mapping[str, s
     row: dict[str, Any] = {"machine": name, "recordings": len(files)}
     back = {there: true for true, there in names.items()}
     try:
-        draft = drafted([opened(file) for file in files], (), (), "")
+        draft = draft_scenario([opened(file) for file in files], (), (), "")
     except InputError as error:
         return row | {"inputs": "refused", "outputs": str(error), "right": False}
     found = {

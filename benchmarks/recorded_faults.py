@@ -41,7 +41,7 @@ from hybrid_mpc import (
     replay,
 )
 from hybrid_mpc.data.scales import noise_of, time_unit
-from hybrid_mpc.estimate.tuning import most_likely
+from hybrid_mpc.estimate.tuning import choose_most_likely
 from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit import with_states
 from hybrid_mpc.identify.prior_model import prior_programs
@@ -188,7 +188,7 @@ def identified(
     def filter_of(scale: float) -> ExtendedKalmanFilter:
         return ExtendedKalmanFilter(model, sigma_y=sigma, sigma_x=scale * base, sigma_x0=first)
 
-    chosen = most_likely(filter_of, shifted(known.train, 0.0), SCALES)
+    chosen = choose_most_likely(filter_of, shifted(known.train, 0.0), SCALES)
     print(
         f"{scenario.name}: {fit.values}, delay {fit.delay:.3g} s; filter: sensors {sigma}, states {chosen * base}"
     )

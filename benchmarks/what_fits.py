@@ -1,6 +1,6 @@
 """What fits into hybrid-mpc and what does not: asked of the pre-flight, and timed.
 
-python benchmarks/what_fits.py            # all tables of docs/own-machine.md
+python benchmarks/what_fits.py            # all tables of docs/fits.md
 python benchmarks/what_fits.py refused    # one of: refused, cells, period
 """
 

@@ -1,4 +1,4 @@
-"""Where work is computed: processes of this machine through joblib's loky, or a cluster through dask."""
+"""Engines that compute jobs: local processes through joblib's loky, or a cluster through dask."""
 
 from __future__ import annotations
 
@@ -22,43 +22,43 @@ from typing import Any, Generic, TypeVar
 from hybrid_mpc.errors import InputError, named_extra, no_exit
 
 WORKERS = min(2, os.cpu_count() or 1)
-"""Processes side by side: the machine this is made for has two cores."""
+"""Number of parallel processes: at most two, the cores of the reference machine."""
 WATCH_S = 0.5
-"""How often a worker looks whether its parent is still there."""
+"""Time [s] between a worker's checks that its parent is alive."""
 REPORT_S = 0.02
-"""How long :func:`run_jobs` waits for a report before it looks whether a job has ended."""
+"""Time [s] that :func:`run_jobs` waits for a report before it checks whether a job has ended."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What tells numerical libraries how many threads to take."""
+"""Variables that set the number of threads of numerical libraries."""
 CONNECT_S = 5.0
-"""How long a scheduler is waited for."""
+"""Longest wait [s] for a scheduler."""
 ADDRESS = re.compile(r"(tcp://)?(\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.-]+):[0-9]{1,5}")
-"""Addresses of schedulers that need nothing else to be known."""
+"""Addresses of schedulers that need no further configuration."""
 LOOK_S = 2.0
-"""How often the workers of a cluster are counted."""
+"""Time [s] between counts of a cluster's workers."""
 ALONE_S = 60.0
-"""How long a cluster may be without any."""
+"""Longest time [s] that a cluster may have no worker."""
 B = TypeVar("B")
 R = TypeVar("R")
 
 
 class Progress:
-    """Where a job reports to; this one says nothing."""
+    """Receives progress reports of a job; this class ignores them."""
 
     def start(self, title: str) -> None:
         """A stage begins."""
 
     def update(self, key: str, done: int, total: int, text: str) -> None:
-        """Part ``key`` of the stage has done ``done`` of ``total``."""
+        """Part ``key`` of the stage has finished ``done`` of ``total``."""
 
     def warn(self, text: str) -> None:
-        """Something that the user should know of, and that stops nothing."""
+        """A warning that does not stop the job."""
 
     def finish(self, text: str) -> None:
-        """The stage is done."""
+        """The stage has ended."""
 
 
 class Lost(Exception):
-    """A batch whose worker died; ``final`` where the engine has tried several times already."""
+    """A batch whose worker died; ``final`` if the engine has already retried it several times."""
 
     def __init__(self, why: str, final: bool) -> None:
         super().__init__(why)
@@ -66,9 +66,9 @@ class Lost(Exception):
 
 
 class Engine(ABC, Generic[B, R]):
-    """Computes batches side by side, each in some worker, by a function of the batch; results depend on no worker.
+    """Computes batches in parallel workers by a function of the batch; results do not depend on the worker.
 
-    ``workers`` is the number of batches side by side, ``name`` is for the record, ``died`` counts workers that died.
+    ``workers`` is the number of parallel batches, ``name`` describes the engine, ``died`` counts dead workers.
     """
 
     workers: int
@@ -82,12 +82,12 @@ class Engine(ABC, Generic[B, R]):
 
     @abstractmethod
     def submit(self, batch: B) -> None:
-        """Begin a batch; RuntimeError if no worker can be started for it."""
+        """Start a batch; RuntimeError if no worker can be started."""
 
     def next(self, timeout: float) -> tuple[B, R | Lost] | None:
-        """A batch that has ended, with its result or how it was lost; None if none ends within ``timeout`` [s].
+        """A finished batch with its result or the reason of its loss; None if none finishes within ``timeout`` [s].
 
-        What the work itself raises is raised here.
+        Exceptions of the work itself are raised here.
         """
         try:
             future = self._ended.get(timeout=timeout)
@@ -99,7 +99,7 @@ class Engine(ABC, Generic[B, R]):
 
     @abstractmethod
     def close(self) -> None:
-        """End what still runs."""
+        """Stop running batches."""
 
     def _watch(self, future: Any, batch: B) -> None:
         self._batches[future] = batch
@@ -110,10 +110,10 @@ class Engine(ABC, Generic[B, R]):
 
 
 class LocalEngine(Engine[B, R]):
-    """Processes of this machine; each computes one batch after the other. Work, batches and results must pickle.
+    """Local processes, each of which computes one batch after the other. Work, batches and results must pickle.
 
-    Numerical libraries take ``threads`` in each process; default: what the environment says. ``begin`` is called in
-    each process before its first batch; connections in it are inherited.
+    ``threads`` is the number of threads of numerical libraries in each process (default: from the environment).
+    ``begin`` is called in each process before its first batch; connections in it are inherited.
 
     Example:
         >>> engine = LocalEngine(sum, workers=1, threads=1)
@@ -147,11 +147,11 @@ class LocalEngine(Engine[B, R]):
             try:
                 future = self._pool.submit(self._work, batch)
                 break
-            except BrokenExecutor as error:  # one of its processes has just died; what it was at tells of it
+            except BrokenExecutor as error:  # a process has just died; its own batch reports the loss
                 self._pool, broken = None, error
         else:
             raise RuntimeError(
-                f"new processes end as they begin ({type(broken).__name__}: {broken}); out of memory, or of processes?"
+                f"new processes end at once ({type(broken).__name__}: {broken}). Check memory and the process limit"
             ) from broken
         self._pools[future] = self._pool
         self._watch(future, batch)
@@ -172,7 +172,7 @@ class LocalEngine(Engine[B, R]):
             self.died += pool not in self._broken
             self._broken.append(pool)
             self._pool = None if pool is self._pool else self._pool
-            # what happened, and the exit codes; or the traceback of what could not be unpickled
+            # the event and the exit codes; or the traceback of a failed unpickling
             why = [line for line in str(error).splitlines() if line][:2]
             why += [str(error.__cause__)] if error.__cause__ else []
             return Lost(f"{type(error).__name__}: {' '.join(why)}", False)
@@ -185,10 +185,10 @@ class LocalEngine(Engine[B, R]):
 
 
 class DaskEngine(Engine[B, R]):
-    """Workers of a dask cluster, by its scheduler's address or a ``distributed.Client``; ``work`` is sent to each once.
+    """Workers of a dask cluster, given by its scheduler's address or a ``distributed.Client``.
 
-    A worker that dies is the scheduler's affair: it gives the batch to another, and gives it up when several workers
-    died of it.
+    ``work`` is sent to each worker once. The scheduler gives the batch of a dead worker to another one, and gives it up
+    after several deaths.
 
     Raises:
         InputError: If dask is missing, the scheduler cannot be reached, or it has no worker.
@@ -204,7 +204,7 @@ class DaskEngine(Engine[B, R]):
             self._seen = set(self._client.nthreads())
             if not self._seen:
                 raise InputError(
-                    f"the scheduler {self._address} has no worker; start some: dask worker ADDRESS [HM-ENGINE-001]"
+                    f"scheduler {self._address}: has no worker. Start one with: dask worker ADDRESS [HM-ENGINE-001]"
                 )
         except BaseException:
             self.close()
@@ -217,7 +217,7 @@ class DaskEngine(Engine[B, R]):
         return str(self._client.scheduler.address)
 
     def next(self, timeout: float) -> tuple[B, R | Lost] | None:
-        """See :class:`Engine`; InputError if the cluster has had no worker for a while."""
+        """See :class:`Engine`; InputError if the cluster has had no worker for ``ALONE_S``."""
         now = time.monotonic()
         if now - self._looked >= LOOK_S:
             self._looked, there = now, set(self._client.nthreads())
@@ -238,8 +238,8 @@ class DaskEngine(Engine[B, R]):
 
     def _alone(self) -> InputError:
         return InputError(
-            f"the scheduler {self._address} has had no worker for {ALONE_S:g} s; what has finished is kept, "
-            "--resume goes on when there are some [HM-ENGINE-006]"
+            f"scheduler {self._address}: no worker for {ALONE_S:g} s. Finished jobs are saved; continue with --resume "
+            "once workers run. [HM-ENGINE-006]"
         )
 
     def _result(self, future: Any) -> R | Lost:
@@ -251,16 +251,16 @@ class DaskEngine(Engine[B, R]):
         except KilledWorker as error:
             return Lost(f"KilledWorker: {str(error).splitlines()[0]}", True)
         except Exception as error:
-            if future.status == "error":  # what the work itself has raised
+            if future.status == "error":  # an exception of the work itself
                 raise
             if self._client.status != "running":
                 raise InputError(
-                    f"the scheduler {self._address} is gone; what has finished is kept, --resume goes on"
-                    " [HM-ENGINE-002]"
+                    f"scheduler {self._address}: the connection is lost. Finished jobs are saved; continue "
+                    "with --resume. [HM-ENGINE-002]"
                 ) from error
-            if not isinstance(error, (CancelledError, OSError)):  # a result that does not unpickle
+            if not isinstance(error, (CancelledError, OSError)):  # the result cannot be unpickled
                 raise
-            self._shared = None  # the shared inputs went with their last worker, or a connection did
+            self._shared = None  # the shared inputs were lost with their last worker or a connection
             return Lost(f"{type(error).__name__}: {error}", False)
 
     def close(self) -> None:
@@ -274,9 +274,9 @@ class DaskEngine(Engine[B, R]):
 def make_engine(
     work: Callable[[B], R], workers: int, cluster: Any = None, *, threads: int | None = None
 ) -> Engine[B, R]:
-    """The engine of a cluster, or of this machine where there is none.
+    """The engine of a cluster, or local processes without one.
 
-    Threads of a cluster's workers are set where they are started.
+    Threads of a cluster's workers are set when these are started.
     """
     return LocalEngine(work, workers, threads=threads) if cluster is None else DaskEngine(work, cluster)
 
@@ -292,18 +292,17 @@ def run_jobs(
 ) -> dict[str, Any]:
     """Run ``function(*args, report)`` for each job and return the results by name.
 
-    A job calls ``report(done, total, text)`` as it goes, which ``on_progress`` gets with its name. Jobs start in the
-    order given, ``workers`` at a time, each in a fresh process with the environment's number of threads, so results do
-    not depend on how many run side by side. ``on_result`` is called as each job ends, also beside one that fails.
-    ``fresh=False``: a process computes one job after the other, for jobs that leave nothing behind that the next would
-    notice and that load the same things for seconds.
+    A job calls ``report(done, total, text)``, which is passed to ``on_progress`` with the job's name. Jobs start in the
+    given order, ``workers`` at a time, each in a fresh process with the environment's number of threads, so results do
+    not depend on the number of parallel jobs. ``on_result`` is called when a job ends, even if another one fails.
+    ``fresh=False`` reuses processes, for jobs without side effects on later ones that import the same slow modules.
 
-    On a ``cluster`` (address of a dask scheduler or a ``distributed.Client``) all jobs are handed to its workers, which
-    must see the files that the jobs name under the same paths; ``on_progress`` is then told of ends alone.
+    On a ``cluster`` (address of a dask scheduler or a ``distributed.Client``) all jobs go to its workers, which must
+    see the jobs' files under the same paths; ``on_progress`` is then called only at the end of each job.
 
     Raises:
-        InputError: If a job raises one: bad input that shows only then. Or if ``workers`` is less than 1.
-        RuntimeError: If a job fails otherwise; the message holds its traceback. In either case the others are ended.
+        InputError: If a job raises one. Or if ``workers`` is less than 1.
+        RuntimeError: If a job fails otherwise, with its traceback. In both cases the other jobs are stopped.
 
     Example:
         >>> def double(x, report):
@@ -341,7 +340,7 @@ def run_jobs(
                     on_result(name, value)
                 else:
                     failed[name] = error
-            if failed:  # raised only now, after the results of others that had ended by then
+            if failed:  # raised only after the results of other finished jobs
                 name, error = next(iter(failed.items()))
                 raise error if isinstance(error, InputError) else RuntimeError(f"{name} failed:\n{error}")
     finally:
@@ -356,7 +355,7 @@ def _on_cluster(
     cluster: Any,
     on_result: Callable[[str, Any], None],
 ) -> dict[str, Any]:
-    """:func:`run_jobs` on the workers of a cluster; what a lost worker was at is handed out again."""
+    """:func:`run_jobs` on a cluster; jobs of lost workers are submitted again."""
     results: dict[str, Any] = {}
     engine: Engine[tuple[str, Any, Any], Any] = DaskEngine(_run_named, cluster)
     try:
@@ -390,8 +389,7 @@ def _run_named(job: tuple[str, Callable[..., Any], tuple[Any, ...]]) -> tuple[An
 class _Worker:
     """A process that computes one job after the other, and its reports.
 
-    It has an engine of its own: the number of threads that a training sets in torch, what modules keep, and the memory
-    of one process must not reach another.
+    Each worker has its own engine: torch's number of threads, state of modules and memory must not reach other jobs.
     """
 
     def __init__(self) -> None:
@@ -399,11 +397,11 @@ class _Worker:
         self._engine = LocalEngine(_run, 1, begin=partial(_report_to, self._theirs))
 
     def start(self, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
-        """Begin a job; the one before has ended."""
+        """Start a job; the previous one has ended."""
         self._engine.submit((function, args))
 
     def ended(self) -> tuple[Any, Exception | None] | None:
-        """The job's value, or what it failed by; None while it runs."""
+        """The job's value or its error; None while it runs."""
         try:
             found = self._engine.next(timeout=0.0)
         except Exception:  # arguments or a result that do not pickle
@@ -414,7 +412,7 @@ class _Worker:
         return (None, RuntimeError(f"its process ended ({ended})")) if isinstance(ended, Lost) else ended
 
     def new_reports(self, *, rest: bool) -> Iterator[tuple[int, int, str]]:
-        """The next report, if there is one; the ``rest`` of them once the job has ended."""
+        """The next report, if any; all ``rest`` after the job has ended."""
         try:
             while self.reports.poll():
                 yield self.reports.recv()
@@ -424,14 +422,14 @@ class _Worker:
             return
 
     def close(self) -> None:
-        """End it if it still runs."""
+        """Stop a running job and close the worker."""
         self._engine.close()
         self._theirs.close()
         self.reports.close()
 
 
 _REPORTS: ContextVar[Connection] = ContextVar("reports")
-"""In a worker of :func:`run_jobs`: the pipe to its parent, which it inherited as it started."""
+"""In a worker of :func:`run_jobs`: the inherited pipe to its parent."""
 
 
 def _report_to(reports: Connection) -> None:
@@ -456,12 +454,12 @@ def _computed(
             return function(*args, report), None
     except InputError as error:
         return None, error
-    except BaseException:  # every failure travels to the parent, which raises it
+    except BaseException:  # the parent raises every failure
         return None, RuntimeError(traceback.format_exc())
 
 
 def _began(parent: int, begin: Callable[[], None] | None) -> None:
-    """Tie a worker to the process of its parent: it leaves Ctrl-C to it, and ends with it, even if it was killed."""
+    """Tie a worker to its parent: the worker ignores Ctrl-C, and ends when the parent ends or is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
@@ -476,7 +474,7 @@ def _began(parent: int, begin: Callable[[], None] | None) -> None:
 
 def _check(workers: int) -> None:
     if workers < 1:
-        raise InputError(f"workers must be 1 or more, got {workers} [HM-ENGINE-003]")
+        raise InputError(f"workers: must be at least 1, got {workers} [HM-ENGINE-003]")
 
 
 def _connected(address: str) -> Any:
@@ -484,13 +482,13 @@ def _connected(address: str) -> Any:
         from distributed import Client
     if not ADDRESS.fullmatch(address):
         raise InputError(
-            f"the scheduler's address must be tcp://HOST:PORT, got {address!r}; for another kind (tls://) connect a "
-            "distributed.Client yourself, and give it in place of the address [HM-ENGINE-004]"
+            f"scheduler: the address must be tcp://HOST:PORT, got {address!r}. For another protocol (tls://) connect a "
+            "distributed.Client and pass it instead of the address. [HM-ENGINE-004]"
         )
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"no dask scheduler at {address} within {CONNECT_S:g} s ({type(error).__name__}); start one with "
-            "'dask scheduler', or leave --scheduler out to use this machine [HM-ENGINE-005]"
+            f"scheduler {address}: no answer within {CONNECT_S:g} s ({type(error).__name__}). Start one with "
+            "'dask scheduler', or leave out --scheduler to use this machine. [HM-ENGINE-005]"
         ) from error

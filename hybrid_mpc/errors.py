@@ -1,7 +1,7 @@
-"""Errors that speak to the user: what was given, what is needed, how to fix it, and a code.
+"""Errors for the user: what is wrong, where, what to do, and a code.
 
 A message ends with its code in brackets, ``[HM-DATA-085]``: the room that found the problem and a number. A code stays
-with its problem when the words change; a number is given once. ``docs/errors.md`` lists all of them.
+with its problem when the words change; a number is used once. ``docs/errors.md`` lists all codes.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 T = TypeVar("T")
 CODE = re.compile(r"\[((?:HM-[A-Z]+|NN)-\d{3})\]")
-"""A code as it stands in a message; ``NN`` are those of ``nn_export``."""
+"""A code in a message; ``NN`` codes belong to ``nn_export``."""
 
 
 class InputError(ValueError):
-    """Bad input of the user: a file, a field, a setting. The command line answers it with exit code 2.
+    """Bad input of the user: a file, a field, a setting. The command line ends with exit code 2.
 
-    Its message names what was given (file, row, field), what is needed, and a remedy.
+    The message names the place (file, row, field), what is wrong, and a remedy.
 
     Example:
         >>> raise InputError("run.csv: no column 'pos_rad'; it has 'time_s', 'angle'. Rename one.")
@@ -34,7 +34,7 @@ class InputError(ValueError):
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What is wrong, one by one."""
+        """All problems, one by one."""
         return self._problems or (str(self),)
 
     @property
@@ -49,7 +49,7 @@ class InputError(ValueError):
 
 
 class MissingPackage(InputError, ImportError):
-    """A package of an extra is not installed; the message says which extra to install."""
+    """A package of an extra is not installed; the message names the extra."""
 
 
 EXTRAS = {
@@ -66,17 +66,17 @@ EXTRAS = {
     "pysindy": "sindy",
     "mujoco": "mujoco",
 }
-"""Extra of the installation by the module that it brings."""
+"""Extra that installs a module."""
 
 
 @contextmanager
 def named_extra(what: str = "") -> Iterator[None]:
-    """Within it, an import of a package that is not installed is an error that names the extra.
+    """Context in which the import of a missing package becomes an error that names its extra.
 
-    Also a decorator of functions that import such packages, or modules that do.
+    Also a decorator of functions that import such packages.
 
     Args:
-        what: What needs the package, for the message. Default: nothing is said.
+        what: What needs the package, for the message. Default: "this".
 
     Raises:
         MissingPackage: If a package of :data:`EXTRAS` is not installed.
@@ -95,13 +95,13 @@ def named_extra(what: str = "") -> Iterator[None]:
         if package not in EXTRAS:
             raise
         raise MissingPackage(
-            f"{what or 'this'} needs {package}, which is not installed: pip install 'hybrid-mpc[{EXTRAS[package]}]'"
-            " [HM-ERRORS-001]"
+            f"{what or 'this'} needs the package {package}, which is not installed. Install it with: "
+            f"pip install 'hybrid-mpc[{EXTRAS[package]}]' [HM-ERRORS-001]"
         ) from missing
 
 
 def said_by(error: BaseException) -> str:
-    """What an error says, one of a user's own class, too, whose text may raise; empty if it says nothing.
+    """The message of an error; empty if it has none, or a user's own class raises in ``__str__``.
 
     Example:
         >>> said_by(ValueError(" no level "))
@@ -109,23 +109,22 @@ def said_by(error: BaseException) -> str:
     """
     try:
         return str(error).strip()
-    except Exception:  # the user's own code may raise anything
+    except Exception:  # __str__ of a user's class may raise any exception
         return ""
 
 
 @contextmanager
 def no_exit(what: str = "") -> Iterator[None]:
-    """Within it, code that ends Python (``sys.exit``, ``SystemExit``, ``GeneratorExit``, ``BaseException`` itself) is
-    an error with the code's file and line.
+    """Context in which code that ends Python (``sys.exit``, ``SystemExit``, ``GeneratorExit``, a bare
+    ``BaseException``) becomes an error with the code's file and line.
 
-    A scenario's file or one of its functions would end a job without a word, with exit code 0. Also a decorator of
-    functions that call such code.
+    Otherwise a scenario could end a job silently, with exit code 0. Also a decorator of functions that call user code.
 
     Args:
-        what: What runs there, for the message. Default: nothing is said.
+        what: What runs, for the message. Default: not named.
 
     Raises:
-        InputError: If the code within raises one of these.
+        InputError: If the code raises one of these exceptions.
 
     Example:
         >>> with no_exit("my_machine.py"):
@@ -139,28 +138,28 @@ def no_exit(what: str = "") -> Iterator[None]:
     except BaseException as stop:
         if not isinstance(stop, SystemExit | GeneratorExit) and type(stop) is not BaseException:
             raise
-        # without this block itself, and what Python is started with, where exit() stands
+        # without frames of this module and of Python's start-up, where exit() is defined
         passed = [frame for frame in traceback.extract_tb(stop.__traceback__) if frame.filename != __file__]
         frames = [frame for frame in passed if not frame.filename.startswith("<frozen")]
         place = f"{frames[-1].filename}:{frames[-1].lineno}: " if frames else ""
         of = f"{what}: " if what and not place.startswith(what) else ""
         raise InputError(
-            f"{of}{place}{_ending(stop)} would end Python; take sys.exit or exit out, or put what a script "
-            'does under if __name__ == "__main__": [HM-ERRORS-002]'
+            f"{of}{place}{_ending(stop)} would end Python. Remove sys.exit or exit, or move the script's code "
+            'under if __name__ == "__main__": [HM-ERRORS-002]'
         ) from stop
 
 
 def _ending(stop: BaseException) -> str:
-    """What ends Python, as it was raised."""
+    """What ends Python, as raised."""
     return f"SystemExit({stop.code!r})" if isinstance(stop, SystemExit) else type(stop).__name__
 
 
 SHOWN = 20
-"""Most problems that one message lists; the others are counted."""
+"""Most problems that a message lists; the others are counted."""
 
 
 def refuse(problems: Sequence[str]) -> None:
-    """Raise one error that names all problems, each a message of its own; no problem is no error.
+    """Raise one error with all problems, each a message of its own; without problems do nothing.
 
     Raises:
         InputError: If there is a problem.
@@ -186,7 +185,7 @@ def refuse(problems: Sequence[str]) -> None:
 
 
 class Collected:
-    """Problems of several checks, told together: each is made though another has failed.
+    """Collects problems of several checks: each check is made even if another has failed.
 
     Example:
         >>> def positive(value: float, name: str) -> float:
@@ -205,7 +204,7 @@ class Collected:
         self._problems: list[str] = []
 
     def __call__(self, check: Callable[P, T], *args: P.args, **options: P.kwargs) -> T | None:
-        """What a check returns; None where it raises InputError."""
+        """The result of a check; None if it raises InputError."""
         try:
             return check(*args, **options)
         except InputError as error:
@@ -213,7 +212,7 @@ class Collected:
             return None
 
     def add(self, problem: str) -> None:
-        """One more problem, a message of its own."""
+        """Add a problem."""
         self._problems.append(problem)
 
     def refuse(self) -> None:
@@ -222,9 +221,9 @@ class Collected:
 
 
 class StorageError(InputError):
-    """The file system refused to write: a full disk, a folder in place of a file, no permission.
+    """Writing failed: a full disk, a folder in place of a file, no permission.
 
-    Its message says what, where and why. The command line adds what is kept, and how to go on.
+    The message says what, where and why. The command line adds what is saved, and how to continue.
 
     Example:
         >>> raise StorageError("cannot write run/a.json: No space left on device")
@@ -235,9 +234,9 @@ class StorageError(InputError):
 
 
 class SafeInputError(RuntimeError):
-    """A run on a machine has ended and its actuator did not take the safe input: the last input may still act.
+    """A run on a machine has ended, but its actuator did not accept the safe input: the last input may still act.
 
-    Raised from the actuator's first failure, behind which stands what had ended the run.
+    Raised from the actuator's first failure, whose context is the error that ended the run.
 
     Example:
         >>> raise SafeInputError("the safe input could not be handed over: cut the machine's power")

@@ -1,7 +1,7 @@
-"""Files: written whole or not at all, read as data alone and within limits; folders that one job at a time may hold.
+"""Files: written whole or not at all, read as pure data within limits; folders locked by one job at a time.
 
-Everything that the library writes goes through :func:`replacing`; its own JSON files and arrays are read by
-:func:`read_json` and :func:`read_arrays`.
+The library writes all files with :func:`replacing`; :func:`read_json` and :func:`read_arrays` read its own JSON files
+and arrays.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from hybrid_mpc.errors import InputError, StorageError, named_extra
 from hybrid_mpc.records import plain, shown
 
 MOST_JSON = 16 * 2**20
-"""Largest JSON file [byte]. A model's own is a few KiB, the longest results are a few hundred."""
+"""Largest JSON file [byte]. A model's file has a few KiB, the longest results a few hundred."""
 MOST_ARRAYS = 2**30
 """Largest content of a file of arrays, unpacked [byte]."""
 MOST_CONTENT = 2**31
-"""Largest file of a user that is read [byte]."""
+"""Largest user file that is read [byte]."""
 MOST_MEMBERS = 10_000
 """Most arrays in a file."""
 HEADER = 10_100
-"""First bytes of an array, which hold its header: numpy reads none of more than 10 000 characters [byte]."""
+"""First bytes of an array, which contain its header: numpy reads at most 10 000 characters of it [byte]."""
 HASH, ARRAYS_HASH = "sha256", "arrays_sha256"
-"""Fields of a document that hold hashes: of its content, of the arrays beside it."""
+"""Fields of a document with the hashes of its content and of the arrays beside it."""
 LOCK, PART = ".lock", ".part"
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """An open binary file that takes the place of ``path`` when the block ends well; folders are made.
+    """An open binary file that replaces ``path`` when the block ends without error; missing folders are created.
 
-    A kill at any moment, a full disk or a second writer leave the old file or a new one, whole. StorageError if it
-    cannot be written.
+    After a kill, a full disk or with a second writer there is either the old file or a complete new one. StorageError
+    if the file cannot be written.
     """
     try:
         with nn_export.files.replacing(path) as file:
@@ -59,13 +59,13 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 @contextlib.contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """A new folder to write in, whose content becomes that of ``folder`` when the block ends well.
+    """A new folder whose content becomes that of ``folder`` when the block ends without error.
 
-    A full disk or an exception within the block leave ``folder`` as it was. One that is not there appears as a whole,
-    whatever is killed when; into one that is there the finished files are moved. Files of other names stay in it.
+    A full disk or an exception within the block leaves ``folder`` unchanged. A new folder appears as a whole, whenever
+    the process is killed; finished files are moved into an existing one. Files of other names stay in it.
 
     Raises:
-        StorageError: If something cannot be written; with how to go on.
+        StorageError: If something cannot be written; with a remedy.
     """
     there = folder.is_dir()
     try:
@@ -84,15 +84,15 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(work, ignore_errors=True)
     except (StorageError, OSError) as error:
         cause = error.__cause__ if isinstance(error, StorageError) and error.__cause__ else error
-        kept = "it is as it was before" if there else "nothing half-written is left"
+        kept = "it is unchanged" if there else "no partial files are left"
         raise StorageError(
-            f"cannot write {folder}: {reason(cause)}; {kept}. Make room there, or choose another folder, "
-            "and give the same command again [HM-FILES-001]"
+            f"{folder}: cannot be written: {reason(cause)}; {kept}. Free space there or choose another folder, "
+            "and repeat the command. [HM-FILES-001]"
         ) from error
 
 
 def _move_into(folder: Path, new: Path, before: Path) -> None:
-    """Move finished files into a folder; all of them, or none. Those of the same names go to ``before``."""
+    """Move finished files into a folder, all or none; files of the same names move to ``before``."""
     before.mkdir()
     moved: list[Path] = []
     try:
@@ -122,19 +122,19 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Content of a JSON file; InputError if it is missing, no regular file, larger than 16 MiB, or no JSON."""
+    """Content of a JSON file; InputError if it is missing, not a regular file, larger than 16 MiB, or not JSON."""
     content = read_bytes(path, MOST_JSON)
     try:
         return nn_export.files.parse_json(content)
     except ValueError as error:
-        raise InputError(f"{path} is damaged: {error} [HM-FILES-017]") from error
+        raise InputError(f"{path}: the file is damaged: {error} [HM-FILES-017]") from error
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The object that a JSON file holds; InputError if it holds anything else, or as :func:`read_json`."""
+    """The object in a JSON file; InputError if it holds anything else, or as :func:`read_json`."""
     found = read_json(path)
     if not isinstance(found, dict):
-        raise InputError(f"{path} is damaged: an object (fields and values) is needed [HM-FILES-002]")
+        raise InputError(f"{path}: the file is damaged: it is not a JSON object [HM-FILES-002]")
     return found
 
 
@@ -142,7 +142,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays as ``.npz`` (no pickle), whole or not at all.
 
     Raises:
-        StorageError: If it cannot be written.
+        StorageError: If the file cannot be written.
     """
     with replacing(path) as file:
         np.savez_compressed(file, **{name: np.asarray(a) for name, a in arrays.items()})  # type: ignore[arg-type]
@@ -156,15 +156,15 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} is damaged: {error} [HM-FILES-018]") from error
+        raise InputError(f"{path}: the file is damaged: {error} [HM-FILES-018]") from error
 
 
 def write_document(
     path: Path, value: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None
 ) -> None:
-    """Write a JSON object with the hash of its content, so that damage is noticed when it is read.
+    """Write a JSON object with the hash of its content, so that damage is detected when it is read.
 
-    ``arrays`` that belong to it are written beside it as ``.npz``, with their hash in the JSON.
+    Its ``arrays`` are written beside it as ``.npz``, with their hash in the JSON.
     """
     document = plain(value)
     if arrays is not None:
@@ -175,18 +175,20 @@ def write_document(
 
 
 def read_document(path: Path, remedy: str = "") -> dict[str, Any]:
-    """The object of a file that :func:`write_document` wrote; ``remedy`` says what to do where it is damaged."""
+    """The object in a file of :func:`write_document`; ``remedy`` is added to the message about a damaged file."""
     document = _whole(path, remedy)
     document.pop(ARRAYS_HASH, None)
     return document
 
 
 def read_document_arrays(path: Path, remedy: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays that belong to a JSON file that :func:`write_document` wrote."""
+    """The arrays of a JSON file of :func:`write_document`."""
     expected, beside = _whole(path, remedy).get(ARRAYS_HASH), path.with_suffix(".npz")
     try:
         if sha256(beside) != expected:
-            raise InputError(f"{beside} is damaged, or does not belong to {path.name} [HM-FILES-003]")
+            raise InputError(
+                f"{beside}: the file is damaged, or does not belong to {path.name} [HM-FILES-003]"
+            )
         return read_arrays(beside)
     except InputError as error:
         raise type(error)(_with(str(error), remedy)) from error
@@ -197,7 +199,7 @@ def _whole(path: Path, remedy: str) -> dict[str, Any]:
         document = read_object(path)
         if document.pop(HASH, None) != digest(document):
             raise InputError(
-                f"{path} is damaged or was changed by hand: its content is not what was saved [HM-FILES-004]"
+                f"{path}: the file is damaged or was changed by hand: its hash is wrong [HM-FILES-004]"
             )
     except InputError as error:
         raise type(error)(_with(str(error), remedy)) from error
@@ -209,76 +211,75 @@ def _with(text: str, remedy: str) -> str:
 
 
 def check_npz(content: bytes, budget: int, names: Sequence[str] | None = None) -> None:
-    """Check what an archive of arrays declares before any array is decompressed.
+    """Check the declared sizes in an archive of arrays before any array is decompressed.
 
-    ``budget`` is the most bytes of numbers in the arrays that are to be read (``names``; default: all), each number
-    counted as 8 of them at least.
+    ``budget`` is the most bytes of numbers in the arrays to read (``names``; default: all), at least 8 per number.
 
     Raises:
-        ValueError: If there are too many members, one is not packed as numpy packs, is no array, or holds another
-            number of bytes than its shape declares, or they are larger than the budget.
-        zipfile.BadZipFile: If it is no archive, or a damaged one.
-        KeyError: If there is no array of such a name.
+        ValueError: If there are too many members, or a member is not compressed like numpy's, is no array, or has
+            another number of bytes than its shape declares, or the arrays exceed the budget.
+        zipfile.BadZipFile: If the content is not an archive, or a damaged one.
+        KeyError: If an array of such a name is missing.
     """
     if content.count(b"PK\x01\x02") > MOST_MEMBERS:  # the mark of an entry in the list of members
-        raise ValueError(f"it has more than {MOST_MEMBERS} members [HM-FILES-005]")
+        raise ValueError(f"the archive has more than {MOST_MEMBERS} members [HM-FILES-005]")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.namelist()
         wanted = members if names is None else [n if n in members else f"{n}.npy" for n in names]
         size = sum(_declared(archive, name) for name in wanted)
     if size > budget:
         raise ValueError(
-            f"its arrays take {size / 1e6:.4g} MB, more than the {budget / 1e6:.4g} MB that are read [HM-FILES-006]"
+            f"the arrays take {size / 1e6:.4g} MB, more than the {budget / 1e6:.4g} MB that are read [HM-FILES-006]"
         )
 
 
 def _declared(archive: zipfile.ZipFile, name: str) -> int:
-    """Bytes that an array takes by its header, each number counted as 8 of them at least [byte]."""
+    """Bytes of an array by its header, at least 8 per number [byte]."""
     member = archive.getinfo(name)
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"member {name[:80]!r} is packed in another way than numpy's [HM-FILES-007]")
+        raise ValueError(f"member {name[:80]!r} is not compressed like numpy's [HM-FILES-007]")
     with archive.open(member) as file:
         begin = io.BytesIO(file.read(HEADER))
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(npy.read_magic(begin))
     if read is None:
-        raise ValueError(f"member {name[:80]!r} is no array of numbers [HM-FILES-008]")
+        raise ValueError(f"member {name[:80]!r} is not an array of numbers [HM-FILES-008]")
     shape, _, dtype = read(begin)
-    if dtype.hasobject:  # which are refused when they are to be read
+    if dtype.hasobject:  # arrays of objects are refused when they are read
         return member.file_size
     count = math.prod(shape)
     if min(shape, default=0) < 0 or begin.tell() + count * dtype.itemsize != member.file_size:
         raise ValueError(
-            f"member {name[:80]!r} declares the shape {shown(str(shape))} of {dtype.str} and holds "
+            f"member {name[:80]!r} declares the shape {shown(str(shape))} of {dtype.str} but holds "
             f"{member.file_size} bytes [HM-FILES-009]"
         )
     return count * max(8, dtype.itemsize)
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """Content of a regular file of at most ``limit`` bytes; InputError if there is none, or it cannot be read."""
+    """Content of a regular file of at most ``limit`` bytes; InputError if it is missing or cannot be read."""
     try:
         return nn_export.files.read_bytes(path, limit)
     except FileNotFoundError as error:
-        raise InputError(f"{path} is missing [HM-FILES-010]") from error
+        raise InputError(f"{path}: the file is missing [HM-FILES-010]") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {reason(error)} [HM-FILES-011]") from error
+        raise InputError(f"{path}: cannot be read: {reason(error)} [HM-FILES-011]") from error
 
 
 def reason(error: BaseException) -> str:
-    """Why the file system refused something, in words."""
+    """The reason of an error of the file system, as text."""
     if isinstance(error, FileExistsError) and error.filename:
-        return f"{error.filename} is a file where a folder is needed"
+        return f"{error.filename} is a file, not a folder"
     return str(getattr(error, "strerror", None) or error)
 
 
 def cannot_write(path: Path, error: OSError) -> StorageError:
-    """What to say where ``path`` cannot be written: the place, the reason, and what is left of it."""
-    kept = "the file from before is kept" if _exists(path) else "nothing half-written is left"
-    return StorageError(f"cannot write {path}: {reason(error)}; {kept} [HM-FILES-019]")
+    """The error that ``path`` cannot be written: place, reason, and what remains."""
+    kept = "the old file is unchanged" if _exists(path) else "no partial file is left"
+    return StorageError(f"{path}: cannot be written: {reason(error)}; {kept} [HM-FILES-019]")
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file that one may look at; a name that is too long for the file system names none."""
+    """Whether a readable file exists; False for a name that is too long for the file system."""
     try:
         return path.is_file()
     except OSError:
@@ -303,11 +304,11 @@ def digest(value: Any) -> str:
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether a folder is not there, or holds nothing but what a killed writer or a lock has left."""
+    """Whether a folder is missing, or holds only leftovers of a killed writer or a lock."""
     try:
         return not folder.exists() or (folder.is_dir() and all(_leftover(path) for path in folder.iterdir()))
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot look into {folder}: {reason(error)} [HM-FILES-012]") from error
+        raise InputError(f"{folder}: cannot be listed: {reason(error)} [HM-FILES-012]") from error
 
 
 def _leftover(path: Path) -> bool:
@@ -315,17 +316,17 @@ def _leftover(path: Path) -> bool:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder for results that holds something, or in which nothing can be written; none is made."""
+    """Refuse a folder for results that is not empty or not writable; it is not created."""
     if not is_empty(folder):
-        raise InputError(f"{folder} exists and is no empty folder; choose another --out [HM-FILES-013]")
+        raise InputError(f"{folder}: exists and is not an empty folder. Choose another --out. [HM-FILES-013]")
     check_writable(folder)
 
 
 def check_writable(folder: Path) -> None:
-    """Refuse a folder in which nothing can be written; it need not be there yet."""
+    """Refuse a folder that is not writable; it may not exist yet."""
     try:
         if "\0" in str(folder):
-            raise ValueError("its name holds a null character [HM-FILES-014]")
+            raise ValueError("its name contains a null character [HM-FILES-014]")
         place = folder.absolute()
         while not place.exists():  # a name that is too long for the file system raises here
             place = place.parent
@@ -335,15 +336,15 @@ def check_writable(folder: Path) -> None:
             os.fsync(file.fileno())
     except (OSError, ValueError) as error:
         raise StorageError(
-            f"cannot write into {folder}: {reason(error)}; choose another --out [HM-FILES-015]"
+            f"{folder}: cannot be written: {reason(error)}. Choose another --out. [HM-FILES-015]"
         ) from error
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, which is made if missing, against other jobs; what killed writers have left in it is removed.
+    """Lock a folder (created if missing) against other jobs, and remove leftovers of killed writers.
 
-    The system lets go of it when the process ends, however it ends. InputError if another job holds it.
+    The system releases the lock whenever the process ends. InputError if another job holds it.
     """
     with named_extra("a job's folder"):
         from filelock import FileLock, Timeout
@@ -354,14 +355,13 @@ def locked(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise InputError(
-            f"{folder} is in use: another process works in this folder; wait for it, or choose another --out"
-            " [HM-FILES-016]"
+            f"{folder}: another process uses this folder. Wait for it, or choose another --out. [HM-FILES-016]"
         ) from error
     except OSError as error:
         raise cannot_write(folder, error) from error
     try:
         for place in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
-            nn_export.files.sweep(place, age=-1.0)  # nobody else writes here
+            nn_export.files.sweep(place, age=-1.0)  # the lock excludes other writers
         yield
     finally:
         lock.release()

@@ -1,6 +1,6 @@
-"""Dataclasses to plain data and back: what JSON, YAML and checkpoints hold is checked field by field when read.
+"""Dataclasses to plain data and back: every field of JSON, YAML and checkpoints is checked when it is read.
 
-CasADi functions are written as programs of ``nn_export`` (operators and numbers): nothing in the data can execute.
+CasADi functions are written as programs of ``nn_export`` (operators and numbers): the data cannot execute anything.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from hybrid_mpc.rules import printable
 
 T = TypeVar("T")
 NUMBERS = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
-"""How numbers are written that JSON does not know."""
+"""Spelling of numbers that JSON does not have."""
 LARGEST = 2**63
-"""Whole numbers of this size or more are refused: no array, seed or count can hold them."""
+"""Integers of this size or more are refused: no array, seed or count can hold them."""
 LONGEST = 40
-"""Characters of a text that a message shows."""
+"""Most characters of a text in a message."""
 LONGEST_WHAT = 100
-"""Characters of what a message calls a record."""
+"""Most characters of a record's description in a message."""
 MOST_NAMED = 20
-"""Most problems of one file that are named; a damaged one may have thousands."""
+"""Most problems of one file that are listed; a damaged file may have thousands."""
 
 
 def plain(value: Any) -> Any:
     """``value`` in JSON's own types.
 
-    Dataclasses and mappings become objects, sequences and arrays lists, paths texts, numbers that JSON does not know
-    ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program; InputError if there is none for it.
+    Dataclasses and mappings become objects, sequences and arrays lists, paths texts, non-finite numbers ``"inf"``,
+    ``"-inf"`` and ``"nan"``, and a CasADi function its program (InputError if it has no program).
 
     Example:
         >>> plain({"x": np.array([1.0, np.inf]), "where": Path("a")})
@@ -62,7 +62,7 @@ def plain(value: Any) -> Any:
 
 
 def _function() -> Any:
-    """The type of CasADi functions; where casadi is not loaded there are none."""
+    """The type of CasADi functions; None if casadi is not loaded."""
     casadi = sys.modules.get("casadi")
     return None if casadi is None else casadi.Function
 
@@ -74,19 +74,19 @@ def _program(function: Any) -> Any:
     try:
         return to_json(program_of(function))
     except ExportError as error:
-        raise InputError(f"an expression that is to be written: {error} [HM-RECORDS-001]") from error
+        raise InputError(f"an expression cannot be written: {error} [HM-RECORDS-001]") from error
 
 
 def record(kind: type[T], data: object, where: str) -> T:
-    """The dataclass ``kind`` from plain data, as :func:`plain` makes it or a user writes it.
+    """The dataclass ``kind`` from plain data, as written by :func:`plain` or by a user.
 
     Every field is checked against its annotation: numbers, texts, flags, None, ``Literal``, tuples, sequences, arrays,
-    mappings with text keys, CasADi functions, unions and dataclasses of these, callables, ``Any``, and what
-    ``Annotated`` adds: a rule of :mod:`hybrid_mpc.rules`. A whole number fits a float, a flag fits no number.
-    Fields with a default may be left out; ``where`` stands in messages.
+    mappings with text keys, CasADi functions, unions and dataclasses of these, callables, ``Any``, and the rules of
+    ``Annotated`` (:mod:`hybrid_mpc.rules`). An integer fits a float, a flag fits no number. Fields with a default may
+    be missing; ``where`` begins the messages.
 
     Raises:
-        InputError: Naming all fields that are missing, unknown (with the nearest known one) or do not fit.
+        InputError: With all fields that are missing, unknown (with the nearest known name) or do not fit.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal
@@ -94,7 +94,7 @@ def record(kind: type[T], data: object, where: str) -> T:
         'q [m]'
         >>> record(Signal, {"nam": "q", "unit": 3}, "model.json")
         Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: model.json: no field 'nam'; did you mean 'name'? There are: name, unit, lower, \
+        hybrid_mpc.errors.InputError: model.json: no field 'nam'; did you mean 'name'? Known names: name, unit, lower, \
 upper, periodic, saturation; name is missing; unit: a text is needed, got 3
     """
     problems: list[str] = []
@@ -108,7 +108,7 @@ upper, periodic, saturation; name is missing; unit: a text is needed, got 3
 
 
 def known(word: object, names: Iterable[str], what: str) -> str:
-    """``word`` if it is one of ``names``, else InputError with the nearest one; ``what`` says what they name."""
+    """Return ``word`` if it is one of ``names``, else raise InputError with the nearest one; ``what`` is their kind."""
     names = list(names)
     if isinstance(word, str) and word in names:
         return word
@@ -117,18 +117,18 @@ def known(word: object, names: Iterable[str], what: str) -> str:
 
 def _unknown(word: object, names: Sequence[str], what: str) -> str:
     near = difflib.get_close_matches(_short(word).strip("'"), names, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}? There are" if near else "there are"
+    hint = f"did you mean {near[0]!r}? Known names" if near else "known names"
     return f"no {what} {_short(word)}; {hint}: {', '.join(names) or 'none'} [HM-RECORDS-011]"
 
 
 def _short(value: object) -> str:
-    """A value as a message shows it: however large it is, in a few words."""
+    """A short text for a value in a message."""
     if isinstance(value, Mapping):
         return f"an object of {len(value)} fields"
     if isinstance(value, list | tuple):
         return f"a list of {len(value)}"
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= LARGEST:
-        return "a whole number beyond 64 bits"
+        return "an integer beyond 64 bits"
     if isinstance(value, str):
         return shown(value)
     text = repr(value)
@@ -136,7 +136,7 @@ def _short(value: object) -> str:
 
 
 def shown(text: str) -> str:
-    """A text in quotes for a message, cut where it is long."""
+    """A text in quotes for a message, shortened if it is long."""
     return repr(text) if len(text) <= LONGEST else f"{text[:LONGEST]!r} ({len(text)} characters)"
 
 
@@ -165,7 +165,7 @@ def _dataclass(kind: type[Any], data: object, where: str, problems: list[str]) -
         return None
     try:
         return kind(**values)
-    except InputError as error:  # what the dataclass itself checks
+    except InputError as error:  # checks of the dataclass itself
         problems += [f"{head}{problem}" for problem in error.problems]
     except OverflowError as error:
         problems.append(f"{head}{error}")
@@ -173,14 +173,14 @@ def _dataclass(kind: type[Any], data: object, where: str, problems: list[str]) -
 
 
 class Fields:
-    """The fields of a dataclass while it is made: each against its annotation, and then what the class itself asks for.
+    """The fields of a new dataclass, checked against their annotations and further conditions of the class.
 
-    In ``__post_init__``: every field takes its annotation's form (a list becomes a tuple, a whole number a float), and
-    all problems of the record are told together.
+    For ``__post_init__``: every field takes the form of its annotation (a list becomes a tuple, an integer a float),
+    and all problems of the record are reported together.
 
     Args:
         made: The record.
-        what: What it is, for messages, e.g. ``"signal 'phi'"``.
+        what: Its description for messages, e.g. ``"signal 'phi'"``.
 
     Example: of a class with ``start: Bound`` and ``end: Bound``::
 
@@ -204,28 +204,30 @@ class Fields:
                 object.__setattr__(made, name, value)
 
     def need(self, names: str, holds: Callable[[], object], otherwise: str) -> None:
-        """One more condition on some fields, asked only where each of them fits by itself."""
+        """Check a further condition on some fields, if each of them fits by itself."""
         if self._wrong.isdisjoint(names.split()) and not holds():
             self._problems.append(otherwise)
 
     def distinct(self, names: str, values: Callable[[], Iterable[object]], what: str) -> None:
-        """Nothing stands twice among some values."""
+        """Check that values differ."""
         given = list(values()) if self._wrong.isdisjoint(names.split()) else []
         if twice := [value for i, value in enumerate(given) if value in given[:i]]:
-            self._problems.append(f"{what} {_short(twice[0])} stands twice [HM-RECORDS-004]")
+            self._problems.append(
+                f"{what} {_short(twice[0])} appears twice. Keep one of them. [HM-RECORDS-004]"
+            )
 
     def add(self, problems: Iterable[str]) -> None:
-        """Problems that were found elsewhere."""
+        """Add problems found elsewhere."""
         self._problems += problems
 
     def refuse(self) -> None:
-        """Raise InputError with all problems, if there are any."""
+        """Raise InputError with all problems, if any."""
         refuse([f"{self._what}: {problem}" for problem in self._problems])
 
 
 @cache
 def _hints(kind: Any) -> dict[str, Any]:
-    """Annotations of a dataclass. Names that it imports for type checkers alone mean anything."""
+    """Annotations of a dataclass. Names imported only for type checkers count as ``Any``."""
     unknown: dict[str, Any] = {}
     while True:
         try:
@@ -237,7 +239,7 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
-    """``value`` as ``kind``; what does not fit goes into ``problems``."""
+    """``value`` as ``kind``; problems are appended to ``problems``."""
     origin, arms = get_origin(kind), get_args(kind)
     if kind is Any or kind is object:
         return value
@@ -264,7 +266,7 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
     elif origin is Callable:
         if callable(value):
             return value
-        needed = "something that can be called"
+        needed = "a callable"
     elif origin in (tuple, list, Sequence) or kind in (tuple, list, Sequence):
         return _sequence(kind, value, where, problems)
     elif origin in (dict, Mapping) or kind in (dict, Mapping):
@@ -284,7 +286,7 @@ def _value(kind: Any, value: object, where: str, problems: list[str]) -> Any:
 
 
 def _ruled(kind: Any, rules: Sequence[Any], value: object, where: str, problems: list[str]) -> Any:
-    """``value`` as ``kind``, which keeps some rules, too: each says what is wrong, or nothing."""
+    """``value`` as ``kind`` that also satisfies ``rules``; each rule returns a problem or an empty text."""
     before = len(problems)
     found = _value(kind, value, where, problems)
     if len(problems) == before:
@@ -293,14 +295,14 @@ def _ruled(kind: Any, rules: Sequence[Any], value: object, where: str, problems:
 
 
 def _key(kind: Any, key: object, where: str, problems: list[str]) -> Any:
-    """A name in a mapping; a number, as YAML reads one, becomes its text."""
+    """A key of a mapping; a number, as YAML may read it, becomes text."""
     text = str(key) if isinstance(key, int | float) and not isinstance(key, bool) else key
     return _value(kind, text, f"{where}: a name in it", problems)
 
 
 def _union(arms: tuple[Any, ...], value: object, where: str, problems: list[str]) -> Any:
     tried: list[list[str]] = []
-    # a whole number stays one where both fit
+    # an integer stays an integer if int and float both fit
     for arm in sorted(arms, key=lambda arm: arm is float or get_args(arm)[:1] == (float,)):
         own: list[str] = []
         found = _value(arm, value, where, own)
@@ -314,7 +316,7 @@ def _union(arms: tuple[Any, ...], value: object, where: str, problems: list[str]
 
 
 def _depth(own: Sequence[str]) -> int:
-    """How deep in a value its first problem lies: the arm of a union that went deepest says most."""
+    """Nesting depth of a value's first problem: the member of a union with the deepest problem explains most."""
     return len(re.findall(r"[.\[]", own[0].split(": ")[0]))
 
 
@@ -341,7 +343,7 @@ def _sequence(kind: Any, value: object, where: str, problems: list[str]) -> Any:
 
 
 def _array(value: object) -> Any:
-    """Lists of numbers as an array; None where they are none, or differ in length."""
+    """Lists of numbers as an array; None if they hold other values, or differ in length."""
     if isinstance(value, np.ndarray):
         return value.astype(np.float64) if value.dtype.kind in "iuf" else None
     if not isinstance(value, list | tuple) or not value:
@@ -355,7 +357,7 @@ def _array(value: object) -> Any:
 
 
 def _built(value: object, where: str, problems: list[str]) -> Any:
-    """A CasADi function from its program, in scalar code."""
+    """A CasADi function from its program, in scalar operations."""
     from nn_export import ExportError, build
     from nn_export.program import from_json
 
@@ -365,9 +367,9 @@ def _built(value: object, where: str, problems: list[str]) -> Any:
         return build(from_json(value, {}, "program")).expand()
     except ExportError as error:
         problems.append(f"{where}: {error}")
-    except RuntimeError as error:  # an operator that CasADi has for matrices alone
+    except RuntimeError as error:  # an operator that CasADi only has for matrices
         problems.append(
-            f"{where}: a program of scalar operators is needed: {str(error).strip().splitlines()[-1]} [HM-RECORDS-010]"
+            f"{where}: must be a program of scalar operators: {str(error).strip().splitlines()[-1]} [HM-RECORDS-010]"
         )
     return None
 

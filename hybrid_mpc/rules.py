@@ -1,11 +1,11 @@
-"""What values of fields may be: names, units, texts and sizes. One rule each, for constructing and for loading.
+"""Rules for values of fields: names, units, texts and sizes. The same rule holds for constructing and for loading.
 
-A field says its rule in its annotation, ``name: Name``. :class:`~hybrid_mpc.records.Fields` checks it where a record is
-made, :func:`~hybrid_mpc.records.record` where it is read.
+A field names its rule in its annotation, ``name: Name``. :class:`~hybrid_mpc.records.Fields` checks it when a record is
+made, :func:`~hybrid_mpc.records.record` when it is read.
 
-Names go into file names, C, HTML, CSV and command lines, so they have no character that means something there. Letters
-and digits are those of any alphabet (``φ``, ``Länge``): they close no comment, quote, tag or path in these. Every
-generator escapes what it writes all the same.
+Names become parts of file names, C, HTML, CSV and command lines, so they have no special characters of these. Letters
+and digits of any alphabet (``φ``, ``Länge``) are allowed: they are not special there. Every generator also escapes what
+it writes.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
 MOST_NAME = 100
-"""Longest name [bytes of UTF-8]: with what is put before and behind it, a file name has at most 255."""
+"""Longest name [bytes of UTF-8]: with prefixes and suffixes, a file name stays below 255."""
 MOST_UNIT = 50
 MOST_LINE, MOST_TEXT = 1_000, 100_000
 """Longest title and longest description [characters]."""
 MOST_SEED = 2**31 - 1
-"""Largest seed: a thousand times it, as loops number theirs, still fits 64 bits."""
+"""Largest seed: a thousand times this number, used to number loops, still fits 64 bits."""
 LARGEST = 1e30
-"""Largest size of a number in any unit. Nothing that is measured is larger, and cost functions, whose terms have up to
-the eighth power of such numbers, stay finite."""
+"""Largest size of a number in any unit. No measured value is larger, and cost functions, whose terms have up to the
+eighth power of such numbers, stay finite."""
 SMALLEST = 1e-30
-"""Smallest size of a number that must be positive: a variance is its square, which must not vanish."""
+"""Smallest positive number: its square, a variance, must not vanish."""
 SHORTEST_S, LONGEST_S = 1e-9, 1e9
-"""Shortest and longest time [s]: a nanosecond, some thirty years."""
+"""Shortest and longest time [s]: a nanosecond, and about thirty years."""
 _NAME = re.compile(r"\w(?:[\w .\[\]-]*[\w\]-])?")
 _UNIT = re.compile(
     r"(?!.*(?:\*/|/\*|//))[\w/^*()°%‰·⋅×√.+−⁻-](?:[\w/^*()°%‰·⋅×√.+−⁻ -]*[\w/^*()°%‰·⋅×√.+−⁻-])?"
 )
 _TURNS = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069\u200e\u200f\u061c\u2028\u2029"
-"""Characters that turn the direction of the text behind them, or end a line without looking like it."""
+"""Characters that change the direction of text, or end a line invisibly."""
 
 
 def name_problem(name: str) -> str:
-    """What is wrong with the name of a signal, parameter, task, model, scenario; empty if nothing is.
+    """The problem with the name of a signal, parameter, task, model or scenario; empty without one.
 
     A name has letters and digits of any alphabet, ``_ . [ ] -`` and blanks. It begins with a letter, a digit or ``_``
     and does not end with a blank or a dot.
@@ -63,7 +63,7 @@ def name_problem(name: str) -> str:
 
 
 def unit_problem(unit: str) -> str:
-    """What is wrong with a unit; empty if nothing is. ``"-"`` stands for no unit.
+    """The problem with a unit; empty without one. ``"-"`` means no unit.
 
     A unit has letters, digits, blanks and ``/ ^ * ( ) ° % ‰ · × √ . + -``, without ``*/``, ``/*`` and ``//``, which
     open and close comments.
@@ -83,7 +83,7 @@ def unit_problem(unit: str) -> str:
 
 
 def line_problem(text: str) -> str:
-    r"""What is wrong with a title or another text of one line; empty if nothing is.
+    r"""The problem with a title or another text of one line; empty without one.
 
     Example:
         >>> line_problem('Pump "A" <b>, 50 % & more'), bool(line_problem("two\nlines"))
@@ -95,29 +95,29 @@ def line_problem(text: str) -> str:
 
 
 def text_problem(text: str) -> str:
-    """What is wrong with a text of several lines; empty if nothing is."""
+    """The problem with a text of several lines; empty without one."""
     if strange := [c for c in text if not (_printed(c) or c in "\n\r\t")]:
         return f"text is needed, got {_shown(text)} with the character {strange[0]!r}"
     return "" if len(text) <= MOST_TEXT else f"at most {MOST_TEXT} characters are needed, got {len(text)}"
 
 
 def column_problem(text: str) -> str:
-    """What is wrong with the name of a recording's column, which may be any text; empty if nothing is."""
+    """The problem with the name of a recording's column, which may be any text; empty without one."""
     return text_problem(text) if text.strip() else f"the name of a column is needed, got {_shown(text)}"
 
 
 def label_problem(text: str) -> str:
-    """What is wrong with a short text of one line that must say something; empty if nothing is."""
+    """The problem with a short, non-empty text of one line; empty without one."""
     return line_problem(text) if text.strip() else f"a text is needed, got {_shown(text)}"
 
 
 def name_or_none_problem(name: str) -> str:
-    """As :func:`name_problem`; an empty name stands for all, or for none."""
+    """As :func:`name_problem`; the empty name means all, or none."""
     return name_problem(name) if name else ""
 
 
 def printable(text: str) -> str:
-    r"""A text of anybody's for a terminal: characters that would move its cursor or change it are shown by number.
+    r"""Any text for a terminal: control characters are shown as escapes.
 
     Example:
         >>> printable("a\x1b[2Jb")
@@ -127,7 +127,7 @@ def printable(text: str) -> str:
 
 
 def markdown(text: str) -> str:
-    """A text of anybody's as it stands in Markdown and in a cell of its tables: in one line, its marks by numbers.
+    """Any text for Markdown and cells of its tables: one line, special characters as numeric entities.
 
     Example:
         >>> markdown("a <b> *c* | 50 %")
@@ -137,7 +137,7 @@ def markdown(text: str) -> str:
 
 
 def csv_cell(text: str) -> str:
-    """A text of anybody's as a cell of a CSV: one that a spreadsheet would compute gets an apostrophe before it.
+    """Any text for a cell of a CSV file: a text that a spreadsheet would evaluate gets an apostrophe in front.
 
     Source: OWASP, *CSV injection*. A number or a lone sign is no formula.
 
@@ -161,7 +161,7 @@ def _shown(text: str) -> str:
 
 @dataclass(frozen=True)
 class Within:
-    """A rule for numbers: from ``low`` to ``high``, or one of ``also``; never NaN. ``needed`` says it in a message.
+    """A rule for numbers: from ``low`` to ``high``, or one of ``also``; never NaN. ``needed`` describes it in messages.
 
     Example:
         >>> Within(0.0, 1.0, "a share from 0 to 1")(1.5)
@@ -174,7 +174,7 @@ class Within:
     also: tuple[float, ...] = ()
 
     def __call__(self, value: float) -> str:
-        """What is wrong with a number; empty if nothing is."""
+        """The problem with a number; empty without one."""
         return (
             ""
             if self.low <= value <= self.high or value in self.also

@@ -1,4 +1,4 @@
-"""A scenario: everything that the jobs need to know about one machine. No torch in here."""
+"""A scenario: the complete description of one machine for all jobs. Does not import torch."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ SWITCHED = (
     "dtype",
     "kind",
 )
-"""How an input of whole numbers may be declared, which no signal can be."""
+"""Arguments with which users try to declare discrete inputs, which signals do not support."""
 
 
 def _is_problem(control: object) -> bool:
-    """Whether it is a control problem, or none; casadi is loaded only for one that is."""
+    """Whether ``control`` is None or a control problem; casadi is loaded only for the latter."""
     if control is None:
         return True
     from hybrid_mpc.control.ocp import OCP
@@ -62,26 +62,26 @@ class Task:
     """A closed-loop task.
 
     Args:
-        name: Short name, e.g. ``"track_sine"``, made as a signal's; files are called after it.
+        name: Short name, e.g. ``"track_sine"``, by the rules of a signal's; part of file names.
         title: One line for plots and the report.
         duration: Length [s].
-        x0: Initial state ``(n_x,)`` [SI], at rest.
-        reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI], or ``y_ref (n, n_y)`` where the control problem weighs
-            outputs; the controller previews it if the problem says so.
-        weight: ``t (n,) [s] -> (n, n_x)``, factors on the control problem's ``q``, not negative, previewed like
-            the reference: zero where a state does not matter, large where it must be met. Instants lie on the grid of
-            model periods. Default: 1 throughout.
+        x0: Initial state ``(n_x,)`` [SI], an equilibrium.
+        reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI], or ``y_ref (n, n_y)`` if the control problem weighs outputs;
+            the controller previews it if the problem says so.
+        weight: ``t (n,) [s] -> (n, n_x)``, nonnegative factors on the control problem's ``q``, previewed like the
+            reference: zero where a state does not matter, large where it must be met. Instants must lie on the grid of
+            model periods. Default: 1.
         control: The task's own control problem, e.g. with other limits. Default: the scenario's.
-        faults: What disturbs the machine in this task; no controller knows it. Default: nothing.
-        figures: ``result -> {name with unit: number}``, figures of the task's own beside the cost. Default: none.
-        w: ``t (n,) [s] -> (n, n_w)``, measured disturbances of the machine in this task: they act on the plant and are
-            measured, and known ahead where the control problem previews them. Default: those of the operating point.
+        faults: Faults and disturbances of the machine in this task, unknown to controllers. Default: none.
+        figures: ``result -> {name with unit: number}``, the task's own results besides the cost. Default: none.
+        w: ``t (n,) [s] -> (n, n_w)``, measured disturbances of the machine in this task: they act on the plant, are
+            measured, and are known in advance if the control problem previews them. Default: the operating point's.
 
     Raises:
-        InputError: If a field is of another kind; all of it together.
+        InputError: With all fields of a wrong kind.
 
     Example:
-        >>> def meet(t):  # at t = 1 s only, and from then on ordinarily
+        >>> def meet(t):  # a large weight at t = 1 s only, weight 1 afterwards
         ...     return np.where(np.abs(t - 1.0) < 0.01, 1e3, 1.0 * (t > 1.0))[:, None] * np.ones(2)
         >>> task = Task("hit", "Be there at 1 s", 2.0, (0.0, 0.0), lambda t: np.zeros((len(t), 2)), meet)
         >>> task.weight(np.array([0.5, 1.0, 1.5]))[:, 0].tolist()
@@ -104,7 +104,7 @@ class Task:
         own.need(
             "control",
             lambda: _is_problem(self.control),
-            f"control: OCP(...) is needed, got {self.control!r:.60} [HM-SCENARIO-001]",
+            f"control: must be OCP(...), got {self.control!r:.60} [HM-SCENARIO-001]",
         )
         own.refuse()
 
@@ -116,16 +116,16 @@ class Budget:
     Args:
         hidden: Hidden units of each network.
         networks: Networks trained per model, each without another part of the data. Their mean is deployed: one network
-            of ``networks * hidden`` hidden units z, on which the time of a control step depends.
+            of ``networks * hidden`` hidden units z, which determines the time of a control step.
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
-        seeds: Closed loops per task and controller, at most: fewer where they tell the controllers' costs apart.
-        oracle_seeds: Closed loops per task of the oracles, which are slow, at most; never more than of the others.
+        seeds: Most closed loops per task and controller; fewer if they suffice to distinguish the controllers' costs.
+        oracle_seeds: Most closed loops per task of the oracles, which are slow; never more than of the others.
         tasks: Names of the tasks to run. Default: all.
-        decay: Weight decay times the number of training samples: the less data, the more is needed to keep a network
-            from learning their noise. Default: 300.
-        prior_replay: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. For a machine
-            whose tasks go where its recordings do not. Default: zero, none.
+        decay: Weight decay times the number of training samples: fewer samples need more decay against overfitting.
+            Default: 300.
+        prior_replay: Weight that fades corrections where nothing was measured (``TrainingSettings``), for a machine
+            whose tasks leave the range of its recordings. Default: zero.
     """
 
     hidden: Count
@@ -146,57 +146,55 @@ DEFAULT_BUDGETS: Mapping[str, Budget] = {
     "quick": Budget(hidden=8, networks=4, teacher_steps=200, free_run_steps=200, seeds=2),
     "full": Budget(hidden=8, networks=4, teacher_steps=2500, free_run_steps=800, seeds=10),
 }
-"""Budgets of a scenario that names none: a first look in minutes, and one that is worth reporting."""
+"""Budgets of a scenario without its own: a first look in minutes, and one for results to report."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One machine: prior, data, and what there is to control.
+    """One machine: prior, data, and the control problem.
 
     Args:
         name: Registered name.
         title: One line for the report.
-        description: A paragraph for the report: the machine, its traps, the source of its data.
+        description: A paragraph for the report: the machine, its difficulties, the source of its data.
         prior: Prior class or factory ``(values=None) -> Prior``.
         data: How recordings are read.
         make_data: ``(folder, seed, budget name) -> CSV or npz paths`` for a simulated machine; default: none.
-        plant: ``() -> Plant``; default: none. Then loops run on a trained model in place of the machine, which tells
-            nothing of the machine.
+        plant: ``() -> Plant``; default: none. Then loops run on a trained model instead, and say nothing about the
+            machine.
         oracle: ``(dt) -> HybridModel`` with the plant's own equations, its hidden states as ``h``.
-        control: The control problem that all controllers share; default: none.
-        sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them. Needed
-            where there is a control problem.
-        first_sigma: Standard deviations of the states that no output shows alone [state units] at the estimator's
-            start. Default: of the speeds of measured states ``sqrt(2) sensor_sigma / dt``, of others by their range.
-        state_noise: How far a state strays in a period (standard deviation, state units), by the state's name, where
-            the machine's builder knows it. Default: by the model's errors on the recordings. A state to whose rate all
-            goes that a prior does not explain seems to stray far, and a filter that believes it takes every lag that
-            the model lacks for a move of that state.
-        safe_input: Input ``(n_u,)`` [input units] that the machine may be left with: when a sensor is lost, when
-            nothing is finite, at the end of a run. It is never guessed: a guard that rests and a run on the real
-            machine need it. Default: none is declared; a loop in simulation then holds its last input.
-        tasks: Closed-loop tasks. Default: none; without a plant, too, a step and holding against a disturbance
+        control: The control problem of all controllers; default: none.
+        sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], for estimators. Required with a
+            control problem.
+        first_sigma: Initial standard deviations in the estimator of the states that are not measured directly [state
+            units]. Default: ``sqrt(2) sensor_sigma / dt`` for speeds of measured states, else by their range.
+        state_noise: Process noise of a state per period (standard deviation, state units), by the state's name, if the
+            machine's builder knows it. Default: from the model's errors on the recordings. These attribute all
+            unexplained rates to one state, so a filter would take every lag that the model lacks for noise of it.
+        safe_input: Input ``(n_u,)`` [input units] that is safe for the machine: after the loss of a sensor, after
+            non-finite results, at the end of a run. It has no default: a guard that rests and a run on the real machine
+            need it. A simulated loop without it holds its last input.
+        tasks: Closed-loop tasks. Default: none; without a plant a step and holding against a disturbance
             (:func:`~hybrid_mpc.check.default_tasks.default_tasks`).
         budgets: Effort by name.
-        draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for moving pictures; default: none.
+        draw: ``x (n_x,) -> polylines (m, 2) [m]`` of the machine, for animations; default: none.
         figures: ``rows -> {file name: (figure, caption)}``, the machine's own figures of the comparison; a row is a
             :class:`~hybrid_mpc.compare.loops.LoopRow` (``task``, ``controller``, ``figures``). Default: none.
-        causes: What may break, by name: the prior's parameters (or ``"gain of <input>"``) that change together then,
-            for :class:`~hybrid_mpc.watch.diagnose.Diagnoser`. Default: each by itself.
+        causes: Possible faults, by name: the prior's parameters (or ``"gain of <input>"``) that change together, for
+            :class:`~hybrid_mpc.watch.diagnose.Diagnoser`. Default: each parameter by itself.
         benchmark: How ``hybrid-mpc benchmark`` evaluates the machine's models on recordings; default: not at all.
-        beyond_recordings: Whether tasks go where no recording was. The filters on the hybrid then assume no less
-            process noise than those on the prior; see also ``Budget.prior_replay``. Default: no.
-        disturbance_model: What unmeasured disturbances are added to, as estimators and controllers assume them. As many
-            as there are outputs leave no offset (:func:`~hybrid_mpc.estimate.offset_free.offset_free`). Default: as
-            many as outputs where the control problem weighs outputs, one at each input and at each output that is not
-            weighed, as far as they are found (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`); else one at
-            each input.
-        terms: What ``hybrid-mpc explain`` chooses missing terms from: names of laws of :mod:`hybrid_mpc.machine.terms`,
-            e.g. ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Own terms are tried beside the
-            laws. Default, where no law is named: all laws.
+        beyond_recordings: Whether tasks leave the range of the recordings. Filters on the hybrid then assume at least
+            the process noise of those on the prior; see also ``Budget.prior_replay``. Default: no.
+        disturbance_model: Unmeasured disturbances that estimators and controllers assume. As many as outputs give
+            offset-free control (:func:`~hybrid_mpc.estimate.offset_free.offset_free`). Default: if the control problem
+            weighs outputs, as many as outputs, one at each input and at each output without weight, as far as they are
+            observable (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`); else one at each input.
+        terms: Candidates of ``hybrid-mpc explain``: names of laws of :mod:`hybrid_mpc.machine.terms`, e.g.
+            ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Default, if no law is named: all
+            laws, besides the own terms.
 
     Raises:
-        InputError: If a field is of another kind, or two tasks have one name; all of it together.
+        InputError: With all fields of a wrong kind, and equal names of tasks.
 
     Example:
         >>> spec = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
@@ -232,60 +230,60 @@ class Scenario:
         own.need(
             "control",
             lambda: _is_problem(self.control),
-            f"control: OCP(...) is needed, got {self.control!r:.60} [HM-SCENARIO-002]",
+            f"control: must be OCP(...), got {self.control!r:.60} [HM-SCENARIO-002]",
         )
         own.distinct("tasks", lambda: [task.name for task in self.tasks], "tasks: the name")
         own.refuse()
 
 
 def registered_scenarios() -> dict[str, str]:
-    """Registered scenario names with the place they come from."""
+    """Registered scenario names, each with its module and attribute."""
     from importlib.metadata import entry_points
 
     return {e.name: e.value for e in sorted(entry_points(group="hybrid_mpc.scenarios"), key=lambda e: e.name)}
 
 
 def scenario_of(named: str, where: Path, given: str = "") -> Scenario | None:
-    """The scenario that a file names, of registered ones alone: a name from a file never runs anything.
+    """The scenario named in a file, if it is registered: a name from a file never runs code.
 
-    ``given`` is the user's own registered name or Python file, which is taken first; ``where`` names the file in
-    messages. None where neither names one.
+    ``given`` is the user's own registered name or Python file, which takes precedence; ``where`` is the file, for
+    messages. None if neither names a scenario.
 
     Raises:
-        InputError: If the file's scenario is not registered, or the user's is another one.
+        InputError: If the file's scenario is not registered, or the user's scenario is another one.
 
     Example:
         >>> scenario_of("golf_robot", Path("model.json")).name
         'golf_robot'
         >>> scenario_of("mine.py", Path("model.json"))
         Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: model.json names the scenario 'mine.py', which is not registered; if it is ...
+        hybrid_mpc.errors.InputError: model.json names the scenario 'mine.py', which is not registered. If it is ...
     """
     if given:
         scenario = load_scenario(given)
         if named and scenario.name != named:
             raise InputError(
-                f"{where} was made for scenario {named!r}, not for {scenario.name!r} [HM-SCENARIO-003]"
+                f"{where} belongs to the scenario {named!r}, not to {scenario.name!r} [HM-SCENARIO-003]"
             )
         return scenario
     if not named:
         return None
     if named not in registered_scenarios():
         raise InputError(
-            f"{where} names the scenario {named!r}, which is not registered; if it is yours, give its file: "
+            f"{where} names the scenario {named!r}, which is not registered. If it is yours, give its file: "
             "--scenario FILE.py [HM-SCENARIO-004]"
         )
     return load_scenario(named)
 
 
 def load_scenario(name_or_path: str) -> Scenario:
-    """The scenario of a registered name or of a user's Python file (which defines ``scenario``).
+    """The scenario of a registered name, or of a user's Python file that defines ``scenario``.
 
-    Loading a Python file runs it, so only a name that the user has typed may come here; for one that stands in a file
-    there is :func:`scenario_of`. It may import other files of its folder, whose names no installed module has.
+    Loading a Python file runs it, so ``name_or_path`` must come from the user; for names in files there is
+    :func:`scenario_of`. The file may import other files of its folder, unless an installed module has the same name.
 
     Raises:
-        InputError: If there is no such name or file, the file fails, or defines no ``scenario``.
+        InputError: If there is no such name or file, the file raises an exception, or it defines no ``scenario``.
 
     Example:
         >>> load_scenario("golf_robot").name
@@ -305,7 +303,7 @@ def load_scenario(name_or_path: str) -> Scenario:
         )
     try:
         there = path.is_file()
-    except OSError as error:  # a name that is too long for the file system
+    except OSError as error:  # e.g. a name that is too long for the file system
         raise InputError(f"no scenario file {path}: {error.strerror} [HM-SCENARIO-006]") from error
     if not there:
         raise InputError(f"no scenario file {path} [HM-SCENARIO-007]")
@@ -313,10 +311,10 @@ def load_scenario(name_or_path: str) -> Scenario:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses and worker processes look their module up by name
+    sys.modules[spec.name] = module  # dataclasses and worker processes find the module by name
     folder = str(path.resolve().parent)
     if folder not in sys.path:
-        sys.path.append(folder)  # files beside it may be imported; installed modules come first
+        sys.path.append(folder)  # the file may import its neighbours; installed modules come first
     with no_exit(str(path)):
         try:
             spec.loader.exec_module(module)
@@ -325,7 +323,7 @@ def load_scenario(name_or_path: str) -> Scenario:
             raise InputError(f"{path}{line}: {_missing(error) or _told(error)} [HM-SCENARIO-008]") from error
     if not hasattr(module, "scenario"):
         raise InputError(
-            f"{path} defines no variable 'scenario'; add: scenario = Scenario(name=..., ...)"
+            f"{path} defines no variable 'scenario'. Add: scenario = Scenario(name=..., ...)"
             " [HM-SCENARIO-009]"
         )
     return _checked(module.scenario, str(path))
@@ -334,9 +332,7 @@ def load_scenario(name_or_path: str) -> Scenario:
 def _checked(scenario: object, where: str) -> Scenario:
     if not isinstance(scenario, Scenario):
         kind = type(scenario).__name__
-        raise InputError(
-            f"{where}: 'scenario' is a {kind}, it must be a hybrid_mpc Scenario [HM-SCENARIO-010]"
-        )
+        raise InputError(f"{where}: 'scenario' must be a hybrid_mpc Scenario, got {kind} [HM-SCENARIO-010]")
     return scenario
 
 
@@ -345,22 +341,22 @@ def _told(error: BaseException) -> str:
 
 
 def _missing(error: BaseException) -> str:
-    """What to write where a class was not given all that it needs; empty for any other error.
+    """The missing arguments of a class, and how to write them; empty for any other error.
 
     Example:
         >>> _missing(TypeError("DataSpec.__init__() missing 2 required positional arguments: 'dt' and 'max_gap'"))
-        'DataSpec lacks dt and max_gap; write DataSpec(..., dt=..., max_gap=...)'
+        'DataSpec lacks dt and max_gap. Write DataSpec(..., dt=..., max_gap=...)'
     """
     found = re.search(r"(\w+)\.__init__\(\) missing \d+ required [\w-]+ arguments?: (.*)", said_by(error))
     if found is None:
         return ""
     names = re.findall(r"'(\w+)'", found[2])
     said = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-    return f"{found[1]} lacks {said}; write {found[1]}(..., {', '.join(f'{name}=...' for name in names)})"
+    return f"{found[1]} lacks {said}. Write {found[1]}(..., {', '.join(f'{name}=...' for name in names)})"
 
 
 def _hint(error: BaseException) -> str:
-    """What helps where a field was given that its class does not have."""
+    """A remedy for an argument that the class does not have."""
     found = re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", said_by(error))
     kinds = {
         kind.__name__: kind for kind in (Signal, Parameter, DataSpec, BenchmarkSpec, Task, Budget, Scenario)
@@ -368,17 +364,14 @@ def _hint(error: BaseException) -> str:
     if found is None or found[1] not in kinds:
         return ""
     if found[1] == "Signal" and found[2] in SWITCHED:
-        return (
-            ". Inputs of whole numbers, or on and off, are not supported; take one that can have any value between, "
-            "such as a duty"
-        )
+        return ". Inputs that are integers, or on and off, are not supported. Use a continuous input, e.g. a duty cycle"
     names = [one.name for one in fields(kinds[found[1]])]
     near = difflib.get_close_matches(found[2], names, n=1)
-    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(names)}"
+    return f"; did you mean {near[0]!r}?" if near else f"; known names: {', '.join(names)}"
 
 
 def _line_in(error: BaseException, path: Path) -> str:
-    """``:LINE`` of a file at which an error arose, for a message."""
+    """``:LINE`` of the file at which an error was raised, for a message."""
     if isinstance(error, SyntaxError):
         return f":{error.lineno}"
     line, trace = "", error.__traceback__

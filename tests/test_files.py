@@ -112,7 +112,7 @@ def test_what_the_file_system_refuses_is_one_clear_line(tmp_path):
 def test_json_that_is_none(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=r"a.json is damaged"):
+    with pytest.raises(InputError, match=r"a.json: the file is damaged"):
         read_json(path)
 
 

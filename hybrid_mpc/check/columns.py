@@ -1,4 +1,4 @@
-"""Columns of recordings: which move, their units, and which one is the time."""
+"""Columns of recordings: which columns move, their units, and which column is the time."""
 
 from __future__ import annotations
 
@@ -24,33 +24,32 @@ from hybrid_mpc.rules import LARGEST, column_problem
 
 Array = NDArray[np.float64]
 MOST_RECORDED = 1e-3 * LARGEST
-"""Largest number of a signal: its range is wider than what was recorded."""
+"""Largest number of a signal; the signal's range, wider than the recording, must stay below ``LARGEST``."""
 EVEN = 0.2
-"""Share by which the distances of time stamps may spread."""
+"""Largest relative spread of evenly spaced time stamps."""
 COUNTED = (
-    "it counts samples and stands for the time, as no column says that it is: write the seconds of one count into "
-    "units, and all lengths below with it"
+    "the column counts samples and is used as the time, since no column is named as time. Write the seconds of one "
+    "count into units, and multiply all lengths below by it"
 )
-"""What is not sure of a time that is a count."""
-UNNAMED = "it rises evenly and no column says that it is the time; is it, in seconds?"
-NO_UNIT = "is it in seconds? Its name names no unit"
+"""Doubt about a time that is a count of samples."""
+UNNAMED = "the column rises evenly and no column is named as time. Check that it is the time in seconds"
+NO_UNIT = "its name has no unit. Check that it is in seconds"
 LONGEST_NAME = 40
 """Most characters of a signal's name."""
 EPOCHS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3), (1e9, 1.0))
-"""What a time since 1970 is at least since 2001, and its unit [s]; after 2130 it is none."""
+"""Smallest time since 1970 (in the year 2001) in each unit [s]; a number five times larger (after 2130) is no epoch."""
 UNIT = re.compile(r"[\w/^*·.%°²³µμΩ() -]{1,20}")
-"""How a unit is written; anything else behind a name is none."""
+"""Pattern of a unit; any other text behind a name is not one."""
 DIVERGED, AGAIN = 1e12, 3
-"""Times a column's usual deviation that a recording which diverges reaches, and fewest numbers that do."""
+"""Least size of diverged numbers, over a column's median size; and the fewest such numbers."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the recordings: full name, name and unit as the header has them, all its numbers ``(m,)``.
+    """A column of the recordings: full name, name and unit from the header, all its numbers ``(m,)``.
 
-    ``lengths`` are those of the recordings, which follow each other. ``periodic`` is an angle that jumps by full turns
-    where it is recorded; its numbers count on. ``asked`` says that the unit is a letter at the end of the name, which
-    may be an index.
+    ``lengths`` are those of the concatenated recordings. ``periodic``: an angle that is recorded wrapped; its numbers
+    are unwrapped. ``asked``: the unit is a letter at the end of the name, which may be an index instead.
     """
 
     full: str
@@ -73,13 +72,13 @@ class Column:
 
     @property
     def identifier(self) -> str:
-        """The name as Python can write it after a dot."""
+        """The name as a Python identifier."""
         text = ascii_of(self.name)[:LONGEST_NAME].strip("_") or "signal"
         return f"c_{text}" if text[0].isdigit() or keyword.iskeyword(text) else text
 
     @property
     def signal(self) -> Signal:
-        """The signal, with a range twice as wide again as what was recorded, on either side."""
+        """The signal; its range extends the recorded one by its span on either side."""
         if self.periodic:
             return Signal(self.identifier, self.unit or "-", periodic=True)
         low, high = self.span
@@ -93,7 +92,7 @@ class Column:
 
 
 def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, str]]:
-    """Columns whose numbers move, and why the others are no signals, by full name."""
+    """Columns whose numbers move, and the reasons why others are no signals, by full name."""
     found: dict[str, Column] = {}
     tables = [read_all(source) for source in sources]
     usual = [_usual_length(read) for read, _ in tables]
@@ -106,19 +105,19 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
         for source, (read, reasons), rows in zip(sources, tables, usual, strict=True):
             where = f" in {source.path.name}" if len(sources) > 1 else ""
             if full not in read:
-                problems.append(reasons.get(full, f"it is not in {source.path.name}"))
+                problems.append(reasons.get(full, f"it is missing in {source.path.name}"))
                 continue
             one = read[full]
             pieces.append(one.values[:, 0])
             if full in one.faults:
                 problems.append(f"{one.faults[full]}{where}")
             elif rows and len(one.values) not in (1, rows):
-                problems.append(f"it has {len(one.values)} values{where}, the others have {rows}")
+                problems.append(f"it has {len(one.values)} values{where}, but the other columns have {rows}")
             elif (k := _diverges(pieces[-1])) is not None:
                 diverged.append(
-                    f"{source.path}: {one.place(k)}, column {shown(full)}: it grows to "
+                    f"{source.path}: {one.place(k)}, column {shown(full)}: grows to "
                     f"{np.nanmax(np.abs(pieces[-1])):.3g}; the recording or the simulation diverged. Cut the file "
-                    "before that row, or leave the recording out [HM-CHECK-003]"
+                    "before that row, or leave out the recording. [HM-CHECK-003]"
                 )
         known = np.concatenate([piece[np.isfinite(piece)] for piece in pieces]) if pieces else np.zeros(0)
         if problem := column_problem(full):
@@ -130,9 +129,9 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
         elif len(known) < FEWEST or max(map(len, pieces)) == 1:
             left_out[full] = f"it has {len(known)} number{'s' * (len(known) > 1)}, fewer than {FEWEST}"
         elif known.min() == known.max():
-            left_out[full] = f"it is {known[0]:g} throughout"
+            left_out[full] = f"it is constant at {known[0]:g}"
         elif np.abs(known).max() > MOST_RECORDED:
-            left_out[full] = f"it reaches {np.abs(known).max():g}; no machine does"
+            left_out[full] = f"it reaches {np.abs(known).max():g}, more than any machine"
         else:
             inner = FIELD.fullmatch(full)
             name, unit = name_and_unit(inner[1] if inner else full)
@@ -151,14 +150,14 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
     if not found:
         why = "".join(f"\n  {shown(name)}: {reason}" for name, reason in left_out.items())
         raise InputError(
-            f"{sources[0].path}: no column has {FEWEST} numbers that move; give a recording in which the machine moves."
+            f"{sources[0].path}: no column has {FEWEST} numbers that move. Give a recording in which the machine moves."
             f"{sources[0].note}{why} [HM-CHECK-004]"
         )
     return found, left_out
 
 
 def _ends_with_unit(full: str) -> bool:
-    """Whether a column's name ends with a unit of more than a letter, or is a time that does: ``time_s``."""
+    """Whether a column's name ends with a unit of several letters, or is a time with a unit: ``time_s``."""
     ending = unit_behind(full)
     return bool(ending.unit and not ending.perhaps) or (
         said_by(full).kind == "time" and bool(said_by(full).unit)
@@ -166,7 +165,7 @@ def _ends_with_unit(full: str) -> bool:
 
 
 def _usual_length(read: Mapping[str, Columns]) -> int:
-    """How many rows most columns of a file have; the time's where columns differ."""
+    """Number of rows of most columns of a file; if columns differ, that of the time."""
     lengths = [
         len(one.values)
         for full, one in sorted(read.items(), key=lambda item: said_by(item[0]).kind != "time")
@@ -176,9 +175,9 @@ def _usual_length(read: Mapping[str, Columns]) -> int:
 
 
 def _diverges(values: Array) -> int | None:
-    """The row from which on numbers grow beyond all bounds; None where they do not.
+    """The row from which on a column diverges; None if it does not.
 
-    Several numbers, each larger than the one before, at the end: a code for missing values is one number.
+    Several different huge numbers must stand at the end: a code for missing values is a single number.
     """
     known = np.flatnonzero(np.isfinite(values))
     size = np.abs(values[known])
@@ -193,11 +192,11 @@ def _diverges(values: Array) -> int | None:
 
 
 def read_all(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
-    """Each column, where blank cells are none; and why the others cannot be read, by full name."""
+    """Each column, blank cells as NaN; and the reasons why others cannot be read, by full name."""
     read: dict[str, Columns] = {}
     counts = Counter(source.header)
     reasons = {
-        name: f"the name stands {count} times in the header; rename all but one"
+        name: f"its name appears {count} times in the header. Rename all but one"
         for name, count in counts.items()
         if count > 1
     }
@@ -208,9 +207,9 @@ def read_all(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
             return {
                 name: replace(whole, values=whole.values[:, j : j + 1]) for j, name in enumerate(names)
             }, reasons
-    except InputError:  # below, column by column
+    except InputError:  # then column by column, below
         pass
-    for name in names:  # vectors may be of any length and kind: each says what is wrong with it
+    for name in names:  # vectors may differ in length and kind: each one has its own error
         try:
             read[name] = source.read(None, [name], [name])
         except InputError as error:
@@ -222,7 +221,7 @@ def read_all(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
 
 
 class Clock(NamedTuple):
-    """The time: its column, None for a sampling time alone; period, the column's unit and the length [s]; a doubt."""
+    """The time: its column (None: only a sampling period), period, unit of the column and length [s], and a doubt."""
 
     column: Column | None
     period: float
@@ -238,7 +237,7 @@ def clock_of(
     asked: str,
     chosen: set[str],
 ) -> Clock:
-    """The time of all recordings: the first one's column, the longest sampling time, the shortest length.
+    """The time of all recordings: the first one's column, the longest sampling period, the shortest length.
 
     Raises:
         InputError: If the column cannot be used in a recording.
@@ -252,13 +251,13 @@ def clock_of(
         clock = (
             _clock(source, full, said_by(full))
             if full in source.header
-            else f"it is not in {source.path.name}"
+            else f"it is missing in {source.path.name}"
         )
         if isinstance(clock, Clock):
             clocks.append(clock)
         else:
             problems.append(
-                f"{source.path}: column {shown(full)}, the time, cannot be used: {clock} [HM-CHECK-005]"
+                f"{source.path}: column {shown(full)} cannot be used as the time: {clock} [HM-CHECK-005]"
             )
     refuse(problems)
     lengths = [
@@ -275,10 +274,10 @@ def _time(
 ) -> Clock:
     """The column of the time.
 
-    A name that says time decides; then numbers that rise evenly; a count of samples only where there is nothing else.
+    A name that means time decides; then numbers that rise evenly; a count of samples only as the last resort.
 
     Raises:
-        InputError: If a column says that it is the time and cannot be used; with the reason.
+        InputError: If a column is named as time and cannot be used; with the reason.
     """
     names = [asked] if asked else [full for full in dict.fromkeys(source.header) if full not in chosen]
     said = {full: said_by(full) for full in names}
@@ -302,10 +301,10 @@ def _time(
             troubles[full] = clock
         lost = [name for name in source.unread if said_by(name).kind == "time"]
         if troubles or lost:
-            role = "was named as" if asked else "says that it is"
-            many = troubles | dict.fromkeys(lost, f"it is of a kind that is not read.{source.note}")
+            role = "was given as the time" if asked else "is the time by its name"
+            many = troubles | dict.fromkeys(lost, f"its kind is not supported.{source.note}")
             refuse([
-                f"{source.path}: column {shown(name)} {role} the time and cannot be used: {trouble} [HM-CHECK-006]"
+                f"{source.path}: column {shown(name)} {role} and cannot be used: {trouble} [HM-CHECK-006]"
                 for name, trouble in many.items()
             ])  # fmt: skip
     for full in names:
@@ -321,15 +320,15 @@ def _time(
             clock = _clock(source, full, one)
             if isinstance(clock, Clock) and counts is (one.kind == "count" or _is_count(column.values)):
                 return clock._replace(doubt=COUNTED if counts else UNNAMED)
-    return Clock(None, 1.0, doubt="the sampling time [s]; no column of the recording looks like time")
+    return Clock(None, 1.0, doubt="give the sampling period [s]; no column of the recording looks like time")
 
 
 def _clock(source: Source, full: str, said: Said) -> Clock | str:
-    """A column as the time; or what is wrong with it."""
+    """A column as the time; or the reason why it cannot be."""
     if source.header.count(full) > 1:
-        return "its name stands more than once in the header. Rename all but one"
+        return "its name appears more than once in the header. Rename all but one"
     if said.unit and said.seconds is None:
-        return f"its unit {said.unit!r} is none of time. Write seconds, or name the unit, e.g. 'time [ms]'"
+        return f"its unit {said.unit!r} is not one of time. Write seconds, or name the unit, e.g. 'time [ms]'"
     try:
         columns = source.read(None, [full], ())
     except InputError as error:
@@ -344,24 +343,24 @@ def _clock(source: Source, full: str, said: Said) -> Clock | str:
         epoch = next(((least, unit) for least, unit in EPOCHS if least <= t[0] < 5 * least), None)
         seconds = epoch[1] if epoch else 1.0
         if said.is_date and epoch is None:
-            return "what the numbers of its dates count is not known. Write seconds since the beginning"
+            return "the unit of its dates is unknown. Write seconds since the beginning"
     column = Column(full, *name_and_unit(full), t, (len(t),))
     if len(t) == 1:
         fine = 0 < t[0] < math.inf
         return (
             Clock(column, seconds * float(t[0]), seconds)
             if fine
-            else f"the sampling time {t[0]:g} is not positive"
+            else f"its sampling period {t[0]:g} is not positive"
         )
     if np.abs(t).max() * seconds > MOST_RECORDED:
-        return f"it reaches {np.abs(t).max():g}"
+        return f"it reaches {np.abs(t).max():g}, more than any time"
     if disorder := columns.disorder(seconds * t, f"column {shown(full)}"):
         return disorder
     return Clock(column, seconds * float(np.median(np.diff(t))), seconds)
 
 
 def _sampling_time(source: Source, full: str, said: Said) -> Clock | None:
-    """The sampling time that a column names: one number, or the same one in every row."""
+    """The sampling period that a column gives: one number, or the same number in every row."""
     clock = _clock(source, full, said)
     if isinstance(clock, Clock):
         return clock._replace(doubt="" if said.unit else NO_UNIT)
@@ -375,36 +374,36 @@ def _sampling_time(source: Source, full: str, said: Said) -> Clock | None:
     if said.unit and said.seconds is None:
         return None
     seconds = said.seconds or 1.0
-    return Clock(None, seconds * float(values[0]), doubt=f"the sampling time [s], by {shown(full)}")
+    return Clock(None, seconds * float(values[0]), doubt=f"the sampling period [s], from {shown(full)}")
 
 
 def no_signal(column: Column) -> str:
-    """Why a column is no signal although its numbers move; empty if it may be one."""
+    """Why a column whose numbers move is no signal; empty if it may be one."""
     said = said_by(column.full)
     even = _mostly_even(column.values)
     if said.kind == "time" and (even or not said.perhaps):
-        return "its name says time"
+        return "by its name it is a time"
     if said.kind == "step":
-        return "its name says sampling time"
+        return "by its name it is a sampling period"
     if said.kind == "count" and (not said.perhaps or (even and _is_count(column.values))):
         return "it counts samples" if column.name else "it has no name"
-    return "it rises evenly, as a time does" if _rises(column.values) else ""
+    return "it rises evenly, like a time" if _rises(column.values) else ""
 
 
 def _rises(values: Array) -> bool:
-    """Whether numbers rise evenly, as time does."""
+    """Whether numbers rise evenly, like a time."""
     return bool(np.isfinite(values).all() and (np.diff(values) > 0).all()) and _mostly_even(values)
 
 
 def _mostly_even(values: Array) -> bool:
-    """Whether most numbers rise evenly: time that may repeat, begin again or lack some."""
+    """Whether most numbers rise evenly, like a time that may repeat, restart or have gaps."""
     steps = np.diff(values[np.isfinite(values)])
     middle = float(np.median(steps)) if len(steps) else 0.0
     return middle > 0 and bool(np.quantile(np.abs(steps / middle - 1), 0.9) < EVEN)
 
 
 def _is_count(values: Array) -> bool:
-    """Whether numbers are whole and mostly follow each other at one distance."""
+    """Whether numbers are whole and mostly have one step."""
     known = values[np.isfinite(values)]
     steps = np.diff(known)
     return bool((known == np.round(known)).all() and (steps == np.median(steps)).mean() >= 0.9)
@@ -414,14 +413,14 @@ def _is_count(values: Array) -> bool:
 
 
 def ascii_of(text: str) -> str:
-    """Letters, digits and underscores alone: letters without their accents, anything else as an underscore."""
+    """A text with only letters, digits and underscores: no accents, underscores for all other characters."""
     bare = text.replace("ß", "ss")
     bare = "".join(c for c in unicodedata.normalize("NFKD", bare) if not unicodedata.combining(c))
     return re.sub(r"\W+", "_", bare, flags=re.ASCII).strip("_")
 
 
 def near(value: float, step: float) -> str:
-    """A number with the digits that tell it from one that is ``step`` away."""
+    """A number with enough digits to tell it from one that is ``step`` away."""
     if not (math.isfinite(value) and 0 < step < math.inf):
         return repr(float(value) + 0.0)
     return repr(round(float(value), -math.floor(math.log10(step))) + 0.0)

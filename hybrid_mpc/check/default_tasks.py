@@ -1,4 +1,4 @@
-"""Default tasks of a machine without any: a step of what is controlled, and holding against a constant disturbance."""
+"""Default tasks of a machine without tasks: a step of the controlled signals, and holding against a disturbance."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
 TOLERATED = 10.0
-"""A step is so many times what the weights tolerate, ``1 / sqrt(q)``, at most."""
+"""Largest step, over the deviation that the weights tolerate, ``1 / sqrt(q)``."""
 ROOM, PUSH = 0.5, 0.2
-"""Share of the room from the operating point to a limit that a step, and that a disturbance at an input, may take."""
+"""Largest shares of the distance from the operating point to a limit: of a step, and of a disturbance at an input."""
 HOLD, LEAD, LASTS = 3, 0.5, 6
-"""Horizons that a set-point is held, that the machine rests before the first change, and that holding lasts."""
+"""Durations in horizons: of a set-point, of the rest before the first change, and of the holding task."""
 RESTS = 0.1
-"""Largest rate, in sizes of the states a horizon, at an operating point that is given."""
+"""Largest rate of a given operating point, in sizes of the states per horizon."""
 
 
 @dataclass(frozen=True)
 class _Rest:
-    """The prior where it works: its point of rest, and the control problem; ``horizon`` in seconds."""
+    """The prior at its steady state ``(x, u, w)``, and the control problem; ``horizon`` in seconds."""
 
     prior: Prior
     control: OCP
@@ -43,41 +43,41 @@ class _Rest:
 
     @property
     def signals(self) -> tuple[Signal, ...]:
-        """What references are of."""
+        """Signals of the references."""
         return self.prior.outputs if self.control.n_y else self.prior.states
 
     @property
     def weights(self) -> Array:
-        """Weights of what references are of."""
+        """Weights of these signals."""
         return self.control.q_y if self.control.n_y else self.control.q
 
     def tracked(self, x: Array, u: Array) -> Array:
-        """What references are of, at a point."""
+        """Values of these signals at a point."""
         return self.equations.shown(np.concatenate([x, u]))[0]
 
     def sizes(self) -> Array:
-        """Sizes of ``(x, u)``: ranges, else what the weights tolerate, else 1."""
+        """Sizes of ``(x, u)``: ranges, else the deviations that the weights tolerate, else 1."""
         ranges = np.array([s.upper - s.lower for s in self.prior.states])
         tolerated = 1.0 / np.sqrt(np.where(self.control.q > 0, self.control.q, 1.0))
         return np.concatenate([np.where(np.isfinite(ranges), ranges, tolerated), self.control.input_range])
 
     def rates(self) -> Array:
-        """Rates ``(n_x,)`` in sizes of the states a horizon."""
+        """Rates ``(n_x,)`` in sizes of the states per horizon."""
         rates = self.equations.rest(np.concatenate([self.x, self.u]))[0]
         return rates * self.horizon / self.sizes()[: len(self.x)]
 
     @cached_property
     def equations(self) -> RateEquations:
-        """Rates of the prior, and what references are of."""
+        """Rates of the prior, and the signals of the references."""
         equations = self.prior.equations
         return RateEquations(
             equations.xdot, self.w, self.prior.p, equations.output if self.control.n_y else None
         )
 
     def moved(self, j: Sequence[int], by: float, unit: Array) -> tuple[Array, Array] | None:
-        """The steady state at which tracked signals ``j`` are off by ``by``, nearest to this one; None: there is none.
+        """The nearest steady state at which the tracked signals ``j`` differ by ``by``; None if there is none.
 
-        They are met to a millionth of ``unit`` ``(len(j),)``.
+        They are met within a millionth of ``unit`` ``(len(j),)``.
         """
         own, start = list(j), np.concatenate([self.x, self.u])
         goal, root = self.tracked(self.x, self.u), np.zeros(len(self.signals))
@@ -87,9 +87,9 @@ class _Rest:
         return (found.v[: len(self.x)], found.v[len(self.x) :]) if found.reached else None
 
     def settled(self) -> _Rest:
-        """The point of rest with what is weighed as it is, as many signals as there are inputs; itself if none is.
+        """The steady state with the same values of the weighted signals, as many as there are inputs.
 
-        A fit moves parameters, and with them where the machine rests.
+        A fit changes parameters and so the steady state. Without such a state the point itself is returned.
         """
         own = np.flatnonzero(self.weights > 0)[: len(self.u)]
         found = self.moved(own.tolist(), 0.0, 1.0 / np.sqrt(self.weights[own]))
@@ -103,7 +103,7 @@ class _Rest:
         return replace(self, x=found[0], u=found[1]) if found is not None and inside else self
 
     def within(self, x: Array, u: Array) -> bool:
-        """Whether a point takes no more than its share of the room to any limit."""
+        """Whether a point uses at most the share ``ROOM`` of the distance to any limit."""
         c, y = self.control, self.prior.outputs
         at = self.prior.equations.output
         rest, now = (at(*p, self.w, self.prior.p).full().ravel() for p in ((self.x, self.u), (x, u)))
@@ -128,19 +128,19 @@ def _ranges(signals: Sequence[Signal]) -> tuple[Array, Array]:
 def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None) -> tuple[Task, ...]:
     """Two tasks around the operating point of a scenario with a control problem.
 
-    ``step``: each signal that the problem weighs, as many as there are inputs, is stepped, one after the other, and the
-    last set-point is the operating point's. Set-points are points of rest within half of the room to every limit, and
-    ten times what the weights tolerate away at most. ``hold``: the operating point is held while a constant
-    disturbance, a fifth of the room to a limit, acts at the first input.
+    ``step``: the weighted signals, as many as there are inputs, step one after the other; the last set-point is the
+    operating point. Set-points are steady states within half of the distance to every limit, and at most ten times the
+    deviation that the weights tolerate. ``hold``: the operating point is held against a constant disturbance at the
+    first input, a fifth of the distance to its limit.
 
     Args:
         scenario: The scenario.
-        values: Fitted parameters of the prior. Where it does not rest at the operating point with these, the point of
-            rest with the same values of what is weighed takes its place. Default: the prior's own.
+        values: Fitted parameters of the prior. If the operating point is no steady state with them, the steady state
+            with the same values of the weighted signals replaces it. Default: the prior's own.
 
     Raises:
-        InputError: If the prior does not rest at its operating point, or nothing that is weighed can be moved to
-            another point of rest.
+        InputError: If the prior has no steady state at its operating point, or no weighted signal has another steady
+            state.
 
     Example:
         >>> from dataclasses import replace
@@ -153,7 +153,7 @@ def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None)
     assert control is not None
     length = control.horizon * dt
     rest = _Rest(prior, control, length, *rest_of(prior))
-    why = f"scenario {scenario.name} declares no tasks, and default ones cannot be made: "
+    why = f"scenario {scenario.name} has no tasks, and default tasks cannot be made: "
     rates = rest.rates()
     if values is not None and not np.all(np.abs(rates) < RESTS):
         rest = rest.settled()
@@ -161,20 +161,20 @@ def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None)
     if not np.all(np.abs(rates) < RESTS):
         moving = ", ".join(s.name for s, r in zip(prior.states, rates, strict=True) if not abs(r) < RESTS)
         raise InputError(
-            f"{why}{moving} of the prior would not rest at the operating point; give operating_point = "
-            "OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),) [HM-CHECK-007]"
+            f"{why}{moving} of the prior would not rest at the operating point. Give operating_point = "
+            "OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),). [HM-CHECK-007]"
         )
     steps = _steps(rest)
     if not steps:
         raise InputError(
-            f"{why}no signal that the control problem weighs has another point of rest within half of the room to the "
-            "limits; give tasks=(Task(...),) [HM-CHECK-008]"
+            f"{why}no weighted signal of the control problem has another steady state within half of the distance to "
+            "the limits. Give tasks=(Task(...),). [HM-CHECK-008]"
         )
     return _step_task(rest, steps, dt), _hold_task(rest, dt)
 
 
 def _steps(rest: _Rest) -> list[tuple[int, float, Array]]:
-    """Place of each signal that steps, by how much, and all references at the new point of rest."""
+    """Index and size of each step, and all references at the new steady state."""
     found = []
     for j in np.flatnonzero(rest.weights > 0).tolist():
         size = TOLERATED / math.sqrt(rest.weights[j])

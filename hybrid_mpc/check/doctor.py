@@ -1,4 +1,4 @@
-"""``hybrid-mpc doctor``: what is installed, and what of this computer a job will use. Nothing heavy is imported."""
+"""``hybrid-mpc doctor``: installed packages, and the hardware that a job will use; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from hybrid_mpc.engine import THREADS
 
 PACKAGE = "hybrid-mpc"
 WAIT_S = 1.0
-"""Longest time [s] that another program is asked."""
+"""Longest wait [s] for another program."""
 State = Literal["ok", "absent", "wrong"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at: its name, what was found, whether a job can do with it, and what to do if not."""
+    """One result: name, what was found, its state, and a remedy if it is not ok."""
 
     name: str
     found: str
@@ -34,8 +34,8 @@ class Finding:
     remedy: str = ""
 
 
-def examined() -> list[Finding]:
-    """All findings, in the order in which they are told."""
+def examine() -> list[Finding]:
+    """All findings, in the order in which they are printed."""
     return [
         Finding("hybrid-mpc", f"{__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}"),
         *_packages(),
@@ -47,13 +47,13 @@ def examined() -> list[Finding]:
 
 
 def _packages() -> Iterator[Finding]:
-    """What the package needs, then its extras."""
+    """Required packages, then the extras."""
     try:
         needed = requires(PACKAGE) or []
     except PackageNotFoundError:
         yield Finding(
-            "packages", "hybrid-mpc itself is not installed, so nobody knows what it needs", "wrong",
-            "pip install 'hybrid-mpc[all]', in the source tree pip install -e '.[all]'",
+            "packages", "hybrid-mpc itself is not installed, so its requirements are unknown", "wrong",
+            "pip install 'hybrid-mpc[all]', or in the source tree pip install -e '.[all]'",
         )  # fmt: skip
         return
     extras: dict[str, list[str]] = {"": []}
@@ -64,7 +64,7 @@ def _packages() -> Iterator[Finding]:
             extras.setdefault(marker[1] if marker else "", []).append(named[0])
     for extra, names in extras.items():
         there = {name: _version(name) for name in dict.fromkeys(names)}
-        told = ", ".join(f"{name} {found or 'absent'}" for name, found in there.items())
+        told = ", ".join(f"{name} {found or 'missing'}" for name, found in there.items())
         if not told:
             continue
         complete = all(there.values())
@@ -83,16 +83,16 @@ def _version(name: str) -> str:
 
 
 def _compiler() -> Finding:
-    """The one that :func:`nn_export.compile_function` would take: ``CC``, else cc, gcc or clang."""
+    """The compiler that :func:`nn_export.compile_function` uses: ``CC``, else cc, gcc or clang."""
     named = os.environ.get("CC")
     for command in [named] if named else ["cc", "gcc", "clang"]:
         words = shlex.split(command)
         if words and shutil.which(words[0]):
             lines = _told([*words, "--version"]).splitlines()
-            told = f"{command}: {lines[0]}" if lines else f"{command}, which tells no version"
+            told = f"{command}: {lines[0]}" if lines else f"{command}, version unknown"
             return Finding("C compiler", told)
-    what = f"CC = {named}, which is no command" if named else "none (cc, gcc, clang)"
-    remedy = "install one to compile models; without it they run in CasADi's machine, slower"
+    what = f"CC = {named} is not a command" if named else "none found (cc, gcc, clang)"
+    remedy = "install a compiler to compile models; without one they run slower, in CasADi's virtual machine"
     return Finding("C compiler", what, "absent", remedy)
 
 
@@ -102,26 +102,26 @@ def _threads() -> Finding:
     except AttributeError:  # not on every system
         cores = os.cpu_count() or 1
     settings = ", ".join(f"{name}={os.environ[name]}" for name in THREADS if name in os.environ)
-    return Finding("threads", f"{cores} cores; BLAS and OpenMP: {settings or 'as many as there are cores'}")
+    return Finding("threads", f"{cores} cores; BLAS and OpenMP: {settings or 'one thread per core'}")
 
 
 def _gpu() -> Finding:
-    """What the driver says; whether the installed torch can use it."""
+    """GPUs that the driver lists, and whether the installed torch can use them."""
     torch = _version("torch")
     names = (
         re.findall(r"GPU \d+: ([^(\n]+)", _told(["nvidia-smi", "-L"])) if shutil.which("nvidia-smi") else []
     )
     if not names:
-        return Finding("GPU", "none found (nvidia-smi); networks are trained on the CPU")
+        return Finding("GPU", "none found (nvidia-smi); networks train on the CPU")
     told = ", ".join(name.strip() for name in names)
     if torch.endswith("+cpu"):
-        remedy = "install a torch with CUDA, then --device cuda"
-        return Finding("GPU", f"{told}, which torch {torch} cannot use", "absent", remedy)
-    return Finding("GPU", f"{told}; give --device cuda to train on it" if torch else told)
+        remedy = "install torch with CUDA, then use --device cuda"
+        return Finding("GPU", f"{told}, but torch {torch} cannot use it", "absent", remedy)
+    return Finding("GPU", f"{told}; train on it with --device cuda" if torch else told)
 
 
 def _told(command: list[str]) -> str:
-    """What a program says, or nothing."""
+    """The output of a program; empty if it fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
     except (OSError, subprocess.SubprocessError):
@@ -130,21 +130,21 @@ def _told(command: list[str]) -> str:
 
 
 def _folders() -> Iterator[Finding]:
-    """Where jobs write beside ``--out``: compiled models, matplotlib's fonts, temporary files."""
+    """Folders that jobs write besides ``--out``: compiled models, matplotlib's fonts, temporary files."""
     cache = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or ""
     home = Path(cache) if cache and Path(cache).is_absolute() else Path.home() / ".cache"
     for name, folder, variable in (
         ("cache", home, "XDG_CACHE_HOME"), ("temporary files", Path(tempfile.gettempdir()), "TMPDIR"),
     ):  # fmt: skip
         if _can_be_written(folder):
-            yield Finding(name, f"{folder}, can be written")
+            yield Finding(name, f"{folder} is writable")
         else:
-            remedy = f"point {variable} at a folder that can be written"
-            yield Finding(name, f"{folder}, cannot be written", "wrong", remedy)
+            remedy = f"set {variable} to a writable folder"
+            yield Finding(name, f"{folder} is not writable", "wrong", remedy)
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Whether a file can be made in a folder, or in the nearest one above it that there is."""
+    """Whether a file can be created in a folder, or in its nearest existing parent."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     try:

@@ -1,4 +1,4 @@
-"""First linear models of a recording: lags for a first prior, its time constants, and whether a loop was closed."""
+"""First linear models of a recording: lags for a first prior, time constants, and signs of a closed loop."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from hybrid_mpc.identify.closed_loop import feedback
 
 Array = NDArray[np.float64]
 FEWEST = 20
-"""Fewest rows of a recording that tell anything."""
+"""Fewest rows of a usable recording."""
 MOST, JUDGED = 4000, 20_000
-"""Most samples from which a lag is fitted, and by which it is judged."""
+"""Most samples to which a lag is fitted, and on which it is evaluated."""
 BETTER = 0.8
-"""Error of two states over that of one below which two are taken."""
+"""Largest error of two states over that of one state with which two are used."""
 MATTERS = 0.1
-"""Share of an output's variance that its lag explains, from which on its time constant matters."""
+"""Least share of an output's variance that its lag explains, for its time constant to matter."""
 STRIDES = (1, 4, 16)
-"""Samples between those from which a growth is taken."""
+"""Distances [samples] of the predictions from which a growth rate is estimated."""
 SHOWN = 10.0
-"""Length of a recording that shows a time constant, over it: a few slow motions are explained by any input."""
+"""Least length of a recording over a time constant that it identifies: any input explains a few slow motions."""
 LAGS = 4
-"""Samples of the past from which outputs are predicted."""
+"""Past samples from which outputs are predicted."""
 ROWS = 10_000
-"""Most samples of a recording from which these predictions are fitted."""
+"""Most samples of a recording to which these predictions are fitted."""
 CLOSED = 2.0
-"""Feedback, in what chance makes of it (:func:`~hybrid_mpc.identify.closed_loop.feedback`), from which on a loop was
-closed. In open loop it was 1.3 at most in eight recordings of machines, in closed loop 2.2 to 34 where it is seen."""
+"""Feedback, over its largest value by chance (:func:`~hybrid_mpc.identify.closed_loop.feedback`), above which a loop is
+closed. In eight recordings of machines it was 1.3 at most in open loop, and 2.2 to 34 in detectable closed loops."""
 GROWS = 3.0
-"""Growth over the length of a recording, as an exponent, from which on it is no drift."""
+"""Least growth over the length of a recording, as an exponent, that is not a drift."""
 PACE = 0.3
-"""Growth over the pace of the motion itself, the rms speed over the spread of the slowest output, from which on it is
-no bias of friction or another nonlinearity: these reach 0.15."""
+"""Least growth rate over the rate of the motion itself (rms speed over spread of the slowest output) that is not a bias
+from friction or another nonlinearity: such biases reach 0.15."""
 AGREE = 0.2
-"""Least of several estimates of a growth over the largest where they agree."""
+"""Least ratio of the smallest to the largest of several agreeing growth rates."""
 
 
 class Runs(NamedTuple):
@@ -54,9 +54,9 @@ class Runs(NamedTuple):
 class Lag:
     """A first linear model of one output.
 
-    ``states`` 1 or 2, its time constant ``seconds`` [s], damping, gains, offset; the ``share`` of the output's variance
-    that its free run explains, and its ``reach``: what all inputs over their ranges make of the output in the end, over
-    its span.
+    ``states`` is 1 or 2: ``T y' = k u + c - y`` or ``T^2 y'' + 2 D T y' = k u + c - y``, with time constant ``seconds``
+    (T) [s], ``damping`` (D), ``gains`` (k) and ``offset`` (c). ``share`` is the part of the output's variance that its
+    free run explains. ``reach`` is the steady-state effect of all inputs over their ranges, over the output's span.
     """
 
     states: int
@@ -69,10 +69,10 @@ class Lag:
 
     @property
     def matters(self) -> float:
-        """The time [s] that counts in control: its slowest time constant, or less where inputs reach farther.
+        """The time [s] that matters for control: the slowest time constant, or less if inputs reach farther.
 
-        A mode so slow that inputs carry the output over its span in a part of it is an integrator for a controller.
-        Of an oscillation it is half a swing at most, within which a controller ends it.
+        For a controller, a mode so slow that inputs move the output over its span in a fraction of it is an integrator.
+        For an oscillation it is at most half a period, within which a controller damps it.
         """
         if self.states == 1:
             return self.seconds / max(self.reach, 1.0)
@@ -84,23 +84,23 @@ class Lag:
 
 
 def first_lag(runs: Sequence[Runs], output: int, dt: float, inputs: int) -> Lag:
-    """A lag of one or two states whose free runs are nearest to an output.
+    """The lag of one or two states whose free runs are closest to an output.
 
-    Each is fitted one step ahead at several strides, since noise hides a slow motion in a short one and a fast motion
-    is over in a long one; free runs at the sampling time choose.
+    Candidates are fitted one step ahead at several strides: noise hides a slow motion in a short stride, and a fast
+    motion ends within a long one. Free runs at the sampling period select the best candidate.
 
     Args:
         runs: Recordings, of any lengths.
         output: Index of the output.
-        dt: Sampling time [s].
-        inputs: How many of the columns that act are inputs, the first ones; the others are disturbances.
+        dt: Sampling period [s].
+        inputs: Number of inputs, the first columns of ``u``; the other columns are disturbances.
     """
     tables = [np.column_stack([run.y[:, output], run.u]) for run in runs]
     every = np.concatenate(tables)
     with np.errstate(over="ignore"):
         middle, size = np.nanmean(every, axis=0), np.nanmax(every, axis=0) - np.nanmin(every, axis=0)
     span, spans = float(size[0]), size[1:]
-    # a gain of zero would be no input at all
+    # a gain of zero would make the input ineffective
     slight = 0.1 * span / spans
     default = Lag(
         1,
@@ -111,7 +111,7 @@ def first_lag(runs: Sequence[Runs], output: int, dt: float, inputs: int) -> Lag:
     )
     if not (np.isfinite(middle).all() and np.isfinite(size).all()):
         return default
-    # about their means and by their spans: levels and units do not enter
+    # centred and scaled by the spans: independent of levels and units
     tables = [(table - middle) / size for table in tables]
     judged = _middles_of(tables, 1, JUDGED)
     variance = float(np.nanvar(np.concatenate([table[:, 0] for table in judged])))
@@ -141,7 +141,7 @@ def first_lag(runs: Sequence[Runs], output: int, dt: float, inputs: int) -> Lag:
 
 
 def pace_of(runs: Sequence[Runs], output: int, dt: float) -> float:
-    """Spread of an output over its rms speed [s]: how long a motion takes."""
+    """Spread of an output over its rms speed [s]: the duration of a motion."""
     y = np.concatenate([run.y[:, output] for run in runs])
     steps = np.concatenate([np.diff(run.y[:, output]) for run in runs])
     speed = float(np.sqrt(np.nanmean(np.square(steps)))) if np.isfinite(steps).any() else 0.0
@@ -149,7 +149,7 @@ def pace_of(runs: Sequence[Runs], output: int, dt: float) -> float:
 
 
 def _middles_of(tables: Sequence[Array], stride: int, most: int) -> list[Array]:
-    """Rows of outputs (first column) at every ``stride``-th sample and means of inputs from there, ``most`` in all."""
+    """Outputs (column 0) at every ``stride``-th sample and the inputs' means until the next, ``most`` rows in all."""
     found = []
     for table in tables:
         rows = min(max(most // len(tables), 4), len(table) // stride)
@@ -162,7 +162,7 @@ def _middles_of(tables: Sequence[Array], stride: int, most: int) -> list[Array]:
 
 
 def _fitted(tables: Sequence[Array], order: int, dt: float) -> Lag | None:
-    """A lag by its errors one row ahead; None where it is none: unstable, or over within a row."""
+    """A lag from least squares one row ahead; None if it is unstable, or decays within a row."""
     rows, future = [], []
     for table in tables:
         past = [table[order - 1 - i : len(table) - 1 - i, 0] for i in range(order)]
@@ -180,6 +180,7 @@ def _fitted(tables: Sequence[Array], order: int, dt: float) -> Lag | None:
         return None
     if order == 1 and not poles[0].real > 0:
         return None
+    # discrete poles z = exp(s dt); of two poles s: s1 s2 = 1 / T^2, s1 + s2 = -2 D / T
     rates = np.log(poles.astype(complex)) / dt
     speed = float(np.sqrt(np.abs(np.prod(rates)))) if order == 2 else float(np.abs(rates[0]))
     damping = float(-rates.real.sum() / (2 * speed)) if order == 2 else 1.0
@@ -191,7 +192,7 @@ def _fitted(tables: Sequence[Array], order: int, dt: float) -> Lag | None:
 
 
 def _free_run_error(tables: Sequence[Array], lag: Lag, dt: float) -> float:
-    """Root mean square error of free runs from each recording's first output, at rest."""
+    """Root mean square error of free runs that start at rest at each recording's first output."""
     if lag.states == 1:
         pole = math.exp(-dt / lag.seconds)
         b, a = np.array([0.0, 1 - pole]), np.array([1.0, -pole])
@@ -218,8 +219,8 @@ def _free_run_error(tables: Sequence[Array], lag: Lag, dt: float) -> float:
 def slowest(lags: Sequence[Lag], length: float) -> tuple[float, int]:
     """The slowest time constant [s] that matters, and the output's index.
 
-    One counts where inputs explain a part of the output by it, and the recording is ``SHOWN`` times as long; where none
-    does, that part of the recording at most.
+    A time constant counts if inputs explain a part of the output by it, and the recording is ``SHOWN`` times longer.
+    If none counts, the result is at most that part of the recording.
     """
     longest = length / SHOWN
     good = [i for i, lag in enumerate(lags) if lag.share >= MATTERS and lag.matters <= longest]
@@ -228,7 +229,7 @@ def slowest(lags: Sequence[Lag], length: float) -> tuple[float, int]:
 
 
 def feedback_of(runs: Sequence[Runs]) -> float:
-    """How far inputs answer to outputs, in what chance makes of it; zero where the recordings are too short to tell."""
+    """Feedback from outputs to inputs, over its largest value by chance; zero if the recordings are too short."""
     parts = _middles(runs, 1)
     fitted = _predictor(parts)
     if fitted is None:
@@ -241,10 +242,10 @@ def feedback_of(runs: Sequence[Runs]) -> float:
 
 
 def growth_of(runs: Sequence[Runs], dt: float) -> float:
-    """Rate [1/s] at which the machine leaves its rest by itself; zero where the data do not show that it does.
+    """Rate [1/s] at which the machine diverges from its steady state by itself; zero if the data do not show it.
 
-    By the largest pole of predictions over several strides, from all recordings and from either half of them,
-    where these agree. One step ahead, feedback biases them little.
+    From the largest pole of predictions over several strides, for all recordings and for either half of them, if these
+    agree. Feedback biases one-step predictions only little.
     """
     found = []
     for stride in STRIDES:
@@ -260,6 +261,7 @@ def growth_of(runs: Sequence[Runs], dt: float) -> float:
             n = runs[0].y.shape[1]
             matrix = np.eye(LAGS * n, k=-n)
             matrix[:n] = fitted[: LAGS * n].T
+            # companion matrix of the predictor: its largest eigenvalue z gives the rate ln|z| / (stride dt)
             largest = float(np.abs(np.linalg.eigvals(matrix)).max())
             found.append(math.log(largest) / (stride * dt) if largest > 0 else -math.inf)
     length = dt * max(len(run.y) for run in runs)
@@ -270,7 +272,7 @@ def growth_of(runs: Sequence[Runs], dt: float) -> float:
 
 
 def _middles(runs: Sequence[Runs], stride: int) -> list[Runs]:
-    """The middle of each recording by its spread about its mean: outputs at every ``stride``-th row, inputs' means."""
+    """The middle of each recording, standardised: outputs at every ``stride``-th row, inputs' means until the next."""
     y, u = (np.concatenate([run[i] for run in runs]) for i in (0, 1))
     middle, size = [np.nanmean(z, axis=0) for z in (y, u)], [np.nanstd(z, axis=0) for z in (y, u)]
     parts = []
@@ -278,7 +280,7 @@ def _middles(runs: Sequence[Runs], stride: int) -> list[Runs]:
         rows = min(ROWS, len(run.y) // stride)
         first = (len(run.y) - stride * rows) // 2
         y0, u0 = (z[first : first + stride * rows] for z in run)
-        # an input counts with its mean over the stride, in which it acts
+        # inputs are averaged over the stride in which they act
         blocks = y0[::stride], u0.reshape(rows, stride, -1).mean(axis=1)
         parts.append(
             Runs(*((z - m) / np.where(s > 0, s, 1.0) for z, m, s in zip(blocks, middle, size, strict=True)))
@@ -287,14 +289,14 @@ def _middles(runs: Sequence[Runs], stride: int) -> list[Runs]:
 
 
 def _rows(run: Runs) -> Array:
-    """Outputs and inputs before each row from ``LAGS`` on, and one."""
+    """Past outputs and inputs of each row from ``LAGS`` on, and a column of ones."""
     n = len(run.y)
     past = [z[LAGS - 1 - i : n - 1 - i] for z in run for i in range(LAGS)]
     return np.column_stack([*past, np.ones(n - LAGS)])
 
 
 def _predictor(runs: Sequence[Runs]) -> Array | None:
-    """Coefficients of predictions one row ahead; None where there are too few rows."""
+    """Coefficients of one-row-ahead predictions; None if there are too few rows."""
     runs = [run for run in runs if len(run.y) > 3 * LAGS]
     if not runs:
         return None

@@ -1,4 +1,4 @@
-"""One look into a recording's file: its columns, its time, and what stands out, before there is a scenario."""
+"""Inspection of a recording's file without a scenario: its columns, its time, and odd values."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 PAUSE = 5.0
-"""Usual steps of the time without a sample that are a gap; ``new`` writes it as ``max_gap``."""
+"""Least gap in the time, in median steps; ``new`` writes it as ``max_gap``."""
 MOST_PLOTTED = 12
 """Most columns in the picture."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column: full name, unit, how many numbers it has, the first and last of its range, why it is no signal."""
+    """A column: full name, unit, count of numbers, the ends of its range, and a note."""
 
     name: str
     unit: str
@@ -43,9 +43,9 @@ class Column:
 
 @dataclass(frozen=True)
 class Look:
-    """What a file holds: ``rows``, its columns, how its time runs, what was done to read it, what stands out.
+    """The contents of a file: number of rows, columns, the time, notes on how it was read, and findings.
 
-    ``t`` ``(rows,)`` are the time stamps [s], sample numbers where there is no time.
+    ``t`` ``(rows,)`` are time stamps [s], or sample numbers if there is no time.
     """
 
     path: Path
@@ -58,7 +58,7 @@ class Look:
 
 
 def look(path: Path) -> Look:
-    """Look into a file.
+    """Inspect a file.
 
     Raises:
         InputError: If it cannot be read.
@@ -105,7 +105,7 @@ def look(path: Path) -> Look:
 
 
 def _time(source: Source, findings: list[str], rows: int) -> tuple[str, Array, str]:
-    """How the time runs, its stamps, and the name of its column."""
+    """A description of the time, its stamps, and the name of its column."""
     count = np.arange(rows, dtype=np.float64)
     try:
         columns, left_out = columns_of([source])
@@ -126,29 +126,27 @@ def _time(source: Source, findings: list[str], rows: int) -> tuple[str, Array, s
         k = int(gaps[np.argmax(steps[gaps])])
         findings.append(f"gaps in the time: {len(gaps)}, the longest {steps[k]:.4g} s before {place(k + 1)}")
     for k in restarts(t):
-        findings.append(f"{place(k)}: time begins anew; a recording is cut there")
+        findings.append(f"{place(k)}: time restarts; a recording is cut there")
     if clock.doubt:
         findings.append(f"time: {clock.doubt}")
     return told, t, name
 
 
 def _odd(full: str, values: Array) -> list[str]:
-    """Numbers of a column that may be none."""
+    """Findings about numbers of a column that may be wrong."""
     if (code := missing_code(values)) is not None:
         count = int((values == code).sum())
         rows = f"{count} row{'s' * (count > 1)}"
         return [
-            f"column {shown(full)}: {code:.10g} in {rows} is far from all others: a code for missing ones?"
+            f"column {shown(full)}: {code:.10g} in {rows} is far from all others; probably a code for missing values"
         ]
     if (odd := outliers(values)) is not None:
-        return [
-            f"column {shown(full)}: {len(odd)} of its values far from all others, e.g. {values[odd[0]]:.6g}"
-        ]
+        return [f"column {shown(full)}: {len(odd)} values are far from all others, e.g. {values[odd[0]]:.6g}"]
     return []
 
 
 def picture(found: Look) -> Figure:
-    """Columns that move over time, one above the other."""
+    """Figure of the columns that move over time, one panel each."""
     from hybrid_mpc.plots.style import finish_column, new_column, plain
 
     moving = [

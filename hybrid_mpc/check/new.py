@@ -1,4 +1,4 @@
-"""A scenario to begin with, written from a recording; what only its user knows is marked TODO."""
+"""``hybrid-mpc new``: write a first scenario from recordings; the user's decisions are marked TODO."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.check.columns import COUNTED, Column, ascii_of, clock_of, columns_of, near, no_signal
 from hybrid_mpc.check.first_model import CLOSED, Lag, Runs, feedback_of, first_lag, growth_of, slowest
-from hybrid_mpc.check.roles import Kind, Trait, Verdict, judged
+from hybrid_mpc.check.roles import Kind, Trait, Verdict, judge_roles
 from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.names import ANGLES
@@ -30,34 +30,34 @@ from hybrid_mpc.rules import LARGEST
 
 Array = NDArray[np.float64]
 MARK = "TODO"
-"""What stands before everything that is left to decide."""
-ACTING = "what only acts: new ... --disturbance-column NAME"
-"""What to do about a column that is no output although it is measured."""
+"""Mark of everything that the user decides."""
+ACTING = "If they act on the machine instead: new ... --disturbance-column NAME"
+"""Remedy for a measured column that is no output."""
 SMOOTHED = 7
-"""Fewest sampling times that are smoothed over: a polynomial of order 4 needs six samples, and stamps are rounded."""
+"""Fewest sampling periods of smoothing: a polynomial of order 4 needs six samples, and stamps are rounded."""
 HORIZONS = 20, 100
-"""Fewest and most periods of the horizon that is proposed."""
+"""Shortest and longest proposed horizon [periods]."""
 KINDS: Mapping[Kind, str] = {
     "input": "an input",
     "output": "an output",
     "disturbance": "a measured disturbance",
     "set-point": "a set-point",
 }
-"""What roles are called."""
+"""Names of the roles in messages."""
 USED = frozenset(("Prior", "Signal", "Parameter", "Scenario", "DataSpec", "OperatingPoint", "OCP"))
 """Names that the written file uses."""
 
 
 @dataclass(frozen=True)
 class Draft:
-    """What recordings show: their time, what is commanded and what measured, and what is neither.
+    """A draft of a scenario from recordings: their time, and the roles of their columns.
 
-    ``period`` is the sampling time [s], ``seconds`` what one in the column of the time is [s]; ``time`` is None where
-    no column may be one. ``doubt`` says what is not sure of the time, ``left_out`` by column why it is no signal.
-    ``disturbances`` are measured and act on the machine, but nobody commands them. ``verdicts`` say by column why it
-    has its role. ``loop`` says how a closed loop is seen, empty if none is; ``growth`` [1/s] is the rate at which the
-    machine leaves its rest, zero if it does not; ``lags`` are first models of the outputs. ``length`` is that of the
-    shortest recording [s]. ``notes`` say by file what was done to read it.
+    ``period`` is the sampling period [s]. ``time`` is the time's column, None without one; ``seconds`` is its unit [s],
+    ``doubt`` what is uncertain about it. ``left_out`` gives, by column, the reason why it is no signal.
+    ``disturbances`` are measured, act on the machine and are not commanded. ``verdicts`` give the reason of each role.
+    ``loop`` describes the evidence of a closed loop, empty without one; ``growth`` [1/s] is the rate at which the
+    machine diverges from its steady state, zero if it does not. ``lags`` are first models of the outputs. ``length`` is
+    that of the shortest recording [s]. ``notes`` say by file how it was read.
     """
 
     time: Column | None
@@ -78,18 +78,18 @@ class Draft:
 
     @property
     def unsure(self) -> dict[str, str]:
-        """Why a column has its role, where that is not sure."""
+        """Reasons of the uncertain roles, by column."""
         return {name: verdict.reason for name, verdict in self.verdicts.items() if not verdict.sure}
 
     @property
     def runs(self) -> tuple[Runs, ...]:
-        """Outputs, and all that acts, of each recording."""
+        """Outputs, and all inputs and disturbances, of each recording."""
         y, u = (list(zip(*(c.pieces for c in group), strict=True)) for group in (self.outputs, self.drives))
         return tuple(Runs(np.column_stack(a), np.column_stack(b)) for a, b in zip(y, u, strict=True))
 
     @property
     def drives(self) -> tuple[Column, ...]:
-        """All that acts on the machine."""
+        """All inputs and disturbances."""
         return (*self.inputs, *self.disturbances)
 
     @property
@@ -99,7 +99,7 @@ class Draft:
 
     @property
     def units(self) -> dict[str, float]:
-        """Factors that the DataSpec names: of a time that is not in seconds, and of units that no signal has."""
+        """Factors for the DataSpec: of a time that is not in seconds, and of units that cannot be read."""
         named = self.time is not None and (self.seconds != 1.0 or self.doubt == COUNTED)
         time = {self.time.full: self.seconds} if named and self.time else {}
         return time | {
@@ -107,7 +107,7 @@ class Draft:
         }
 
     def data(self, smoothing: float, warm_up: float) -> DataSpec:
-        """How the recording is read; ``smoothing`` and ``warm_up`` [s]."""
+        """The DataSpec of the recordings; ``smoothing`` and ``warm_up`` [s]."""
         return DataSpec(
             self.time.full if self.time else float(_rounded(self.period)),
             tuple(c.full for c in self.inputs), tuple(c.full for c in self.outputs),
@@ -119,7 +119,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class Roles:
-    """Signals by their role, as reading asks for them: a state an output, and a second one where it has a speed."""
+    """Signals by role, for reading: one state per output, and a second one if the output has a speed."""
 
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
@@ -128,7 +128,7 @@ class Roles:
 
     @classmethod
     def of(cls, draft: Draft, names: Sequence[str] = (), speeds: Sequence[Signal] = ()) -> Roles:
-        """Those of a draft; ``names`` of the outputs, by default their own, and ``speeds`` of some of them."""
+        """Signals of a draft; ``names`` of the outputs (default: their own), ``speeds`` of some of them."""
         inputs, outputs, disturbances = (
             tuple(c.signal for c in group) for group in (draft.inputs, draft.outputs, draft.disturbances)
         )
@@ -141,42 +141,42 @@ def write_scenario(
     path: Path, data: Path | Sequence[Path], inputs: Sequence[str] = (), outputs: Sequence[str] = (), time: str = "",
     disturbances: Sequence[str] = (),
 ) -> Draft:  # fmt: skip
-    """Write a scenario for recordings; returned is what it was made from.
+    """Write a scenario for recordings, and return its draft.
 
     Args:
-        path: Python file to make; there must be none.
-        data: The recording, or several of one machine. Signals are the columns that all have.
-        inputs: Columns of the inputs. Default: those that look commanded (:mod:`hybrid_mpc.check.roles`).
-        outputs: Columns of the outputs. Default: those that look measured.
-        time: Column of the time. Default: one whose name says so, or else one that rises evenly.
-        disturbances: Columns of measured disturbances. Default: those whose names or numbers say so.
+        path: Python file to create; it must not exist.
+        data: The recording, or several of one machine. Signals are the columns that all of them have.
+        inputs: Columns of the inputs. Default: columns that look commanded (:mod:`hybrid_mpc.check.roles`).
+        outputs: Columns of the outputs. Default: columns that look measured.
+        time: Column of the time. Default: a column named as time, else one that rises evenly.
+        disturbances: Columns of measured disturbances. Default: by their names and numbers.
 
     Raises:
-        InputError: If the file is there, a recording is bad, too short, or diverges, they show no input or no output,
-            or have a time that cannot be used: with the reader's reason.
+        InputError: If the file exists, a recording is faulty, too short or diverges, has no input or no output, or has
+            a time that cannot be used; with the reason.
 
     Example:
         ``write_scenario(Path("my_machine.py"), [Path("monday.csv"), Path("tuesday.csv")])``
     """
     if path.suffix != ".py":
         raise InputError(
-            f"{path}: a scenario is a Python file; give a name that ends with .py [HM-CHECK-009]"
+            f"{path}: a scenario is a Python file. Give a name that ends with .py. [HM-CHECK-009]"
         )
     if path.exists():
-        raise InputError(f"{path} is there already; give another name, or remove it [HM-CHECK-010]")
+        raise InputError(f"{path}: the file exists already. Give another name, or remove it. [HM-CHECK-010]")
     files = (data,) if isinstance(data, Path) else tuple(data)
     if not files:
-        raise InputError("no recordings given; name at least one file with --data [HM-CHECK-011]")
-    draft = drafted([opened(file) for file in files], inputs, outputs, time, disturbances)
+        raise InputError("recordings: none given. Name at least one file with --data. [HM-CHECK-011]")
+    draft = draft_scenario([opened(file) for file in files], inputs, outputs, time, disturbances)
     write_text(path, scenario_text(path, files, draft))
     return draft
 
 
 def left_to_decide(path: Path) -> list[str]:
-    r"""Lines of a scenario's file whose comment begins with the mark, with their numbers; texts do not count.
+    r"""Comments in a scenario's file that begin with the mark, with line numbers; strings do not count.
 
     Raises:
-        InputError: If the file is no text of Python.
+        InputError: If the file is not valid Python.
 
     Example:
         >>> import tempfile
@@ -194,19 +194,19 @@ def left_to_decide(path: Path) -> list[str]:
                     found.append(f"line {token.start[0]}: {token.string.removeprefix(mark).lstrip(': ')}")
     except (SyntaxError, UnicodeDecodeError, tokenize.TokenError) as error:
         raise InputError(
-            f"{path}: cannot be read as Python ({error}). Save it as UTF-8 text. [HM-CHECK-012]"
+            f"{path}: not valid Python ({error}). Correct it, or save it as UTF-8 text. [HM-CHECK-012]"
         ) from error
     return found
 
 
-def drafted(
+def draft_scenario(
     sources: Sequence[Source],
     inputs: Sequence[str],
     outputs: Sequence[str],
     time: str,
     disturbances: Sequence[str] = (),
 ) -> Draft:
-    """Roles of the recordings' columns: as they are given, or as their names and numbers look."""
+    """Assign roles to the recordings' columns: as given, else by names and numbers."""
     columns, left_out = columns_of(sources)
     source = sources[0]
 
@@ -214,7 +214,7 @@ def drafted(
         found = list(map(source.find, names))
         refuse(
             [
-                f"{source.path}: column {shown(name)} is no signal: {left_out[name]} [HM-CHECK-013]"
+                f"{source.path}: column {shown(name)} cannot be a signal: {left_out[name]} [HM-CHECK-013]"
                 for name in found
                 if name in left_out
             ]
@@ -235,7 +235,7 @@ def drafted(
         else:
             free.append(column)
     while True:
-        verdicts = judged([Trait(c.full, c.unit, c.pieces) for c in free], kinds)
+        verdicts = judge_roles([Trait(c.full, c.unit, c.pieces) for c in free], kinds)
         verdicts |= _left_to_user(verdicts, given)
         roles: dict[Kind, tuple[Column, ...]] = {
             kind: given.get(kind) or tuple(c for c in free if verdicts[c.full].kind == kind)
@@ -244,9 +244,9 @@ def drafted(
         if not roles["input"] or not roles["output"]:
             reasons = "".join(f"\n  {shown(name)}: {reason}" for name, reason in left_out.items())
             raise InputError(
-                f"{source.path}: no column is left for {'an output' if roles['input'] else 'an input'}; it has "
-                f"{', '.join(source.header)}. Say which is which: --input-column, --output-column, --disturbance-column"
-                f".{source.note}{f' No signals are:{reasons}' if reasons else ''} [HM-CHECK-014]"
+                f"{source.path}: no column is left for {'an output' if roles['input'] else 'an input'}; the file has "
+                f"{', '.join(source.header)}. Give the roles: --input-column, --output-column, --disturbance-column."
+                f"{source.note}{f' Not used:{reasons}' if reasons else ''} [HM-CHECK-014]"
             )
         draft = Draft(
             time=clock.column,
@@ -261,12 +261,12 @@ def drafted(
             verdicts=verdicts,
             length=clock.length,
         )
-        draft = _counting_on([one.path for one in sources], draft)
+        draft = _unwrap([one.path for one in sources], draft)
         still = [full for full in _at_rest([one.path for one in sources], draft) if full not in kinds]
         if not still:
             break
         free = [c for c in free if c.full not in still]
-        left_out |= dict.fromkeys(still, "it does not move in the part of the recording that trains")
+        left_out |= dict.fromkeys(still, "it does not move in the training data")
     used = {c.full for c in (*draft.signals, *draft.set_points)}
     left_out |= {c.full: verdicts[c.full].reason for c in free if c.full not in used}
     runs = draft.runs
@@ -278,17 +278,19 @@ def drafted(
 def _left_to_user(
     verdicts: Mapping[str, Verdict], given: Mapping[Kind, Sequence[Column]]
 ) -> dict[str, Verdict]:
-    """Verdicts of columns that look like what the user has named others for: these lists are complete."""
+    """Verdicts of columns with a role for which the user named other columns: the user's lists are complete."""
     named = {c.full for group in given.values() for c in group}
     found: dict[str, Verdict] = {}
     for full, verdict in verdicts.items():
         if full in named or not given.get(verdict.kind):
             continue
-        found[full] = Verdict("none", f"no role was given to it; as {verdict.kind}: {verdict.reason}")
+        found[full] = Verdict(
+            "none", f"the user named other columns as {verdict.kind}; its reason: {verdict.reason}"
+        )
     kept = {full: found.get(full, verdict) for full, verdict in verdicts.items()}
     if given["input"] and not given["output"] and not any(v.kind == "output" for v in kept.values()):
         found |= {
-            full: Verdict("output", "all that is left", sure=False)
+            full: Verdict("output", "it is the only column left", sure=False)
             for full, verdict in verdicts.items()
             if full not in named and verdict.kind in ("input", "set-point")
         }
@@ -296,23 +298,23 @@ def _left_to_user(
 
 
 def _in_loop(draft: Draft) -> Draft:
-    """The draft with what its recordings say of a closed loop, and of an unstable machine in it."""
+    """The draft with signs of a closed loop, and of an unstable machine in it."""
     if any(not np.isfinite(c.values).all() for c in draft.inputs):
         return draft
-    # measured disturbances answer to nothing
+    # measured disturbances cannot depend on outputs
     runs = [Runs(run.y, run.u[:, : len(draft.inputs)]) for run in draft.runs]
     answered = feedback_of(runs)
     loop = ""
     if answered > CLOSED:
-        loop = f"inputs answer to outputs, {answered:.1f} times the most by chance"
+        loop = f"inputs react to outputs, {answered:.1f} times more than by chance"
     elif draft.set_points:
         loop = "set-points are recorded"
     growth = growth_of(runs, draft.period) if loop else 0.0
     return replace(draft, loop=loop, growth=growth)
 
 
-def _counting_on(paths: Sequence[Path], draft: Draft) -> Draft:
-    """The draft whose angles count on where they are recorded wrapped; the recordings can be read as it says."""
+def _unwrap(paths: Sequence[Path], draft: Draft) -> Draft:
+    """The draft with wrapped angles unwrapped; checks that the recordings can be read with it."""
     trial = replace(draft, outputs=tuple(replace(c, periodic=c.unit in ANGLES) for c in draft.outputs))
     recordings, problems = read_recordings(
         paths, Roles.of(trial), trial.data(SMOOTHED * draft.period, 2 * draft.period)
@@ -332,7 +334,7 @@ def _counting_on(paths: Sequence[Path], draft: Draft) -> Draft:
 
 
 def _at_rest(paths: Sequence[Path], draft: Draft) -> list[str]:
-    """Inputs and outputs that do not move in what trains, by their full names."""
+    """Inputs and outputs that do not move in the training data, by their full names."""
     roles = Roles.of(draft)
     dataset = load_trajectories(
         paths, roles, draft.data(SMOOTHED * draft.period, 2 * draft.period), needed=("train",)
@@ -340,7 +342,7 @@ def _at_rest(paths: Sequence[Path], draft: Draft) -> list[str]:
     found = []
     for key, columns, signals in (("u", draft.inputs, roles.inputs), ("y", draft.outputs, roles.outputs)):
         for j, (column, signal) in enumerate(zip(columns, signals, strict=True)):
-            # as input and as output: what else there is does not count
+            # the column is checked as an input and as an output, alone
             train = [
                 replace(piece, u=part, y=part, censored=np.zeros(part.shape, dtype=np.int8))
                 for piece in dataset.by_role("train")
@@ -353,17 +355,17 @@ def _at_rest(paths: Sequence[Path], draft: Draft) -> list[str]:
     return found
 
 
-# What is written
+# The written file
 
 
 def _text(text: str) -> str:
-    """A string as Python writes it: everything that a recording or a path says stands in these, or in comments."""
+    """A string literal of Python: every text from a recording or a path is one, or is part of a comment."""
     written = repr(text)
     return f'"{written[1:-1]}"' if not {'"', "'"} & set(text) else written
 
 
 def printable(text: str) -> str:
-    r"""A text that cannot end its line, as a comment or a terminal takes it: unseen characters are escaped.
+    r"""A text on one line, for a comment or a terminal: invisible characters are escaped.
 
     Example:
         >>> print(printable("u\n1, größe"))
@@ -377,12 +379,12 @@ def _rounded(value: float, digits: int = 3) -> str:
 
 
 def _signal(column: Column, name: str) -> tuple[str, str]:
-    """A Signal as it is written, and what stands behind it."""
+    """A Signal as source text, and the comment behind it."""
     low, high = column.span
     recorded = f"recorded: {near(low, (high - low) / 2000)} to {near(high, (high - low) / 2000)}"
-    unit = f"unit by the header; {recorded}" if column.unit else f"{MARK}: its unit; {recorded}"
+    unit = f"unit from the header; {recorded}" if column.unit else f"{MARK}: give its unit; {recorded}"
     if column.asked:
-        unit = f"{MARK}: its unit? by the last letter of its name; {recorded}"
+        unit = f"{MARK}: check the unit, taken from the last letter of the name; {recorded}"
     signal = column.signal
     ends = "periodic=True" if column.periodic else f"{signal.lower!r}, {signal.upper!r}"
     return f"Signal({_text(name)}, {_text(column.unit or '-')}, {ends})", unit
@@ -398,7 +400,7 @@ def _names(columns: Sequence[Column], taken: set[str]) -> list[str]:
 
 
 def _unused(name: str, taken: Iterable[str]) -> str:
-    """A name that is not taken: the given one, or with a number behind it."""
+    """A name that is not taken: the given one, or the given one with a number."""
     there, given, k = set(taken), name, 2
     while name in there:
         name, k = f"{given}_{k}", k + 1
@@ -406,10 +408,10 @@ def _unused(name: str, taken: Iterable[str]) -> str:
 
 
 def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
-    """The file: signals, a first prior of lags, and how the recording is read.
+    """The text of the file: signals, a first prior of lags, and the DataSpec.
 
     Raises:
-        InputError: If the recording cannot be read with them, with the reader's reason.
+        InputError: If the recordings cannot be read with these, with the reason.
     """
     y_names = _names(draft.outputs, set())
     u_names, w_names = _names(draft.inputs, set()), _names(draft.disturbances, set())
@@ -427,12 +429,12 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         parameters.append((name, min(max(value, low), high), unit, low, high, text))
         return f"p.{name}"
 
-    speeds: dict[str, tuple[str, Signal]] = {}  # a second state of an output: its name and itself
+    speeds: dict[str, tuple[str, Signal]] = {}  # second states by output: name and signal
     for name, column, lag in zip(y_names, draft.outputs, lags, strict=True):
         unit = column.unit or "-"
         span = float(np.ptp(column.span))
         low, high = column.span[0] - span, column.span[1] + span
-        # what the drives make of the output at their middle; what they leave of it may lie far from all that it was
+        # the effect of the drives at their medians; what remains of the output may lie far outside its recorded range
         made = sum(
             gain * float(np.nanmedian(c.values)) for gain, c in zip(lag.gains, draft.drives, strict=True)
         )
@@ -460,7 +462,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         for (kind_of, drive), source, gain in zip(drives, draft.drives, lag.gains, strict=True):
             reach = float(_rounded(min(10 * max(abs(gain), span / float(np.ptp(source.span))), LARGEST)))
             per = f"{unit}/({source.unit})" if source.unit and source.unit != "-" else unit
-            # rounded by what it makes of the output at the largest input
+            # rounded such that the output at the largest input stays the same
             value = float(near(gain, span / 500 / max(map(abs, source.span)))) or float(_rounded(gain))
             towards.append(
                 f"{parameter(f'k_{name}_{drive}', value, per, -reach, reach, f'gain from {drive}')} * {kind_of}.{drive}"
@@ -468,15 +470,15 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
             gains[-1].append(parameters[-1][1])
         steady.append(f"{name}_steady = {' + '.join(towards)}")
         if lag.states == 1:
-            rates.append((f"({name}_steady - x.{name}) / {constant}", "a lag of first order"))
+            rates.append((f"({name}_steady - x.{name}) / {constant}", "first-order lag"))
             continue
         steps = np.diff(column.values) / draft.period
         rms = float(np.sqrt(np.nanmean(steps**2))) if np.isfinite(steps).any() else 0.0
-        # refused are speeds whose rms is beyond: a sensor's noise, differentiated, is within
+        # speeds with a larger rms are refused later: differentiated sensor noise must stay within
         fast = float(_rounded(max(10 * span / lag.seconds, 3 * rms), 2))
         speed = _unused(f"{name}_rate", {*y_names, *(one for one, _ in speeds.values())})
         speeds[name] = speed, Signal(speed, per_second(unit), -fast, fast)
-        rates.append((f"x.{speed}", f"exact: the rate of {name}"))
+        rates.append((f"x.{speed}", f"exact: the derivative of {name}"))
     states = [_signal(column, name) for name, column in zip(y_names, draft.outputs, strict=True)]
     for name, (constant, damping) in zip(y_names, lag_names, strict=True):
         if damping:
@@ -484,15 +486,15 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
             ends = f"{signal.lower!r}, {signal.upper!r}"
             states.append((f"Signal({_text(speed)}, {_text(signal.unit)}, {ends})", "not measured"))
             pull = f"({name}_steady - x.{name}) / {constant}**2"
-            rates.append((f"{pull} - 2 * {damping} / {constant} * x.{speed}", "second order"))
+            rates.append((f"{pull} - 2 * {damping} / {constant} * x.{speed}", "second-order lag"))
     corrected = [n for n in y_names if n not in speeds] + [speed for speed, _ in speeds.values()]
     pace, _ = slowest(lags, draft.length)
     dt, length = draft.period, draft.length
-    # a fifth of the recording validates and a fifth tests: each must hold a warm-up and what is scored
+    # validation and test data are a fifth each: both must hold a warm-up and the scored periods
     smoothing = max(SMOOTHED * dt, min(10 * dt, length / 40))
     warm = max(2 * dt, min(max(10 * dt, pace), length / 10, length / 5 - smoothing - (MIN_SCORED + 2) * dt))
     spec = draft.data(smoothing, warm)
-    # what is refused of the recording as the file reads it is refused here, by its reason
+    # faults of the recording that the written file would meet are reported now
     roles = Roles.of(draft, y_names, [signal for _, signal in speeds.values()])
     train = load_trajectories(data, roles, spec).by_role("train")
     check_excitation(train, inputs=roles.inputs, outputs=roles.outputs)
@@ -504,16 +506,16 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
     lines = [
         _text(
             f"{title}: written from {printable(_and(file.name for file in data))} by hybrid-mpc new. "
-            f"Lines marked {MARK} are yours to decide."
+            f"Lines marked {MARK} are for you to decide."
         ),
         "",
         "from hybrid_mpc import OCP, DataSpec, OperatingPoint, Parameter, Prior, Scenario, Signal",
         "",
         "",
         f"class {kind}(Prior):",
-        '    """A first prior: each output is a lag of all that acts."""',
+        '    """A first prior: each output is a lag of all inputs and disturbances."""',
         "",
-        f"    # {MARK}: write the machine's own equations in xdot; its states need not be measured",
+        f"    # {MARK}: write the machine's own equations in xdot; states need not be measured",
         "    states = (",
         *(f"        {text},  # {note}" for text, note in states),
         "    )",
@@ -537,9 +539,9 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         ),
         "    )",
         f"    corrects = {_tuple(map(_text, corrected))}",
-        f"    # {MARK}: where the machine works; your own equations rest elsewhere: see check",
+        f"    # {MARK}: give the operating point; your own equations have another steady state (see check)",
         f"    # operating_point = OperatingPoint({point})",
-        f"    # {MARK}: balances(self, x, u, w, p), if something is stored: energy, mass, heat",
+        f"    # {MARK}: write balances(self, x, u, w, p) if the machine stores energy, mass or heat",
         "",
         "    def xdot(self, x, u, w, p):",
         *(f"        {text}" for text in steady),
@@ -550,16 +552,16 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         "",
         "scenario = Scenario(",
         f"    {_text(ascii_of(path.stem) or 'machine')},",
-        f"    {_text(title)},  # {MARK}: a title",
-        f'    "",  # {MARK}: a few words for the report',
+        f"    {_text(title)},  # {MARK}: give a title",
+        f'    "",  # {MARK}: describe the machine in a few words for the report',
         f"    prior={kind},",
         "    data=DataSpec(",
         f"        {_text(spec.time) if isinstance(spec.time, str) else repr(spec.time)},"
         + (f"  # {MARK}: {printable(draft.doubt)}" if draft.doubt else ""),
-        f"        {_tuple(map(_text, spec.inputs))},  # {MARK}: are these commanded?",
-        f"        {_tuple(map(_text, spec.outputs))},  # {MARK}: does the machine move these? {ACTING}",
+        f"        {_tuple(map(_text, spec.inputs))},  # {MARK}: check that these are commanded",
+        f"        {_tuple(map(_text, spec.outputs))},  # {MARK}: check that the machine moves these. {ACTING}",
         *(
-            f"        # {MARK}: is {printable(name)} {KINDS[draft.verdicts[name].kind]}? {printable(reason)}"
+            f"        # {MARK}: check that {printable(name)} is {KINDS[draft.verdicts[name].kind]}: {printable(reason)}"
             for name, reason in draft.unsure.items()
             if draft.verdicts[name].kind in KINDS and draft.verdicts[name].kind != "set-point"
         ),
@@ -572,10 +574,10 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
             for name, reason in draft.left_out.items()
         ),
         *(f"        # {MARK}: {line}" for line in loop_lines(draft)),
-        f"        dt={spec.dt!r},  # s, as it was sampled; a tenth of the fastest motion is enough",
+        f"        dt={spec.dt!r},  # s, the sampling period; a tenth of the fastest time constant is enough",
         f"        max_gap={spec.max_gap!r},",
         f"        smoothing={spec.smoothing!r},",
-        f"        warm_up={spec.warm_up!r},  # s of the past that start a free run",
+        f"        warm_up={spec.warm_up!r},  # s of the past that determine the initial state of a free run",
         *([f"        disturbances={_tuple(map(_text, spec.disturbances))},"] if w_names else []),
         *(
             [f"        units={{{', '.join(f'{_text(n)}: {f!r}' for n, f in spec.units.items())}}},"]
@@ -591,13 +593,13 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
 
 
 def _first_rest(draft: Draft, gains: Array, offsets: Array) -> tuple[list[float], list[float], list[float]]:
-    """Outputs, inputs and disturbances at which the lags rest: as near to the recording's middle as they can."""
+    """Outputs, inputs and disturbances at a steady state of the lags, as close as possible to the recorded medians."""
     n_u = len(draft.inputs)
     y, drives = (np.array([np.nanmedian(c.values) for c in cs]) for cs in (draft.outputs, draft.drives))
     missing = y - offsets - gains @ drives
     sizes = np.array([np.ptp(c.span) for c in (*draft.outputs, *draft.drives)])
     per_y, per_u = sizes[: len(y)], sizes[len(y) : len(y) + n_u]
-    # in shares of what was recorded: units do not enter
+    # scaled by the recorded spans: independent of units
     drives[:n_u] += per_u * (np.linalg.pinv(gains[:, :n_u] * per_u / per_y[:, None]) @ (missing / per_y))
     held = [
         float(near(min(max(v, c.span[0]), c.span[1]), np.ptp(c.span) / 500))
@@ -607,28 +609,28 @@ def _first_rest(draft: Draft, gains: Array, offsets: Array) -> tuple[list[float]
 
 
 def horizon_of(draft: Draft) -> tuple[int, str]:
-    """Periods of a first horizon, and why: twice the slowest time constant that matters, within ``HORIZONS``."""
+    """A first horizon in periods, and the reason: twice the slowest time constant that matters, within ``HORIZONS``."""
     pace, i = slowest(draft.lags, draft.length)
     asked = max(round(2 * pace / draft.period), 1)
     periods = min(max(asked, HORIZONS[0]), HORIZONS[1])
     why = (
-        f"{periods} periods of {draft.period:.3g} s; the slowest time constant that matters is {pace:.3g} s, of "
+        f"{periods} periods of {draft.period:.3g} s; the slowest time constant that matters is {pace:.3g} s, that of "
         f"{printable(draft.outputs[i].full)}"
     )
     if asked > periods:
-        why += f". Twice that are {asked} periods: take a longer dt"
+        why += f". Twice this time is {asked} periods: use a longer dt"
     return periods, why
 
 
 def first_limits(span: tuple[float, float], growth: float) -> tuple[float, float]:
-    """Limits of an input in a first control problem: what was recorded.
+    """Limits of an input in a first control problem: the recorded range.
 
-    An unstable machine falls where its input stays at a limit. Where its input was moved to both sides of zero, it may
-    be moved as far to either side: a recording from one start may hold much of one side alone.
+    An unstable machine falls over if its input stays at a limit. If the recorded input has both signs, its limits are
+    made symmetric: a recording from one initial state may hold mostly one sign.
 
     Args:
         span: Smallest and largest recorded value.
-        growth: Rate [1/s] at which the machine leaves its rest; 0: it does not.
+        growth: Rate [1/s] at which the machine diverges from its steady state; 0 if it does not.
 
     Example:
         >>> first_limits((-4.8, 14.0), 5.0), first_limits((-4.8, 14.0), 0.0), first_limits((0.0, 14.0), 5.0)
@@ -641,10 +643,10 @@ def first_limits(span: tuple[float, float], growth: float) -> tuple[float, float
 
 
 def _first_control(draft: Draft, n_x: int) -> list[str]:
-    """A control problem for a first loop, commented out: what only the user knows is marked.
+    """A control problem for a first loop, commented out; the user's decisions are marked.
 
-    Outputs are weighed by one over the square of a twentieth of what was recorded, changes of inputs of a tenth
-    (Bryson's rule); for the limits of inputs see :func:`first_limits`.
+    Weights follow Bryson's rule, ``1 / (tolerated deviation)^2``: a twentieth of the recorded span for outputs, a tenth
+    for changes of inputs. For the limits of inputs see :func:`first_limits`.
     """
     horizon, why = horizon_of(draft)
 
@@ -656,39 +658,39 @@ def _first_control(draft: Draft, n_x: int) -> list[str]:
     free = f"q={_tuple(['0.0'] * n_x)}, r={_tuple(['0.0'] * len(draft.inputs))}"
     sigma = _tuple(_rounded(0.005 * float(np.ptp(c.span))) for c in draft.outputs)
     return [
-        f"    # {MARK}: what a controller is to do. For a first loop take away the # before:",
+        f"    # {MARK}: define the control problem. For a first loop remove the # in front:",
         f"    # control=OCP({horizon}, {free}, u_min={low}, u_max={high},",
         f"    #             # {why}",
         "    #             # weights: one over the square of a deviation that you tolerate",
         f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",
-        f"    # sensor_sigma={sigma},  # how much each sensor errs",
-        "    # safe_input=(...),  # within these limits, and no harm when a sensor is lost: nobody can guess it",
+        f"    # sensor_sigma={sigma},  # standard deviation of each sensor's error",
+        "    # safe_input=(...),  # within these limits, and harmless when a sensor is lost: only you know it",
     ]
 
 
 def loop_lines(draft: Draft) -> list[str]:
-    """What is said of a closed loop and of an unstable machine; empty where neither is seen."""
+    """Lines about a closed loop and an unstable machine; empty without either."""
     lines = []
     if draft.loop:
         lines.append(
-            f"recorded in closed loop? {draft.loop}. Free runs are biased there; the fit of the prior fits "
-            "predictions, too"
+            f"the recordings seem to come from a closed loop ({draft.loop}). Free runs are biased there, so the fit "
+            "of the prior also uses predictions"
         )
     if draft.growth:
         lines.append(
-            f"unstable? deviations grow by e in {1 / draft.growth:.3g} s. The lags written here are stable: write the "
-            "machine's equation before a controller is built on it"
+            f"the machine seems to be unstable: deviations grow by a factor of e in {1 / draft.growth:.3g} s. The lags "
+            "written here are stable: write the machine's equation before you build a controller"
         )
     return lines
 
 
 def _and(names: Iterable[str]) -> str:
-    """Names one after another; of many the first and how many more."""
+    """A list of names; of more than three, the first and the count of the others."""
     given = list(names)
     return ", ".join(given) if len(given) <= 3 else f"{given[0]} and {len(given) - 1} more"
 
 
 def _tuple(written: Iterable[str]) -> str:
-    """What is written already, as a tuple."""
+    """A tuple as source text, from the source texts of its items."""
     given = list(written)
     return f"({', '.join(given)},)" if len(given) == 1 else f"({', '.join(given)})"

@@ -1,4 +1,4 @@
-"""Everything that a scenario defines, built and called once before any work; all that is wrong is reported at once."""
+"""Pre-flight check: everything that a scenario defines is built and called once, and all errors are listed together."""
 
 from __future__ import annotations
 
@@ -41,30 +41,30 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 QUIET = 1e-4
-"""Process noise a period of the observer that is tried, over the states' sizes: little, as that of a good prior."""
+"""Process noise per period of the trial observer, over the states' sizes: small, as for a good prior."""
 STARTS = 32
 """Starts of the search for equilibria."""
 FEW = 6
-"""Equilibria that are told one by one; more are a continuum as a rule."""
+"""Most equilibria that are listed; more are usually a continuum."""
 REACHED = 0.01
-"""Share of its size by which a state may miss a set-point that counts as one that can be held."""
+"""Largest deviation of a state from a set-point that counts as held, over the state's size."""
 ANSWER = 10
-"""Periods within which the plant is asked for its answer to a step of an input."""
+"""Periods of the plant's response to a step of an input that is compared with the prior's."""
 AGAINST = -0.3
-"""Cosine between the plant's and the prior's answer below which they go different ways."""
+"""Cosine between the responses of plant and prior below which they have different directions."""
 
 
 @dataclass(frozen=True)
 class Rest:
-    """A prior where it rests, as far as that is known.
+    """A prior at its operating point.
 
     Args:
-        x: States ``(n_x,)``: the operating point, or else the middle of the signals' ranges.
+        x: States ``(n_x,)``: the operating point, else the middle of the signals' ranges.
         u: Inputs ``(n_u,)`` there.
         w: Disturbances ``(n_w,)`` there.
-        modes: Eigenvalues ``(n_x,)`` [1/s] of the rates by the states.
-        substeps: Runge-Kutta steps a period.
-        equilibria: Points of rest under ``u`` within the signals' ranges.
+        modes: Eigenvalues ``(n_x,)`` [1/s] of the rates' Jacobian by the states.
+        substeps: Runge-Kutta steps per period.
+        equilibria: Steady states under ``u`` within the signals' ranges.
     """
 
     x: Array
@@ -77,17 +77,17 @@ class Rest:
 
 @dataclass(frozen=True)
 class Preflight:
-    """What a scenario's pre-flight has understood, and what is wrong with it.
+    """The result of a scenario's pre-flight check.
 
     Args:
         scenario: The scenario.
         prior: Its prior; None if it cannot be made.
-        problems: What must be mended, a line each.
-        warnings: What is doubtful about the scenario.
-        doubts: What is doubtful about the recordings.
-        rest: Where the prior rests; None if its equations cannot be asked there.
+        problems: Errors, one line each; a run needs them corrected.
+        warnings: Warnings about the scenario.
+        doubts: Warnings about the recordings.
+        rest: The prior at its operating point; None if its equations cannot be evaluated there.
         dataset: The recordings; None if there are none, or they cannot be read.
-        default_tasks: Tasks that the scenario gets where it declares none and has no plant.
+        default_tasks: Default tasks of a scenario that has neither tasks nor a plant.
     """
 
     scenario: Scenario
@@ -105,10 +105,10 @@ class Preflight:
 def check_scenario(
     scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
 ) -> Preflight:
-    """Build and call everything that a scenario defines, before any work is done; arguments as of :func:`preflight`.
+    """Build and call everything that a scenario defines; arguments as for :func:`preflight`.
 
     Raises:
-        InputError: Naming everything that is wrong, a line each.
+        InputError: With all errors, one line each.
     """
     found = preflight(scenario, budget, recordings)
     refuse(found.problems)
@@ -119,16 +119,16 @@ def check_scenario(
 def preflight(
     scenario: Scenario, budget: Budget | None = None, recordings: Callable[[], Dataset] | None = None
 ) -> Preflight:
-    """Build and call everything that a scenario defines, and say what was understood and what is wrong.
+    """Build and call everything that a scenario defines, and collect errors and warnings.
 
-    The prior is asked at the origin, at random points within its signals' ranges and at their ends, and exported; the
-    model, controllers, estimators, plant, tasks and their references are built of it and called. A part is looked at
-    whatever is wrong with the others, as far as it does not need them.
+    The prior is evaluated at the origin, at random points within its signals' ranges and at their ends, and exported;
+    model, controllers, estimators, plant, tasks and references are built and called. An error in one part does not
+    prevent the check of the parts that do not depend on it.
 
     Args:
         scenario: The scenario.
-        budget: The effort that is meant. Default: all of the scenario's.
-        recordings: Reads the recordings. Default: there are none yet.
+        budget: The effort to check. Default: all efforts of the scenario.
+        recordings: Function that reads the recordings. Default: none yet.
     """
     report = Report()
     prior, asked = check_prior(report, scenario.prior)
@@ -158,25 +158,25 @@ def preflight(
 
 
 def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
-    """Those of a scenario without plant and tasks; that there can be none is told, and stops nothing."""
+    """Default tasks of a scenario without plant and tasks; if none can be made, that is only a warning."""
     if scenario.plant is not None or scenario.control is None or scenario.tasks:
         return ()
     with report.part("default tasks"):
         try:
             return default_tasks(scenario)
         except InputError as none:
-            report.warn(f"tasks: none are declared, and no loop will run: {str(none).partition(': ')[2]}")
+            report.warn(f"tasks: none are given, so no loop will run: {str(none).partition(': ')[2]}")
     return ()
 
 
 def _sizes(signals: tuple[Signal, ...], at: Array) -> Array:
-    """Size of each signal: its range, or else its value, 1 at least."""
+    """Size of each signal: its range, else its value, at least 1."""
     ranges = np.array([s.upper - s.lower for s in signals], dtype=np.float64)
     return np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(at), 1.0))
 
 
 def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest | None, HybridModel | None]:
-    """Where the prior rests, how fast it is there, what the outputs tell of it; and the prior as a deployed model."""
+    """The prior at its operating point, with speed and observability; and the prior as a deployed model."""
     from hybrid_mpc.identify.fit import check_observable
 
     dt = scenario.data.dt
@@ -201,52 +201,53 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
     if prior.operating_point is None and 1 < len(found) <= FEW:
         told = "; ".join(f"x = {(p.x.round(6) + 0.0).tolist()} ({p.stability})" for p in found)
         report.warn(
-            f"prior: several equilibria under u = {u.tolist()}: {told}. Say around which one the machine works: "
-            "operating_point = OperatingPoint(x=(...), u=(...)). Until then the middle of the signals' ranges is taken"
+            f"prior: several equilibria under u = {u.tolist()}: {told}. Give the one at which the machine works: "
+            "operating_point = OperatingPoint(x=(...), u=(...)). Until then the middle of the signals' ranges is used"
         )
     return Rest(x, u, w, modes, substeps, found), model
 
 
 def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
-    """An operating point is an equilibrium."""
-    if moving := moves_at_rest(prior, second):
+    """Check that the operating point is an equilibrium."""
+    if moving := drift_at_rest(prior, second):
         x, u, w = rest_of(prior)
         report.add(
-            f"prior: operating_point is no equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}; give the input "
-            f"that holds it there, or the states where this input does{_nearest(prior, x, u, w)} [HM-CHECK-015]"
+            f"prior: operating_point is not an equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}. Give the "
+            f"input that holds these states, or the states that this input holds{_nearest(prior, x, u, w)} "
+            "[HM-CHECK-015]"
         )
 
 
-def moves_at_rest(prior: Prior, second: float) -> str:
-    """What moves at the operating point, in words; empty where nothing does, or no point is given.
+def drift_at_rest(prior: Prior, second: float) -> str:
+    """The states that move at the operating point, as text; empty if none moves, or no point is given.
 
-    ``second`` is the time [s] within which a state at rest may move by a hundredth of its size.
+    ``second`` is the time [s] within which a state may drift by a hundredth of its size.
     """
     if prior.operating_point is None:
         return ""
     x, u, w = rest_of(prior)
     rates = prior.equations.xdot(x, u, w, prior.p).full().ravel()
     return ", ".join(
-        f"{s.name} changes by {r:.3g} {s.unit} a second"
+        f"{s.name} changes by {r:.3g} {s.unit} per second"
         for s, r, size in zip(prior.states, rates, _sizes(prior.states, x), strict=True)
         if abs(r) * second > DRIFT * size
     )
 
 
-def rests_no_more(prior: Prior, second: float) -> tuple[str, ...]:
-    """A warning where a fitted prior does not rest at its operating point, and where it does; as ``moves_at_rest``."""
-    moving = moves_at_rest(prior, second)
+def warn_of_drift(prior: Prior, second: float) -> tuple[str, ...]:
+    """A warning if a fitted prior has no steady state at its operating point, with the nearest steady state."""
+    moving = drift_at_rest(prior, second)
     if not moving:
         return ()
     return (
-        f"with the fitted parameters the machine does not rest at operating_point ({moving}), where observers begin. "
-        "Write the fitted values into the prior's parameters, and where they rest into operating_point"
+        f"operating_point is not an equilibrium with the fitted parameters ({moving}), but observers start there. "
+        "Write the fitted values into the prior's parameters, and their steady state into operating_point"
         f"{_nearest(prior, *rest_of(prior))}",
     )
 
 
 def _nearest(prior: Prior, x: Array, u: Array, w: Array) -> str:
-    """The equilibrium that Newton's method finds from a point, to be copied; nothing where it finds none."""
+    """The equilibrium that Newton's method finds from a point, as text to copy; empty if it finds none."""
     n_x, scale = len(x), np.concatenate([_sizes(prior.states, x), np.ones(len(u))])
     equations, near = RateEquations(prior.equations.xdot, w, prior.p), np.concatenate([x, u])
     found = rate_search(equations, scale, near, np.zeros(n_x), free=np.arange(n_x)).descend(near, x)
@@ -269,7 +270,7 @@ def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[E
 def _check_recordings(
     report: Report, prior: Prior, recordings: Callable[[], Dataset], rest: Rest | None, spec: DataSpec
 ) -> Dataset | None:
-    """The recordings can be read, move what is to be learned, and have been where the machine works."""
+    """Check that the recordings can be read, excite the machine, and cover the operating point."""
     dataset = None
     with report.part("recordings"):
         dataset = recordings()
@@ -280,8 +281,8 @@ def _check_recordings(
     for file, sampling in zip(dataset.files, dataset.sampling, strict=True):
         if sampling > COARSE * spec.dt:
             report.warn(
-                f"recordings: {file} is sampled every {sampling:.3g} s, the model's period is {spec.dt:g} s: what lies "
-                "between is made up; raise dt in the DataSpec, or record faster"
+                f"recordings: {file} is sampled every {sampling:.3g} s, but the model's period is {spec.dt:g} s, so "
+                "samples between are interpolated. Raise dt in the DataSpec, or record faster"
             )
     train = dataset.by_role("train")
     free = sum(not p.fixed for p in prior.parameters)
@@ -300,14 +301,14 @@ def _check_recordings(
                 beyond = max(low - value, value - high)
                 if beyond > 0.5 * (high - low) and not signal.periodic:
                     report.warn(
-                        f"recordings: {signal.label} goes from {low:.4g} to {high:.4g}, at the operating point it is "
-                        f"{value:.4g}; record there, or correct the operating point or a unit"
+                        f"recordings: {signal.label} ranges from {low:.4g} to {high:.4g}, but at the operating point "
+                        f"it is {value:.4g}. Record there, or correct the operating point or a unit"
                     )
     return dataset
 
 
 def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
-    """As many columns as signals, in units that can be turned into theirs; causes that the prior has."""
+    """Check that there is one column per signal, in a convertible unit, and that causes name parameters."""
     spec = scenario.data
     for what, columns, signals in (
         ("inputs", spec.inputs, prior.inputs),
@@ -316,8 +317,8 @@ def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
     ):
         if len(columns) != len(signals):
             report.add(
-                f"data: {len(columns)} columns of {what} {list(columns)}, the prior has {len(signals)}: "
-                f"{[s.name for s in signals]} [HM-CHECK-016]"
+                f"data: {len(columns)} columns of {what} {list(columns)}, but the prior has {len(signals)}: "
+                f"{[s.name for s in signals]}. Name one column per signal. [HM-CHECK-016]"
             )
             continue
         for column, signal in zip(columns, signals, strict=True):
@@ -331,7 +332,7 @@ def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
     ]
     if unknown:
         report.add(
-            f"causes: the prior has no parameter {', '.join(unknown)}; it has: {', '.join(prior.values)} [HM-CHECK-017]"
+            f"causes: the prior has no parameter {', '.join(unknown)}; it has {', '.join(prior.values)} [HM-CHECK-017]"
         )
 
 
@@ -342,19 +343,19 @@ def _check_control(
     if control is None:
         if scenario.tasks:
             report.add(
-                "tasks: there is no control problem to run them with; give control=OCP(...) [HM-CHECK-018]"
+                "tasks: no control problem is given to run them. Give control=OCP(...). [HM-CHECK-018]"
             )
         return
     before = len(report.problems)
     _check_sensors(report, scenario, prior)
-    if len(report.problems) > before:  # what stands on them says no more
+    if len(report.problems) > before:  # errors of the sensors would only repeat themselves in the observer
         model = None
     _check_problem(report, scenario, "control", control, prior, model, rest)
     built = {_structure(control)}
     with report.part("safe_input"):
         loop_settings(replace(scenario, sensor_sigma=(), first_sigma=None))
     for task in scenario.tasks:
-        if task.control is not None:  # a controller is built once for all that differ in numbers alone
+        if task.control is not None:  # one controller is built for all problems that differ only in numbers
             new = _structure(task.control) not in built
             built.add(_structure(task.control))
             what = f"control of task {task.name}"
@@ -362,7 +363,7 @@ def _check_control(
 
 
 def _structure(control: OCP) -> tuple[Any, ...]:
-    """What tells controllers apart that are built differently."""
+    """What distinguishes controllers that are built differently."""
     bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())
     expressions = control.soft, control.hard, id(control.economic)
     return control.horizon, control.blocks, control.du_max is None, bounded, expressions
@@ -372,18 +373,18 @@ def _check_sensors(report: Report, scenario: Scenario, prior: Prior | None) -> N
     if prior is not None and len(scenario.sensor_sigma) != len(prior.outputs):
         given = scenario.sensor_sigma
         report.add(
-            f"sensor_sigma needs {len(prior.outputs)} numbers, got {len(given)}: {given} [HM-CHECK-019]"
+            f"sensor_sigma: must have {len(prior.outputs)} numbers, got {len(given)}: {given} [HM-CHECK-019]"
         )
     for name in ("sensor_sigma", "first_sigma"):
         values = getattr(scenario, name)
         if values is not None and not all(s > 0 for s in values):
-            report.add(f"{name} must be positive, got {values} [HM-CHECK-020]")
+            report.add(f"{name}: must be positive, got {values} [HM-CHECK-020]")
     for name, sigma in scenario.state_noise.items():
         if prior is not None and name not in [s.name for s in prior.states]:
             names = ", ".join(s.name for s in prior.states)
-            report.add(f"state_noise: no state {name!r}; there are: {names} [HM-CHECK-021]")
+            report.add(f"state_noise: no state {name!r}; the prior has {names} [HM-CHECK-021]")
         if not sigma > 0:
-            report.add(f"state_noise of {name} must be positive, got {sigma} [HM-CHECK-022]")
+            report.add(f"state_noise: {name} must be positive, got {sigma} [HM-CHECK-022]")
 
 
 def _check_problem(
@@ -401,10 +402,10 @@ def _check_problem(
     for name, size in {"q": len(prior.states), "r": len(prior.inputs)}.items():
         values = getattr(control, name)
         if len(values) != size:
-            report.add(f"{what}: {name} needs {size} numbers, got {len(values)}: {values} [HM-CHECK-023]")
+            report.add(f"{what}: {name} must have {size} numbers, got {len(values)}: {values} [HM-CHECK-023]")
     if model is None or rest is None or len(report.problems) > before:
         return
-    # each start is sought from for seconds, and their shapes are known to be right
+    # searching from each start takes seconds, and the starts' shapes are checked already
     control = control.changed(starts=())
     with report.part(f"{what}: estimator"):
         estimator = make_estimator(model, scenario, QUIET * Sizes(model, control).states, control)
@@ -438,7 +439,7 @@ def _check_plant(
             sizes = oracle.n_x, oracle.n_u, oracle.n_y
             if sizes != (model.n_x, model.n_u, model.n_y):
                 raise InputError(
-                    f"its model has (states, inputs, outputs) = {sizes}, the prior "
+                    f"its model has (states, inputs, outputs) = {sizes}, but the prior has "
                     f"{(model.n_x, model.n_u, model.n_y)} [HM-CHECK-024]"
                 )
 
@@ -447,20 +448,24 @@ def _check_methods(plant: Plant, prior: Prior, dt: float) -> None:
     n_x, n_u, n_y = len(prior.states), len(prior.inputs), len(prior.outputs)
     point = prior.operating_point
     x, u = (np.zeros(n_x), np.zeros(n_u)) if point is None else (np.array(point.x), np.array(point.u))
-    if (len(x), len(u)) != (n_x, n_u):  # told by the prior
+    if (len(x), len(u)) != (n_x, n_u):  # reported by the check of the prior
         return
     step: Any = plant.step
     state = step(plant.reset(x, 0), u, dt, *((rest_of(prior)[2],) if prior.disturbances else ()))
     y, x = plant.measure(state, np.random.default_rng(0)), plant.truth(state)
     for name, found, size in (("measure", y, n_y), ("truth", x, n_x)):
         if np.shape(found) != (size,):
-            raise InputError(f"{name} must return the shape ({size},), got {np.shape(found)} [HM-CHECK-025]")
+            raise InputError(
+                f"{name}: must return an array of shape ({size},), got {np.shape(found)} [HM-CHECK-025]"
+            )
         if not np.all(np.isfinite(found)):
-            raise InputError(f"{name} gives {found} one period after rest; it must be finite [HM-CHECK-026]")
+            raise InputError(
+                f"{name}: must return finite numbers, got {found} one period after rest [HM-CHECK-026]"
+            )
 
 
 def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) -> None:
-    """Plant and prior answer to a step of each input in the same direction."""
+    """Check that plant and prior respond to a step of each input in the same direction."""
     ranges = np.array([s.upper - s.lower for s in model.inputs])
     steps = np.where(np.isfinite(ranges), 0.1 * ranges, 1.0)
     room = np.array([s.upper for s in model.inputs]) - rest.u
@@ -487,8 +492,8 @@ def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) 
                 for s, a, b, k in zip(model.states, own, expected, sizes, strict=True)
             )
             report.warn(
-                f"plant: a step of {signal.label} by {steps[j]:g} moves plant and prior different ways within {ANSWER} "
-                f"periods: {told}; is a sign or a unit wrong in one of them?"
+                f"plant: a step of {signal.label} by {steps[j]:g} moves plant and prior in different directions within "
+                f"{ANSWER} periods: {told}. Check signs and units in both"
             )
 
 
@@ -499,7 +504,7 @@ def _check_task(
     control = task.control or scenario.control
     n_p = 0 if control is None else control.n_p
     if len(task.x0) != n_x:
-        report.add(f"{what}: x0 needs {n_x} numbers, got {task.x0} [HM-CHECK-027]")
+        report.add(f"{what}: x0 must have {n_x} numbers, got {task.x0} [HM-CHECK-027]")
     else:
         with report.part(what):
             _check_within("x0", np.array([task.x0]), np.zeros(1), prior.states)
@@ -509,14 +514,14 @@ def _check_task(
             check_channels(install(plant, task.faults)[1], *names)
     if task.duration < dt:
         report.add(
-            f"{what}: duration must be at least a period of {dt} s, got {task.duration} [HM-CHECK-028]"
+            f"{what}: duration must be at least one period of {dt} s, got {task.duration} [HM-CHECK-028]"
         )
         return
     t = np.arange(0.0, task.duration, dt)
     by_output = control is not None and control.n_y > 0
     signals = prior.outputs if by_output else prior.states
     n_r = len(signals) + n_p
-    last = f"; the last {n_p} for the parameters of the economic cost and of bounds"
+    last = f"; the last {n_p} columns are parameters of the economic cost and of bounds"
     for name, preview, columns in (("reference", task.reference, n_r), ("weight", task.weight, n_x)):
         if preview is None:
             continue
@@ -524,16 +529,16 @@ def _check_task(
             values = np.asarray(preview(t))
             if values.shape != (len(t), columns):
                 raise InputError(
-                    f"{name} must return the shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
+                    f"{name}: must return shape {(len(t), columns)} for {len(t)} times, got {values.shape}"
                     f"{last if columns > len(signals) else ''} [HM-CHECK-059]"
                 )
             if not np.all(np.isfinite(values)):
                 k = int(np.argmax(~np.isfinite(values).all(axis=1)))
                 raise InputError(
-                    f"{name} is {values[k]} at {t[k]:g} s; it must be finite during the task [HM-CHECK-029]"
+                    f"{name}: must be finite during the task, got {values[k]} at {t[k]:g} s [HM-CHECK-029]"
                 )
             if name == "weight" and np.any(values < 0):
-                raise InputError("weight: factors must not be negative [HM-CHECK-030]")
+                raise InputError("weight: factors must be zero or positive [HM-CHECK-030]")
             if name == "reference":
                 _check_within(name, values[:, : len(signals)], t, signals)
                 if control is not None and rest is not None:
@@ -542,21 +547,21 @@ def _check_task(
 
 
 def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal]) -> None:
-    """Values are within their signals' ranges."""
+    """Check that values are within their signals' ranges."""
     for j, signal in enumerate(signals):
         beyond = (values[:, j] < signal.lower) | (values[:, j] > signal.upper)
         if beyond.any():
             k = int(np.argmax(beyond))
             raise InputError(
-                f"{name}: {signal.label} is {values[k, j]:g} at {t[k]:g} s, outside its range from {signal.lower:g} to "
-                f"{signal.upper:g}; correct its unit, or the bounds of the signal [HM-CHECK-031]"
+                f"{name}: {signal.label} is {values[k, j]:g} at {t[k]:g} s, outside its range {signal.lower:g} to "
+                f"{signal.upper:g}. Correct its unit, or the bounds of the signal. [HM-CHECK-031]"
             )
 
 
 def _check_set_point(
     report: Report, task: Task, reference: Array, control: OCP, prior: Prior, rest: Rest, by_output: bool
 ) -> None:
-    """Where a reference of states or outputs comes to rest, the inputs' limits let the machine rest, too."""
+    """Check that inputs within their limits can hold the final set-point of a reference of states or outputs."""
     n_x, n_u = len(prior.states), len(prior.inputs)
     last = reference[-max(2, len(reference) // 10) :]
     weights, signals = (control.q_y, prior.outputs) if by_output else (control.q, prior.states)
@@ -585,7 +590,7 @@ def _check_set_point(
     nearest, what = found.y, "y" if by_output else "x"
     if (np.abs(nearest - target)[tied] / wanted[tied] > REACHED).any():
         report.warn(
-            f"task {task.name}: its reference comes to rest at {what} = {target.round(6).tolist()}, which no input "
-            f"within its limits holds; the nearest point of rest is {what} = {(nearest.round(4) + 0.0).tolist()} under "
+            f"task {task.name}: the reference ends at {what} = {target.round(6).tolist()}, which no input within its "
+            f"limits can hold; the nearest steady state is {what} = {(nearest.round(4) + 0.0).tolist()} under "
             f"u = {found.v[n_x:].round(4).tolist()}"
         )

@@ -1,6 +1,4 @@
-"""What of a prior is wrong: names, units, shapes, jumps, time, balances. Each part is looked at, whatever the others
-are.
-"""
+"""Check of a prior: names, units, shapes, jumps, time, balances. An error in one part does not prevent the others."""
 
 from __future__ import annotations
 
@@ -27,70 +25,70 @@ from nn_export import ExportError
 
 Array = NDArray[np.float64]
 POINTS = 16
-"""Random points at which a prior is asked, beside the origin and the ends of the signals' ranges."""
+"""Random points at which a prior is evaluated, besides the origin and the ends of the signals' ranges."""
 BALANCE = 1e-6
-"""Largest residual of a balance along the prior's own flow, as a share of its terms: rounding is 1e9 times less."""
+"""Largest residual of a balance along the prior's own flow, over its terms; rounding is a billion times smaller."""
 SAMPLES = 64
-"""Points of each line along which jumps are looked for."""
+"""Points of each line along which jumps are searched."""
 HALVINGS = 40
-"""How often the piece with the largest change is halved: a line is a hundredth of a billionth of its length then."""
+"""Bisections of the piece with the largest change; the last piece is 1e-12 of the piece's length."""
 JUMP = 1e-4
-"""What a function changes by on such a piece, as a share of what it changes by along the line, to be called a jump: a
-slope would have to be ten million times steeper than the line's."""
+"""Change over the last piece, over the change along the whole line, above which it is a jump: a slope would have to be
+ten million times steeper than the line's."""
 DRIFT = 0.01
-"""Share of its range that a state may drift by within a warm-up at an operating point that counts as an equilibrium."""
+"""Largest drift of a state within a warm-up, over its range, at an operating point that counts as an equilibrium."""
 ROLES = ("states", "inputs", "outputs", "disturbances", "parameters")
 TIMES = ("t", "time", "time_s", "clock", "now", "k")
 ALGEBRAIC = ("z", "alg", "algebraic", "dae", "xdot", "x_dot", "dx", "dxdt")
 NO_TIME = (
-    "; time enters by a measured disturbance alone: a column of the recordings that is known beforehand, a Signal in "
+    ". Time can only enter as a measured disturbance: a column of the recordings that is known in advance, a Signal in "
     "disturbances, w.<name> in the equations"
 )
 NO_DAE = (
-    "; algebraic variables are not supported: put their equation where they are used, or give them a fast rate of "
-    "their own"
+    ". Algebraic variables are not supported: substitute their equations where they are used, or give them fast rates "
+    "of their own"
 )
-FINITE = "; it must be within the signals' ranges. Keep a root, a logarithm or a division off its end"
+FINITE = ". It must be finite within the signals' ranges. Keep roots, logarithms and divisions away from singularities"
 TOO_FEW = "HM-MACHINE-016"
-"""Code of equations that give another number of values than there are signals."""
+"""Code of the error that equations give another number of values than there are signals."""
 IF = "Cannot compute the truth value"
-"""What CasADi says where code decides by an expression."""
+"""CasADi's message if code branches on an expression."""
 NUMBER = ("must be real number", "float() argument", "to_int not defined", "loop of ufunc")
-"""What is said where a number is wanted and an expression is given."""
+"""Messages of functions that expect a number and get an expression."""
 NO_NUMBERS = (
-    "; write ca.sin(x), ca.sqrt(x) ... instead of math's functions and float(), which know numbers alone"
+    ". Write ca.sin(x), ca.sqrt(x) ... instead of functions of math and float(), which accept only numbers"
 )
 
 
 @dataclass
 class Report:
-    """What was found so far: problems, which end a job, and warnings."""
+    """Results so far: problems, which stop a job, and warnings."""
 
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     def add(self, text: str) -> None:
-        """A problem, told once."""
+        """Add a problem, once."""
         if text not in self.problems:
             self.problems.append(text)
 
     def warn(self, text: str) -> None:
-        """Something doubtful."""
+        """Add a warning, once."""
         if text not in self.warnings:
             self.warnings.append(text)
 
     @contextmanager
     def part(self, what: str) -> Iterator[None]:
-        """A part of the scenario; what it raises is a problem of its own, and the next part is looked at."""
+        """Check one part of the scenario: an exception becomes a problem, and the next part is still checked."""
         try:
             with no_exit(), named_extra():
                 yield
         except InputError as error:
             for text in error.problems:
                 self.add(f"{what}: {text}")
-        except ExportError as error:  # of several lines, each with an operator
+        except ExportError as error:  # several lines, one per operator
             self.add(f"{what}: {error}")
-        except Exception as error:  # the user's own code may raise anything, and this is where it is reported
+        except Exception as error:  # user code may raise any exception; it becomes a problem of the report
             said = (said_by(error) or "no message").splitlines()[0]
             self.add(
                 f"{what} raised {type(error).__name__}: {said}{_place(error)}{_hint(error)} [HM-CHECK-061]"
@@ -98,7 +96,7 @@ class Report:
 
     @contextmanager
     def sound(self, what: str) -> Iterator[list[bool]]:
-        """The same; the list is empty until the part has passed."""
+        """As ``part``; the list stays empty unless the part passes."""
         before, passed = len(self.problems), list[bool]()
         with self.part(what):
             yield passed
@@ -108,11 +106,11 @@ class Report:
 
 @dataclass(frozen=True)
 class Points:
-    """Where a prior is asked: states ``(n, n_x)``, inputs, disturbances and parameters ``(n, n_p)``.
+    """Points at which a prior is evaluated: states ``(n, n_x)``, inputs, disturbances and parameters ``(n, n_p)``.
 
-    The origin, or what of the ranges is next to it, random points within the ranges, then the ends of the ranges: of
-    one signal alone, and of all together. Parameters are the prior's own, at the random points some within their
-    bounds.
+    First the origin (or the nearest point of the ranges), then random points within the ranges, then the ends of the
+    ranges, of each signal alone and of all together. Parameters are the prior's own; at every other random point they
+    are random within their bounds.
     """
 
     x: Array
@@ -146,27 +144,27 @@ class Points:
 
     @property
     def columns(self) -> tuple[Array, Array, Array, Array]:
-        """As CasADi takes them: a point a column."""
+        """Arguments for CasADi: one column per point."""
         return self.x.T, self.u.T, self.w.T, self.p.T
 
     @property
     def nominal(self) -> Points:
-        """Those with the prior's own parameters."""
+        """Points with the prior's own parameters."""
         return self.where((self.p == self.p[0]).all(axis=1))
 
     def where(self, kept: NDArray[np.bool_]) -> Points:
-        """Those of a mask ``(n,)``."""
+        """Points of a mask ``(n,)``."""
         return Points(self.x[kept], self.u[kept], self.w[kept], self.p[kept])
 
     def named(self, k: int) -> str:
-        """One of them as text; parameters where they are not the prior's own."""
+        """A point as text, with parameters if they are not the prior's own."""
         other = bool((self.p[k] != self.p[0]).any())
         shown = {key: v for key, v in vars(self).items() if v.size and (key != "p" or other)}
         return ", ".join(f"{name} = {v[k].tolist()}" for name, v in shown.items())
 
 
 def _drawn(signals: Sequence[Signal], seed: int) -> Array:
-    """The origin, or what of the range is next to it, and random points within the range: rows."""
+    """The origin (or the nearest point of the range) and random points within the range, as rows."""
     rng = np.random.default_rng(seed)
     columns = []
     for signal in signals:
@@ -181,8 +179,8 @@ def _finite_range(signal: Signal) -> tuple[float, float]:
 
 
 def check_prior(report: Report, make: Callable[..., Prior]) -> tuple[Prior | None, bool]:
-    """The prior if it can be made, and whether its equations can be asked where it rests."""
-    prior = _made(report, make)
+    """The prior if it can be made, and whether its equations can be evaluated at its operating point."""
+    prior = _make(report, make)
     if prior is None:
         return None, False
     _check_signals(report, prior)
@@ -193,19 +191,21 @@ def check_prior(report: Report, make: Callable[..., Prior]) -> tuple[Prior | Non
     with report.sound("prior") as rests:
         _check_point(prior)
     with report.part("prior"):
-        prior.corrected  # noqa: B018  tells names that are no states
-    if len(prior.p) == len(prior.parameters) and _written(report, prior):  # two of one name were told above
+        prior.corrected  # noqa: B018  raises for names that are no states
+    if len(prior.p) == len(prior.parameters) and _written(
+        report, prior
+    ):  # duplicate names are reported above
         return prior, _check_numbers(report, prior) and bool(rests)
     return prior, False
 
 
-def _made(report: Report, make: Callable[..., Prior]) -> Prior | None:
+def _make(report: Report, make: Callable[..., Prior]) -> Prior | None:
     prior: Prior | None = None
     with report.part("prior"):
         found = make()
         if not isinstance(found, Prior):
             raise InputError(
-                f"it makes a {type(found).__name__}; needed is a hybrid_mpc Prior, e.g. prior=MyPrior [HM-CHECK-032]"
+                f"must make a hybrid_mpc Prior, e.g. prior=MyPrior, but makes a {type(found).__name__} [HM-CHECK-032]"
             )
         prior = found
     if prior is not None:
@@ -213,7 +213,7 @@ def _made(report: Report, make: Callable[..., Prior]) -> Prior | None:
             again = make(dict(prior.values))
             if again.values != prior.values:
                 raise InputError(
-                    f"prior(values) must take its values over; {prior.values} became {again.values} [HM-CHECK-033]"
+                    f"prior(values) must use its values, but {prior.values} became {again.values} [HM-CHECK-033]"
                 )
     return prior
 
@@ -222,18 +222,20 @@ def _check_signals(report: Report, prior: Prior) -> None:
     for role in ROLES[:-1]:
         signals = getattr(prior, role)
         if not (signals or role == "disturbances"):
-            report.add(f"prior: {role} must be a tuple of one Signal or more, got {signals!r} [HM-CHECK-034]")
+            report.add(
+                f"prior: {role} must be a tuple of at least one Signal, got {signals!r} [HM-CHECK-034]"
+            )
         elif len({s.name for s in signals}) < len(signals):
             report.add(
-                f"prior: two of the {role} have the same name: {[s.name for s in signals]} [HM-CHECK-035]"
+                f"prior: {role} must have different names, got {[s.name for s in signals]} [HM-CHECK-035]"
             )
     names = [p.name for p in prior.parameters]
     if len(set(names)) < len(names):
-        report.add(f"prior: two parameters have the same name: {names} [HM-CHECK-036]")
+        report.add(f"prior: parameters must have different names, got {names} [HM-CHECK-036]")
 
 
 def _check_attributes(report: Report, prior: Prior) -> None:
-    """What a class has that no prior has: algebraic variables, roles that are misspelt, rates that nobody asks for."""
+    """Attributes that a prior does not have: algebraic variables, misspelt roles, rates that are never called."""
     kind = type(prior)
     own = [
         c for c in kind.__mro__ if issubclass(c, Prior) and not c.__module__.startswith("hybrid_mpc.machine")
@@ -245,47 +247,47 @@ def _check_attributes(report: Report, prior: Prior) -> None:
         near = difflib.get_close_matches(name, ROLES, n=1, cutoff=0.8)
         if held and near and name not in ROLES:
             report.add(
-                f"prior: {kind.__name__} has signals under {name!r}, which nobody reads; did you mean {near[0]!r}?"
+                f"prior: {kind.__name__} has signals under {name!r}, which is not used; did you mean {near[0]!r}?"
                 " [HM-CHECK-038]"
             )
     if isinstance(prior, MechanicalPrior) and "xdot" not in prior.methods and kind.xdot is not Prior.xdot:
         report.add(
-            f"prior: {kind.__name__}.xdot is never asked: a MechanicalPrior's rates are made of "
-            f"{', '.join(list(prior.methods)[:4])}. Write these, or make it a Prior [HM-CHECK-039]"
+            f"prior: {kind.__name__}.xdot is never called: the rates of a MechanicalPrior come from "
+            f"{', '.join(list(prior.methods)[:4])}. Write these, or derive from Prior. [HM-CHECK-039]"
         )
 
 
 def _check_units(report: Report, prior: Prior) -> None:
-    """Units that contradict each other; one that is not known contradicts nothing."""
+    """Report units that contradict each other; an unknown unit contradicts nothing."""
     if type(prior).output is Prior.output:
         states = {s.name: s for s in prior.states}
         for one in prior.outputs:
             state = states.get(one.name)
             if state is not None and differ(one.unit, state.unit):
                 report.add(
-                    f"prior: the output {one.label} is the state {state.label} as it is; give both one unit, or write "
-                    "output(x, u, w, p), which converts. Columns in other units: units={...} in the DataSpec"
-                    " [HM-CHECK-040]"
+                    f"prior: the output {one.label} is the state {state.label} unchanged. Give both the same unit, or "
+                    "write output(x, u, w, p) with the conversion. For columns in other units use units={...} in the "
+                    "DataSpec. [HM-CHECK-040]"
                 )
     if not isinstance(prior, MechanicalPrior):
         return
     for q, v in zip(prior.states[: prior.n_q], prior.states[prior.n_q :], strict=True):
         if differ(v.unit, per_second(q.unit)):
             report.add(
-                f"prior: {v.label} is the rate of {q.label}, so its unit must be {per_second(q.unit)}; are the states "
-                "in the order [q, v]? [HM-CHECK-041]"
+                f"prior: {v.label} is the rate of {q.label}, so its unit must be {per_second(q.unit)}. Check that the "
+                "states are in the order [q, v]. [HM-CHECK-041]"
             )
     if type(prior).force is MechanicalPrior.force and len(prior.inputs) == prior.n_q:
         for u, q in zip(prior.inputs, prior.states[: prior.n_q], strict=True):
             if not is_product(u.unit, q.unit, "J"):
                 report.add(
-                    f"prior: the input {u.label} drives {q.label} as a force, so their product must be an energy [J]; "
-                    "correct a unit, or write force(q, v, u, w, p), which converts [HM-CHECK-042]"
+                    f"prior: the input {u.label} drives {q.label} as a force, so their product must be an energy [J]. "
+                    "Correct a unit, or write force(q, v, u, w, p) with the conversion. [HM-CHECK-042]"
                 )
 
 
 def _check_point(prior: Prior) -> None:
-    """The operating point has the right sizes and lies within the ranges."""
+    """Check that the operating point has the right sizes and lies within the ranges."""
     point = prior.operating_point
     if point is None:
         return
@@ -298,8 +300,8 @@ def _check_point(prior: Prior) -> None:
     ):  # fmt: skip
         if len(values) != len(signals):
             raise InputError(
-                f"operating_point: {name} needs {len(signals)} numbers ("
-                f"{', '.join(s.name for s in signals) or 'there are none'}), got {len(values)}: {values} [HM-CHECK-044]"
+                f"operating_point: {name} must have {len(signals)} numbers ("
+                f"{', '.join(s.name for s in signals) or 'none'}), got {len(values)}: {values} [HM-CHECK-044]"
             )
         beyond = [
             f"{s.label} from {s.lower:g} to {s.upper:g}"
@@ -308,13 +310,13 @@ def _check_point(prior: Prior) -> None:
         ]
         if beyond:
             raise InputError(
-                f"operating_point: {name} = {values} is outside the range of {', '.join(beyond)}; correct it, or the "
-                "bounds of the signal [HM-CHECK-045]"
+                f"operating_point: {name} = {values} is outside the range of {', '.join(beyond)}. Correct it, or the "
+                "bounds of the signal. [HM-CHECK-045]"
             )
 
 
 def _written(report: Report, prior: Prior) -> bool:
-    """Whether all methods take what they are given and give what they must."""
+    """Whether all methods accept their arguments and return what they must."""
     before, kind, whole = len(report.problems), type(prior).__name__, list[str]()
     wrong = [
         name for name, arguments in prior.methods.items() if _check_arguments(report, prior, name, arguments)
@@ -329,7 +331,7 @@ def _written(report: Report, prior: Prior) -> bool:
     for name, arguments in prior.methods.items():
         if name not in wrong:
             with report.part("prior"):
-                _ask(prior, name, arguments, f"{kind}.{name}({', '.join(arguments)})")
+                _call(prior, name, arguments, f"{kind}.{name}({', '.join(arguments)})")
     if len(report.problems) == before:
         for text in whole:
             report.add(text)
@@ -337,7 +339,7 @@ def _written(report: Report, prior: Prior) -> bool:
 
 
 def _check_arguments(report: Report, prior: Prior, name: str, arguments: Sequence[str]) -> bool:
-    """Tell a method that takes something else, time or algebraic variables, say; whether it does."""
+    """Report a method with other arguments, such as time or algebraic variables; whether it has any."""
     signature = inspect.signature(getattr(prior, name))
     others = [key for key in signature.parameters if key not in arguments]
     fits = True
@@ -349,14 +351,14 @@ def _check_arguments(report: Report, prior: Prior, name: str, arguments: Sequenc
     if fits and not time and not algebraic:
         return False
     report.add(
-        f"prior: {type(prior).__name__}.{name} must take ({', '.join(arguments)}), it takes "
+        f"prior: {type(prior).__name__}.{name} must take ({', '.join(arguments)}), but takes "
         f"({', '.join(signature.parameters)}){NO_TIME if time else NO_DAE if algebraic else ''} [HM-CHECK-046]"
     )
     return True
 
 
-def _ask(prior: Prior, name: str, arguments: Sequence[str], what: str) -> None:
-    """Ask one method, and check the shape of what it gives."""
+def _call(prior: Prior, name: str, arguments: Sequence[str], what: str) -> None:
+    """Call one method, and check the shape of its result."""
     given = tuple((key, ca.SX.sym(key, len(prior.names_of(key)))) for key in arguments)
     if name == "balances":
         prior._balances(*given)
@@ -375,18 +377,18 @@ def _ask(prior: Prior, name: str, arguments: Sequence[str], what: str) -> None:
     except InputError as error:
         few = name == "xdot" and TOO_FEW in error.codes
         raise InputError(
-            f"{error}. A state needs a rate{NO_DAE} [HM-CHECK-060]" if few else str(error)
+            f"{error}. Every state needs a rate{NO_DAE} [HM-CHECK-060]" if few else str(error)
         ) from error
 
 
 def _check_numbers(report: Report, prior: Prior) -> bool:
-    """All that equations which can be asked give: finite, smooth, of the state alone, in balance; whether finite."""
+    """Check values of the equations: finite, smooth, functions of the state, in balance; return whether finite."""
     points = Points.of(prior)
     finite = []
     with report.part("prior"):
         _check_again(prior, points)
     with report.sound("prior") as masses:
-        _check_masses(prior, points.nominal)  # a corner of the parameters' box may be no machine
+        _check_masses(prior, points.nominal)  # extreme parameters may describe no machine
     if not masses:
         return False
     for what, f in (
@@ -402,7 +404,7 @@ def _check_numbers(report: Report, prior: Prior) -> bool:
     with report.part("prior"):
         _check_clock(prior)
     sound = points.nominal
-    if len(finite) < 2:  # an end of a range must not hide what is wrong elsewhere
+    if len(finite) < 2:  # a singular end of a range must not hide other errors
         sound = sound.where(_finite_at(prior, sound))
     if len(sound.x):
         _check_effects(report, prior, sound)
@@ -413,20 +415,20 @@ def _check_numbers(report: Report, prior: Prior) -> bool:
     for balance in prior.equations.balances:
         if differ(balance.rate_unit, per_second(balance.unit)):
             report.add(
-                f"prior: balance {balance.name}: what is stored in {balance.unit} comes and goes in "
-                f"{per_second(balance.unit)}, not in {balance.rate_unit}; correct unit or rate_unit [HM-CHECK-047]"
+                f"prior: balance {balance.name}: the rate of a storage in {balance.unit} has the unit "
+                f"{per_second(balance.unit)}, not {balance.rate_unit}. Correct unit or rate_unit. [HM-CHECK-047]"
             )
     if len(finite) == 2:
         return True
     try:
         x, u, w = rest_of(prior)
         return bool(_finite_at(prior, Points(x[None], u[None], w[None], prior.p[None]))[0])
-    except (ValueError, RuntimeError):  # an operating point that does not fit, which was told
+    except (ValueError, RuntimeError):  # the operating point does not fit, which is reported already
         return False
 
 
 def _finite_at(prior: Prior, points: Points) -> NDArray[np.bool_]:
-    """Where rates and outputs and their derivatives are finite ``(n,)``."""
+    """Where rates, outputs and their derivatives are finite ``(n,)``."""
     symbols = [ca.SX.sym(key, len(prior.names_of(key))) for key in POINT]
     value = ca.vertcat(prior.equations.xdot(*symbols), prior.equations.output(*symbols))
     slopes = [ca.vec(ca.densify(ca.jacobian(value, symbol))) for symbol in symbols]
@@ -435,8 +437,8 @@ def _finite_at(prior: Prior, points: Points) -> NDArray[np.bool_]:
 
 
 def _check_again(prior: Prior, points: Points) -> None:
-    """The equations are the same when they are asked again: no clock, no dice."""
-    if type(prior).evaluated is not Prior.evaluated:  # traced once, which takes seconds
+    """Check that the equations are the same when called again: no clock, no random numbers."""
+    if type(prior).evaluated is not Prior.evaluated:  # a torch prior: tracing again takes seconds
         return
     symbols = [ca.SX.sym(key, v.shape[1]) for key, v in vars(points).items()]
     rates, outputs, _ = prior.expressions(*symbols)
@@ -448,13 +450,13 @@ def _check_again(prior: Prior, points: Points) -> None:
         found, before = (g(*points.columns).full() for g in (again, f))
         if not np.allclose(found, before, rtol=1e-9, atol=0.0, equal_nan=True):
             raise InputError(
-                f"{what} gives something else when it is asked again; it must be a function of (x, u, w, p) alone, "
+                f"{what} gives a different result when called again. It must be a function of (x, u, w, p) only, "
                 f"without a clock or random numbers{NO_TIME} [HM-CHECK-048]"
             )
 
 
 def _check_masses(prior: Prior, points: Points) -> None:
-    """A mass matrix is symmetric and positive definite within the signals' ranges."""
+    """Check that a mass matrix is symmetric and positive definite within the signals' ranges."""
     if not isinstance(prior, MechanicalPrior):
         return
     masses = prior.masses
@@ -464,23 +466,23 @@ def _check_masses(prior: Prior, points: Points) -> None:
         if not right or np.linalg.eigvalsh(matrix).min() <= 0:
             found = matrix.tolist() if prior.n_q > 1 else float(matrix[0, 0])
             raise InputError(
-                f"mass_matrix(q, p) is {found} at {points.named(k)}; an inertia must be positive, a mass matrix "
-                "symmetric and positive definite. Check its terms and their signs [HM-CHECK-049]"
+                f"mass_matrix(q, p) is {found} at {points.named(k)}. An inertia must be positive, a mass matrix "
+                "symmetric and positive definite: check its terms and their signs. [HM-CHECK-049]"
             )
 
 
 def _check_finite(what: str, f: ca.Function, points: Points) -> None:
-    """Values and derivatives are finite within the signals' ranges."""
+    """Check that values and derivatives are finite within the signals' ranges."""
     symbols = dict(zip(POINT, f.sx_in(), strict=True))
     value = f(*symbols.values())
-    parts = {"it": value} | {
+    parts = {"its value": value} | {
         f"its derivative by {key}": ca.vec(ca.densify(ca.jacobian(value, symbols[key]))) for key in "xup"
     }
     found = ca.Function("parts", [*symbols.values()], [*parts.values()])(*points.columns)
     for which, values in zip(parts, found, strict=True):
         bad = ~np.isfinite(values.full()).all(axis=0)
-        if which == "it" and bad.all():
-            raise InputError(f"{what}: it is not finite anywhere{NO_NUMBERS} [HM-CHECK-050]")
+        if which == "its value" and bad.all():
+            raise InputError(f"{what}: its value is not finite anywhere{NO_NUMBERS} [HM-CHECK-050]")
         if bad.any():
             where = points.named(int(np.argmax(bad)))
             raise InputError(
@@ -489,7 +491,7 @@ def _check_finite(what: str, f: ca.Function, points: Points) -> None:
 
 
 def _check_smooth(what: str, f: ca.Function, prior: Prior, points: Points) -> None:
-    """It does not jump within the ranges: the largest change along lines between points, cornered by halving."""
+    """Check that a function has no jumps within the ranges: bisect the largest change along lines between points."""
     one = np.hstack([points.nominal.x, points.nominal.u, points.nominal.w])
     ends = one[:-1], one[1:]
     sizes = [len(prior.states), len(prior.inputs), len(prior.disturbances)]
@@ -528,26 +530,26 @@ def _check_smooth(what: str, f: ca.Function, prior: Prior, points: Points) -> No
             signal = (prior.states if what.startswith("xdot") else prior.outputs)[i]
             of = "the rate of " if what.startswith("xdot") else ""
             raise InputError(
-                f"{what}: {of}{signal.name} jumps from {first[found]:.4g} to {last[found]:.4g} at {where}. What "
-                "switches needs a smooth form of a width that you choose, e.g. tanh(v / 0.01) for sign(v); an input "
-                "that takes whole numbers, or is on or off, is not supported [HM-CHECK-052]"
+                f"{what}: {of}{signal.name} jumps from {first[found]:.4g} to {last[found]:.4g} at {where}. Replace a "
+                "switch by a smooth function of a width that you choose, e.g. tanh(v / 0.01) for sign(v). Inputs that "
+                "are integers, or on and off, are not supported. [HM-CHECK-052]"
             )
 
 
 def _check_clock(prior: Prior) -> None:
-    """No state counts the time."""
+    """Check that no state counts the time."""
     x, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in POINT)
     rates = prior.equations.xdot(x, u, w, p)
     for state, rate in zip(prior.states, ca.vertsplit(rates), strict=True):
         if rate.is_constant() and float(rate) != 0.0:
             raise InputError(
-                f"the rate of {state.label} is {float(rate):g} whatever happens: it counts the time{NO_TIME}"
+                f"the rate of {state.label} is always {float(rate):g}, so the state counts the time{NO_TIME}"
                 " [HM-CHECK-053]"
             )
 
 
 def _check_effects(report: Report, prior: Prior, points: Points) -> None:
-    """Each input acts, and smoothly; disturbances and parameters that nothing depends on are doubtful."""
+    """Check that each input acts smoothly; warn of disturbances and parameters without effect."""
     symbols = [ca.SX.sym(key, len(prior.names_of(key))) for key in POINT]
     value = ca.vertcat(prior.equations.xdot(*symbols), prior.equations.output(*symbols))
     groups: tuple[tuple[Signal | Parameter, ...], ...] = prior.inputs, prior.disturbances, prior.parameters
@@ -557,64 +559,60 @@ def _check_effects(report: Report, prior: Prior, points: Points) -> None:
             if key != "u":
                 if not there:
                     role = "parameter" if key == "p" else "disturbance"
-                    report.warn(
-                        f"prior: no rate and no output depends on the {role} {one.label}; leave it out"
-                    )
+                    report.warn(f"prior: no rate and no output depends on the {role} {one.label}. Remove it")
                 continue
             slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(value, component))])
             if there and slope(*points.columns).full().any():
                 continue
             how = (
-                "acts by switching alone: its derivatives are zero everywhere. Inputs of whole numbers, or on and off, "
-                "are not supported; take one that can have any value between, such as a duty"
+                "only switches: its derivatives are zero everywhere. Inputs that are integers, or on and off, are not "
+                "supported. Use a continuous input such as a duty cycle"
                 if there
-                else "changes no rate and no output; use it in the equations, or leave it out"
+                else "changes no rate and no output. Use it in the equations, or remove it"
             )
             report.add(f"prior: the input {one.label} {how} [HM-CHECK-054]")
 
 
 def _check_balance(prior: Prior, balance: BalanceEquations, points: Points, rates: Array) -> None:
-    """A balance tells something of the rates, is finite, holds along the flow, and loses what is not negative."""
+    """Check that a balance constrains rates, is finite, holds along the flow, and has no negative loss."""
     name = f"balance {balance.name} [{balance.rate_unit}]"
     symbols = balance.residual.sx_in()
     if not ca.depends_on(balance.residual(*symbols), symbols[1]):
         corrected = ", ".join(prior.states[i].name for i in prior.corrected)
         raise InputError(
-            f"{name}: the storage does not change with {corrected or 'any state'}, whose rates a network may correct, "
-            "so it tells nothing; store what changes with them, or leave the balance out [HM-CHECK-055]"
+            f"{name}: the storage does not depend on {corrected or 'any state'}, whose rates a network may correct, so "
+            "the balance has no effect. Store what depends on them, or remove the balance. [HM-CHECK-055]"
         )
     x, u, w, p = points.columns
     supply, loss = (f(x, u, w, p).full()[0] for f in (balance.supply, balance.loss))
     residual = np.abs(balance.residual(x, rates, u, w, p).full()[0])
     bad = ~np.isfinite([supply, loss, residual]).all(axis=0)
     if bad.any():
-        raise InputError(
-            f"{name}: it is not finite at {points.named(int(np.argmax(bad)))}{FINITE} [HM-CHECK-056]"
-        )
+        raise InputError(f"{name}: not finite at {points.named(int(np.argmax(bad)))}{FINITE} [HM-CHECK-056]")
     size, k = float(np.max(np.abs([supply, loss, residual]))), int(np.argmax(residual))
     if residual[k] > BALANCE * size:
         raise InputError(
             f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, "
-            "where it must be 0; is a term or a sign left out? [HM-CHECK-057]"
+            "but must be 0. Look for a missing term or a wrong sign. [HM-CHECK-057]"
         )
     k = int(np.argmin(loss))
     if loss[k] < -BALANCE * size:
         raise InputError(
-            f"{name}: the loss is {loss[k]:.3g} at {points.named(k)}; it must not be negative. Put what may have "
-            "either sign into the supply [HM-CHECK-058]"
+            f"{name}: the loss is {loss[k]:.3g} at {points.named(k)}, but must not be negative. Move terms of either "
+            "sign into the supply. [HM-CHECK-058]"
         )
 
 
 def _hint(error: BaseException) -> str:
-    """What helps against Python's own words."""
+    """A remedy for known messages of Python and CasADi."""
     text = said_by(error)
     if IF in text:
-        return "; write ca.if_else(condition, one, other) instead of if"
+        return ". Write ca.if_else(condition, one, other) instead of if"
     return NO_NUMBERS if any(word in text for word in NUMBER) else ""
 
 
 def _place(error: BaseException) -> str:
-    """The last line of the user's own code that an error came through."""
+    """The last line of the user's own code in an error's traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     library = Path(__file__).parents[1]
     own = [f for f in frames if library not in Path(f.filename).parents and "site-packages" not in f.filename]

@@ -1,17 +1,17 @@
-"""Roles of a recording's columns, by their names, their numbers and what moves what.
+"""Roles of a recording's columns, from their names, their numbers and their effects on each other.
 
-Evidence is taken in this order, and the first that decides is the reason that is given:
+The first evidence in this order decides, and is given as the reason:
 
-1. copies: a column that is a constant times another, or another one cut off at limits, is no signal of its own;
+1. copies: a column that is a constant times another, or another one clipped at limits, is no signal of its own;
 2. the name: words for a set-point, a command, a sensor (:func:`hybrid_mpc.data.names.role_said_by`);
-3. a set-point: nothing moves it, a column follows it with gain one, and a third one answers to it;
-4. values that are held and then jump are commanded; a coarse sensor repeats itself, too, but moves by single steps;
+3. a set-point: no column affects it, one follows it with gain one, and a third one reacts to it;
+4. values that are held and then jump are commanded; a coarse sensor repeats values, too, but moves by single steps;
 5. the unit: machines are driven in V, %, N m, and measured in rad, m, K;
-6. causality: an input is moved by no other column and helps to predict outputs (Granger, *Investigating causal
-   relations by econometric models and cross-spectral methods*, 1969); where all columns move each other, as in closed
-   loop, the input is the roughest, since machines are low-pass filters.
+6. causality: no column affects an input, and an input helps to predict outputs (Granger, *Investigating causal
+   relations by econometric models and cross-spectral methods*, 1969). If all columns affect each other, as in a closed
+   loop, the input is the roughest column, since machines are low-pass filters.
 
-Only 1 to 4 are sure; what rests on 5 and 6 is said to be doubtful.
+Only 1 to 4 are certain; roles from 5 and 6 are reported as uncertain.
 """
 
 from __future__ import annotations
@@ -31,51 +31,51 @@ from hybrid_mpc.data.names import ANGLES, DRIVING_UNITS, REACHED_UNITS, Role, is
 Array = NDArray[np.float64]
 Kind = Literal["input", "output", "set-point", "disturbance", "none"]
 HELD = 0.5
-"""Share of samples equal to the one before from which on a column looks commanded."""
+"""Least share of samples equal to the previous one for a column to look commanded."""
 COARSE_STEP, COARSE_SPAN = 3.5, 30.0
-"""A column whose usual change is at most so many of its smallest ones, and whose span is more than so many, is a coarse
-sensor at a slow motion: what is commanded jumps, or has few levels."""
+"""A coarse sensor in slow motion has a median change of at most ``COARSE_STEP`` smallest changes, and a span of more
+than ``COARSE_SPAN`` of them. A command jumps, or has few levels."""
 EXACT, ROUNDED = 1e-3, 1e-6
-"""Largest error of a copy over its span: the rounding of the file's digits, but no more than the first and no less than
-the second. Two sensors of one quantity differ by more."""
+"""Bounds of the largest error of a copy over its span, which is the rounding of the file. Two sensors of one quantity
+differ by more."""
 SAMPLED = 2000
-"""Most rows by which two columns are first compared."""
+"""Most rows by which two columns are compared first."""
 INTERIOR, LIMITED = 0.1, 0.02
-"""Least shares of samples within and at the limits of a copy that is cut off."""
+"""Least shares of samples between and at the limits of a clipped copy."""
 MOST_LEVELS = 8
-"""Most whole numbers that the modes of a machine have."""
+"""Most integer values of a column of modes."""
 SWITCHES = 5
-"""Fewest changes of a switch that show what it moves."""
+"""Fewest changes of a switch that show its effect."""
 LAGS = 6
-"""Samples of the past from which columns are predicted."""
+"""Past samples from which columns are predicted."""
 ROWS = 6000
-"""Most samples from which a prediction is fitted."""
+"""Most samples to which a prediction is fitted."""
 FEWEST_ROWS = 60
-"""Fewest."""
+"""Fewest samples to which a prediction is fitted."""
 STRIDES = (1, 4, 16, 64)
-"""Samples between those that are predicted: slow machines are sampled fast."""
+"""Sampling distances of the predictions: slow machines are often sampled fast."""
 ACTS = 5.0
-"""Link of two columns that is one: chance gives 1, with a standard deviation of 0.6."""
+"""Least link of a real effect: by chance a link is 1, with a standard deviation of 0.6."""
 QUIET = 3.0
-"""Links up to here are chance."""
+"""Largest link that may be chance."""
 LEADS = 2.0
-"""Times a link is stronger than the one back where the first column moves the second."""
+"""Least ratio of a link to the reverse one for the first column to be the cause."""
 MOST_LINKED = 16
 """Most columns among which links are computed."""
 FOLLOWS = 0.5
-"""Share of a column's variance by which it follows a set-point, at least."""
+"""Least explained share of the variance of a column that follows a set-point."""
 GAIN, OFFSET = 0.25, 0.25
-"""By how much the gain of what follows may differ from one; and its mean from the set-point's, in the deviations of
-that."""
+"""Largest deviations of a column that follows a set-point: of its gain from one, and of its mean, in standard
+deviations of the set-point."""
 ANSWERS = 0.8
-"""Share of variance that a command explains of what a drive measures of it."""
+"""Least share of variance of a drive's measurement that its command explains."""
 RATE = 0.97
-"""Correlation of a column with the rate of another from which on it is that rate."""
+"""Least correlation of a column with the rate of another for it to be that rate."""
 
 
 @dataclass(frozen=True)
 class Trait:
-    """A column as its role is judged: full name, unit, its numbers in each recording ``(m,)``, NaN where blank."""
+    """A column for the assignment of roles: full name, unit, numbers ``(m,)`` of each recording, NaN where blank."""
 
     full: str
     unit: str
@@ -83,35 +83,35 @@ class Trait:
 
     @cached_property
     def values(self) -> Array:
-        """All numbers that are known."""
+        """All known numbers."""
         whole = np.concatenate(self.pieces)
         return whole[np.isfinite(whole)]
 
     @cached_property
     def changes(self) -> Array:
-        """Differences of neighbours within the recordings."""
+        """Differences of consecutive samples within the recordings."""
         steps = np.concatenate([np.diff(piece) for piece in self.pieces])
         return steps[np.isfinite(steps)]
 
     @cached_property
     def levels(self) -> Array:
-        """Distinct numbers."""
+        """Distinct numbers, increasing."""
         return np.unique(self.values)
 
     @property
     def whole(self) -> bool:
-        """Whether it is known in every row, as an input is."""
+        """Whether every row has a number, as for an input."""
         return sum(map(len, self.pieces)) == len(self.values)
 
     @cached_property
     def said(self) -> Role:
-        """What its name says."""
+        """The role by its name."""
         few = len(self.levels) <= MOST_LEVELS and bool((self.levels == np.round(self.levels)).all())
         return role_said_by(self.full, self.unit, switches=few)
 
     @cached_property
     def is_held(self) -> bool:
-        """Whether it is held and then jumps."""
+        """Whether the column is held and then jumps."""
         changes = np.abs(self.changes)
         if not len(changes) or (changes == 0).mean() < HELD or not changes.any():
             return False
@@ -121,12 +121,12 @@ class Trait:
 
     @property
     def is_switch(self) -> bool:
-        """Whether it is zero or one."""
+        """Whether the column only has the values zero and one."""
         return set(self.levels.tolist()) <= {0.0, 1.0}
 
     @property
     def roughness(self) -> float:
-        """Size of its changes over its own."""
+        """Root mean square of the changes, over the standard deviation."""
         size = float(np.std(self.values))
         return (
             float(np.sqrt(np.mean(np.square(self.changes)))) / size if size > 0 and len(self.changes) else 0.0
@@ -134,7 +134,7 @@ class Trait:
 
 
 class Verdict(NamedTuple):
-    """A column's role, why, and whether that is sure; ``none`` is no signal."""
+    """A column's role, the reason, and whether it is certain; ``none`` is no signal."""
 
     kind: Kind
     reason: str
@@ -146,14 +146,14 @@ BY_NAME = "by its name"
 
 @dataclass
 class _Links:
-    """How far one column helps to predict another, computed once."""
+    """How much one column helps to predict another; each link is computed once."""
 
     known: dict[tuple[str, ...], float] = field(default_factory=dict)
 
     def of(self, source: Trait, target: Trait, now: bool = False, beside: Sequence[Trait] = ()) -> float:
-        """The strongest link over all strides: chance gives one.
+        """The strongest link over all strides; by chance it is 1.
 
-        ``now``: the source's present counts with its past. ``beside``: columns whose past is known as well.
+        ``now``: the present sample of the source is used, too. ``beside``: columns whose past is known as well.
         """
         key = source.full, target.full, "now" * now, *(one.full for one in beside)
         if key not in self.known:
@@ -161,18 +161,18 @@ class _Links:
         return self.known[key]
 
     def into(self, target: Trait, others: Sequence[Trait]) -> float:
-        """The strongest link into a column."""
+        """The strongest link to a column."""
         return max((self.of(one, target) for one in others if one is not target), default=0.0)
 
     def out_of(self, source: Trait, others: Sequence[Trait], beside: Sequence[Trait] = ()) -> float:
-        """The strongest link out of a column."""
+        """The strongest link from a column."""
         return max((self.of(source, one, beside=beside) for one in others if one is not source), default=0.0)
 
 
 def _link(source: Trait, target: Trait, stride: int, now: bool, beside: Sequence[Trait]) -> float:
-    """How far the past of one column helps to predict another beyond its own past, and that of those beside.
+    """How much the past of one column helps to predict another, beyond its own past and that of ``beside``.
 
-    Logarithm of the ratio of the residuals' variances, times samples over lags: a likelihood ratio, by chance 1.
+    ``ln(var_without / var_with) n / k`` with n samples and k added lags: a likelihood ratio, by chance 1.
     """
     pasts, others, nexts = [], [], []
     budget = ROWS // len(target.pieces) + LAGS + 1
@@ -209,7 +209,7 @@ def _residual(rows: Array, future: Array) -> float:
 
 
 def _line(x: Array, y: Array) -> tuple[float, float, float]:
-    """Slope, constant and explained share of the variance of ``y`` as a line over ``x``."""
+    """Slope, constant and explained share of variance of the least-squares line ``y = a x + b``."""
     x0, y0 = float(x.mean()), float(y.mean())
     xx, yy = float(np.mean((x - x0) ** 2)), float(np.mean((y - y0) ** 2))
     if not (xx > 0 and yy > 0 and math.isfinite(xx) and math.isfinite(yy)):
@@ -219,7 +219,7 @@ def _line(x: Array, y: Array) -> tuple[float, float, float]:
 
 
 def copy_of(one: Trait, other: Trait) -> str:
-    """How the second column is a copy of the first: ``scaled``, ``cut off`` at limits, or empty if it is none."""
+    """How the second column is a copy of the first: ``scaled``, ``cut off`` at limits, or empty if it is not."""
     x, y = (np.concatenate(trait.pieces) for trait in (one, other))
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
@@ -256,14 +256,14 @@ def _copy(x: Array, y: Array) -> str:
 
 
 def _digit(values: Array) -> float:
-    """The smallest difference of two numbers: what the file rounds to, or less."""
+    """The smallest difference of two numbers: at most the rounding of the file."""
     return float(np.diff(np.unique(values)).min(initial=math.inf))
 
 
 def follows(goal: Trait, reached: Trait) -> float:
-    """How well a column follows a set-point: the explained share of its variance at the best lag, with gain one.
+    """How well a column follows a set-point: explained share of its variance at the best lag, with gain one.
 
-    Zero where gain or mean are others.
+    Zero if gain or mean differ.
     """
     best = 0.0
     longest = max(map(len, goal.pieces))
@@ -279,7 +279,7 @@ def follows(goal: Trait, reached: Trait) -> float:
 
 
 def _shifted(one: Trait, other: Trait, lag: int) -> tuple[Array, Array]:
-    """Numbers of a column and those of another ``lag`` samples later, where both are known."""
+    """Pairs of a column's numbers and another column's ``lag`` samples later, where both are known."""
     whole = [np.zeros((0, 2))]
     for x, y in zip(one.pieces, other.pieces, strict=True):
         rows = max(len(x) - lag, 0)
@@ -306,14 +306,14 @@ def is_rate(rate: Trait, whole: Trait) -> bool:
     return bool(known.sum() >= FEWEST_ROWS and _line(a[known], b[known])[2] >= RATE**2)
 
 
-def judged(traits: Sequence[Trait], given: Mapping[str, Kind] | None = None) -> dict[str, Verdict]:
-    """The role of every column; those ``given`` keep theirs, and count as what they are.
+def judge_roles(traits: Sequence[Trait], given: Mapping[str, Kind] | None = None) -> dict[str, Verdict]:
+    """The role of every column; ``given`` roles are kept and used as evidence.
 
     Example:
         >>> rng = np.random.default_rng(0)
         >>> u = np.repeat(rng.standard_normal(40), 10)
         >>> y = np.convolve(u, 0.9 ** np.arange(60))[:400] + 0.01 * rng.standard_normal(400)
-        >>> found = judged([Trait("a", "", (y,)), Trait("b", "", (u,)), Trait("c", "", (2 * u,))])
+        >>> found = judge_roles([Trait("a", "", (y,)), Trait("b", "", (u,)), Trait("c", "", (2 * u,))])
         >>> [(name, verdict.kind) for name, verdict in found.items()]
         [('a', 'output'), ('b', 'input'), ('c', 'none')]
     """
@@ -321,11 +321,11 @@ def judged(traits: Sequence[Trait], given: Mapping[str, Kind] | None = None) -> 
 
 
 class _Judge:
-    """Columns and what is found of them, step by step."""
+    """Columns and the verdicts on them, step by step."""
 
     def __init__(self, traits: Sequence[Trait], given: Mapping[str, Kind]) -> None:
         self.traits = {trait.full: trait for trait in traits}
-        self.found = {full: Verdict(kind, "as you say") for full, kind in given.items()}
+        self.found = {full: Verdict(kind, "given by the user") for full, kind in given.items()}
         self.given = frozenset(given)
         self.copies: set[str] = set()
         self.links = _Links()
@@ -344,7 +344,7 @@ class _Judge:
         return {full: self.found[full] for full in self.traits}
 
     def of(self, *kinds: Kind) -> list[Trait]:
-        """Columns of these roles."""
+        """Columns with one of these roles."""
         return [t for full, t in self.traits.items() if full in self.found and self.found[full].kind in kinds]
 
     @property
@@ -356,8 +356,8 @@ class _Judge:
         self.found[trait.full] = Verdict(kind, reason, sure)
 
     def _copies(self) -> None:
-        """Of two copies that one stays which is given, else which acts, else whose name says more, else the first."""
-        if len(self.traits) < 3:  # of two columns one is the output, however exactly it answers
+        """Of two copies, keep the given, else the acting one, else the one whose name says more, else the first."""
+        if len(self.traits) < 3:  # of only two columns, one is the output even if it equals the other
             return
         for one, other in combinations(self.traits.values(), 2):
             if any(t.full in self.found and self.found[t.full].kind == "none" for t in (one, other)):
@@ -370,11 +370,11 @@ class _Judge:
                 if other.said and not one.said:
                     kept, left = other, one
             elif {one.said, other.said} <= {"measured", "quantity"}:
-                kept, left, how = *((one, other) if there else (other, one)), "{} cut off at limits"
+                kept, left, how = *((one, other) if there else (other, one)), "{} clipped at limits"
             else:
                 kept, left, how = (
                     *((other, one) if there else (one, other)),
-                    "{} before it is cut off at limits",
+                    "{} before it is clipped at limits",
                 )
             if left.full in self.given:
                 kept, left = left, kept
@@ -383,13 +383,13 @@ class _Judge:
                 self.copies.add(left.full)
 
     def _named(self) -> None:
-        """What names say."""
+        """Roles by names."""
         kinds: dict[Role, Kind] = {
             "command": "input", "actuator": "input", "set-point": "set-point", "measured": "output",
             "quantity": "output", "disturbance": "disturbance", "flag": "none", "label": "none",
         }  # fmt: skip
         reasons = {
-            "flag": "a flag by its name: it has few values",
+            "flag": "by its name a flag; it has few values",
             "label": "by its name an error, a fault, a correction or a part of a command",
         }
         for trait in self.open:
@@ -397,16 +397,16 @@ class _Judge:
                 self._say(
                     trait, kinds[trait.said], reasons.get(trait.said, BY_NAME), trait.said != "disturbance"
                 )
-        # what a drive measures of its command, or the second of two commands in series
+        # a drive's measurement of its command, or the second of two commands in series
         inputs = [t for t in self.of("input") if t.full not in self.given]
         for one in [t for t in inputs if t.said == "actuator"]:
             for other in [t for t in self.of("input") if t is not one and t.unit == one.unit]:
                 if is_command_of(other.full, one.full) or self._answers_to(one, other):
-                    self._say(one, "none", f"it follows {other.full!r}: what the drive makes of it")
+                    self._say(one, "none", f"it follows {other.full!r}: the drive's response to it")
                     break
 
     def _answers_to(self, answer: Trait, command: Trait) -> bool:
-        """Whether a column is what a drive measures of a command."""
+        """Whether a column is a drive's measurement of a command."""
         if self.links.of(command, answer) < LEADS * self.links.of(answer, command):
             return False
         pairs = [_shifted(command, answer, lag) for lag in range(LAGS + 1)]
@@ -414,9 +414,9 @@ class _Judge:
         return max(shares, default=0.0) >= ANSWERS
 
     def _set_points(self) -> None:
-        """Columns that nothing moves, that one follows with gain one, and to which what drives it answers.
+        """Set-points: no column affects them, one follows with gain one, and the column that drives it reacts.
 
-        A drive's torque follows its command as well, but there no third column moves it as much.
+        A drive's torque follows its command as well, but then no third column affects it as strongly.
         """
         others = [*self.open, *self.of("input", "output")]
         if not 3 <= len(others) <= MOST_LINKED:
@@ -441,13 +441,13 @@ class _Judge:
                 self._say(best, "output", f"it follows {goal.full!r}", False)
             drive = max(drives, key=lambda t: t.roughness)
             if drive.full not in self.found and drive.said == "":
-                self._say(drive, "input", f"it answers to {goal.full!r} and moves {best.full!r}", False)
+                self._say(drive, "input", f"it reacts to {goal.full!r} and affects {best.full!r}", False)
 
     def _held(self) -> None:
-        """What is held and jumps, beside something that is not."""
+        """Columns that are held and jump, next to others that do not."""
         if all(t.is_held for t in [*self.open, *self.of("output")]):
             return
-        named = bool(self.of("input"))  # beside a command by its name it may be a load that is held
+        named = bool(self.of("input"))  # next to a command by name, a held column may be a load
         for trait in self.open:
             if trait.is_held and not trait.is_switch:
                 self._say(trait, "input", "it is held and jumps", sure=not named)
@@ -456,26 +456,26 @@ class _Judge:
                 moved = [t for t in [*self.open, *self.of("output")] if t is not trait]
                 moves = (trait.changes != 0).sum() >= SWITCHES and self.links.out_of(trait, moved) >= ACTS
                 if moves or not self.of("input"):
-                    why = "moves other columns" if moves else "is held, and no other column drives"
+                    why = "affects other columns" if moves else "is held, and no other column drives"
                     self._say(trait, "input", f"it is a switch that {why}", False)
                 else:
-                    self._say(trait, "none", "it is a switch that moves nothing: a flag", False)
+                    self._say(trait, "none", "it is a switch without effect: a flag", False)
 
     def _by_unit(self) -> None:
-        """Units in which machines are driven, and in which they are measured."""
+        """Units of inputs, and units of outputs."""
         driven = [t for t in self.open if t.unit in DRIVING_UNITS and t.said == "" and t.whole]
         if not self.of("input"):
             for trait in driven:
                 if len(self.open) > 1 or self.of("output"):
-                    self._say(trait, "input", f"machines are driven in {trait.unit}", False)
+                    self._say(trait, "input", f"{trait.unit} is a typical unit of inputs", False)
 
     def _by_cause(self) -> None:
-        """An input where there is none yet: what moves the others, else the roughest."""
+        """If there is no input yet: the column that affects the others, else the roughest."""
         if self.of("input"):
             return
         answers = [t for t in self.open if t.said == "answer"]
         for trait in answers:
-            self._say(trait, "input", "what drives, as it is measured; no command is recorded", False)
+            self._say(trait, "input", "the drive's measurement; no command is recorded", False)
         if answers:
             return
         free = self.open
@@ -483,14 +483,14 @@ class _Judge:
         if goals and (not free or len(free) + len(self.of("output")) < 2):
             for goal in goals:
                 self._say(
-                    goal, "input", "a set-point, but nothing else drives: machine and controller", False
+                    goal, "input", "a set-point, but no other column drives: machine and controller", False
                 )
             return
         free = free or [t for t in self.of("output") if t.full not in self.given]
         outputs = [t for t in self.of("output") if t not in free]
         if len(free) + len(outputs) < 2:
             return
-        candidates = [t for t in free if t.whole] or free  # an input is known in every row
+        candidates = [t for t in free if t.whole] or free  # an input has a number in every row
         candidates = [t for t in candidates if t.said != "measured"] or candidates
         candidates = [t for t in candidates if t.unit not in REACHED_UNITS] or candidates
         if len(free) + len(outputs) <= MOST_LINKED:
@@ -504,27 +504,32 @@ class _Judge:
             ]  # fmt: skip
             if causes and len(causes) < len(every):
                 for trait in causes:
-                    self._say(trait, "input", "it moves other columns, and none moves it", False)
+                    self._say(trait, "input", "it affects other columns, and none affects it", False)
                 return
             if any(self.links.out_of(t, every) >= ACTS for t in candidates):
                 roughest = max(candidates, key=lambda t: t.roughness)
                 commands = [t for t in candidates if t is not roughest and self._answers_to(roughest, t)]
                 if commands:
                     self._say(
-                        roughest, "none", f"it follows {commands[0].full!r}: what a drive makes of it", False
+                        roughest,
+                        "none",
+                        f"it follows {commands[0].full!r}: the drive's response to it",
+                        False,
                     )
                     roughest = commands[0]
-                self._say(roughest, "input", "columns move each other, and it is the roughest", False)
+                self._say(roughest, "input", "columns affect each other, and this one is the roughest", False)
                 return
-        self._say(candidates[0], "input", "nothing tells inputs from outputs; it is the first column", False)
+        self._say(
+            candidates[0], "input", "no evidence tells inputs from outputs; it is the first column", False
+        )
 
     def _answers(self) -> None:
-        """What drives measure where a command is recorded."""
+        """Measurements of drives whose command is recorded."""
         for trait in [t for t in self.open if t.said == "answer"]:
-            self._say(trait, "none", "what a drive measures of its command")
+            self._say(trait, "none", "a drive's measurement of its command")
 
     def _rest(self) -> None:
-        """What is left is measured: an output, or a disturbance if nothing moves it and it moves an output."""
+        """Other columns are measured: disturbances if nothing affects them and they affect outputs, else outputs."""
         inputs = self.of("input")
         weak = [t for t in self.of("output") if t.said == "quantity" and t.full not in self.given]
         for trait in [*self.open, *weak]:
@@ -532,7 +537,7 @@ class _Judge:
             if not outputs or len(outputs) + len(inputs) > MOST_LINKED:
                 self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
                 continue
-            # what no input reaches is no output of the machine; an angle is the machine's own
+            # a column that no input affects is no output of the machine; angles belong to the machine in any case
             free = trait.unit not in ANGLES and all(self.links.of(t, trait) < QUIET for t in inputs)
             free = free and not any(is_rate(trait, t) or is_rate(t, trait) for t in outputs)
             moved = [t for t in outputs if self.links.of(trait, t, beside=inputs) >= ACTS] if free else []
@@ -541,24 +546,27 @@ class _Judge:
             if moved and back < max(QUIET, there / LEADS):
                 if trait.unit in DRIVING_UNITS and trait.whole and trait.said == "":
                     self._say(
-                        trait, "input", f"it moves outputs, and machines are driven in {trait.unit}", False
+                        trait,
+                        "input",
+                        f"it affects outputs, and {trait.unit} is a typical unit of inputs",
+                        False,
                     )
                 else:
-                    self._say(trait, "disturbance", "no input moves it, and it moves outputs", False)
+                    self._say(trait, "disturbance", "no input affects it, and it affects outputs", False)
             elif free and trait.said == "":
-                self._say(trait, "output", "no input moves it; does it act on the machine instead?", False)
+                self._say(trait, "output", "no input affects it; it may be a disturbance instead", False)
             else:
                 self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
 
     def _something(self) -> None:
-        """An output and an input, if need be of columns whose names say something else; copies stay copies."""
+        """Ensure one output and one input, if need be against names; copies stay copies."""
         inputs = self.of("input")
         if not self.of("output") and len(inputs) > 1:
             ours = [t for t in inputs if t.full not in self.given]
             ours = [t for t in ours if t.said != "command"] or ours
             if ours:
                 last = max(ours, key=lambda t: self.links.into(t, inputs))
-                self._say(last, "output", "nothing else is measured, and the others move it most", False)
+                self._say(last, "output", "no other column is measured, and the others affect it most", False)
         spare = [
             t for t in [*self.of("disturbance"), *self.of("set-point"), *self.of("none")]
             if t.full not in self.given and t.full not in self.copies
@@ -569,5 +577,5 @@ class _Judge:
                 trait = next((t for t in spare if t.whole), spare[0])
                 spare.remove(trait)
                 self._say(
-                    trait, kind, f"nothing else is left; its name says {trait.said or 'nothing'}", False
+                    trait, kind, f"it is the only column left; its name says {trait.said or 'nothing'}", False
                 )

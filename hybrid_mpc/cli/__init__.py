@@ -1,4 +1,4 @@
-"""The command line ``hybrid-mpc``: one thin module a command."""
+"""The command line ``hybrid-mpc``: one thin module per command."""
 
 from hybrid_mpc.cli.main import main
 

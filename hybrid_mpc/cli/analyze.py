@@ -26,20 +26,18 @@ def analyze(
     out: EmptyFolder,
     scenario: Annotated[
         str,
-        typer.Option(
-            help="The machine, a registered name or a .py file. Default: the one the model was made for."
-        ),
+        typer.Option(help="The machine, a registered name or a .py file. Default: the machine of the model."),
     ] = "",
     data: Annotated[
         list[Path] | None,
-        typer.Option(help="A recording to take a frequency response from; may be repeated."),
+        typer.Option(help="A recording for a frequency response; may be repeated."),
     ] = None,
     speed: Annotated[
-        float | None, typer.Option(help="Size of the motions that friction is linearized for [unit of v].")
+        float | None, typer.Option(help="Size of the motions at which friction is linearized [unit of v].")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of what is drawn at random.", min=0, max=MOST_SEED)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of random draws.", min=0, max=MOST_SEED)] = 0,
 ) -> None:
-    """Poles, Bode plots, margins of the control loop and more, as tables, pictures and a page."""
+    """Write poles, Bode plots, margins of the control loop and more as tables, figures and a page."""
     from hybrid_mpc.analyze.analysis import analyze_models
     from hybrid_mpc.analyze.page import write_analysis
     from hybrid_mpc.cli.progress import make_progress, print_summary

@@ -1,4 +1,4 @@
-"""``hybrid-mpc benchmark``: free runs of a machine's models over recordings that they have not seen."""
+"""``hybrid-mpc benchmark``: free runs of a machine's models over held-out recordings."""
 
 from __future__ import annotations
 
@@ -21,29 +21,31 @@ EXAMPLES = (
 def benchmark(
     machine: ScenarioName,
     data: Annotated[
-        list[Path] | None, typer.Option(help="A recording to train on; give it once for each file.")
+        list[Path] | None, typer.Option(help="A recording for training; may be repeated.")
     ] = None,
     test: Annotated[
         list[Path] | None,
-        typer.Option(help="A recording to evaluate on. Default: what the training holds back."),
+        typer.Option(help="A recording for evaluation; may be repeated. Default: the held-out test data."),
     ] = None,
     model: Annotated[
         Path | None,
-        typer.Option(help="Folder of a benchmark made before: evaluate its model, train nothing."),
+        typer.Option(help="Folder of an earlier benchmark: evaluate its model, train nothing."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/MACHINE-benchmark.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to create. Default: runs/MACHINE-benchmark.")
+    ] = None,
     budget: Annotated[str, typer.Option(help="Effort: quick or full.")] = "quick",
     seed: Annotated[int, typer.Option(help="Seed of the networks.", min=0, max=MOST_SEED)] = 0,
     refit: Annotated[
         float | None,
         typer.Option(
-            help="A machine that has changed: fit the prior anew to so many seconds of each test file."
+            help="For a machine that has changed: refit the prior to this many seconds of each test file."
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Kinds of networks trained at the same time.", min=1)] = 2,
+    workers: Annotated[int, typer.Option(help="Number of network kinds trained in parallel.", min=1)] = 2,
     scheduler: Scheduler = None,
 ) -> None:
-    """Fit the prior, train networks on it, and evaluate free runs over unseen recordings."""
+    """Fit the prior, train networks, and evaluate free runs over held-out recordings."""
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.scenario import load_scenario
     from hybrid_mpc.workflow.benchmark import BenchmarkSettings, draw, table

@@ -1,4 +1,4 @@
-"""``hybrid-mpc check``: what is understood of a machine and its recordings, and what is wrong, before any work."""
+"""``hybrid-mpc check``: report on a machine and its recordings, and list all errors, before any work."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXAMPLES = (
     "  hybrid-mpc check my_machine.py --data monday.csv --data tuesday.csv --fit"
 )
 WRONG = 2
-"""Exit code where something must be mended."""
+"""Exit code if there are errors."""
 LISTED = 6
 """Most equilibria that are listed."""
 
@@ -44,15 +44,14 @@ def check(
     fit: Annotated[
         bool,
         typer.Option(
-            "--fit", help="Fit the prior too, compare it with simpler models, and name wrong terms."
+            "--fit", help="Also fit the prior, compare it with simpler models, and name wrong terms."
         ),
     ] = False,
 ) -> None:
-    """Say what is understood of a machine and its recordings, and all that is wrong with them; compute nothing.
+    """Report on a machine and its recordings, and list all errors; nothing is computed.
 
-    The same is asked first by 'run', 'tune' and 'benchmark'. With --fit the prior is fitted as a run does it, and what
-    puts its structure in doubt is named. Nothing is trained, no file is written. Exit code 2 if something must be
-    mended.
+    'run', 'tune' and 'benchmark' begin with the same check. With --fit the prior is fitted as in a run, and doubts
+    about its structure are listed. No network is trained, no file is written. Exit code 2 if there are errors.
     """
     from hybrid_mpc.check.new import left_to_decide
     from hybrid_mpc.check.preflight import preflight
@@ -76,8 +75,8 @@ def check(
         warnings += told
     left = left_to_decide(Path(scenario)) if scenario.endswith(".py") else []
     for texts, style, title in (
-        (left, "cyan", "left to decide"), (warnings, "yellow", "doubtful"),
-        (in_doubt, "bold yellow", "in doubt: the structure of the prior"), (problems, "bold red", "to be mended"),
+        (left, "cyan", "left to decide"), (warnings, "yellow", "warnings"),
+        (in_doubt, "bold yellow", "doubts about the structure of the prior"), (problems, "bold red", "errors"),
     ):  # fmt: skip
         if texts:
             console.print(f"\n{len(texts)} {title}", style=style)
@@ -86,15 +85,13 @@ def check(
     if problems:
         raise typer.Exit(WRONG)
     if in_doubt:
-        console.print("\nCorrect the prior before a run: docs/prior-wrong.md says how to read each doubt.")
+        console.print("\nCorrect the prior before a run; docs/prior-wrong.md explains each doubt.")
         return
-    console.print(
-        "\nNothing to be mended; 'hybrid-mpc run' may start." if data or fit else "\nNothing to be mended."
-    )
+    console.print("\nNo errors; continue with 'hybrid-mpc run'." if data or fit else "\nNo errors.")
 
 
 def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Fit the prior and print what was found; what must be mended, warnings, and doubts about the structure."""
+    """Fit the prior and print the results; return errors, warnings, and doubts about the structure."""
     from dataclasses import replace
 
     from hybrid_mpc.cli.progress import Unwarned, make_progress
@@ -135,7 +132,7 @@ def _error(value: float | None) -> str:
 
 
 def _free_runs(prior: Prior, found: PriorResult) -> Table:
-    """Errors of the prior and of simpler models."""
+    """Errors of the prior and of simpler models in free runs."""
     length = "" if found.longest_run is None else f" of {found.longest_run:.3g} s"
     columns = [text for s in prior.outputs for text in (f"RMSE {s.label}", f"FIT {s.name} [%]")]
     table = _table(f"free runs{length} on the test recordings", "model", "error [spreads]", *columns)
@@ -143,7 +140,7 @@ def _free_runs(prior: Prior, found: PriorResult) -> Table:
     simpler = {name: one.errors for name, one in found.baselines.items()}
     for name, errors in {**found.errors, **simpler}.items():
         if errors is None:
-            table.add_row(name, f"none: {found.baselines[name].reason}")
+            table.add_row(name, f"no result: {found.baselines[name].reason}")
             continue
         cells = [
             text
@@ -164,7 +161,7 @@ def _number(value: float | None, spec: str) -> str:
 
 
 def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
-    """What was understood."""
+    """Print the description of the machine."""
     scenario, prior = found.scenario, found.prior
     console.print(scenario.title, style="bold", markup=False)
     if prior is None:
@@ -172,7 +169,7 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
     console.print(_signals(found, prior, spec))
     if prior.parameters:
         console.print(_parameters(prior))
-    told = "none: there is no MOPGRNN"
+    told = "none, so there is no MOPGRNN"
     if not found.problems and prior.equations.balances:
         told = ", ".join(f"{b.name} ({b.unit}, {b.rate_unit})" for b in prior.equations.balances)
     if not found.problems:
@@ -187,9 +184,9 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
     if control is not None and hasattr(control, "horizon"):
         tasks = ", ".join(task.name for task in scenario.tasks) or "none"
         if found.default_tasks:
-            tasks = f"none declared, so default ones: {'; '.join(task.title for task in found.default_tasks)}"
+            tasks = f"none given; default tasks: {'; '.join(task.title for task in found.default_tasks)}"
         if scenario.plant is None:
-            tasks += "; loops run on a trained model, for there is no plant"
+            tasks += "; loops run on a trained model, since there is no plant"
         length = f"{control.horizon} periods, {control.horizon * spec.dt:.4g} s"
         _line(console, "control", f"{length}; tasks: {tasks}")
     if found.dataset is not None:
@@ -208,7 +205,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _signals(found: Preflight, prior: Prior, spec: DataSpec) -> Table:
-    """Signals with their units, ranges and columns, and what the recordings hold of them."""
+    """Signals with units, ranges and columns, and their recorded ranges."""
     recorded = found.dataset is not None
     table = _table("signals", "", "name", "unit", "range", "column", *(["recorded"] if recorded else []))
     for role, signals, columns, key in (
@@ -249,8 +246,8 @@ def _parameters(prior: Prior) -> Table:
 
 
 def _rest_lines(prior: Prior, rest: Rest, dt: float) -> list[tuple[str, str]]:
-    """Where the prior rests, how fast it is there."""
-    origin = "given" if prior.operating_point is not None else "not given: the middle of the ranges"
+    """The operating point, equilibria and time constants."""
+    origin = "given" if prior.operating_point is not None else "not given, so the middle of the ranges"
     point = ", ".join(
         f"{s.name} = {v:.4g} {s.unit}"
         for signals, values in ((prior.states, rest.x), (prior.inputs, rest.u), (prior.disturbances, rest.w))
@@ -261,19 +258,19 @@ def _rest_lines(prior: Prior, rest: Rest, dt: float) -> list[tuple[str, str]]:
         for p in rest.equilibria[:LISTED]
     )
     count = len(rest.equilibria)
-    more = f" and {count - LISTED} more found: a continuum?" if count > LISTED else ""
+    more = f" and {count - LISTED} more, perhaps a continuum" if count > LISTED else ""
     return [
         (f"operating point ({origin})", point),
         ("equilibria under these inputs", (listed + more) or "none found within the ranges"),
         (
             "time constants there",
-            f"{_times(rest.modes)}; {rest.substeps} Runge-Kutta steps a period of {dt:g} s",
+            f"{_times(rest.modes)}; {rest.substeps} Runge-Kutta steps per period of {dt:g} s",
         ),
     ]
 
 
 def _times(modes: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> str:
-    """The slowest and the fastest time constant, and how many modes integrate or run away."""
+    """The slowest and the fastest time constant, and the numbers of integrating and unstable modes."""
     import numpy as np
 
     size = float(np.abs(modes).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""``hybrid-mpc control``: closed loops of a model that exists."""
+"""``hybrid-mpc control``: closed loops of a finished model."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ EXAMPLES = (
 
 def control(
     scenario: ScenarioName,
-    model: Annotated[Path, typer.Option(help="Artifact folder: model/ of a finished run.")],
-    out: Annotated[Path, typer.Option(help="Folder to make.")],
+    model: Annotated[Path, typer.Option(help="Artifact folder, e.g. model/ of a finished run.")],
+    out: Annotated[Path, typer.Option(help="Folder to create.")],
     task: Annotated[
         list[str] | None,
-        typer.Option(help="A task, or the beginning of tasks' names; may be repeated. Default: all."),
+        typer.Option(help="A task, or the beginning of task names; may be repeated. Default: all."),
     ] = None,
     controller: Annotated[
         list[str] | None,
@@ -42,28 +42,28 @@ def control(
         ),
     ] = None,
     solver: Annotated[str, typer.Option(help="rti, native, sqp or ipopt.")] = "rti",
-    seeds: Annotated[int, typer.Option(help="Loops of each task and controller.", min=1)] = 10,
-    seed: Annotated[int, typer.Option(help="Seed of the loops.", min=0, max=MOST_SEED)] = 0,
+    seeds: Annotated[int, typer.Option(help="Number of loops per task and controller.", min=1)] = 10,
+    seed: Annotated[int, typer.Option(help="First seed of the loops.", min=0, max=MOST_SEED)] = 0,
     fault: Annotated[
-        list[str] | None, typer.Option(help="TARGET:CHANNEL=VALUE@START:END in every loop; may be repeated.")
+        list[str] | None, typer.Option(help="TARGET:CHANNEL=VALUE@START:END, in every loop; may be repeated.")
     ] = None,
     guard: Annotated[
         bool,
-        typer.Option("--guard", help="Watch with the model's detector; no input while the sensor is frozen."),
+        typer.Option("--guard", help="Use the model's fault monitor; no input while the sensor is frozen."),
     ] = False,
     adapt: Annotated[
         bool,
         typer.Option(
             "--adapt",
-            help="--guard, and a backup that learns what has become of mass and friction (scenario's causes).",
+            help="As --guard, with a backup model that adapts mass and friction (the scenario's causes).",
         ),
     ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Finish the loops that the folder holds.")] = False,
-    gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw moving pictures.")] = True,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the loops in an existing folder.")] = False,
+    gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw animations.")] = True,
 ) -> None:
-    """Close the loop around the simulated machine with a trained model, without training anything.
+    """Close the loop around the simulated machine with a trained model; nothing is trained.
 
-    A machine without plant is stood in for by a model: then nothing that is found is of the machine.
+    If the machine has no plant, a model replaces it; the results then describe that model, not the machine.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.compare.study import DEFAULT_CONTROLLERS, Study
@@ -83,7 +83,7 @@ def control(
 
 
 def summary(results: ControlResults) -> list[str]:
-    """One line a task and controller; on models those of each controller by itself."""
+    """One line per task and controller; for loops on models, a table per controller."""
     if len(results.on_model) > 1:
         parts = (_of_controller(results, name) for name in results.on_model)
         return [line for part in parts for line in summary(part)]
@@ -104,14 +104,14 @@ def summary(results: ControlResults) -> list[str]:
     lines += [line for row in results.loops if results.reaction for line in _guarded(row)]
     for name, times in results.step_ms.items():
         lines.append(
-            f"a step of {name}: median {times['median']:.2f} ms, 99 % within {times['p99']:.2f} ms, period "
+            f"step time of {name}: median {times['median']:.2f} ms, 99 % within {times['p99']:.2f} ms, period "
             f"{results.period_ms:g} ms"
         )
     return lines
 
 
 def _of_controller(results: ControlResults, name: str) -> ControlResults:
-    """The part of the results that is of one controller."""
+    """The results of one controller."""
     return replace(
         results, on_model={name: results.on_model[name]}, step_ms={name: results.step_ms[name]},
         summary={task: {name: cells[name]} for task, cells in results.summary.items()},
@@ -120,9 +120,9 @@ def _of_controller(results: ControlResults, name: str) -> ControlResults:
 
 
 def _guarded(row: LoopRow) -> list[str]:
-    """What the guard of one loop saw and did."""
+    """Alarms and mode switches of the guard in one loop."""
     invalid = row.invalid_s or 0.0
-    rest = f"; without a valid level: {invalid:.2f} s" if invalid else ""
+    rest = f"; no valid reading for {invalid:.2f} s" if invalid else ""
     if not row.alarms:
         return [f"guard, {row.task}, seed {row.seed}: no alarm{rest}"]
     when = ", ".join(f"{a.start_s:.2f} to {a.end_s:.2f} s" for a in row.alarms)

@@ -1,4 +1,4 @@
-"""``hybrid-mpc data``: a look into a recording's file, or the recordings of a simulated machine."""
+"""``hybrid-mpc data``: show a recording's file, or write the recordings of a simulated machine."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ def data(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="FILE|SCENARIO", help="A recording; or a machine that makes its own, with --out."
+            metavar="FILE|SCENARIO", help="A recording; or, with --out, a machine with simulated recordings."
         ),
     ],
-    out: Annotated[Path | None, typer.Option(help="Folder to make; an existing one must be empty.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to create; an existing one must be empty.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the recordings.", min=0, max=MOST_SEED)] = 0,
     budget: Annotated[str, typer.Option(help="Amount: quick or full.")] = "full",
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
-    plot: Annotated[bool, typer.Option("--plot", help="Open a picture of the recording.")] = False,
+    plot: Annotated[bool, typer.Option("--plot", help="Open a figure of the recording.")] = False,
 ) -> None:
-    """Look into a recording: columns, units, ranges, time, gaps, and what stands out. Nothing is written.
+    """Show a recording: columns, units, ranges, time, gaps and doubtful values. Nothing is written.
 
     With --out: write a simulated machine's recordings as CSV or npz files, with a README on units, sampling and roles.
     """
     if out is None:
         if not Path(source).exists() and Path(source).suffix in ("", ".py"):
             raise typer.BadParameter(
-                f"{source}: there is no such file; a machine's own recordings need --out"
+                f"{source}: file not found. To write a machine's own recordings, give --out"
             )
         tell(Path(source), plot)
         return
@@ -58,7 +58,7 @@ def data(
 
 
 def tell(path: Path, plot: bool) -> None:
-    """Print what is in a file; open a picture of it if asked to."""
+    """Print the contents of a file; open a figure if asked to."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -83,28 +83,28 @@ def tell(path: Path, plot: bool) -> None:
     if plot:
         with tempfile.NamedTemporaryFile(prefix=f"{path.stem}-", suffix=".png", delete=False) as file:
             picture(found).savefig(file, format="png")
-        print(f"\npicture: {file.name}")
+        print(f"\nfigure: {file.name}")
         typer.launch(file.name)
 
 
 def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: str = "") -> list[Path]:
-    """The recordings of a scenario that makes its own, and a README beside them; returned are the recordings.
+    """Write the recordings of a scenario that simulates them, and a README; return the paths of the recordings.
 
     Raises:
-        InputError: If the scenario makes no data, has no such budget or data set, or the folder is not empty.
+        InputError: If the scenario has no simulated data, no such budget or data set, or the folder is not empty.
     """
     make = scenario.make_data
     if make is None:
         raise InputError(
-            f"{scenario.name} makes no data of its own; give its recordings to 'hybrid-mpc run' with --data"
+            f"{scenario.name} has no simulated recordings. Give measured ones to 'hybrid-mpc run' with --data."
             " [HM-CLI-001]"
         )
     if budget not in scenario.budgets:
         raise InputError(
-            f"{scenario.name} has no budget {budget!r}; it has: {', '.join(scenario.budgets)} [HM-CLI-002]"
+            f"{scenario.name} has no budget {budget!r}; it has {', '.join(scenario.budgets)} [HM-CLI-002]"
         )
     if data_set and "data_set" not in inspect.signature(make).parameters:
-        raise InputError(f"{scenario.name} has one data set only; leave --set {data_set} out [HM-CLI-003]")
+        raise InputError(f"{scenario.name} has only one data set. Leave out --set {data_set}. [HM-CLI-003]")
     from hybrid_mpc.files import check_folder, write_text
 
     check_folder(out)
@@ -117,7 +117,7 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
 
 
 def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
-    """What a reader of ``files`` must know, and the ``command`` that wrote them; sampling as it is in the files."""
+    """The README of ``files``, with the ``command`` that wrote them; the sampling is computed from the files."""
     from hybrid_mpc.data.differentiate import LocalPolynomial
 
     spec, prior = scenario.data, scenario.prior()
@@ -125,7 +125,7 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
     period, spread = _sampling(files, spec.time)
     band = LocalPolynomial(spec.smoothing).bandwidth(period)
     arrays = all(path.suffix == ".npz" for path in files)
-    stamp = "one number, the sampling time" if arrays else "time stamp of the row, as it was sampled"
+    stamp = "one number, the sampling period" if arrays else "time stamp of the row"
     lines = [
         f"# Recordings: {markdown(scenario.title)}", "", markdown(scenario.description), "",
         f"Written by `{command}`.", "",
@@ -136,13 +136,13 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
             for column, s in signals
         ),
         "",
-        f"Sampling: {1e3 * period:.3g} ms, even; arrays of numpy by these names."
+        f"Sampling: {1e3 * period:.3g} ms, uniform; numpy arrays by these names."
         if arrays
-        else f"Sampling: {1e3 * period:.3g} ms; the time stamps, which are recorded, jitter by {1e3 * spread:.2g} ms "
-        "(one standard deviation). Commas separate, points mark decimals, the first row is the header.",
+        else f"Sampling: {1e3 * period:.3g} ms; the recorded time stamps jitter by {1e3 * spread:.2g} ms "
+        "(one standard deviation). Commas separate cells, points mark decimals, the first row is the header.",
         "",
-        f"'hybrid-mpc run' first smooths and differentiates the outputs by a local quartic over "
-        f"{spec.smoothing:g} s (-3 dB at {band:.1f} Hz) and brings them to {1e3 * spec.dt:g} ms.",
+        f"'hybrid-mpc run' smooths and differentiates the outputs by a local quartic over "
+        f"{spec.smoothing:g} s (-3 dB at {band:.1f} Hz) and resamples them to {1e3 * spec.dt:g} ms.",
         "", "| file | role |", "| --- | --- |",
         *(f"| {markdown(path.name)} | {_role(scenario, path)} |" for path in files), "",
     ]  # fmt: skip
@@ -154,7 +154,7 @@ def _meaning(is_input: bool) -> str:
 
 
 def _role(scenario: Scenario, path: Path) -> str:
-    """Roles of a file's windows, in words; without any, it is split in order of time."""
+    """Roles of a file's windows, as text; a file without windows is split in order of time."""
     windows = scenario.data.windows.get(path.stem)
     if windows is None:
         train, valid, test = (f"{100 * share:.0f} %" for share in scenario.data.fractions)
@@ -172,7 +172,7 @@ def _sampling(files: Sequence[Path], column: str | float) -> tuple[float, float]
         return column, 0.0
     times = []
     for path in files:
-        if path.suffix == ".npz":  # one number, the sampling time
+        if path.suffix == ".npz":  # one number, the sampling period
             with np.load(path) as arrays:
                 times.append(float(arrays[column]) * np.arange(2))
             continue

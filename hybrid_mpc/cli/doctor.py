@@ -1,21 +1,21 @@
-"""``hybrid-mpc doctor``: what is installed, and what of this computer a job will use."""
+"""``hybrid-mpc doctor``: installed packages, and the hardware that a job will use."""
 
 from __future__ import annotations
 
 import typer
 
 WRONG = 1
-"""Exit code where a job could not run."""
+"""Exit code if no job can run."""
 
 
 def doctor() -> None:
-    """Versions of packages and extras, compiler, threads, GPU, and whether caches can be written.
+    """Print versions of packages and extras, compiler, threads, GPU, and whether caches are writable.
 
-    Exit code 1 if a job could not run.
+    Exit code 1 if no job can run.
     """
-    from hybrid_mpc.check.doctor import examined
+    from hybrid_mpc.check.doctor import examine
 
-    findings = examined()
+    findings = examine()
     width = max(len(one.name) for one in findings)
     for one in findings:
         mark = {"ok": " ", "absent": "-", "wrong": "!"}[one.state]

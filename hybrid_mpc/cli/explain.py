@@ -1,4 +1,4 @@
-"""``hybrid-mpc explain``: the physical terms that a prior lacks, found by held-out recordings."""
+"""``hybrid-mpc explain``: physical terms that a prior lacks, selected on held-out recordings."""
 
 from __future__ import annotations
 
@@ -25,22 +25,24 @@ EXAMPLES = (
 def explain(
     scenario: ScenarioName,
     data: Recordings = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/explain-SCENARIO.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to create. Default: runs/explain-SCENARIO.")
+    ] = None,
     terms: Annotated[
         list[str] | None,
         typer.Option(
-            help="Law to choose from, e.g. coulomb; may be repeated. Default: the scenario's, else all."
+            help="Law to consider, e.g. coulomb; may be repeated. Default: the scenario's, else all."
         ),
     ] = None,
-    most: Annotated[int, typer.Option(help="Most steps that add terms.", min=1)] = 8,
+    most: Annotated[int, typer.Option(help="Largest number of steps that add terms.", min=1)] = 8,
     time_column: TimeColumn = "",
     input_column: InputColumns = None,
     output_column: OutputColumns = None,
 ) -> None:
-    """Find the physical terms that the prior lacks: fit it, search a library of terms, judge by held-out recordings.
+    """Find physical terms that the prior lacks: fit it, search a library of terms, evaluate on held-out recordings.
 
-    The folder then holds explain.html, explain.json and NAME_explained.py, a scenario whose prior has the found terms.
-    Nothing is trained. The same command goes on with a search that was stopped.
+    Writes explain.html, explain.json and NAME_explained.py, a scenario whose prior has the found terms. No network is
+    trained. Repeat the command to continue a search that was stopped.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.workflow.explain import explain as search
@@ -63,22 +65,22 @@ def explain(
 
 
 def summary(found: ExplainResult, folder: Path) -> list[str]:
-    """What was found, in a few lines."""
+    """The result in a few lines."""
     told = found.explanation
-    lines = [f"judged by {told.evidence.text}, free runs of {told.evidence.length:.3g} s"]
+    lines = [f"evaluated on {told.evidence.text}, in free runs of {told.evidence.length:.3g} s"]
     if not told.found:
         return [*lines, f"no term was added: {told.reason}"]
     lines += [f"found: {term.name}: {term.formula}" for term in told.found]
-    return [*lines, f"the search ended: {told.reason}", f"scenario: {(folder / found.file).resolve()}"]
+    return [*lines, f"end of the search: {told.reason}", f"scenario: {(folder / found.file).resolve()}"]
 
 
 def _steps(found: ExplainResult) -> Table:
-    """A row a step."""
+    """One row per step."""
     from hybrid_mpc.workflow.explain_page import alternatives_of, interval, signed, values_of
 
     told = found.explanation
     table = _table(
-        "steps", "step", "held-out error [-]", "ratio to the step before", "fitted values", "alternatives"
+        "steps", "step", "held-out error [-]", "ratio to the previous step", "fitted values", "alternatives"
     )
     table.add_row("prior, nominal", f"{told.nominal:.3g}", "", "", "")
     table.add_row("prior, fitted", f"{told.before:.3g}", "", "", "")
@@ -90,7 +92,7 @@ def _steps(found: ExplainResult) -> Table:
 
 
 def _tests(found: ExplainResult) -> Table:
-    """A row a model."""
+    """One row per model."""
     from hybrid_mpc.workflow.explain_page import MODELS
 
     labels = list(next(iter(found.tests.values())).rmse)

@@ -1,4 +1,4 @@
-"""``hybrid-mpc export``: a trained controller for other machines, a kit of the former format in the present one."""
+"""``hybrid-mpc export``: a trained controller as C, or a kit of an older format in the present one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EXAMPLES = (
 )
 
 app = typer.Typer(
-    help="Write a trained controller for other machines, or an old kit in the present format.",
+    help="Write a trained controller as C, or an older kit in the present format.",
     no_args_is_help=True, rich_markup_mode=None,
 )  # fmt: skip
 
@@ -26,15 +26,15 @@ app = typer.Typer(
 @app.command("kit", epilog="Example:\n\n  hybrid-mpc export kit runs/old --out kit")
 def kit(
     old: Annotated[
-        Path, typer.Argument(help="Kit of the former format (model.json), or the folder of its run.")
+        Path, typer.Argument(help="Kit of an older format (model.json), or the folder of its run.")
     ],
     out: EmptyFolder,
 ) -> None:
-    """Write a kit of the former format in the present one, into a new folder; nothing is computed again."""
+    """Write a kit of an older format in the present one, into a new folder; nothing is recomputed."""
     from hybrid_mpc.kit.migrate import migrate_kit
 
     folder = migrate_kit(old, out)
-    print(f"kit in {folder.resolve()}. Load it with hm.load, or name the folder in place of the old one.")
+    print(f"kit in {folder.resolve()}. Load it with hm.load, or use its folder instead of the old one.")
 
 
 @app.command("c", epilog=EXAMPLES)
@@ -42,28 +42,32 @@ def c(
     model: ArtifactFolder,
     out: EmptyFolder,
     name: Annotated[
-        str, typer.Option("--model", help="Model that plans. Default: the recommended one.")
+        str, typer.Option("--model", help="Model of the controller. Default: the recommended one.")
     ] = "",
-    task: Annotated[str, typer.Option(help="Whose control problem. Default: the common one.")] = "",
-    single: Annotated[bool, typer.Option("--float", help="Numbers are float instead of double.")] = False,
-    monitor: Annotated[bool, typer.Option("--monitor/--no-monitor", help="Watch the loop.")] = True,
+    task: Annotated[
+        str, typer.Option(help="Task with the control problem. Default: the common problem.")
+    ] = "",
+    single: Annotated[bool, typer.Option("--float", help="Use float instead of double.")] = False,
+    monitor: Annotated[
+        bool, typer.Option("--monitor/--no-monitor", help="Include the fault monitor.")
+    ] = True,
     guard: Annotated[
-        bool, typer.Option("--guard", help="React to the monitor: no input while the sensor is frozen.")
+        bool, typer.Option("--guard", help="React to alarms: no input while the sensor is frozen.")
     ] = False,
     adapt: Annotated[
         bool,
         typer.Option(
-            "--adapt", help="--guard, and a second controller that learns what has become of the machine."
+            "--adapt", help="As --guard, with a second controller that adapts to the changed machine."
         ),
     ] = False,
     check: Annotated[
         bool,
         typer.Option(
-            "--check", help="Compile it and run its test: code made of the folder's content runs here."
+            "--check", help="Compile it and run its test; this runs code generated from the folder's content."
         ),
     ] = False,
 ) -> None:
-    """Estimator, real-time iteration, safeguards, monitor and guard as self-contained C11, with a test program."""
+    """Write estimator, real-time iteration, safeguards, monitor and guard as self-contained C11, with a test."""
     from hybrid_mpc.files import check_folder
     from hybrid_mpc.kit.artifact import load
     from hybrid_mpc.kit.export_c import generate_controller
@@ -73,7 +77,5 @@ def c(
     folder = generate_controller(
         load(model), out, model=name, task=task, single=single, monitor=monitor, guard=reaction, check=check
     )
-    said = (
-        "compiled, its test passed, README.md has the sizes" if check else "nothing of it was compiled or run"
-    )
+    said = "compiled and tested; README.md has the sizes" if check else "not compiled or run"
     print(f"C in {folder.resolve()}; {said}. Next: make -C {shlex.quote(str(folder))} test")

@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import entry_points
 from typing import Annotated, Any
 
-# Before numpy or torch are loaded: arrays here are small, threads inside them only cost time.
+# Before numpy or torch are loaded: arrays here are small, so threads inside these libraries only cost time.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 try:
@@ -16,7 +16,7 @@ try:
     from rich.console import Console
     from rich.markup import escape
     from typer.core import TyperCommand, TyperGroup
-except ImportError as missing:  # the online half installs without the command line's libraries
+except ImportError as missing:  # a model runs without the libraries of the command line
     raise SystemExit(
         f"hybrid-mpc: {missing}. Install the command line with: pip install 'hybrid-mpc[all]'"
     ) from None
@@ -44,35 +44,35 @@ from hybrid_mpc.rules import printable
 
 BAD_INPUT, CTRL_C = 2, 130
 SAVED = {
-    "run": "finished stages are saved: the same command with --resume goes on",
-    "reproduce": "what is done is saved: the same command with --resume goes on",
-    "explain": "finished steps are saved: the same command goes on",
-    "benchmark": "what is fitted and trained is saved: the same command goes on",
-    "control": "finished loops are saved: the same command with --resume goes on",
-    "tune": "finished trials are saved: the same command with --resume goes on",
-    "study": "finished runs are saved: the same command with --resume goes on",
-    "analyze": "figures and tables are not complete: the same command with another --out makes them anew",
-    "predict": "tables and pictures are not complete: the same command with another --out makes them anew",
-    "monitor": "tables and pictures are not complete: the same command with another --out makes them anew",
-    "data": "the recordings are not complete: the same command with another --out makes them anew",
+    "run": "finished stages are saved; repeat the command with --resume to continue",
+    "reproduce": "finished parts are saved; repeat the command with --resume to continue",
+    "explain": "finished steps are saved; repeat the command to continue",
+    "benchmark": "finished fits and networks are saved; repeat the command to continue",
+    "control": "finished loops are saved; repeat the command with --resume to continue",
+    "tune": "finished trials are saved; repeat the command with --resume to continue",
+    "study": "finished runs are saved; repeat the command with --resume to continue",
+    "analyze": "figures and tables are incomplete; repeat the command with another --out",
+    "predict": "tables and figures are incomplete; repeat the command with another --out",
+    "monitor": "tables and figures are incomplete; repeat the command with another --out",
+    "data": "the recordings are incomplete; repeat the command with another --out",
 }
-"""What is left where a command was ended by Ctrl-C or by the file system."""
+"""What a command leaves when Ctrl-C or the file system ends it, and how to continue."""
 
 
 class Command(TyperCommand):
-    """A command that says how several files are given: ``--data *.csv`` is what everyone types first."""
+    """A command that explains options with several values: many users type ``--data *.csv``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As typer does it; words that are left over name the options that take one value each time."""
+        """As typer; an error about extra words names the options that take one value each time."""
         given = [word for word in args if word in self._repeated()]
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter:
             raise
-        except Exception as error:  # typer keeps the class of its errors of usage to itself
+        except Exception as error:  # typer does not export the class of its usage errors
             if given and "unexpected extra argument" in getattr(error, "message", ""):
                 option = given[-1]
-                error.message += f". {option} takes one value; give it once for each: {option} A {option} B"  # type: ignore[attr-defined]
+                error.message += f". {option} takes one value; repeat it: {option} A {option} B"  # type: ignore[attr-defined]
             raise
 
     def _repeated(self) -> set[str]:
@@ -80,12 +80,10 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """The commands. In all of them code of a user that ends Python is an error, and a package that is not installed is
-    named with its extra.
-    """
+    """All commands. User code that ends Python becomes an error, and a missing package is named with its extra."""
 
     def invoke(self, ctx: Any) -> Any:
-        """As typer does it."""
+        """As typer."""
         with no_exit(), named_extra("this command"):
             return super().invoke(ctx)
 
@@ -135,8 +133,8 @@ def _root(
 
 
 def main() -> None:
-    """Run the command line; bad input ends with a message and exit code 2, Ctrl-C with 130."""
-    for stream in (sys.stdout, sys.stderr):  # what a terminal's character set lacks is shown by number
+    """Run the command line; an input error ends with a message and exit code 2, Ctrl-C with 130."""
+    for stream in (sys.stdout, sys.stderr):  # characters that a terminal lacks are printed as escapes
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -149,7 +147,7 @@ def main() -> None:
     except InputError as error:
         errors.print(f"[bold red]error:[/] {_escape(str(error))}")
         sys.exit(BAD_INPUT)
-    except BrokenPipeError:  # who read the output, a pager say, has gone
+    except BrokenPipeError:  # the reader of the output, e.g. a pager, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(BAD_INPUT)
     except OSError as error:
@@ -160,7 +158,7 @@ def main() -> None:
         _say_what_is_saved(errors)
         sys.exit(BAD_INPUT)
     except SystemExit as stop:
-        if stop.code == CTRL_C:  # typer takes the KeyboardInterrupt and says nothing
+        if stop.code == CTRL_C:  # typer catches the KeyboardInterrupt and prints nothing
             errors.print("interrupted")
             _say_what_is_saved(errors)
         raise

@@ -1,4 +1,4 @@
-"""``hybrid-mpc monitor``: what watches a machine, over recordings of it."""
+"""``hybrid-mpc monitor``: run a machine's fault monitor over recordings."""
 
 from __future__ import annotations
 
@@ -29,36 +29,36 @@ def monitor(
     scenario: Annotated[
         str,
         typer.Option(
-            help="Columns, sensors, control problem: a name or a .py file. Default: the folder's own."
+            help="Columns, sensors, control problem: a name or a .py file. Default: from the model's folder."
         ),
     ] = "",
     learn: Annotated[
         float,
         typer.Option(
-            help="The recordings are nominal: learn what to alarm by, for so many false alarms an hour."
+            help="Learn limits from these recordings, which must be nominal, for this many false alarms per hour."
         ),
     ] = 0.0,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="calibration.json with limits. Default: the model's own."),
+        typer.Option(help="calibration.json with limits. Default: the model's."),
     ] = None,
     residuals: Annotated[
         bool,
         typer.Option(
             "--residuals",
-            help="Watch the residuals of outputs and balances of a mechanical machine, too, in place of its energy.",
+            help="For a mechanical machine: monitor residuals of outputs and balances instead of the energy.",
         ),
     ] = False,
     resolution: Annotated[
         list[float] | None,
         typer.Option(
-            help="Step of a sensor [its unit]; once for each: test for freezing. Default: by its noise."
+            help="Resolution of each sensor [its unit], for the test of freezing; may be repeated. Default: from noise."
         ),
     ] = None,
 ) -> None:
-    """Say where in recordings the model does not describe the machine, and what would explain it.
+    """Report where the model does not describe recordings, with a diagnosis.
 
-    Exit code 1 if a recording gave no valid reading.
+    Exit code 1 if a recording has no valid reading.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.files import check_folder
@@ -74,7 +74,7 @@ def monitor(
     if scenario or held.predicting is None:  # else the folder has all that is needed
         machine = scenario_of(held.provenance.scenario, folder / KIT, scenario)
         if machine is None:
-            raise InputError(f"{folder / KIT} does not say whose model it is; give --scenario [HM-CLI-004]")
+            raise InputError(f"{folder / KIT} does not name its scenario. Give --scenario. [HM-CLI-004]")
     job = prepared(
         machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration, residuals=residuals,
@@ -84,7 +84,7 @@ def monitor(
     if learn:
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)
-        line = f"learned from {60 * found.hours:.1f} min, for {found.false_alarms_per_hour:g} false alarms an hour"
+        line = f"learned from {60 * found.hours:.1f} min for {found.false_alarms_per_hour:g} false alarms per hour"
         if not found.rated:
             line = f"learned from {60 * found.hours:.1f} min: {found.method}"
         print_summary([line], out / "calibration.json", "limits")
@@ -98,23 +98,23 @@ def monitor(
 
 
 def watching(job: MonitorJob) -> str:
-    """What decides on alarms, in a line."""
+    """The channels and limits, in one line."""
     limits = job.limits
     if limits is None:
         why = next((text for file, text in job.kit.lacks.items() if file.startswith("watch/")), "")
         return (
-            f"the kit holds no limits of {job.kind}{f' ({why})' if why else ''}: nothing alarms but a monitor without "
+            f"the kit has no limits of {job.kind}{f' ({why})' if why else ''}: the only alarm is a monitor without "
             "valid readings (see --learn)"
         )
     channels = ", ".join(dict.fromkeys(one.channel for one in limits.channels))
     return (
-        f"watched: {channels}; limits for {limits.false_alarms_per_hour:g} false alarms an hour, learned from "
+        f"channels: {channels}; limits for {limits.false_alarms_per_hour:g} false alarms per hour, learned from "
         f"{60 * limits.hours:.1f} min: {limits.method}"
     )
 
 
 def summary(result: MonitorResult) -> list[str]:
-    """One line a recording and alarm."""
+    """One line per recording and alarm."""
     lines = []
     for row in result.recordings:
         n = len(row.alarms)
@@ -123,17 +123,17 @@ def summary(result: MonitorResult) -> list[str]:
             why = f": {alarm.diagnosis}" if alarm.diagnosis else ""
             of = f" ({', '.join(alarm.channels)})" if alarm.channels else ""
             lines.append(f"  {alarm.start_s:.2f} to {alarm.end_s:.2f} s{of}{why}")
-    for what, cuts in (("gap", result.gaps), ("not watched", result.not_watched)):
+    for what, cuts in (("gap", result.gaps), ("not monitored", result.not_watched)):
         lines += [f"{what} in {cut.file}: {cut.start:.2f} to {cut.end:.2f} s, {cut.why}" for cut in cuts]
     return lines
 
 
 def _invalid(row: RecordingResult) -> str:
-    """What of a recording gave no valid reading, and why."""
+    """Time without valid readings, with reasons."""
     parts = (
         (row.warm_up_s, "warm-up"),
         (row.missing_s, "samples are missing"),
-        (row.not_finite_s, "model or estimator gives no finite number"),
+        (row.not_finite_s, "results of model or estimator are not finite"),
     )
     text = ", ".join(f"{seconds:.2f} s {why}" for seconds, why in parts if seconds)
     if not row.valid_s:

@@ -1,4 +1,4 @@
-"""``hybrid-mpc new``: a scenario to begin with, written from recordings."""
+"""``hybrid-mpc new``: write a first scenario from recordings."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ EXAMPLES = (
 
 
 def new(
-    path: Annotated[Path, typer.Argument(metavar="FILE.py", help="Python file to make.")],
-    data: Annotated[list[Path], typer.Option(help="A recording of the machine; give it once for each file.")],
+    path: Annotated[Path, typer.Argument(metavar="FILE.py", help="Python file to create.")],
+    data: Annotated[list[Path], typer.Option(help="A recording of the machine; may be repeated.")],
     time_column: TimeColumn = "",
     input_column: InputColumns = None,
     output_column: OutputColumns = None,
     disturbance_column: DisturbanceColumns = None,
 ) -> None:
-    """Write a scenario for recordings: their columns, sampling, ranges, units, and a first prior of linear lags.
+    """Write a scenario for recordings: columns, sampling, ranges, units, and a first prior of linear lags.
 
-    What only you can know is marked TODO; 'hybrid-mpc check' lists what is left.
+    Lines marked TODO are for you to decide; 'hybrid-mpc check' lists them.
     """
     from hybrid_mpc.check.new import KINDS, horizon_of, left_to_decide, loop_lines, printable, write_scenario
 
@@ -37,7 +37,7 @@ def new(
     inputs, outputs, disturbances = named
     draft = write_scenario(path, data, inputs, outputs, time_column, disturbances)
     lines = [
-        *(f"{name}, as it was read: {note}" for name, notes in draft.notes.items() for note in notes),
+        *(f"{name}: {note}" for name, notes in draft.notes.items() for note in notes),
         f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.period:.4g} s",
         *([f"  to decide: {draft.doubt}"] if draft.doubt else []),
         f"inputs: {', '.join(c.full for c in draft.inputs)}",
@@ -48,7 +48,7 @@ def new(
     if draft.set_points:
         lines.append(f"set-points, not used: {', '.join(c.full for c in draft.set_points)}")
     lines += [
-        f"  to decide: is {name} {KINDS[draft.verdicts[name].kind]}? {reason}"
+        f"  to decide: check that {name} is {KINDS[draft.verdicts[name].kind]}: {reason}"
         for name, reason in draft.unsure.items()
         if draft.verdicts[name].kind in KINDS
     ]

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands take; a default is the command's own."""
+"""Arguments and options of several commands; each command sets its own default."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ import typer
 ScenarioName: TypeAlias = Annotated[
     str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
 ]
-Recordings: TypeAlias = Annotated[
-    list[Path] | None, typer.Option(help="A recording; give it once for each file.")
-]
+Recordings: TypeAlias = Annotated[list[Path] | None, typer.Option(help="A recording; may be repeated.")]
 TimeColumn: TypeAlias = Annotated[str, typer.Option(help="Column of the time [s]. Default: the scenario's.")]
 InputColumns: TypeAlias = Annotated[
-    list[str] | None, typer.Option(help="Column of an input, in the prior's order.")
+    list[str] | None, typer.Option(help="Column of an input, in the prior's order; may be repeated.")
 ]
 OutputColumns: TypeAlias = Annotated[
-    list[str] | None, typer.Option(help="Column of a measured output, in the prior's order.")
+    list[str] | None, typer.Option(help="Column of a measured output, in the prior's order; may be repeated.")
 ]
 DisturbanceColumns: TypeAlias = Annotated[
-    list[str] | None, typer.Option(help="Column of a measured disturbance: it acts, and nobody commands it.")
+    list[str] | None, typer.Option(help="Column of a measured disturbance (not commanded); may be repeated.")
 ]
-Device: TypeAlias = Annotated[str, typer.Option(help="Where networks are trained: cpu, cuda, cuda:1, ...")]
-ArtifactFolder: TypeAlias = Annotated[Path, typer.Argument(help="Artifact folder: model/ of a finished run.")]
-EmptyFolder: TypeAlias = Annotated[Path, typer.Option(help="Folder to make; an existing one must be empty.")]
+Device: TypeAlias = Annotated[str, typer.Option(help="Device for training: cpu, cuda, cuda:1, ...")]
+ArtifactFolder: TypeAlias = Annotated[
+    Path, typer.Argument(help="Artifact folder, e.g. model/ of a finished run.")
+]
+EmptyFolder: TypeAlias = Annotated[
+    Path, typer.Option(help="Folder to create; an existing one must be empty.")
+]
 Scheduler: TypeAlias = Annotated[
     str | None,
-    typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, in place of processes of this machine."),
+    typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, instead of local processes."),
 ]

@@ -1,4 +1,4 @@
-"""``hybrid-mpc predict``: what a model predicts of recordings, from its folder alone."""
+"""``hybrid-mpc predict``: predictions of recordings by a model, from its folder alone."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def predict(
     out: EmptyFolder,
     model: Annotated[str, typer.Option(help="prior or hybrid. Default: the recommended one.")] = "",
 ) -> None:
-    """Free runs and one-step predictions of recordings with bands and residuals.
+    """Write free runs and one-step predictions of recordings, with bands and residuals.
 
-    The folder says how recordings are read; neither scenario nor checkpoints are needed.
+    The folder describes how to read recordings; scenario and checkpoints are not needed.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.files import check_folder
@@ -47,7 +47,7 @@ def predict(
 
 
 def summary(found: Sequence[Prediction]) -> list[str]:
-    """A line a recording, kind of prediction and output."""
+    """One line per recording, kind of prediction and output."""
     lines = [f"{'recording':16} {'':14} {'output':20} {'RMSE':>10} {'FIT [%]':>8} {'in band':>8} {'of':>5}"]
     for one in found:
         for kind, run in (("free run", one.free_run), ("one step", one.one_step)):

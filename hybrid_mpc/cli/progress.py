@@ -1,4 +1,4 @@
-"""Progress on the terminal: rich bars; plain lines where the output is no terminal."""
+"""Progress on the terminal: rich bars; plain lines if the output is not a terminal."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from hybrid_mpc.engine import Progress
 from hybrid_mpc.rules import printable
 
 LINE_EVERY_S = 5.0
-"""Plain output says something at most this often within a stage."""
+"""Least time between two plain lines of one stage."""
 
 
 class Bars(Progress):
-    """Rich progress bars, one a part of the stage."""
+    """Rich progress bars, one per part of the stage."""
 
     def __init__(self, console: Console) -> None:
         self._bars = rich_progress.Progress(
@@ -42,7 +42,7 @@ class Bars(Progress):
         self._bars.stop()
 
     def start(self, title: str) -> None:
-        """A line for the stage, which its parts' bars join."""
+        """Add a bar for the stage; bars of its parts follow below."""
         self._stage = self._bars.add_task(title, total=1, text="")
 
     def update(self, key: str, done: int, total: int, text: str) -> None:
@@ -52,7 +52,7 @@ class Bars(Progress):
         self._bars.update(self._parts[key], completed=done, total=total, text=text)
 
     def warn(self, text: str) -> None:
-        """A line above the bars."""
+        """Print a line above the bars."""
         self._bars.console.print(
             printable(f"warning: {text}"), style="yellow", markup=False, highlight=False, soft_wrap=True
         )
@@ -79,46 +79,46 @@ class Lines(Progress):
         return None
 
     def start(self, title: str) -> None:
-        """Note the stage."""
+        """Print the stage."""
         self._stage = time.monotonic()
         say(f"{title} ...")
 
     def update(self, key: str, done: int, total: int, text: str) -> None:
-        """A line now and then."""
+        """Print a line from time to time."""
         now = time.monotonic()
         if now - self._last >= LINE_EVERY_S:
             self._last = now
             say(f"  {key}: {done}/{total} {text}")
 
     def warn(self, text: str) -> None:
-        """A line of its own."""
+        """Print a line."""
         say(f"  warning: {text}")
 
     def finish(self, text: str) -> None:
-        """How long the stage took."""
+        """Print the result and the duration of the stage."""
         say(f"  {text or 'done'} after {time.monotonic() - self._stage:.1f} s")
 
 
 class Unwarned(Progress):
-    """Passes on how far a job is; its warnings are printed behind its results."""
+    """Passes progress on and drops warnings, which the command prints after its results."""
 
     def __init__(self, progress: Progress) -> None:
         self.start, self.update, self.finish = progress.start, progress.update, progress.finish  # type: ignore[method-assign]
 
 
 def say(text: str) -> None:
-    """Print a text of anybody's, a finding or the name of a file, so that it cannot change the terminal."""
+    """Print any text, e.g. a finding or the name of a file, without control characters for the terminal."""
     print(printable(text), flush=True)
 
 
 def make_progress() -> Bars | Lines:
-    """Bars on a terminal, lines elsewhere."""
+    """Bars on a terminal, lines otherwise."""
     console = Console()
     return Bars(console) if console.is_terminal else Lines()
 
 
 def print_summary(lines: Iterable[str], result: Path, name: str = "results") -> None:
-    """Print what a command found, and where it wrote it."""
+    """Print a command's results and where they are written."""
     for line in lines:
         say(line)
     say(f"{name}: {result.resolve()}")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hybrid_mpc.workflow.stages.results import Control, Identification, OnModel, Results, Watch
 
 INCOMPLETE = 1
-"""Exit code of a run whose report lacks a part."""
+"""Exit code of a run whose report is incomplete."""
 EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc run golf_robot --out runs/golf\n\n"
@@ -37,7 +37,7 @@ EXAMPLES = (
 def run(
     scenario: ScenarioName,
     data: Recordings = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/SCENARIO.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to create. Default: runs/SCENARIO.")] = None,
     seed: Annotated[
         int, typer.Option(help="Seed of data, training and closed loops.", min=0, max=MOST_SEED)
     ] = 0,
@@ -46,7 +46,7 @@ def run(
         bool,
         typer.Option(
             "--resume",
-            help="Go on with the run that the folder holds: finish it, or make anew what has changed.",
+            help="Continue the run in the folder: finish it, or repeat the stages whose inputs have changed.",
         ),
     ] = False,
     time_column: TimeColumn = "",
@@ -54,35 +54,35 @@ def run(
     output_column: OutputColumns = None,
     network_settings: Annotated[
         Path | None,
-        typer.Option("--settings", help="JSON file of network settings, as hybrid-mpc tune leaves it."),
+        typer.Option("--settings", help="JSON file of network settings, as written by hybrid-mpc tune."),
     ] = None,
     device: Device = "cpu",
     deploy: Annotated[
         str,
         typer.Option(
-            help="Model to recommend whatever validation says: phy (the fitted prior), pgrnn or mopgrnn."
+            help="Model to recommend regardless of validation: phy (the fitted prior), pgrnn or mopgrnn."
         ),
     ] = "",
     only: Annotated[
         list[str] | None,
-        typer.Option(help="Stage that may run, once for each; the others are taken as they are."),
+        typer.Option(help="Run only this stage; may be repeated. Other stages keep their results."),
     ] = None,
     skip: Annotated[
-        list[str] | None, typer.Option(help="Stage after the export that is not to run, once for each.")
+        list[str] | None, typer.Option(help="Leave out this stage after the export; may be repeated.")
     ] = None,
     scheduler: Scheduler = None,
     explain: Annotated[
         bool,
         typer.Option(
-            "--explain", help="Search for terms that the prior lacks first, and go on with those found."
+            "--explain", help="First search for terms that the prior lacks, and use a prior with those found."
         ),
     ] = False,
 ) -> None:
-    """Fit the prior, train, export, close the loop, learn what to alarm by, analyze, and write a report.
+    """Fit the prior, train, export, close the loop, learn alarm limits, analyze, and write a report.
 
     The stages are data, explain, prior, training, choice, evaluation, export, noise, control, on_model, estimation,
-    promises, watch, analysis and report. With --resume a stage runs again only where something that it reads
-    has changed. Exit code 1 if a stage after the export could not run; the report then says why.
+    promises, watch, analysis and report. With --resume a stage runs again only if one of its inputs has changed.
+    Exit code 1 if a stage after the export failed; the report gives the reason.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
     from hybrid_mpc.workflow.run import failed_stages
@@ -107,16 +107,16 @@ def run(
         results = run_job(
             settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress, cluster=scheduler,
         )  # fmt: skip
-    lines = ["the run ends here: later stages have not run, and --only names none of them"]
+    lines = ["the run stops here: --only leaves out the later stages"]
     print_summary(lines if results is None else summary(results), folder / "report.html", "report")
     if failed := failed_stages(folder):
         for stage, why in failed.items():
-            say(f"stage {stage} could not run: {why}")
+            say(f"stage {stage} failed: {why}")
         raise typer.Exit(INCOMPLETE)
 
 
 def summary(results: Results) -> list[str]:
-    """The figures of a run that are worth a line on the terminal."""
+    """The most important results of a run, one line each."""
     from hybrid_mpc.kit.promises import promise_lines
     from hybrid_mpc.workflow.stages.advice import doubt_of
 
@@ -134,12 +134,12 @@ def summary(results: Results) -> list[str]:
     lines += on_model_lines(results.on_model)
     lines += watch_lines(results.watch)
     if results.promises.rows is None:
-        return [*lines, f"promises of the kit: not examined: {results.promises.reason}"]
+        return [*lines, f"promises of the kit: not tested: {results.promises.reason}"]
     return lines + promise_lines(results.promises.rows)
 
 
 def comparison_lines(found: Control) -> list[str]:
-    """The hybrid's cost by task over that of the baseline that it does least well against, on the same seeds."""
+    """By task, the hybrid's cost over that of its strongest baseline, on equal seeds."""
     from hybrid_mpc.compare.sequential import hardest
 
     lines = []
@@ -150,7 +150,7 @@ def comparison_lines(found: Control) -> list[str]:
 
 
 def on_model_lines(found: OnModel) -> list[str]:
-    """What the run says of its closed loops on models."""
+    """Closed-loop costs on models, one line per controller."""
     lines = []
     for name, cells in (found.details.controllers if found.details is not None else {}).items():
         words = ", ".join(f"{task} {_cell(cell.cost.mean)}" for task, cell in cells.items())
@@ -159,7 +159,7 @@ def on_model_lines(found: OnModel) -> list[str]:
 
 
 def errors_table(found: Identification) -> list[str]:
-    """Errors of free runs on unseen data as lines: a row a model, a column an output and a balance."""
+    """Errors of free runs on held-out data: one row per model, one column per output and balance."""
     outputs, balances = _labels(found.rmse), _labels(found.balance_violation)
     heads = ["error [-]", "E_sim [-]", *(f"RMSE {s}" for s in outputs), *(f"violation {b}" for b in balances)]
     rows: dict[str, list[object]] = {"": list(heads)}
@@ -176,11 +176,11 @@ def errors_table(found: Identification) -> list[str]:
         f"  {name:12}" + "".join(f"  {_cell(cell):>{w}}" for cell, w in zip(cells, widths, strict=True))
         for name, cells in rows.items()
     ]
-    return ["free runs on unseen data:", *lines]
+    return ["free runs on held-out data:", *lines]
 
 
 def _labels(errors: Mapping[str, object]) -> list[str]:
-    """Signals or balances with unit that errors are of."""
+    """Labels, with units, of the signals or balances in errors."""
     return next((list(own) for own in errors.values() if isinstance(own, Mapping)), [])
 
 
@@ -200,24 +200,24 @@ def tracking(errors: Mapping[str, float]) -> str:
 
 
 def watch_lines(found: Watch) -> list[str]:
-    r"""What the run says of its monitor.
+    r"""Results of the fault monitor.
 
     Example:
         >>> from hybrid_mpc.workflow.stages.results import FaultedLoop, Watch
         >>> row = FaultedLoop("weak_pump", "the pump weakens", "levels", 450.0, None, (), "", 1)
         >>> watch = Watch("residuals", 2.0, 0.1, 0.0, (), (row,))
         >>> print(*watch_lines(watch), sep="\n")
-        monitor of residuals: learned from 6.0 min for 2 false alarms an hour; 0 alarms on recordings
-          weak_pump: never seen (alarms before it: 1)
+        monitor of residuals: learned from 6.0 min for 2 false alarms per hour; 0 alarms on recordings
+          weak_pump: not detected (alarms before it: 1)
     """
     if found.alarms is None or found.hours is None:
         return [f"monitor: {found.reason}"]
     lines = [
         f"monitor of {found.kind}: learned from {60 * found.hours:.1f} min for {found.wanted_per_hour:g} false alarms "
-        f"an hour; {len(found.alarms)} alarms on recordings"
+        f"per hour; {len(found.alarms)} alarms on recordings"
     ]
     for row in found.faults or ():
-        seen = "never seen" if row.delay_s is None else f"seen after {row.delay_s:.3g} s"
+        seen = "not detected" if row.delay_s is None else f"detected after {row.delay_s:.3g} s"
         seen += f" in {row.channels[0]}" if row.channels else ""
         before = f" (alarms before it: {row.false_alarms})" if row.false_alarms else ""
         lines.append(f"  {row.fault}: {seen}{before}" + (f": {row.diagnosis}" if row.diagnosis else ""))

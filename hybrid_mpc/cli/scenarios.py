@@ -1,4 +1,4 @@
-"""``hybrid-mpc scenarios``: the machines that are ready."""
+"""``hybrid-mpc scenarios``: list the available machines."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ WIDTH = 80
 
 
 def scenarios() -> None:
-    """List the registered scenarios, where their recordings come from, and what they are."""
+    """List the registered scenarios: name, source of the recordings, machine."""
     from hybrid_mpc.scenario import load_scenario, registered_scenarios
 
     names = registered_scenarios()

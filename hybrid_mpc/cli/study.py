@@ -26,7 +26,7 @@ EXAMPLES = (
     "  hybrid-mpc study run mine.yaml --scheduler tcp://10.0.0.7:8786 --out studies/mine --resume"
 )
 FAILED = 1
-"""Exit code where runs have failed."""
+"""Exit code if runs have failed."""
 
 app = typer.Typer(
     help="Many closed loops from one configuration: run, report, compare.",
@@ -37,26 +37,30 @@ app = typer.Typer(
 
 @app.command("run", epilog=EXAMPLES)
 def run(
-    study: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file, or a built-in study's name.")],
-    out: Annotated[Path, typer.Option(help="Folder to make.")],
+    study: Annotated[
+        str, typer.Argument(metavar="CONFIG", help="A YAML file, or the name of a built-in study.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to create.")],
     model: Annotated[
         list[str] | None,
-        typer.Option(help="Artifact folder or run folder, or LABEL=FOLDER for several; replaces the file's."),
+        typer.Option(
+            help="Artifact or run folder, or LABEL=FOLDER for several; overrides the file's models."
+        ),
     ] = None,
     scenario: Annotated[
         str,
         typer.Option(
-            help="The machine of a YAML file: a registered name or a .py file; replaces the file's."
+            help="Machine of a YAML file: a registered name or a .py file; overrides the file's scenario."
         ),
     ] = "",
     workers: Annotated[int, typer.Option(help="Processes on this machine.", min=1)] = 2,
     scheduler: Scheduler = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Finish the study that the folder holds.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the study in the folder.")] = False,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="With --resume: failed runs again.")
+        bool, typer.Option("--retry-failed", help="With --resume: repeat failed runs.")
     ] = False,
     dry: Annotated[
-        bool, typer.Option("--dry-run", help="Say how many runs there are, and how long they take.")
+        bool, typer.Option("--dry-run", help="Print the number of runs and the expected time.")
     ] = False,
 ) -> None:
     """Run a study; exit code 1 if runs have failed."""
@@ -83,7 +87,7 @@ def run(
 
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -> None:
-    """Write report.html, of a study that still runs too."""
+    """Write report.html, also for a study in progress."""
     from hybrid_mpc.compare.study_results import StudyResults, write_study_report
 
     print(f"report: {write_study_report(StudyResults.load(folder)).resolve()}")
@@ -92,8 +96,8 @@ def report(folder: Annotated[Path, typer.Argument(help="Folder of a study.")]) -
 @app.command("compare")
 def compare(
     first: Annotated[Path, typer.Argument(help="Folder of a study.")],
-    second: Annotated[Path, typer.Argument(help="Folder of another.")],
-    value: Annotated[str, typer.Option(help="Figure to compare.")] = "cost",
+    second: Annotated[Path, typer.Argument(help="Folder of another study.")],
+    value: Annotated[str, typer.Option(help="Quantity to compare.")] = "cost",
 ) -> None:
     """Compare two studies run by run, on common draws and seeds."""
     from hybrid_mpc.compare.study_results import StudyResults
@@ -101,7 +105,7 @@ def compare(
     found = StudyResults.load(first).compare(StudyResults.load(second), value)
     for column, (one, two) in found.attrs["differs"].items():
         print(f"{column}: {one} against {two}")
-    print(f"{value} of {second} less that of {first}:")
+    print(f"{value} of {second} minus that of {first}:")
     print(_text(found))
 
 
@@ -121,15 +125,15 @@ def _study(name: str, models: dict[str, str], scenario: str) -> Study:
     there = built_in_studies()
     if name in there:
         if scenario:
-            raise InputError(f"study {name} has a scenario of its own; leave --scenario out [HM-CLI-005]")
+            raise InputError(f"study {name} has its own scenario. Leave out --scenario. [HM-CLI-005]")
         if not models:
             raise InputError(
-                f"study {name} needs a model: --model FOLDER, e.g. model/ of a finished run [HM-CLI-006]"
+                f"study {name} needs a model. Give --model FOLDER, e.g. model/ of a finished run. [HM-CLI-006]"
             )
         return built_in_study(name, models)
     if not Path(name).is_file() and Path(name).suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"no study {name!r}; built-in studies are: {', '.join(there)}. Or give the path of a .yaml file."
+            f"no study {name!r}; built-in studies are {', '.join(there)}. Or give the path of a .yaml file."
             " [HM-CLI-007]"
         )
     return read_study(
@@ -145,7 +149,7 @@ def _models(given: list[str] | None) -> dict[str, str]:
             label, folder = "model", text
         if label in models:
             raise InputError(
-                f"--model {text}: there is a model {label!r} already; give labels: --model LABEL=FOLDER [HM-CLI-008]"
+                f"--model {text}: two models are called {label!r}. Give labels: --model LABEL=FOLDER. [HM-CLI-008]"
             )
         models[label] = folder
     return models
@@ -158,8 +162,8 @@ def _plan(plan: Plan, workers: int) -> list[str]:
     lines = [f"{plan.runs} runs: {axes}"]
     for kind, seconds in plan.kinds.items():
         own = "" if kind.horizon is None else f", horizon {kind.horizon}"
-        lines.append(f"  {kind.model}, {kind.controller}, {kind.solver}{own}: {seconds:.2f} s a run")
-    return [*lines, f"expected: {duration_text(plan.seconds)} in {workers} processes"]
+        lines.append(f"  {kind.model}, {kind.controller}, {kind.solver}{own}: {seconds:.2f} s per run")
+    return [*lines, f"expected time: {duration_text(plan.seconds)} in {workers} processes"]
 
 
 def _tell(results: StudyResults) -> None:

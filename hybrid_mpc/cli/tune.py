@@ -1,4 +1,4 @@
-"""``hybrid-mpc tune``: settings of the networks, chosen by validation."""
+"""``hybrid-mpc tune``: search for network settings by validation error."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ EXAMPLES = (
 def tune(
     scenario: ScenarioName,
     data: Recordings = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to make. Default: runs/tune-SCENARIO.")] = None,
-    trials: Annotated[int, typer.Option(help="Trainings in all.", min=1)] = 20,
+    out: Annotated[Path | None, typer.Option(help="Folder to create. Default: runs/tune-SCENARIO.")] = None,
+    trials: Annotated[int, typer.Option(help="Total number of trainings.", min=1)] = 20,
     budget: Annotated[str, typer.Option(help="Effort of a training: quick or full.")] = "quick",
     kind: Annotated[str, typer.Option(help="rnn, pgrnn or mopgrnn.")] = "mopgrnn",
     vary: Annotated[
@@ -38,16 +38,14 @@ def tune(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of data, trainings and search.", min=0, max=MOST_SEED)] = 0,
     timeout: Annotated[
-        float | None, typer.Option(help="No further training starts after this time [s]. Default: none.")
+        float | None, typer.Option(help="Start no further training after this time [s]. Default: no limit.")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the search that the folder holds.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the search in the folder.")] = False,
     time_column: TimeColumn = "",
     input_column: InputColumns = None,
     output_column: OutputColumns = None,
 ) -> None:
-    """Search hidden units and other settings of the networks by the validation error of free runs."""
+    """Search for hidden units and other settings of the networks by the validation error of free runs."""
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.identify.tune import parsed_space
     from hybrid_mpc.workflow.tune import TuneSettings, run_tuning, usage
@@ -60,15 +58,15 @@ def tune(
     with make_progress() as progress:
         found = run_tuning(settings, folder, trials=trials, timeout=timeout, resume=resume, progress=progress)
     print_summary(summary(found, settings.space.names), folder / "results.json")
-    print(f"a run with these settings: {usage(settings, folder)}")
+    print(f"run with these settings: {usage(settings, folder)}")
 
 
 def summary(found: SearchResult, names: tuple[str, ...]) -> list[str]:
-    """One line a trial, with the searched settings of these names, then the best."""
+    """One line per trial with the searched settings ``names``, then the best trial."""
     lines = ["  ".join(["trial", f"{'state':8}", f"{'E_sim':>8}", "   s", *names])]
     for row in found.trials:
         values = [f"{row.values[name]:>{len(name)}.3g}" for name in names]
         head = [f"{row.number:5}", f"{row.state:8}", f"{row.value:8.4g}", f"{row.duration:4.0f}"]
         lines.append("  ".join(head + values))
-    base = "" if found.base is None else f"; first settings {found.base:.4g}"
+    base = "" if found.base is None else f"; initial settings {found.base:.4g}"
     return [*lines, f"best: trial {found.best.number} with {found.best.value:.4g} on validation{base}"]

@@ -1,4 +1,4 @@
-"""The controllers that closed loops compare, by name: same problem, period, horizon and safeguards."""
+"""The compared controllers by name: same control problem, period, horizon and safeguards."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from hybrid_mpc.scenario import Scenario
 Array = NDArray[np.float64]
 ORACLE_ITERATIONS = 1
 FIRST_ITERATIONS = 10
-"""Linearizations an oracle makes from each of its starts in a period, and for its first plan from all of them. In a
-period it starts from its last plan and from the rival's that is cheaper by its own equations."""
+"""SQP iterations of an oracle from each of its starts: in a period, and for its first plan. In a period it starts from
+its last plan, and from the rival plan that is cheapest by its own equations."""
 
 
 @dataclass(frozen=True)
 class NamedController:
     """A controller of a ``"prior"``, ``"hybrid"`` or ``"oracle"`` model with its estimator.
 
-    An ``observer`` follows an unknown load at the input; ``truth`` is handed the plant's true state.
+    With ``observer`` it estimates an unknown load at the input; with ``truth`` it gets the plant's true state.
     """
 
     model: str
@@ -52,21 +52,21 @@ CONTROLLERS: Mapping[str, NamedController] = {
     "oracle": NamedController("oracle", observer=True),
     "oracle_state": NamedController("oracle", truth=True),
 }
-"""Baselines: the fitted prior without and with disturbance observer; the hybrid likewise; two oracles on the
-plant's own equations, one with the same measurements through the same kind of estimator, one with the truth."""
+"""Fitted prior and hybrid, each without and with disturbance observer; two oracles with the plant's own equations, one
+with the same measurements and the same kind of estimator, one with the true state."""
 ORACLES = ("oracle", "oracle_state")
 OBSERVERS = ("prior_observer", "hybrid_observer")
 LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
-"""Whose process noise is the least that a controller has, where tasks go beyond the recordings."""
+"""Controller whose process noise is a lower bound, for scenarios whose tasks go beyond the recordings."""
 
 
 def build(
     name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti"
 ) -> tuple[Estimator, SafeController]:
-    """Estimator and controller by name for a task's control problem; oracles have a solver of their own.
+    """Build estimator and controller by name for a task's control problem; oracles have a solver of their own.
 
     Raises:
-        InputError: If there is no such controller, the scenario has no oracle, or the kit no noise.
+        InputError: If the controller is unknown, the scenario has no oracle, or the kit has no noise.
     """
     c, prior = CONTROLLERS[known(name, CONTROLLERS, "controller")], kit.models["prior"]
     if c.model != "oracle":
@@ -74,7 +74,9 @@ def build(
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
         return estimator, make_controller(model, prior, control, solver=solver, safe_input=kit.safe_input)
     if scenario.oracle is None:
-        raise InputError(f"scenario {scenario.name} has no oracle [HM-COMPARE-001]")
+        raise InputError(
+            f"controller {name}: scenario {scenario.name} has no oracle; choose another [HM-COMPARE-001]"
+        )
     model = _oracle(scenario, prior)
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(kit.models[m], ocp) for m in ("prior", "hybrid")]
@@ -87,15 +89,15 @@ def build(
 
 
 def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]) -> dict[str, Array]:
-    """Process noise of every controller that estimates, each by maximum likelihood on the same recordings.
+    """Process noise of every controller with an estimator, by maximum likelihood on the same recordings.
 
-    These are training recordings with smoothed states.
+    The recordings are training recordings with smoothed states.
     """
     models = dict(artifact.models)
     if scenario.oracle is not None:
         models["oracle"] = _oracle(scenario, artifact.models["prior"])
     errors = {name: process_noise(model, recordings) for name, model in artifact.models.items()}
-    # the plant's own equations err by nothing but the smoothing: start from the better model's errors
+    # errors of the plant's own equations come from the smoothing only: start from the better model's errors
     errors["oracle"] = errors["hybrid"]
     found = {
         name: tuned_noise(
@@ -108,7 +110,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
 
 
 def _oracle(scenario: Scenario, prior: HybridModel) -> HybridModel:
-    """The oracle's model, with operating point and disturbance model of the others."""
+    """The oracle's model, with the operating point and disturbance model of the prior."""
     assert scenario.oracle is not None
     return replace(
         scenario.oracle(prior.dt), nominal_x=prior.nominal_x, nominal_u=prior.nominal_u,
@@ -117,7 +119,7 @@ def _oracle(scenario: Scenario, prior: HybridModel) -> HybridModel:
 
 
 def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[str, Array]:
-    """Process noise by controller; where tasks go beyond the recordings a hybrid has no less than its prior."""
+    """Process noise by controller; if tasks go beyond the recordings, a hybrid has at least the noise of the prior."""
     found = dict(noise)
     if scenario.beyond_recordings:
         for hybrid, prior in LEAST_NOISE.items():
@@ -129,16 +131,17 @@ def no_surer_than_prior(scenario: Scenario, noise: Mapping[str, Array]) -> dict[
 def find_noise(
     scenario: Scenario, artifact: Kit, controllers: Sequence[str], seed: int
 ) -> tuple[Mapping[str, Array], str]:
-    """Process noise of the filters of controllers, and in words where it came from.
+    """Process noise of the controllers' filters, and a text that names its source.
 
     Args:
         scenario: The machine.
         artifact: Prior and hybrid.
         controllers: Names of controllers.
-        seed: Seed of the recordings that the machine makes where the artifact holds no noise.
+        seed: Seed of the simulated recordings that are used if the artifact has no noise.
 
     Raises:
-        InputError: If the artifact's noise does not fit its models, or it holds none and there is no way to make data.
+        InputError: If the artifact's noise does not match its models, or if it has no noise and the scenario cannot
+            simulate recordings.
 
     Example:
         ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
@@ -150,7 +153,7 @@ def find_noise(
         return no_surer_than_prior(scenario, held), "the model's own" if needed else "no filter"
     machine = scenario
     if not any(name in ORACLES for name in lacking):
-        machine = replace(scenario, oracle=None)  # whose noise takes the longest
+        machine = replace(scenario, oracle=None)  # tuning its noise takes the longest
     source = f"recordings of the simulated machine (quick, seed {seed}), smoothed by the prior"
     if own := [name for name in needed if name in held]:
         source = f"{', '.join(lacking)}: {source}; {', '.join(own)}: the model's own"
@@ -168,8 +171,8 @@ def _estimated_noise(
 
     if scenario.make_data is None or scenario.control is None:
         raise InputError(
-            f"the model holds no process noise for {', '.join(lacking)}, and scenario {scenario.name} makes no data to "
-            "estimate it on; run the scenario again [HM-COMPARE-002]"
+            f"model: no process noise for {', '.join(lacking)}, and scenario {scenario.name} cannot simulate "
+            "recordings to estimate it. Run the scenario again [HM-COMPARE-002]"
         )
     prior = scenario.prior(artifact.provenance.prior_parameters)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Closed loops as pictures: from the arrays of their rows, their control problem and their machine's signals."""
+"""Figures of closed loops, from the arrays of their rows, the control problem and the machine's signals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Arrays = Mapping[str, NDArray[np.float64]]
 
 
 def curves_of(machine: Prior | HybridModel) -> list[tuple[int, Signal]]:
-    """States that a moving picture of a machine has curves of, with their places: those that are outputs, else all.
+    """States that an animation shows as curves, with their indices: those that are outputs, else all.
 
     Example:
         >>> from scenarios.golf_robot.prior import GolfRobotPrior
@@ -34,14 +34,15 @@ def curves_of(machine: Prior | HybridModel) -> list[tuple[int, Signal]]:
 def loop_figure(
     title: str, problem: OCP, machine: Prior | HybridModel, loops: Mapping[str, Arrays]
 ) -> Figure:
-    """Loops of one task by controller: every output, state and input in its unit, with the control problem's references
-    and bounds. Each loop has the arrays in :data:`~hybrid_mpc.compare.loops.DRAWN`.
+    """Figure of one task's loops by controller: outputs, states and inputs with their references and bounds.
+
+    Each loop has the arrays in :data:`~hybrid_mpc.compare.loops.DRAWN`.
 
     Example: ``loop_figure(task.title, kit.problem(task.name), kit.models["prior"], {"hybrid": row.arrays})``
     """
     some = next(iter(loops.values()))
     references: dict[str, Any] = {"reference": some["reference"]}
-    if problem.n_y:  # those of states are then what the set-point's steady state comes to
+    if problem.n_y:  # then the references of states are the computed steady states
         controlled = np.where(problem.q_y > 0, some["y_ref"], np.nan)
         references = {"reference": None, "output_reference": controlled}
     return closed_loops(

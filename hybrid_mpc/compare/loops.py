@@ -1,4 +1,4 @@
-"""Closed loops: from a loop's specification to its row, on a bench that holds the machine and its models."""
+"""Closed loops: a bench with the machine and its models runs a loop's specification and returns its row."""
 
 from __future__ import annotations
 
@@ -37,37 +37,37 @@ from hybrid_mpc.watch.replay import alarm_intervals
 Array = NDArray[np.float64]
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
 MODEL = "model"
-"""Label of the model on the bench where there is one."""
+"""Label of the model on a bench with a single model."""
 MONITORS = (*WATCHES, "none")
-"""What watches a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`; or nothing does."""
+"""Monitors of a hybrid, see :meth:`~hybrid_mpc.kit.artifact.Kit.monitor`, or none."""
 ALARMING = ("guard", "energy", "residuals")
 """Monitors that alarm."""
 GUARDS = ("", "rest", "adapt", "prior")
-"""What an alarm does: nothing; a frozen sensor takes the input away; and a backup takes over, which estimates the
-prior's parameters, or which plans with the fitted prior."""
+"""Reactions to an alarm: none; ``rest``: the safe input when a sensor freezes; ``adapt`` and ``prior`` also switch to a
+backup controller, which estimates the prior's parameters, or plans with the fitted prior."""
 ARRAYS = (
     "step_ms", "plans",
     *(f.name for f in fields(ClosedLoopResult) if f.name not in ("dt", "timing_ms", "switches", "given_way")),
 )  # fmt: skip
-"""What a row may hold of its loop."""
+"""Arrays of a loop that its row may keep."""
 DRAWN = ("t", "x", "u", "y", "w", "reference", "y_ref")
-"""Those that a figure of a loop needs."""
+"""Arrays that the figure of a loop needs."""
 TIMES = ("total", "solve", "estimate")
 MOST_BUILT = 64
-"""Controllers that a bench holds; loops come ordered by controller, so few are asked for again."""
+"""Largest number of controllers that a bench keeps; loops are ordered by controller, so few are needed again."""
 ON_MODEL = "on the model, not the machine"
-"""What stands wherever a loop is shown in which a model stands in for the machine."""
+"""Text beside every loop in which a model replaces the machine."""
 DRAWN_PRIOR = "prior_drawn"
-"""Name of the prior with parameters drawn from their fitted covariance, where it stands in for a machine."""
+"""Name of the prior with parameters drawn from their fitted covariance, if it replaces the machine."""
 SAME_MOTION = 1e-6
-"""Runs of two models that differ by less than this share of the motion are those of one model, but for rounding."""
+"""Relative difference of the motion below which two models count as the same, apart from rounding."""
 REPORT_PERIODS = 25
 """Periods between two reports of :func:`run_loops`."""
 
 
 @dataclass(frozen=True)
 class LoopSpec:
-    """One closed loop: all that decides what it computes, but for the content of its model.
+    """Specification of a closed loop: everything that its result depends on, except for the content of its model.
 
     Args:
         scenario: Registered name or path of a user's file.
@@ -76,25 +76,25 @@ class LoopSpec:
         controller: Name in :data:`~hybrid_mpc.compare.controllers.CONTROLLERS`.
         solver: ``"rti"``, ``"native"``, ``"sqp"`` or ``"ipopt"``.
         horizon: Periods. Default: the task's own.
-        monitor: Name in :data:`MONITORS`; without a hybrid there is none. Default: ``"own"``, or ``"guard"`` with a
-            guard.
-        faults: Beside what the task itself brings.
-        drawn_faults: Those that a draw takes at random.
-        late: Intervals [s] in which solves miss their deadline.
-        parameters: Parameters of the plant and their factors.
-        draw: Number of the draw that ``parameters`` and ``drawn_faults`` are from.
-        seed: Number of the loop: the same sensor noise for all that share it, ``draw`` and ``run_seed``.
+        monitor: Name in :data:`MONITORS`; a controller without hybrid has none. Default: ``"own"``, or ``"guard"`` with
+            a guard.
+        faults: Faults in addition to those of the task. Default: none.
+        drawn_faults: Random faults of a draw. Default: none.
+        late: Intervals [s] in which solves miss their deadline. Default: none.
+        parameters: Parameters of the plant and their factors. Default: none.
+        draw: Number of the draw of ``parameters`` and ``drawn_faults``. Default: 0.
+        seed: Seed of the loop: loops with the same ``seed``, ``draw`` and ``run_seed`` have the same noise. Default: 0.
         duration: Longest duration [s]. Default: the task's own.
-        guard: Name in :data:`GUARDS`; it needs a monitor that alarms.
-        run_seed: Seed of the run that the loop belongs to.
-        rounds: The task is run over and over, its reference scaled by these factors, one a round. Default: once.
+        guard: Name in :data:`GUARDS`; it needs a monitor that alarms. Default: none.
+        run_seed: Seed of the run that the loop belongs to. Default: 0.
+        rounds: Factors of the reference, one a round of the repeated task. Default: a single round.
         keep: Arrays of its row, names in :data:`ARRAYS`: fields of
             :class:`~hybrid_mpc.loop.simulate.ClosedLoopResult`, ``"step_ms"`` ``(n,)``, ``"plans"``
-            ``(n, N + 1, n_x)``. No part of the identity.
-        number: Place in a study, no part of the identity.
+            ``(n, N + 1, n_x)``. Not part of the identity. Default: none.
+        number: Number in a study, not part of the identity. Default: 0.
 
     Raises:
-        InputError: If a name is unknown, a value is of the wrong kind, or a guard has nothing that alarms.
+        InputError: If a name is unknown, a value is of the wrong kind, or a guard has no monitor that alarms.
 
     Example:
         >>> spec = LoopSpec("golf_robot", "model", "track_sine", "prior", seed=3)
@@ -131,25 +131,25 @@ class LoopSpec:
             known(self.guard, GUARDS[1:], "guard")
         if self.guard and (self.monitor not in ALARMING or CONTROLLERS[self.controller].model != "hybrid"):
             raise InputError(
-                f"a guard acts on alarms: give a controller with the hybrid and monitor {' or '.join(ALARMING)}, got "
-                f"controller {self.controller} and monitor {self.monitor} [HM-COMPARE-003]"
+                f"guard: it reacts to alarms, so it needs a controller with the hybrid and monitor "
+                f"{' or '.join(ALARMING)}; got controller {self.controller} and monitor {self.monitor} [HM-COMPARE-003]"
             )
         for name in ("faults", "drawn_faults"):
             given = getattr(self, name)
             if not isinstance(given, tuple) or not all(isinstance(f, Fault) for f in given):
                 raise InputError(
-                    f"LoopSpec: {name} is a tuple of Fault, got {given!r}; write (Fault(start, end, target, value),), "
-                    'or parsed_fault("TARGET:CHANNEL=VALUE@START:END") for a text [HM-COMPARE-004]'
+                    f"LoopSpec: {name} must be a tuple of Fault, got {given!r}. Write (Fault(start, end, target, "
+                    'value),), or parsed_fault("TARGET:CHANNEL=VALUE@START:END") for a text [HM-COMPARE-004]'
                 )
         seeds = (self.seed, self.run_seed)
         if not all(isinstance(seed, int) and seed >= 0 for seed in seeds):
             raise InputError(
-                f"seed and run_seed are whole numbers from 0 on, got {self.seed!r} and {self.run_seed!r}"
+                f"seed and run_seed: give whole numbers of at least 0, got {self.seed!r} and {self.run_seed!r}"
                 " [HM-COMPARE-005]"
             )
         if self.duration is not None and not self.duration > 0:
             raise InputError(
-                f"duration: a positive number of seconds needed, got {self.duration} [HM-COMPARE-006]"
+                f"duration: give a positive number of seconds, got {self.duration} [HM-COMPARE-006]"
             )
         for name in self.keep:
             known(name, ARRAYS, "array to keep")
@@ -181,7 +181,7 @@ class LoopSpec:
 
 @dataclass(frozen=True)
 class Interval:
-    """A stretch of time, from its first instant to its last [s]."""
+    """An interval of time: start and end [s]."""
 
     start_s: float
     end_s: float
@@ -189,7 +189,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class ModeChange:
-    """A change of the guard's mode: when [s], names of the mode before and from then on, and what led to it."""
+    """A change of the guard's mode: time [s], names of the modes before and after it, and the reason."""
 
     t_s: float
     before: str
@@ -199,31 +199,32 @@ class ModeChange:
 
 @dataclass(frozen=True)
 class LoopRow:
-    """The figures of a closed loop. Signals are named with their unit, e.g. ``"phi [rad]"``.
+    """The figures of a closed loop. Names of signals contain their unit, e.g. ``"phi [rad]"``.
 
     Args:
         task: Name of the task.
         controller: Name of the controller.
-        seed: Number of the loop.
+        seed: Seed of the loop.
         seconds: Length [s].
         cost: Closed-loop cost on the plant's true state.
-        tracking_rmse: Root mean square deviation from the reference by signal: of the true states, or, where references
-            are the outputs', of the measured outputs that the problem weighs.
+        tracking_rmse: Root mean square deviation from the reference by signal: of the true states, or of the measured
+            outputs that the problem weights if the reference is one of outputs.
         largest_x: Largest magnitude of the true states, by signal.
         largest_u: Largest magnitude of the inputs, by signal.
-        limits: Largest share of the way from rest to each limit that was used: 1 is the limit, more a violation.
-        excess: By how much limits were left at most; ``change of`` an input where that is limited.
-        sources: Share of periods by what gave the input.
+        limits: Largest used share of the distance from the operating point to each limit: 1 is the limit, more a
+            violation.
+        excess: Largest violation of each limit, also for ``change of`` an input if that is limited.
+        sources: Share of periods by the source of the input.
         figures: The task's own figures.
-        alarms: Alarms of the monitor; one that is on at the end ends there. None where nothing could alarm.
-        alarm_share: Share of periods with an alarm; None where nothing could alarm.
-        largest_violation: Largest violation of the energy balance [W]; None where the monitor does not read it.
-        invalid_s: Time in which the monitor had no valid level [s]; None without one.
+        alarms: Alarms of the monitor; an alarm that is on at the end ends there. None without a monitor that alarms.
+        alarm_share: Share of periods with an alarm; None without a monitor that alarms.
+        largest_violation: Largest violation of the energy balance [W]; None if the monitor does not compute it.
+        invalid_s: Time without a valid level of the monitor [s]; None without a monitor.
         switches: Changes of the guard's mode.
         timing_ms: ``median, p95, p99, max`` of the durations of ``total``, ``solve`` and ``estimate`` [ms].
-        on_model: Name of the model that stood in for the machine; empty: the loop ran on the scenario's plant.
-        given_way: Share of the periods in which a hard bound had to give way, by its name. Default: none did.
-        arrays: What the specification asked to keep. Default: nothing.
+        on_model: Name of the model that replaced the machine. Default: empty, the loop ran on the scenario's plant.
+        given_way: Share of the periods with a relaxed hard bound, by its name. Default: none.
+        arrays: The arrays that the specification keeps. Default: none.
     """
 
     task: str
@@ -273,18 +274,18 @@ class LoopRow:
 
 
 class Bench:
-    """What loops run on: a machine, its models, and the controllers that were built for them so far.
+    """Runs loops: holds a machine, its models, and the controllers that were built for them.
 
-    Control problem and sensors are the scenario's, for all models; what was learned is the models' own. A machine
-    without plant is stood in for by a model (:func:`stand_in`), and has default tasks if it has none.
+    Control problem and sensors are the scenario's for all models; learned limits are the models' own. Without a plant,
+    a model replaces the machine (:func:`stand_in`), and default tasks are used if the scenario has none.
 
     Args:
-        scenario: The machine, with control problem; with a plant it needs tasks, too.
-        kits: Loaded artifacts by label; their process noise is that of the filters.
+        scenario: The machine with its control problem; with a plant it also needs tasks.
+        kits: Loaded artifacts by label; the filters use their process noise.
 
     Raises:
-        InputError: If the scenario has nothing to run, or a model is another machine's; or for a name in place of a
-            scenario or of a kit.
+        InputError: If the scenario has nothing to run, a model belongs to another machine, or a name is given in place
+            of a scenario or of a kit.
 
     Example:
         ``row, result = Bench(scenario, {"model": hm.load("runs/golf")}).run(spec)``
@@ -294,17 +295,17 @@ class Bench:
     def __init__(self, scenario: Scenario, kits: Mapping[str, Kit]) -> None:
         if not isinstance(scenario, Scenario):
             raise InputError(
-                f"Bench: a Scenario is needed, got {scenario!r}; give load_scenario(NAME) [HM-COMPARE-007]"
+                f"Bench: scenario must be a Scenario, got {scenario!r}; give load_scenario(NAME) [HM-COMPARE-007]"
             )
         if not isinstance(kits, Mapping):
             raise InputError(
-                f'Bench: kits by label are needed, got a {type(kits).__name__}; give {{"model": hm.load(FOLDER)}}'
+                f'Bench: kits must be a mapping, got a {type(kits).__name__}; give {{"model": hm.load(FOLDER)}}'
                 " [HM-COMPARE-008]"
             )
         for label, kit in kits.items():
             if not isinstance(kit, Kit):
                 raise InputError(
-                    f"Bench: kit {label!r} is a {type(kit).__name__}; load it: hm.load(FOLDER)"
+                    f"Bench: kit {label!r} must be a Kit, got a {type(kit).__name__}; give hm.load(FOLDER)"
                     " [HM-COMPARE-009]"
                 )
             check_kit(scenario, kit, f"model {label}")
@@ -317,17 +318,18 @@ class Bench:
         self._guards: dict[tuple[object, ...], Guard] = {}
 
     def kit(self, spec: LoopSpec) -> Kit:
-        """The model of a specification; refused if there is none, or the loop is another scenario's."""
+        """The kit of a specification; InputError if it is unknown, or the loop belongs to another scenario."""
         own = self.scenario.name
         others = () if spec.scenario == own else registered_scenarios()
         if spec.scenario in others and load_scenario(spec.scenario).name != own:
             raise InputError(
-                f"a loop of scenario {spec.scenario} given, the bench has {own} [HM-COMPARE-010]"
+                f"loop: it belongs to scenario {spec.scenario}, but the bench has {own}. Make a bench of its scenario "
+                "[HM-COMPARE-010]"
             )
         return self.kits[known(spec.model, self.kits, "model on the bench")]
 
     def task(self, spec: LoopSpec) -> Task:
-        """The task of a specification, with its rounds and its duration; refused if there is none of that name."""
+        """The task of a specification, with its rounds and its duration; InputError for an unknown name."""
         (task,) = tasks_of(self.scenario, (spec.task,))
         kit = self.kit(spec)
         if spec.rounds:
@@ -342,7 +344,7 @@ class Bench:
         return problem if spec.horizon is None else problem.changed(horizon=spec.horizon)
 
     def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
-        """Estimator and controller of a specification; they remember nothing, so one serves many loops."""
+        """Estimator and controller of a specification; they have no memory, so many loops can share them."""
         kit = self.kit(spec)
         key = (spec.model, spec.controller, spec.solver, spec.horizon, self._stated(spec))
         if key not in self._built:
@@ -355,13 +357,13 @@ class Bench:
         return self._built[key]
 
     def monitor(self, spec: LoopSpec) -> Monitor | None:
-        """What watches the loop of a specification; refused if the model lacks what it needs."""
+        """The monitor of a specification, None without one; InputError if the model lacks its limits."""
         if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
             return None
         return self.kit(spec).monitor("hybrid", kind=spec.monitor, task=spec.task)
 
     def guard(self, spec: LoopSpec) -> Guard | None:
-        """What an alarm does in the loop of a specification; None: nothing. Refused if the model lacks its parts."""
+        """The guard of a specification, None without one; InputError if the model lacks its parts."""
         if not spec.guard:
             return None
         kit = self.kit(spec)
@@ -383,11 +385,11 @@ class Bench:
         return self._guards[key]
 
     def _stated(self, spec: LoopSpec) -> str:
-        """Whose control problem it is: the task's own, or that of all tasks."""
+        """Name of the task if it has a control problem of its own; empty for that of all tasks."""
         return spec.task if spec.task in self.kit(spec).loop.control else ""
 
     def plant(self, spec: LoopSpec) -> Plant:
-        """The plant of a specification, with its parameters changed; without one the model that stands in."""
+        """The plant of a specification with its changed parameters, or the model that replaces a missing plant."""
         if self.scenario.plant is None:
             return varied(stand_in(self.kit(spec), spec.controller), spec.parameters)
         return varied(self.scenario.plant(), spec.parameters)
@@ -405,12 +407,12 @@ class Bench:
 
         Args:
             spec: The loop.
-            task: In place of the task that it names, e.g. with another reference.
-            monitor: In place of the one that it names.
-            on_step: Called after every period, e.g. to show progress.
+            task: Replaces the task of the specification, e.g. by one with another reference. Default: its own.
+            monitor: Replaces the monitor of the specification. Default: its own.
+            on_step: Called after every period, e.g. to show progress. Default: nothing.
 
         Returns:
-            Its row, and its whole record.
+            The loop's row, and its complete record.
         """
         plans: list[Array] = []
 
@@ -442,15 +444,15 @@ def run_loops(
     specs: Sequence[LoopSpec],
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> Iterator[LoopRow]:
-    """Run loops one after the other, alone in this process, so that the durations of their steps count.
+    """Run loops one after the other in this process, so that the durations of their steps count.
 
     Args:
-        bench: What they run on.
+        bench: The bench.
         specs: The loops.
-        report: Called with ``(done, total, text)``, in periods of all loops, as they go on. Default: nothing.
+        report: Called with ``(done, total, text)``, counted in periods of all loops. Default: nothing.
 
     Yields:
-        The row of each as it ends.
+        The row of each loop when it ends.
 
     Example: ``costs = [row.cost for row in run_loops(bench, specs)]``
     """
@@ -472,23 +474,23 @@ def write_rows(path: Path, rows: Sequence[LoopRow], of: str) -> None:
     Args:
         path: The file, ``.json``; arrays lie beside it as ``.npz``.
         rows: The loops.
-        of: Digest of all that decides what they are.
+        of: Digest of everything that the rows depend on.
 
     Raises:
-        StorageError: If they cannot be written.
+        StorageError: If the file cannot be written.
     """
     write_document(path, {"of": of, "rows": [row.plain() for row in rows]}, arrays_of(rows))
 
 
 def read_rows(path: Path, of: str) -> list[LoopRow] | None:
-    """Rows that :func:`write_rows` wrote; None if there are none of that digest.
+    """Read the rows that :func:`write_rows` wrote; None if the file is missing or has another digest.
 
     Raises:
         InputError: If the file is damaged.
     """
     if not path.is_file():
         return None
-    remedy = "delete it, and its loops run again"
+    remedy = "delete this file; then its loops run again"
     document = read_document(path, remedy)
     if document.get("of") != of:
         return None
@@ -497,7 +499,7 @@ def read_rows(path: Path, of: str) -> list[LoopRow] | None:
 
 
 def arrays_of(rows: Sequence[LoopRow]) -> dict[str, Array]:
-    """The arrays of rows by ``"NUMBER/NAME"``, the number being that of the row."""
+    """The arrays of rows by ``"NUMBER/NAME"``, with the number of the row."""
     return {f"{i}/{name}": values for i, row in enumerate(rows) for name, values in row.arrays.items()}
 
 
@@ -514,7 +516,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
     """The row of a loop, from its task, its control problem, a model that names the signals, and its record."""
     r, labels = result, [signal.label for signal in model.states]
     tracked, errors = labels, result.tracking_rmse
-    if r.tracks_outputs:  # those that nothing weighs have no reference
+    if r.tracks_outputs:  # outputs without weight have no reference
         tracked = [s.label for s, weight in zip(model.outputs, problem.q_y, strict=True) if weight > 0]
         errors = errors[problem.q_y > 0]
     inputs = [signal.label for signal in model.inputs]
@@ -549,10 +551,9 @@ def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
 
 
 def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
-    """Largest share of the way from rest to each limit that a loop used [-]: 1 is the limit, more a violation.
+    """Largest used share of the distance from the operating point to each limit [-]: 1 is the limit, more a violation.
 
-    By signal of the model: inputs and, where limited, ``change of`` an input, the plant's true states and, as
-    ``output`` of a name, the measured outputs.
+    By name: inputs, ``change of`` an input, the plant's true states, and ``output`` of a measured output.
     """
     rest = np.clip(model.u0, control.u_min, control.u_max)
     changes = np.abs(np.diff(r.u, axis=0, prepend=rest[None]))
@@ -575,14 +576,14 @@ def limits_used(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[s
 
 
 def share_given_way(r: ClosedLoopResult) -> dict[str, float]:
-    """Share of a loop's periods in which each hard bound had to give way; empty where none did."""
+    """Share of a loop's periods in which each hard bound was relaxed; empty if none was."""
     names = [name for period in r.given_way for name in period]
     return {name: names.count(name) / len(r.t) for name in sorted(set(names))}
 
 
 def excess(control: OCP, r: ClosedLoopResult, model: HybridModel) -> dict[str, float]:
-    """By how much a loop left its limits at most, in the signals' units: inputs and, where limited, changes, states,
-    measured outputs.
+    """Largest violation of each limit in a loop, in the signals' units: inputs, their changes, states, measured
+    outputs.
     """
     beyond = np.maximum(r.u - control.u_max, control.u_min - r.u)
     over = {s.label: v for s, v in zip(model.inputs, beyond.T, strict=True)}
@@ -622,8 +623,8 @@ def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
     holder = inner if is_dataclass(inner) else plant
     if not is_dataclass(holder) or isinstance(holder, type):
         raise InputError(
-            f"the plant {type(plant).__name__} has no parameters to vary: it must be a dataclass, or have one "
-            "named 'parameters' [HM-COMPARE-011]"
+            f"plant {type(plant).__name__}: no parameters to vary. Make it a dataclass, or give it a dataclass "
+            "'parameters' [HM-COMPARE-011]"
         )
     numbers = [f.name for f in fields(holder) if f.init and isinstance(getattr(holder, f.name), float)]
     changed = {
@@ -635,28 +636,29 @@ def varied(plant: Any, factors: Sequence[tuple[str, float]]) -> Any:
 
 
 def stand_in(kit: Kit, controller: str) -> ModelPlant:
-    """The model that a controller meets where there is no plant: the prior's meets the hybrid, the hybrid's the
-    best of its networks alone.
+    """The model that replaces a missing plant: the hybrid for the prior's controller, and the best single network of
+    the hybrid for the hybrid's controller.
 
-    Where these move as the controller's own model does, as with a correction of zero, it is the prior with parameters
-    drawn from what the fit knows of them (:data:`DRAWN_PRIOR`).
+    If these models behave like the controller's own model (correction of zero), it is the prior with parameters drawn
+    from their fitted covariance (:data:`DRAWN_PRIOR`).
 
     Raises:
-        InputError: If the controller is an oracle's, or the artifact holds no other model than the controller's.
+        InputError: If the controller is an oracle's, or the artifact has no other model than the controller's.
     """
     of = CONTROLLERS[controller].model
     if of == "oracle":
         raise InputError(
-            f"controller {controller} knows the equations of a plant, and there is none; leave it out [HM-COMPARE-012]"
+            f"controller {controller}: an oracle needs a plant, but the scenario has none. Leave it out "
+            "[HM-COMPARE-012]"
         )
     held = kit.models.get("hybrid")
     others = kit.members.values() if of == "hybrid" else () if held is None else (held,)
     if not others:
         needed = "a hybrid" if of == "prior" else "a network of its training alone"
         raise InputError(
-            f"there is no plant, and the model of scenario {kit.name} holds no model to stand in for the machine of "
-            f"controller {controller}: needed is {needed}. Train 2 networks or more (networks of the budget) and run "
-            "it again, leave this controller out, or write a plant [HM-COMPARE-013]"
+            f"controller {controller}: scenario {kit.name} has no plant, and its kit lacks {needed} to replace it. Run "
+            "the scenario with at least 2 networks (networks of the budget), leave this controller out, or write a "
+            "plant [HM-COMPARE-013]"
         )
     own = kit.models[of]
     problem = next(iter(kit.loop.control.values()), None)
@@ -667,21 +669,21 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
     drawn = drawn_prior(kit.models["prior"])
     if drawn is None or not moves_otherwise(own, drawn, inputs):
         raise InputError(
-            f"there is no plant, and all models of scenario {kit.name} move as that of controller {controller} does: "
-            "the networks correct nothing, and the fit tells no spread of the prior's parameters. A loop on the "
-            "controller's own model would tell nothing; leave this controller out, or write a plant [HM-COMPARE-014]"
+            f"controller {controller}: scenario {kit.name} has no plant, and all its models behave like the "
+            "controller's own. The networks correct nothing, and the covariance of the prior's parameters is "
+            "unknown. Leave this controller out, or write a plant [HM-COMPARE-014]"
         )
     return ModelPlant(drawn, kit.sensor_sigma)
 
 
 def drawn_prior(prior: HybridModel) -> HybridModel | None:
-    """The prior with parameters drawn from a normal distribution of their fitted covariance, within their bounds;
-    always the same draw. None where the covariance is unknown or zero.
+    """The prior with parameters ``p ~ N(p_fit, covariance)`` within their bounds, always the same draw; None if the
+    covariance is unknown or zero.
     """
     covariance = np.array(prior.covariance, dtype=np.float64)
     if not covariance.any():
         return None
-    # scaled by the deviations: parameters of very different units are factored alike
+    # scale by the standard deviations, since the units of parameters differ widely
     deviation = np.sqrt(np.diag(covariance))
     scale = np.where(deviation > 0, deviation, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -701,10 +703,9 @@ def moves_otherwise(
 
     Args:
         one: A model.
-        other: Another one, of the same signals.
-        inputs: Lower and upper bounds ``(n_u,)`` within which inputs are drawn. Default: one to either side of the
-            operating point.
-        periods: Length of the run.
+        other: Another model of the same signals.
+        inputs: Lower and upper bounds ``(n_u,)`` of the random inputs. Default: the operating point plus and minus 1.
+        periods: Length of the run. Default: 50.
     """
     low, high = (one.u0 - 1.0, one.u0 + 1.0) if inputs is None else inputs
     low, high = np.where(np.isfinite(low), low, one.u0 - 1.0), np.where(np.isfinite(high), high, one.u0 + 1.0)
@@ -718,7 +719,7 @@ def moves_otherwise(
         runs.append(np.array(run))
     both = np.isfinite(runs[0]) & np.isfinite(runs[1])
     moved = np.abs(np.where(both, runs[0] - one.x0, 0.0)).max(axis=0)
-    # a state that stands still differs by rounding of its own size
+    # a constant state differs by rounding relative to its own size
     moved = np.maximum(moved, SAME_MOTION * np.abs(np.where(both, runs[0], 0.0)).max(axis=0))
     apart = np.abs(np.where(both, runs[0] - runs[1], 0.0)).max(axis=0)
     finite = np.isfinite(runs[0]), np.isfinite(runs[1])
@@ -726,38 +727,41 @@ def moves_otherwise(
 
 
 def check_complete(scenario: Scenario, *, plant: bool = False) -> None:
-    """Refuse a scenario without control problem or task, or without ``plant`` where it takes the machine's own."""
+    """Refuse a scenario without control problem or task, or, with ``plant=True``, without a plant."""
     parts: dict[str, object] = {"control problem": scenario.control, "task": scenario.tasks or None}
     if plant:
         parts = {"plant": scenario.plant, **parts}
     if lacks := [name for name, part in parts.items() if part is None]:
         raise InputError(
-            f"scenario {scenario.name} has no {lacks[0]}: there is no loop to close in simulation [HM-COMPARE-015]"
+            f"scenario {scenario.name}: no {lacks[0]}, so no closed loop can be simulated. Add it to the scenario "
+            "[HM-COMPARE-015]"
         )
 
 
 def check_kit(scenario: Scenario, kit: Kit, where: str) -> None:
-    """Refuse an artifact without prior or hybrid, of another scenario, or of other sizes; ``where`` names it."""
+    """Refuse an artifact without prior or hybrid, of another scenario, or of other sizes; ``where`` is its name."""
     assert scenario.control is not None
     if missing := [name for name in ("prior", "hybrid") if name not in kit.models]:
         raise InputError(
-            f"{where} holds {', '.join(kit.models)}; needed is a model {missing[0]} too [HM-COMPARE-016]"
+            f"{where}: no model {missing[0]}; it only has {', '.join(kit.models)}. Run the scenario again "
+            "[HM-COMPARE-016]"
         )
     if kit.name and kit.name != scenario.name:
         raise InputError(
-            f"{where} was made for scenario {kit.name}, not for {scenario.name} [HM-COMPARE-017]"
+            f"{where}: made for scenario {kit.name}, not for {scenario.name}. Give a model of {scenario.name} "
+            "[HM-COMPARE-017]"
         )
     needed = scenario.control.n_x, scenario.control.n_u, len(scenario.sensor_sigma)
     for name, model in kit.models.items():
         if (sizes := (model.n_x, model.n_u, model.n_y)) != needed:
             raise InputError(
-                f"{where}: model {name} has (states, inputs, outputs) = {sizes}, scenario {scenario.name} {needed}"
-                " [HM-COMPARE-018]"
+                f"{where}: model {name} has (states, inputs, outputs) = {sizes}, but scenario {scenario.name} has "
+                f"{needed}. Run the scenario again [HM-COMPARE-018]"
             )
 
 
 def check_faults(scenario: Scenario, faults: Sequence[Fault], model: HybridModel) -> None:
-    """Refuse faults that the machine, whose signals a ``model`` names, cannot show."""
+    """Refuse faults that the plant does not support, or with channels that are not signals of the ``model``."""
     assert scenario.plant is not None
     outside = install(scenario.plant(), faults)[1]
     check_channels(outside, [s.name for s in model.outputs], [s.name for s in model.inputs])

@@ -1,4 +1,4 @@
-"""Nominal loops of a simulated machine, which limits are learned from, and loops in which something breaks."""
+"""Nominal loops of a simulated machine, from which limits are learned, and the faults that are simulated."""
 
 from __future__ import annotations
 
@@ -18,34 +18,35 @@ from hybrid_mpc.watch.lengths import block_seconds, settling_samples
 CONTROLLER = "hybrid_observer"
 """The controller of these loops."""
 BLOCKS = 9
-"""Whole blocks (of five of the machine's seconds) in a loop. Four such loops suffice for a threshold of two false
-alarms an hour, eight for one."""
+"""Whole blocks (of five time constants of the machine) in a loop. Four such loops suffice for a threshold of two false
+alarms an hour, eight loops for one."""
 FEWEST, MOST = 4, 16
-"""Loops: one for each seed of the budget, within these."""
+"""Smallest and largest number of loops; in between, one loop for each seed of the budget."""
 FIRST_SEED = 500
-"""Their numbers begin here, away from those of the compared loops."""
+"""First seed of these loops; compared loops have smaller seeds."""
 SMALLEST = 0.6
-"""Every time round, the reference is scaled by a factor drawn from here to 1: no two rounds are alike."""
+"""The reference of each round is scaled by a random factor from here to 1, so rounds differ."""
 AGEING, DRIFT_S = (1.0, 1.1, 0.9), 30.0
-"""Where the plant knows it, friction drifts to these shares, in turn, within so many of the machine's seconds:
-ageing, of which no monitor is to speak."""
+"""If the plant has friction, it drifts by these factors in turn, within 30 time constants of the machine. A monitor
+must not alarm because of such ageing."""
 WEAKER = 0.8
-"""What is left of an actuator's force where it weakens."""
+"""Remaining share of the force of a weakened actuator."""
 LOAD_SHARE = 0.2
 """Unknown load, as a share of half the input's range."""
 
 
 def nominal_tasks(scenario: Scenario) -> list[Task]:
-    """Tracking tasks in which nothing goes wrong; if there are none, other tasks without faults.
+    """Tracking tasks without faults; if there are none, other tasks without faults.
 
     Raises:
-        InputError: If something goes wrong in every task.
+        InputError: If every task has a fault.
     """
     calm = [task for task in scenario.tasks if not task.faults]
     tasks = [task for task in calm if task.weight is None] or calm
     if not tasks:
         raise InputError(
-            f"scenario {scenario.name}: every task brings a fault; limits are learned from one without [HM-COMPARE-019]"
+            f"scenario {scenario.name}: every task has a fault. Add a task without faults to learn limits from "
+            "[HM-COMPARE-019]"
         )
     return tasks
 
@@ -53,10 +54,10 @@ def nominal_tasks(scenario: Scenario) -> list[Task]:
 def nominal_loops(
     scenario: Scenario, budget: Budget, model: HybridModel, *, named: str = "", run_seed: int = 0
 ) -> list[LoopSpec]:
-    """The loops of a budget: calm tasks in turn, each round of them scaled by its own share.
+    """The nominal loops of a budget: fault-free tasks in turn, each round with its own factor.
 
     Raises:
-        InputError: If something goes wrong in every task.
+        InputError: If every task has a fault.
 
     Example:
         >>> from types import SimpleNamespace
@@ -93,7 +94,7 @@ def stage_of(spec: LoopSpec) -> str:
 
 
 def knows(scenario: Scenario, target: str) -> bool:
-    """Whether the scenario's plant can show a fault of its own."""
+    """Whether the scenario's plant supports a fault ``target`` of its own."""
     if scenario.plant is None:
         return False
     try:
@@ -105,7 +106,7 @@ def knows(scenario: Scenario, target: str) -> bool:
 
 @dataclass(frozen=True)
 class Broken:
-    """What breaks in a loop: a short name, the same in words, and the fault."""
+    """A simulated fault: short name, description, and the fault."""
 
     name: str
     title: str
@@ -113,8 +114,8 @@ class Broken:
 
 
 def broken(scenario: Scenario, model: HybridModel, control: OCP, start: float) -> list[Broken]:
-    """What is tried from ``start`` [s] on: friction twice as large where the plant knows it, each actuator a fifth
-    weaker, an unknown load at the first input, each sensor frozen.
+    """The simulated faults, which begin at ``start`` [s]: friction doubles (if the plant supports it), each actuator
+    loses a fifth of its force, an unknown load at the first input, each sensor freezes.
 
     Example:
         >>> from types import SimpleNamespace as Some

@@ -1,6 +1,6 @@
-"""What a kit promises of its loops, examined: loops on wrong models with loads, margins, limits, the observer.
+"""Examine the promises of a kit: no offset with wrong models and loads, margins, limits, step time, observer.
 
-Everything is computed from the kit, the scenario's tasks, and what the run has found so far. No recordings are needed.
+Everything is computed from the kit, the scenario's tasks, and earlier results of the run. No recordings are needed.
 """
 
 from __future__ import annotations
@@ -37,63 +37,63 @@ from hybrid_mpc.scenario import Task
 
 Array = NDArray[np.float64]
 OFF = 0.2
-"""Share by which each parameter of the wrong models is off, up or down: more than a fit leaves of what its recordings
-tell, and about what a load of another mass or a worn bearing does."""
+"""Relative error of each parameter of the wrong models, with random sign: larger than the uncertainty after a fit,
+about the effect of another mass or of a worn bearing."""
 LOAD = 0.2
-"""Load of a trial, as a share of the room from the set-point's input to its limit, or of a disturbance's size: that of
-the default task ``hold``."""
+"""Load of a trial, as a share of the distance from the set-point's input to its limit, or of the disturbance's size;
+the default task ``hold`` has the same load."""
 PERIODS, LONGER, FEWEST, MOST = 800, 800, 3, 4
-"""Periods that all trials of a run may take together, a few seconds of computing, and those of a trial of a slow loop;
-trials of a set-point."""
+"""Total number of periods of all trials (a few seconds of computing); periods of the longer trial of a slow loop;
+fewest and most trials of a set-point."""
 LASTS = 6
-"""Horizons that a trial lasts: a load that no jump shows is found to two thirds within 1.5 of them, so 2 % are left."""
+"""Length of a trial in horizons. The observer's time constant is at most 1.5 horizons; exp(-6 / 1.5) = 2 % is left."""
 END = 0.2
-"""Share of a trial, or of a task, at its end over which offset and scatter count: as in the report's step responses."""
+"""Last share of a trial or task over which offset and scatter are evaluated; as in the report's step responses."""
 NOISE = 1.0
 """Largest offset within the noise, in standard deviations of the sensor."""
 RESTS = 5.0
-"""Largest scatter of an output that has settled, in standard deviations of its sensor. The sensor itself makes one; an
-observer hands a part of its noise on to the input, and an unstable machine moves by several."""
+"""Largest scatter of a settled output, in standard deviations of its sensor. The sensor noise alone makes 1. Noise that
+the observer passes on to the input adds to it, in an unstable machine several times as much."""
 SLOW = "the observer is slow"
-"""How the reason begins where a load is found, but not within a trial."""
+"""Begin of the reason of a loop whose observer estimates the load, but not within the trial."""
 STILL_MOVES = 0.02
-"""Change of the estimated load within the end of a trial, over the load, from which on it still moves."""
+"""Change of the estimated load within the end of a trial, over the load, above which the estimate has not settled."""
 STANDS = 0.2
-"""Motion of a true output, over the noise of its sensor, below which it stands still."""
+"""Standard deviation of a true output, over that of its sensor noise, below which the output stands still."""
 CONSTANTS = 3
-"""Time constants of the observer after which a load counts as found: a twentieth of it is left."""
+"""Time constants of the observer after which a load counts as estimated: exp(-3) = 5 % is left."""
 AT_LIMIT = 1e-3
 """Distance from a limit, over the input's range, that counts as at the limit."""
 TAIL = (0.05, 0.01)
-"""Shares of the cost that are left between which the slowest mode that counts is seen."""
+"""Remaining shares of the cost between which the time constant of its slowest mode is measured."""
 LOOKED, LEAST = 20, 2000
-"""Horizons over which the cost of a deviation is followed, and periods at least."""
+"""Number of horizons over which the cost of a deviation is followed, and smallest number of periods."""
 CARRIES = 0.95
-"""Share of the cost of a deviation that is to lie within the horizon; the terminal weight stands for the rest."""
+"""Required share of the cost of a deviation within the horizon; the terminal weight approximates the rest."""
 MODULUS = 0.5
 """Least distance of the Nyquist curve from -1: peak sensitivity 2, gain margin 2, phase margin 29 degrees (Astrom and
 Hagglund, *Advanced PID Control*, 2006, section 4.6)."""
-SOFTER = "Larger weights of changes (r_delta), or less process noise; hybrid-mpc analyze shows more."
+SOFTER = "Increase the weights of changes (r_delta), or reduce the process noise; hybrid-mpc analyze shows details."
 BY_NETWORK = (
-    "The network's slope at the set-point takes this margin: record small motions about the set-point and run again. "
+    "The network's slope at the set-point reduces this margin: record small motions about the set-point and run again. "
     "Start on the machine with small steps, and compare with the prior's loop (hybrid-mpc control --controller "
     "prior_observer --controller hybrid_observer)."
 )
-"""What to do about small margins: of any loop, and of a hybrid's where the prior's are larger."""
+"""Remedies for small margins: ``SOFTER`` for any loop, ``BY_NETWORK`` if the prior's margins are larger."""
 HALF = 0.5
-"""Share of the period that 99 of 100 steps may take: the rest is for sensors, for the actuator and for other work."""
+"""Share of the period that 99 % of the steps may take: sensors, actuator and other work need the rest."""
 NEAR = 0.05
-"""Distance from a hard bound, over the room to it, at which a loop starts."""
+"""Distance of a start from a hard bound, as a share of the distance from the set-point to the bound."""
 WHITE = 0.3
-"""Largest correlation of an innovation with an earlier one: that explains less than a tenth of the variance."""
+"""Largest autocorrelation of the innovations: it explains less than 10 % of their variance."""
 SURE = 4.0
-"""Largest mean of normalised squared innovations, and one over the smallest: errors of twice or half the deviation that
-the observer assumes."""
+"""Largest mean normalised squared innovation, and the inverse of the smallest: innovations of twice or half the assumed
+standard deviation."""
 
 
 @dataclass(frozen=True)
 class LoadedPlant(ModelPlant):
-    """A model in place of the machine, on which constant unmeasured disturbances act.
+    """A model in place of the machine, with constant unmeasured disturbances.
 
     Args:
         d: The disturbances ``(n_d,)``, in the order of the model's ``disturbance_model``.
@@ -102,7 +102,7 @@ class LoadedPlant(ModelPlant):
     d: tuple[float, ...]
 
     def step(self, state: ModelState, u: Array, dt: float, w: Array | None = None) -> ModelState:
-        """A period on."""
+        """The state after one period."""
         on_u, on_x, _ = self.model.disturbed
         after = super().step(state, u + on_u @ np.array(self.d), dt, w)
         return after._replace(x=after.x + on_x @ np.array(self.d))
@@ -114,16 +114,16 @@ class LoadedPlant(ModelPlant):
 
 @dataclass(frozen=True)
 class SetPoint:
-    """Where loops are examined: a set-point of a control problem, with the parts of its loop.
+    """A set-point of a control problem at which loops are examined, with the parts of its loop.
 
     Args:
-        model: The model that the kit recommends.
+        model: The recommended model.
         problem: The control problem.
-        tasks: Names of the tasks that have this problem; the first one ends at this set-point, if any does.
+        tasks: Names of the tasks with this problem; the first task ends at this set-point, if any task does.
         reference: The set-point ``(columns,)``.
-        w: Measured disturbances ``(n_w,)`` there.
+        w: Measured disturbances ``(n_w,)`` at the set-point.
         estimator: The kit's observer.
-        controller: Its controller.
+        controller: The kit's controller.
     """
 
     model: HybridModel
@@ -136,10 +136,12 @@ class SetPoint:
 
     @cached_property
     def rest(self) -> tuple[Array, Array]:
-        """State and input of the set-point's steady state; of a reference of states that, and the input that holds it.
+        """State ``(n_x,)`` and input ``(n_u,)`` of the set-point's steady state.
+
+        If the reference is one of states: this state, and the input that holds it best.
 
         Raises:
-            InputError: If there is no such steady state.
+            InputError: If the set-point has no steady state.
         """
         m = self.model
         empty = np.full(m.n_y, np.nan)
@@ -152,8 +154,8 @@ class SetPoint:
         x, u = target.x[0], target.u[0]
         if self.problem.n_y and (target.steady is None or not target.steady.steady):
             raise InputError(
-                f"the set-point {self.reference.tolist()} of {self.title} has no steady state"
-                " [HM-COMPARE-020]"
+                f"set-point {self.reference.tolist()} of {self.title}: the model has no steady state there. Choose "
+                "another set-point [HM-COMPARE-020]"
             )
         if not self.problem.n_y:
             sizes = self.controller.controller.problem.sizes.states
@@ -163,13 +165,13 @@ class SetPoint:
 
     @property
     def title(self) -> str:
-        """The tasks, in words."""
+        """Text that names the tasks."""
         others = f" and {len(self.tasks) - 1} more" if len(self.tasks) > 1 else ""
         return f"task {self.tasks[0]}{others}" if self.tasks else "the operating point"
 
     @cached_property
     def held(self) -> list[int]:
-        """Places of the outputs that are held."""
+        """Indices of the controlled outputs."""
         return held_outputs(self.model, self.problem, *self.rest, self.w)
 
     def errors(self, y: Array, u: Array) -> Array:
@@ -184,13 +186,13 @@ class SetPoint:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far an output is from its set-point at the end of a loop [its unit].
+    """Deviation of an output from its set-point at the end of a loop [unit of the output].
 
     Args:
         signal: The output.
-        sigma: Standard deviation of its sensor.
-        offset: Mean deviation over the end.
-        scatter: Standard deviation there.
+        sigma: Standard deviation of its sensor noise.
+        offset: Mean deviation over the end of the loop.
+        scatter: Standard deviation over the end of the loop.
     """
 
     signal: Signal
@@ -200,18 +202,18 @@ class Deviation:
 
     @property
     def kept(self) -> bool:
-        """Whether it has settled within the noise."""
+        """Whether the output has settled within the noise."""
         return abs(self.offset) <= NOISE * self.sigma and self.scatter <= RESTS * self.sigma
 
     @property
     def size(self) -> float:
-        """The larger of offset and scatter over what they may be; infinite where a loop diverges."""
+        """The larger of offset and scatter over their limits [-]; infinite if the loop diverges."""
         found = max(abs(self.offset) / NOISE, self.scatter / RESTS) / self.sigma
         return found if math.isfinite(found) else math.inf
 
     def __str__(self) -> str:
         if not math.isfinite(self.size):
-            return f"{self.signal.name} runs away"
+            return f"{self.signal.name} diverges"
         what = f"{abs(self.offset):.2g} {self.signal.unit} off"
         if self.scatter > RESTS * self.sigma:
             what += f", moving by {self.scatter:.2g} {self.signal.unit}"
@@ -223,9 +225,9 @@ class Trial:
     """A simulated loop at a set-point, on a wrong model with loads.
 
     Args:
-        deviations: Of the outputs that are held.
-        settled_s: Time after which they stay within the noise [s]; None: not within the trial.
-        why: Why they do not; empty where they do.
+        deviations: Those of the controlled outputs.
+        settled_s: Time after which all stay within the noise [s]; None if they do not.
+        why: Why they do not settle; empty if they do.
         result: The loop's record.
     """
 
@@ -236,17 +238,17 @@ class Trial:
 
     @property
     def worst(self) -> Deviation:
-        """The output that is furthest off."""
+        """The largest deviation."""
         return max(self.deviations, key=lambda one: one.size)
 
 
 @dataclass(frozen=True)
 class TaskEnd:
-    """How a task of the run's loops ends that ends at a set-point.
+    """Deviations at the end of a task that ends at a set-point, in a loop of the run.
 
     Args:
-        task: Its name.
-        deviations: Of the outputs that are held.
+        task: Name of the task.
+        deviations: Those of the controlled outputs.
     """
 
     task: str
@@ -255,12 +257,12 @@ class TaskEnd:
 
 @dataclass(frozen=True)
 class Tested:
-    """What the innovations of the kit's observer say on test recordings.
+    """Statistics of the innovations of the kit's observer on test recordings.
 
     Args:
-        correlation: Largest autocorrelation in size [-].
-        nis: Mean normalised innovation squared of an output [-]; 1 is as sure as it may be.
-        samples: Samples looked at.
+        correlation: Largest magnitude of the autocorrelation [-].
+        nis: Mean normalised innovation squared per output [-]; 1 if the assumed covariance is right.
+        samples: Number of samples.
     """
 
     correlation: float
@@ -269,7 +271,7 @@ class Tested:
 
 
 def held_outputs(model: HybridModel, problem: OCP, x: Array, u: Array, w: Array) -> list[int]:
-    """Places of the outputs that a problem holds: weighed ones, or those that show a weighed state at a point."""
+    """Indices of the controlled outputs: weighted ones, or those that depend on a weighted state at a point."""
     if problem.n_y:
         return [int(i) for i in np.flatnonzero(problem.q_y > 0)]
     by_x = output_with_jacobian(model)(x, u, w)[1].full()
@@ -277,8 +279,8 @@ def held_outputs(model: HybridModel, problem: OCP, x: Array, u: Array, w: Array)
 
 
 def errors_of(model: HybridModel, problem: OCP, reference: Array, w: Array, y: Array, u: Array) -> Array:
-    """Deviations ``(n, n_y)`` of measured outputs ``(n, n_y)`` from a set-point ``(columns,)``, under the inputs
-    ``(n, n_u)`` that acted.
+    """Deviations ``(n, n_y)`` of measured outputs ``(n, n_y)`` from a set-point ``(columns,)``, with the applied inputs
+    ``(n, n_u)``.
     """
     if problem.n_y:
         return np.asarray(y - reference[: problem.n_y])
@@ -287,7 +289,7 @@ def errors_of(model: HybridModel, problem: OCP, reference: Array, w: Array, y: A
 
 
 def task_end(kit: Kit, task: Task, loop: Mapping[str, Array]) -> TaskEnd | None:
-    """How a task ended in a loop of the run; None where it ends at no set-point, or weighs no output.
+    """Deviations at the end of a task in a loop of the run; None if the task ends at no set-point or weights no output.
 
     Args:
         kit: The kit.
@@ -311,12 +313,12 @@ def task_end(kit: Kit, task: Task, loop: Mapping[str, Array]) -> TaskEnd | None:
 
 
 def quiet(estimator: Filter) -> ExtendedKalmanFilter:
-    """The filter that observes while nothing happens."""
+    """The quiet filter of a switching observer, or the observer itself."""
     return estimator.filters[0] if isinstance(estimator, SwitchingFilter) else estimator
 
 
 def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
-    """One set-point of each control problem of a kit's tasks: that at which a task ends, else the operating point.
+    """One set-point for each control problem of a kit's tasks: the end of a task, else the operating point.
 
     Raises:
         InputError: If the kit lacks a control problem or noise.
@@ -351,7 +353,7 @@ def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
 
 
 def end_of(task: Task, model: HybridModel) -> tuple[Array, Array] | None:
-    """Set-point and measured disturbances at which a task ends; None where they move, or weights do."""
+    """Set-point and measured disturbances at the end of a task; None if they change there, or if weights change."""
     t = task.duration * np.linspace(1.0 - END, 1.0, 50)
     rows = np.asarray(task.reference(t), dtype=np.float64)
     w = np.tile(model.w, (len(t), 1)) if task.w is None else np.asarray(task.w(t), dtype=np.float64)
@@ -359,15 +361,15 @@ def end_of(task: Task, model: HybridModel) -> tuple[Array, Array] | None:
     return (rows[-1], w[-1]) if still and task.weight is None else None
 
 
-# No offset: loops on wrong models with loads.
+# Row "no offset": loops on wrong models with constant loads.
 
 
 def wrong_model(model: HybridModel, draw: int) -> HybridModel:
-    """The model with each parameter that a fit may move a fifth off, up or down, within its bounds.
+    """The model with parameters ``p (1 ± OFF)`` within their bounds.
 
     Args:
         model: The model.
-        draw: Number of the draw; each has signs of its own, always the same. 0: the model itself.
+        draw: Number of the draw, which determines the signs. 0: the model itself.
     """
     if not draw:
         return model
@@ -383,15 +385,17 @@ def wrong_model(model: HybridModel, draw: int) -> HybridModel:
 
 
 def loads(point: SetPoint, draw: int) -> Array:
-    """A constant value ``(n_d,)`` of each disturbance of the model: a fifth of the room from the set-point's input to
-    the limit on that side, or of the disturbance's size; signs by the draw.
+    """A constant value ``(n_d,)`` of each disturbance of the model; the draw determines the signs.
+
+    Its size is ``LOAD`` times the distance from the set-point's input to the limit on that side, or times the
+    disturbance's size.
     """
     model, problem, (_, u) = point.model, point.problem, point.rest
     sizes = disturbance_sizes(model, problem)
     signs = np.random.default_rng([draw, 1]).choice((-1.0, 1.0), model.n_d)
     found = LOAD * sizes * signs
     for j, i in zip(*np.nonzero(model.disturbed[0].T), strict=True):
-        # a load is met by the input's motion the other way
+        # the input must move against the load
         room = u[i] - problem.u_min[i] if signs[j] > 0 else problem.u_max[i] - u[i]
         found[j] = signs[j] * LOAD * min(room, sizes[j]) if math.isfinite(room) else found[j]
     return np.asarray(found)
@@ -402,8 +406,8 @@ def trial(point: SetPoint, draw: int, periods: int) -> Trial:
 
     Args:
         point: The set-point.
-        draw: Number of the draw; 0 has the right parameters, and loads.
-        periods: Length.
+        draw: Number of the draw; 0 has the right parameters.
+        periods: Length [periods].
 
     Raises:
         InputError: If the set-point has no steady state.
@@ -416,7 +420,7 @@ def trial(point: SetPoint, draw: int, periods: int) -> Trial:
 
 
 def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int = 0) -> Trial:
-    """A loop of the kit's parts on a plant, from a state ``(n_x,)``; durations are the processor's, not the clock's."""
+    """A loop of the kit's parts on a plant, from a state ``(n_x,)``; durations are processor time."""
     model = point.model
     result = simulate(
         plant, point.estimator, point.controller, point.reference, dt=model.dt, duration=periods * model.dt, x0=x0,
@@ -434,7 +438,7 @@ def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int
 def deviations(
     signals: Sequence[Signal], held: Sequence[int], sigma: Array, errors: Array
 ) -> tuple[Deviation, ...]:
-    """How far outputs are off over the end of a loop, of errors ``(n, n_y)``; NaN are samples that were lost."""
+    """Deviations over the end of a loop, from errors ``(n, n_y)`` of the outputs; NaN are lost samples."""
     late = errors[int((1.0 - END) * len(errors)) :]
     with np.errstate(over="ignore", invalid="ignore"):
         return tuple(
@@ -446,9 +450,9 @@ def deviations(
 
 
 def _settled(errors: Array, sigma: Array, horizon: int) -> int | None:
-    """Period from which means of errors over half a horizon stay within twice the noise; None: never.
+    """Period from which moving means of the errors over half a horizon stay within twice the noise; None: never.
 
-    Twice, since an observer hands noise on to the input, and means of few samples move.
+    Twice, because the observer passes noise on to the input, and means of few samples scatter.
     """
     width = max(1, horizon // 2)
     if len(errors) < 2 * width:
@@ -464,10 +468,10 @@ def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
     problem, model = point.problem, point.model
     late = slice(int((1.0 - END) * len(errors)), None)
     if not np.all(np.isfinite(result.x)):
-        return "the loop runs away"
+        return "the loop diverges"
     away = np.abs(result.x[late] - point.rest[0]).max(axis=0) > 2.0 * np.abs(_room(model))
     if away.any():
-        return f"the loop does not hold {model.states[int(np.flatnonzero(away)[0])].name}"
+        return f"the loop does not keep {model.states[int(np.flatnonzero(away)[0])].name} within its range"
     edge = AT_LIMIT * problem.input_range
     at = np.mean((result.u[late] >= problem.u_max - edge) | (result.u[late] <= problem.u_min + edge), axis=0)
     if at.max() > 0.5:
@@ -477,30 +481,32 @@ def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
     periods = periods_to_find(quiet(point.estimator), SEARCHED * problem.horizon)
     slowest = float(np.max(np.where(np.isnan(periods), np.inf, periods)))
     if not math.isfinite(slowest):
-        return "the disturbance model does not move: the observer's noise takes every load for noise of the states"
+        return (
+            "the estimated disturbance does not move: the observer explains every load by its process noise"
+        )
     found = deviations(model.outputs, point.held, point.sigma, errors)
     if all(abs(one.offset) <= NOISE * one.sigma for one in found):
-        return "it does not come to rest: noise or friction keeps it moving"
+        return "the loop does not come to rest: noise or friction keeps it moving"
     half = (len(errors) - late.start) // 2
     d, sizes = result.d[late], LOAD * disturbance_sizes(model, problem)
     moved = np.abs(d[half:].mean(axis=0) - d[:half].mean(axis=0)) / sizes
     if moved.max() > STILL_MOVES or CONSTANTS * slowest > len(errors):
-        return f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load is still on its way"
+        return f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load has not settled"
     if not problem.n_y and np.any(problem.r > 0) and np.any(np.abs(point.rest[1] - model.u0) > edge):
-        return "the weight r asks for the operating point's input; let r be 0 and weigh changes by r_delta"
+        return "the weight r pulls the input to that of the operating point; set r = 0 and weight changes by r_delta"
     true = np.array([model.output(x, model.u0, point.w, model.p).full().ravel() for x in result.x[late]])
     if all(float(np.std(true[:, one])) < STANDS * point.sigma[one] for one in point.held):
-        return "it stands still there, as where dry friction sticks"
+        return "the machine stands still off its set-point, as with dry friction"
     return "no disturbance of the model explains the error"
 
 
 def _room(model: HybridModel) -> Array:
-    """Ranges of the states ``(n_x,)``; infinite where there is none."""
+    """Ranges of the states ``(n_x,)``; infinite without bounds."""
     return np.array([s.upper - s.lower for s in model.states])
 
 
 def ranks(point: SetPoint) -> OffsetFree:
-    """The rank conditions of the set-point; friction at rest may hide a load that shows in motion."""
+    """The rank conditions at the set-point; friction at rest may hide a load that is observable in motion."""
     x, u = point.rest
     found = offset_free(point.model, point.held, x=x, u=u, w=point.w)
     if (
@@ -512,12 +518,12 @@ def ranks(point: SetPoint) -> OffsetFree:
 
 
 def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -> Promise:
-    """Whether a constant load leaves no offset at a set-point.
+    """Row "no offset": whether constant loads leave no offset at a set-point.
 
     Args:
         point: The set-point.
         trials: Its trials.
-        several: Whether there are other set-points, so that the row names its tasks.
+        several: Whether there are other set-points, so that the row must name its tasks. Default: False.
     """
     name = "no offset" + (f" in {point.title}" if several else "")
     settled = [one for one in trials if not one.why]
@@ -532,14 +538,14 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
         within += f"; the worst leaves {worst.worst}: {worst.why}"
     if point.problem.economic is not None:
         return Promise(
-            name, "not promised", f"the cost is economic, and may want an offset; {within}",
-            "Weigh the outputs (q_y) without an economic cost where a set-point is to be held.",
+            name, "not promised", f"the cost is economic, so its optimum may have an offset; {within}",
+            "To hold a set-point, weight the outputs (q_y) and omit the economic cost.",
         )  # fmt: skip
     lacks = []
     if len(point.held) > point.model.n_u:
         names = ", ".join(point.model.outputs[i].name for i in point.held)
         lacks.append(
-            f"{len(point.held)} outputs ({names}) are held by {point.model.n_u} input"
+            f"{len(point.held)} outputs ({names}) are controlled by {point.model.n_u} input"
             + "s" * (point.model.n_u > 1)
         )
     if why := ranks(point).why:
@@ -547,7 +553,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
     if lacks:
         return Promise(
             name, "not promised", f"{'; '.join(lacks)}; {within}",
-            "Weigh no more outputs than there are inputs, and declare as many disturbances as outputs "
+            "Weight at most as many outputs as there are inputs, and declare as many disturbances as outputs "
             "(docs/disturbances.md).",
         )  # fmt: skip
     if worst.why:
@@ -557,21 +563,21 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
 
 
 def remedy_of(why: str) -> str:
-    """What to do where a loop keeps an offset, by its reason."""
+    """Remedy for an offset, by its reason."""
     if "limit" in why:
-        return "Choose set-points with more room to the limits of the inputs, or a stronger actuator."
+        return "Choose set-points farther from the limits of the inputs, or use a stronger actuator."
     if "slow" in why or "does not move" in why:
         return (
-            "Give the states less noise (Scenario(state_noise=...)), or a prior that errs less over one period; "
-            "see the rows on the observer."
+            "Reduce the process noise (Scenario(state_noise=...)), or improve the prior's one-step prediction; see the "
+            "rows on the observer."
         )
     if "weight r" in why:
         return "Set r = 0."
     if "friction" in why:
-        return "Friction in the prior (docs/disturbances.md#dry-friction), or a machine that sticks less."
+        return "Model the friction in the prior (docs/disturbances.md#dry-friction), or reduce it in the machine."
     return (
-        "Declare a disturbance where the error enters (Scenario(disturbance_model=...)), and look at friction and "
-        "at the task's own loops in the report."
+        "Declare a disturbance where the error enters (Scenario(disturbance_model=...)). Look at friction, and at the "
+        "task's loops in the report."
     )
 
 
@@ -579,17 +585,19 @@ def remedy_of(why: str) -> str:
 
 
 def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
-    """Whether a step ends within the period, of processor time, which no other work of the computer changes."""
+    """Row "step time": whether steps end within the period, in processor time, which other processes hardly change."""
     ms = np.sort(np.concatenate([one.result.timing_ms["total"] for one in trials]))
     p99, worst = float(np.quantile(ms, 0.99)), float(ms[-1])
     told = (
-        f"99 % of {ms.size} steps take {p99:.3g} ms of processor time, the longest {worst:.3g} ms, the period is "
-        f"{period_ms:.4g} ms"
+        f"99 % of {ms.size} steps take less than {p99:.3g} ms of processor time, the longest {worst:.3g} ms; the "
+        f"period is {period_ms:.4g} ms"
     )
-    remedy = "Solver native (compiled C), a shorter horizon, move blocks or a longer dt (docs/choosing.md)."
+    remedy = (
+        "Use solver native (compiled C), a shorter horizon, move blocks or a longer dt (docs/choosing.md)."
+    )
     if p99 > period_ms:
         return Promise("step time", "not promised", told, remedy)
-    # a single long step may be the operating system's
+    # ignore a single long step: it may be caused by the operating system
     if p99 > HALF * period_ms or ms[-2] > period_ms:
         return Promise("step time", "doubted", told, remedy)
     return Promise("step time", "shown", f"{told}; on this computer")
@@ -599,10 +607,11 @@ def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
 
 
 def horizon(points: Sequence[SetPoint]) -> Promise:
-    """Whether a plan is long enough: what share of the cost of a deviation lies within it, and the slowest mode of it.
+    """Row "horizon": which share of the cost of a deviation lies within the horizon, and the slowest mode of the cost.
 
-    Of the linear-quadratic regulator at the working point: ``x' P x`` is the cost of all time, and ``x_N' P x_N`` what
-    the horizon leaves to the terminal weight; mean over the deviations that inputs of their ranges leave behind.
+    With the linear-quadratic regulator at the operating point, ``x' P x`` is the cost over all time, and ``x_N' P x_N``
+    the part after the horizon. The share is ``1 - sum x_N' P x_N / sum x_0' P x_0`` over the states that inputs of
+    their full range reach within the horizon.
     """
     name = "horizon"
     point, cost = min(
@@ -610,21 +619,25 @@ def horizon(points: Sequence[SetPoint]) -> Promise:
     )
     dt, n = point.model.dt, point.problem.horizon
     share = 1.0 - float(cost[n])
-    told = f"the {n} periods ({n * dt:.3g} s) hold {100 * share:.3g} % of the cost of a deviation"
+    told = f"the {n} periods ({n * dt:.3g} s) contain {100 * share:.3g} % of the cost of a deviation"
     tail = [int(np.argmax(cost < left)) for left in TAIL]
     if all(tail):
-        # exp(-2 t / tau): the cost is a square
+        # cost ~ exp(-2 t / tau), since it is quadratic in the state
         slow = 2.0 * dt * max(tail[1] - tail[0], 1) / math.log(TAIL[0] / TAIL[1])
-        told += f"; the slowest mode that counts has a time constant of {slow:.2g} s"
+        told += f"; the time constant of its slowest mode is {slow:.2g} s"
     if share >= CARRIES:
         return Promise(name, "shown", told)
     enough = int(np.argmax(cost <= 1.0 - CARRIES))
-    want = f"A horizon of {enough} periods holds {100 * CARRIES:.0f} %" if enough else "Weigh what drifts"
-    return Promise(name, "doubted", told, f"{want}; a longer dt or move blocks make that cheaper.")
+    want = (
+        f"A horizon of {enough} periods contains {100 * CARRIES:.0f} %"
+        if enough
+        else "Weight drifting states"
+    )
+    return Promise(name, "doubted", told, f"{want}; a longer dt or move blocks reduce its computing time.")
 
 
 def _left_costs(point: SetPoint) -> Array:
-    """Share of the cost of a deviation that is left after each period, ``(m,)``, over some horizons."""
+    """Remaining share of the cost of a deviation after each period, ``(m,)``."""
     model, n = point.model, point.problem.horizon
     a, b, q, r = make_ocp(model, point.problem).linear_quadratic(model)
     p, k = dare(a, b, q, r)
@@ -640,12 +653,12 @@ def _left_costs(point: SetPoint) -> Array:
 
 
 def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Promise:
-    """Stability margins of the loop of observer and controller, linearized at the set-points, broken at each input.
+    """Row "stability margins": of the linearized loop of observer and controller at the set-points, for each input.
 
     Args:
         points: Set-points of the recommended model.
-        of_prior: The same of the fitted prior, if that is not recommended: they say whether the network takes the
-            margin.
+        of_prior: Set-points of the fitted prior, if another model is recommended: they show whether the network reduces
+            the margin. Default: none.
     """
     name = "stability margins"
     worst: tuple[SetPoint, Signal, Margins] | None = None
@@ -668,7 +681,7 @@ def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Pr
     )
     if good:
         return Promise(name, "shown", told)
-    told += f": beyond these the linearized loop is unstable (a distance of {MODULUS:g} is good)"
+    told += f". Beyond these margins the linearized loop is unstable (recommended distance: {MODULUS:g})"
     other = _distance(of_prior, signal)
     if other is None:
         return Promise(name, "doubted", told, SOFTER)
@@ -687,10 +700,10 @@ def _margins_at(point: SetPoint) -> list[tuple[Signal, Margins]]:
 
 
 def _distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
-    """Least distance from -1 at an input over set-points; None where there is none."""
+    """Least distance from -1 at an input over set-points; None without a linearized loop."""
     try:
         found = [own.modulus for point in points for s, own in _margins_at(point) if s == signal]
-    except InputError:  # the prior's loop has no linearization there
+    except InputError:  # the prior's loop cannot be linearized there
         return None
     return min(found, default=None)
 
@@ -701,12 +714,12 @@ def _distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
 def limits(
     points: Sequence[SetPoint], trials: Sequence[Trial], given_way: Mapping[str, Mapping[str, float]]
 ) -> Promise:
-    """Whether every period has a plan within the hard bounds, from starts close to them.
+    """Row "limits": whether the controller finds a plan within the hard bounds in every period.
 
     Args:
         points: The set-points.
         trials: All trials.
-        given_way: Share of the periods in which each hard bound gave way, by task of the run's loops.
+        given_way: Share of the periods with a relaxed hard bound, by task of the run's loops and bound.
     """
     name, model = "limits", points[0].model
     results = [one.result for one in trials]
@@ -718,33 +731,33 @@ def limits(
         own = tried(point, plant, x0, point.problem.horizon).result
         results.append(own)
         if gave := sorted({way for period in own.given_way for way in period}):
-            found.append(f"from {label} the bound of {', '.join(gave)} gives way")
+            found.append(f"from {label} the bound of {', '.join(gave)} is relaxed")
     found += [
-        f"in task {task} the bound of {bound} gave way in {100 * share:.2g} % of the periods"
+        f"in task {task} the bound of {bound} was relaxed in {100 * share:.2g} % of the periods"
         for task, own in given_way.items()
         for bound, share in own.items()
     ]
     sources = [source for one in results for source in one.source]
     failed = sum(source != Source.MPC.name for source in sources)
     if failed:
-        found.append(f"{failed} of {len(sources)} solves failed, and the safeguard gave the input")
+        found.append(f"{failed} of {len(sources)} solves failed, so the safeguard computed the input")
     if found:
         return Promise(
             name, "doubted", "; ".join(found),
-            "Bounds further apart, a longer horizon, or a set at the end of the plan (HardBound(..., at_end=True)).",
+            "Widen the bounds, use a longer horizon, or a terminal set (HardBound(..., at_end=True)).",
         )  # fmt: skip
     ends = [bound for point in hard for bound in point.problem.hard if bound.at_end]
     if not hard:
         soft = any(_is_soft(point.problem) for point in points)
-        told = "bounds of states and outputs are soft" if soft else "only inputs are bounded"
+        told = "the bounds of states and outputs are soft" if soft else "only inputs are bounded"
         return Promise(
             name,
             "shown",
-            f"{told}: every period has a plan within the inputs' limits ({len(sources)} periods tried)",
+            f"{told}; every period has a plan within the inputs' limits ({len(sources)} periods tested)",
         )
-    told = f"no hard bound gives way from {len(starts)} starts within {100 * NEAR:.0f} % of one"
+    told = f"no hard bound is relaxed from {len(starts)} starts within {100 * NEAR:.0f} % of a bound"
     return Promise(
-        name, "shown", told + (", and the plan ends in a set" if ends else "; in simulation, no proof")
+        name, "shown", told + (", and the plan has a terminal set" if ends else " (simulation, not a proof)")
     )
 
 
@@ -754,7 +767,9 @@ def _is_soft(problem: OCP) -> bool:
 
 
 def starts_near(point: SetPoint) -> Sequence[tuple[str, Array]]:
-    """States close to each hard bound of a state, and of an output that shows a state alone; the others rest."""
+    """Starts close to each hard bound of a state, or of an output that depends on one state, with a text; all other
+    states are at the set-point.
+    """
     model, (x, u) = point.model, point.rest
     rows = output_with_jacobian(model)(x, u, point.w)[1].full()
     found: list[tuple[str, Array]] = []
@@ -784,75 +799,80 @@ def starts_near(point: SetPoint) -> Sequence[tuple[str, Array]]:
 
 
 def process_noise(kit: Kit) -> Promise:
-    """Whether the observer takes the states to stray less in a period than they moved in all recordings."""
+    """Row "process noise": whether it is at most the spread of the states in the recordings."""
     name, model = "process noise", kit.models[kit.recommended]
     sigma = kit.noise(f"{kit.recommended}_observer")
     if not model.state_spread:
         return Promise(
-            name, "not promised", "this kit does not hold the spread of the states", "Run the main job again."
+            name, "not promised", "this kit has no spread of the states", "Run the scenario again."
         )
     spread = np.array(model.state_spread)
     shares = np.where(spread > 0, sigma / np.where(spread > 0, spread, 1.0), 0.0)
     i = int(shares.argmax())
     signal = model.states[i]
     told = (
-        f"{signal.name} strays by {sigma[i]:.2g} {signal.unit} a period, {100 * shares[i]:.2g} % of its spread "
-        f"({spread[i]:.2g} {signal.unit})"
+        f"the largest is that of {signal.name}: {sigma[i]:.2g} {signal.unit} a period, {100 * shares[i]:.2g} % of its "
+        f"spread ({spread[i]:.2g} {signal.unit})"
     )
     if shares[i] <= 1.0:
         return Promise(name, "shown", told)
     return Promise(
         name, "doubted", told,
-        "The prior does not describe this state: correct it, or give Scenario(state_noise=...).",
+        "The prior does not describe this state. Correct the prior, or set Scenario(state_noise=...).",
     )  # fmt: skip
 
 
 def innovations(found: Tested | str) -> Promise:
-    """Whether innovations on test recordings are white enough, and as large as the observer assumes; or why unknown."""
+    """Row "innovations": whether they are nearly white, and as large as assumed, on test recordings; or why unknown."""
     name = "innovations"
     if isinstance(found, str):
         return Promise(name, "not promised", found, "Give longer test recordings.")
     told = (
-        f"largest correlation {found.correlation:.2g} (white: below {WHITE:g}), squared size {found.nis:.3g} of "
-        f"what the observer assumes, on {found.samples} samples"
+        f"largest autocorrelation {found.correlation:.2g} (at most {WHITE:g}), variance {found.nis:.3g} times the "
+        f"assumed one (from {1 / SURE:g} to {SURE:g}), on {found.samples} samples"
     )
     if found.correlation <= WHITE and 1.0 / SURE <= found.nis <= SURE:
         return Promise(name, "shown", told)
     return Promise(
         name, "doubted", told,
-        "The observer lacks something that the recordings have: a state, friction, a delay, or the sensor's noise "
-        "(sensor_sigma); section Estimation of the report shows it.",
+        "The observer's model lacks a state, friction or a delay, or the sensor noise (sensor_sigma) is wrong; see "
+        "section Estimation of the report.",
     )  # fmt: skip
 
 
 def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Promise:
-    """Whether the observer finds a constant load: by its quiet filter's gain, and in a loop on the model itself.
+    """Row "disturbance model": how fast the observer estimates a constant load, in a loop on the model itself.
 
     Args:
         points: The set-points.
-        trials: The first trial of each, on the right parameters.
+        trials: The first trial of each set-point, with the right parameters.
     """
     name, model = "disturbance model", points[0].model
-    remedy = "Less process noise (Scenario(state_noise=...)), or other disturbances (Scenario(disturbance_model=...))."
+    remedy = (
+        "Reduce the process noise (Scenario(state_noise=...)), or declare other disturbances "
+        "(Scenario(disturbance_model=...))."
+    )
     worst = (0.0, "")
     for point, one in zip(points, trials, strict=True):
         n, dt = point.problem.horizon, model.dt
         periods = periods_to_find(quiet(point.estimator), SEARCHED * n)
         dead = [_disturbance(model, j) for j, v in enumerate(periods) if not math.isfinite(v)]
         if dead:
-            told = f"the load at {dead[0]} is not found: the observer's gain on it is zero"
+            told = f"the load at {dead[0]} is not estimated: the observer's gain on it is zero"
             return Promise(name, "not promised", told, remedy)
         goal, d = loads(point, 0), one.result.d
-        # a load may be as small as the noise of its estimate: then a tenth of an ordinary one counts
+        # a load may be as small as the noise of its estimate: then allow a tenth of an ordinary load
         near = np.maximum(np.abs(goal) / 3.0, 0.1 * LOAD * disturbance_sizes(model, point.problem))
         late = int(np.flatnonzero(np.append(True, np.any(np.abs(d - goal) > near, axis=1)))[-1])
-        found = "two thirds of a load are found after" if late < len(d) else "a load is not found within"
+        found = (
+            "two thirds of a load are estimated after" if late < len(d) else "a load is not estimated within"
+        )
         told = (
-            f"in a loop on the model itself in {point.title} {found} {late * dt:.3g} s ({late / n:.2g} horizons); the "
+            f"{found} {late * dt:.3g} s ({late / n:.2g} horizons) in a loop on the model itself, {point.title}; the "
             f"quiet filter alone takes {float(periods.max()) * dt:.3g} s"
         )
         worst = max(worst, (late / n, told))
-    if worst[0] <= LASTS / CONSTANTS:  # then a twentieth is left at the end of a trial
+    if worst[0] <= LASTS / CONSTANTS:  # then exp(-CONSTANTS) = 5 % is left at the end of a trial
         return Promise(name, "shown", worst[1])
     return Promise(name, "doubted", worst[1], remedy)
 
@@ -866,16 +886,16 @@ def _disturbance(model: HybridModel, j: int) -> str:
 
 
 def tasks_end(ends: Sequence[TaskEnd], where: str) -> Promise:
-    """Whether the run's own loops of tasks that end at a set-point end there.
+    """Row "set-points of the tasks": whether the run's loops reach the set-points at the end of their tasks.
 
     Args:
-        ends: The tasks' ends.
-        where: What the loops ran on, in words.
+        ends: Deviations at the ends of the tasks.
+        where: Text that names the plant of the loops.
     """
     name = "set-points of the tasks"
     if not ends:
         return Promise(
-            name, "not promised", "no task of the run's loops ends at a set-point", "Add one, e.g. a step."
+            name, "not promised", "no task of the run's loops ends at a set-point", "Add a task, e.g. a step."
         )
     missed = [
         f"{one.task}: {deviation}" for one in ends for deviation in one.deviations if not deviation.kept
@@ -884,7 +904,7 @@ def tasks_end(ends: Sequence[TaskEnd], where: str) -> Promise:
         return Promise(name, "shown", f"{', '.join(one.task for one in ends)} end within the noise, {where}")
     return Promise(
         name, "doubted", f"{'; '.join(missed)}; {where}",
-        "Look at these loops in the report: friction, a limit, a slow observer, or a load without a disturbance model.",
+        "Look at these loops in the report. Causes: friction, a limit, a slow observer, a load without a disturbance.",
     )  # fmt: skip
 
 
@@ -895,19 +915,19 @@ def examine(
     ends: Sequence[TaskEnd] = (),
     where: str = "",
     given_way: Mapping[str, Mapping[str, float]] | None = None,
-    tested: Tested | str = "no test recording was looked at",
+    tested: Tested | str = "no test recording was examined",
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> tuple[Promise, ...]:
-    """All promises of a kit.
+    """Examine all promises of a kit.
 
     Args:
         kit: The kit.
         tasks: The scenario's tasks.
-        ends: How tasks end in the run's own loops.
-        where: What these ran on.
-        given_way: Share of their periods in which hard bounds gave way, by task.
-        tested: What innovations on recordings say, or why nothing.
-        report: Called with what is done, of how many, and what comes.
+        ends: Deviations at the ends of tasks in the run's loops. Default: none.
+        where: Text that names the plant of these loops.
+        given_way: Share of their periods with a relaxed hard bound, by task and bound. Default: none.
+        tested: Statistics of the innovations on recordings, or why there are none.
+        report: Called with ``(done, total, text)``. Default: no report.
 
     Raises:
         InputError: If the kit lacks a control problem or noise.
@@ -921,7 +941,7 @@ def examine(
     every: list[list[Trial]] = []
     for i, (point, length) in enumerate(zip(points, lengths, strict=True)):
         report(i, len(points), f"loops on wrong models, {point.title}")
-        # where the ranks lack nothing is promised: the loop on the right parameters tells how long steps take
+        # without full rank "no offset" is not promised: one loop suffices to measure the step time
         number = 1 if len(point.held) > point.model.n_u or ranks(point).why else draws
         trials = [trial(point, draw, length) for draw in range(number)]
         worst = max(range(number), key=lambda draw: trials[draw].worst.size)
@@ -945,11 +965,11 @@ def examine(
 
 
 def _of_prior(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
-    """Set-points of the fitted prior; none where it is what the kit recommends."""
+    """Set-points of the fitted prior; empty if the kit recommends the prior."""
     return [] if kit.recommended == "prior" else set_points(replace(kit, recommended="prior"), tasks)
 
 
 def _needed(longer: Trial) -> str:
-    """Whether a slow loop settles in a longer trial."""
+    """Text that says whether a slow loop settles in a longer trial."""
     seconds = len(longer.result.t) * longer.result.dt
     return f"in a loop of {seconds:.3g} s it {'does not settle either' if longer.why else 'settles'}"

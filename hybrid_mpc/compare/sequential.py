@@ -1,4 +1,4 @@
-"""Costs of two controllers on the same seeds, compared by an interval that holds although loops may stop early."""
+"""Comparison of the costs of two controllers on the same seeds, by an interval that holds with early stopping."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 
 LOOKS = 3
-"""How often costs are looked at, at most; each look takes a part of the 5 %, so more looks widen the last interval."""
+"""Largest number of interim analyses (looks). Each look spends a part of the 5 % error probability, so more looks widen
+the last interval."""
 FEWEST = 6
-"""Seeds before the first look. At the level of a first look of two, the interval of four seeds is 2.3 times as wide as
-that of six at 95 %: it would decide little, and still take its part of the 5 %."""
+"""Seeds before the first look. The interval of four seeds at the level of a first look is 2.3 times as wide as that of
+six seeds at 95 %: such a look would decide little, but spend its part of the 5 %."""
 LEVEL = 0.95
-"""Probability that no interval of any look misses the ratio."""
+"""Probability that the intervals of all looks contain the ratio."""
 MOST_LOG = 100.0
-"""Half width of an interval of logarithms beyond which it says nothing, and its ends are no numbers any more."""
+"""Largest half width of an interval of logarithms; a wider one says nothing, and its ends overflow."""
 SAME = 0.02
-"""Ratios within 2 % of 1 are taken for the same cost: more loops would not change what anybody does."""
+"""Ratios within 2 % of 1 count as the same cost: a smaller difference does not matter in practice."""
 
 
 def looks(most: int) -> tuple[int, ...]:
-    """Numbers of seeds after which costs are looked at: thirds of ``most``, none below six; the last is ``most``.
+    """Numbers of seeds at the looks: thirds of ``most``, at least six; the last is ``most``.
 
     Args:
         most: Largest number of seeds, at least 1, fixed before the first loop runs.
@@ -36,12 +37,12 @@ def looks(most: int) -> tuple[int, ...]:
 
 
 def level_at(n: int, most: int) -> float:
-    """Level of an interval at the look of ``n`` seeds, such that those of all looks hold together with 95 %.
+    """Level of the interval at the look of ``n`` seeds, such that the intervals of all looks together hold with 95 %.
 
     Look ``k`` of ``K`` has the level ``1 - 0.05 k / (1 + ... + K)``.
 
     Args:
-        n: Seeds that were run.
+        n: Number of seeds that have run.
         most: Largest number of seeds, fixed before the first loop.
 
     Example:
@@ -55,14 +56,14 @@ def level_at(n: int, most: int) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How one controller's cost compares with another's on the same seeds.
+    """Cost of one controller over that of another on the same seeds.
 
     Args:
-        ratio: Geometric mean of the ratios seed by seed; None where a cost is not finite or not positive.
-        low: Lower end of the interval of the ratio; None where there is none.
-        high: Its upper end.
+        ratio: Geometric mean of the ratios seed by seed; None if a cost is not finite or not positive.
+        low: Lower end of the interval of the ratio; None without an interval.
+        high: Upper end.
         n: Number of seeds.
-        reason: Why there is no ratio, or no interval. Default: there are both.
+        reason: Why ratio or interval is missing. Default: empty, both exist.
     """
 
     ratio: float | None
@@ -73,7 +74,7 @@ class Comparison:
 
     @property
     def finding(self) -> str:
-        """``"cheaper"``, ``"dearer"``, ``"the same"`` (surely within 2 %), or ``"undecided"``."""
+        """``"cheaper"``, ``"dearer"``, ``"the same"`` (interval within 2 % of 1), or ``"undecided"``."""
         if self.low is None or self.high is None:
             return "undecided"
         if self.low > 1.0 - SAME and self.high < 1.0 + SAME:
@@ -82,12 +83,12 @@ class Comparison:
 
     @property
     def decided(self) -> bool:
-        """Whether the interval tells the costs apart, or tells that they are the same."""
+        """Whether the interval shows that one cost is lower, or that the costs are the same."""
         return self.finding != "undecided"
 
     @property
     def words(self) -> str:
-        """The ratio with its interval, or why there is none.
+        """Text with the ratio and its interval, or why there is no interval.
 
         Example:
             >>> Comparison(0.5, 0.4, 0.625, 6).words
@@ -99,7 +100,7 @@ class Comparison:
 
 
 def hardest(comparisons: Mapping[str, Comparison]) -> str:
-    """The baseline that a controller does least well against: of the largest ratio. Those without one come last.
+    """The best baseline: that of the largest ratio of costs. Baselines without a ratio come last.
 
     Example:
         >>> hardest({"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": Comparison(0.8, 0.7, 0.9, 6)})
@@ -112,11 +113,11 @@ def hardest(comparisons: Mapping[str, Comparison]) -> str:
 def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> Comparison:
     """Compare costs with those of a base on the same seeds, at one of the looks.
 
-    The interval is Student's t of the logarithms of the ratios, at the level of its look (:func:`level_at`). So the
-    probability that an interval of any look misses the ratio is at most 5 % (the union bound), and loops may stop at
-    the look that decides; the rules of stopping do not matter. It assumes that the logarithms are normal and the seeds
-    independent. It is the level of one comparison: of twenty tasks that are alike one may be told apart. Later looks
-    get the larger part, so the last interval is little wider than that of a fixed number of seeds.
+    The interval is Student's t of the logarithms of the ratios, at the level of its look (:func:`level_at`). By the
+    union bound, the probability that any look's interval misses the ratio is at most 5 %, so loops may stop at any
+    look. This assumes normal logarithms and independent seeds. The level belongs to a single comparison: with equal
+    costs, one of twenty tasks may be decided wrongly. Later looks get a larger part of the 5 %, so the last interval is
+    only a little wider than that of a fixed number of seeds.
 
     Args:
         costs: ``(n,)``, one a seed.
@@ -124,7 +125,7 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
         most: Largest number of seeds, fixed before; ``n`` is one of ``looks(most)``.
 
     Raises:
-        ValueError: If the numbers of costs differ, or are of no look.
+        ValueError: If the numbers of costs differ, or are not a number of a look.
 
     Source:
         Group sequential tests with spent errors: Lan, DeMets, Discrete sequential boundaries for clinical trials,
@@ -140,11 +141,12 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
     x, y, n, every = np.asarray(costs, dtype=float), np.asarray(base, dtype=float), len(costs), looks(most)
     if x.shape != y.shape or n not in every:
         raise ValueError(
-            f"{n} costs and {len(base)} of the base; needed as many of each, one of {every} [HM-COMPARE-021]"
+            f"costs: got {n}, and {len(base)} of the base; give the same number of both, one of {every} "
+            "[HM-COMPARE-021]"
         )
     for values, of in ((x, "its own"), (y, "the baseline's")):
         if not np.all(np.isfinite(values)):
-            return Comparison(None, None, None, n, f"a loop diverged, {of}")
+            return Comparison(None, None, None, n, f"a loop diverged: {of}")
     if not (np.all(x > 0.0) and np.all(y > 0.0)):
         return Comparison(None, None, None, n, "a cost is not positive")
     logs = np.log(x) - np.log(y)
@@ -153,5 +155,5 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
         return Comparison(ratio, None, None, n, "one seed has no interval")
     half = float(student.ppf(0.5 + level_at(n, most) / 2, n - 1) * logs.std(ddof=1) / math.sqrt(n))
     if half > MOST_LOG:
-        return Comparison(ratio, None, None, n, "the ratios scatter too far for an interval")
+        return Comparison(ratio, None, None, n, "the ratios scatter too much for an interval")
     return Comparison(ratio, ratio * math.exp(-half), ratio * math.exp(half), n)

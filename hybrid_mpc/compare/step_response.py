@@ -1,4 +1,4 @@
-"""What a closed loop's answer to a set-point is like: rise, settling, overshoot, offset."""
+"""Step responses of closed loops: rise time, settling time, overshoot, offset."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 AT_REST = 0.2
-"""Share of a loop at its end over which a set-point must be held, and over which the offset is a mean. The set-point
-before a step must have been held for that share of the time after it."""
+"""Last share of a loop over which the set-point must be constant, and over which the offset is averaged. Before a step,
+the set-point must be constant for this share of the time after the step."""
 SETTLED = 0.05
 """Share of a step within which a signal has settled."""
 RISE = (0.1, 0.9)
-"""Shares of a step between which a signal rises, as python-control's ``step_info`` counts it."""
+"""Shares of a step between which the rise time is measured, as in python-control's ``step_info``."""
 CLEAR = 10.0
-"""Size of a step, in standard deviations of the signal at the end, from which it tells of a rise."""
+"""Smallest size of a step, in standard deviations of the signal at the end of the loop."""
 LARGEST = 0.5
-"""Share of the largest deviation behind it that a step must have: else a load moves the signal, not the set-point."""
+"""Smallest size of a step, as a share of the largest deviation after it: else a load moves the signal."""
 STILL = 1e-9
-"""Share of a reference's size by which rounding may move it."""
+"""Relative change of a reference that counts as rounding."""
 JUMP = 0.5
-"""Share of a step that the reference must make at once: one that came there slowly asks for no rise."""
+"""Smallest share of a step that the reference must make within one period; a slow ramp has no rise time."""
 
 
 @dataclass(frozen=True)
 class StepResponse:
-    """The answer of a signal to its last set-point.
+    """The response of a signal to its last set-point.
 
     Args:
-        offset: Mean deviation over the last fifth [the signal's unit].
-        rise: Time from 10 to 90 % of the step [s]; None where there is no clear step, or it is not reached.
-        settling: Time until it stays within 5 % of the step [s]; None likewise.
-        overshoot: By how much it goes beyond, in per cent of the step; None where there is no clear step.
+        offset: Mean deviation over the last fifth [unit of the signal].
+        rise: Rise time from 10 to 90 % of the step [s]; None without a clear step, or if 90 % is not reached.
+        settling: Time until the signal stays within 5 % of the step [s]; None likewise.
+        overshoot: Overshoot [% of the step]; None without a clear step.
     """
 
     offset: float
@@ -48,15 +48,14 @@ class StepResponse:
 
 
 def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> StepResponse | None:
-    """The answer to the last set-point; None where the reference moves until the end.
+    """The response to the last set-point; None if the reference moves until the end.
 
-    A step leads from one set-point that is held to another. A pulse that comes back, or the end of a moving reference,
-    asks for no rise: then there is the offset alone.
+    A step leads from one constant set-point to another. After a pulse or a moving reference, only the offset is given.
 
     Args:
-        t: Instants ``(n,)`` [s].
-        values: The signal ``(n,)``; NaN where it was not measured.
-        reference: Its reference ``(n,)``.
+        t: Times ``(n,)`` [s].
+        values: The signal ``(n,)``; NaN for missing samples.
+        reference: The reference ``(n,)``.
 
     Example:
         >>> t = np.linspace(0.0, 10.0, 1001)
@@ -87,7 +86,7 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
     if abs(size) <= least or jump < JUMP * abs(size) or not stood:
         return StepResponse(offset)
     answer = (y[begin:] - y[begin]) * np.sign(size)
-    if np.max(answer) < RISE[1] * abs(size):  # it never arrives
+    if np.max(answer) < RISE[1] * abs(size):  # the signal never reaches 90 % of the step
         return StepResponse(offset, overshoot=0.0)
     share, times = answer / abs(size), t[begin:] - t[begin]
     low, high = (int(np.argmax(share >= level)) for level in RISE)
@@ -102,13 +101,13 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
 
 
 def step_responses(problem: OCP, machine: Prior, loop: Mapping[str, Array]) -> dict[Signal, StepResponse]:
-    """Answers of all signals of a loop that the problem weighs and that end at a set-point.
+    """Responses of all weighted signals of a loop that end at a set-point.
 
-    Of a speed whose position has a moving reference the offset alone counts: its jumps belong to that motion.
+    For a speed whose position has a moving reference, only the offset is given.
 
     Args:
-        problem: The control problem: outputs where it weighs those, else states.
-        machine: Names the signals, and says which are speeds of which.
+        problem: The control problem; it weights outputs or states.
+        machine: Names the signals, and pairs speeds with positions.
         loop: Arrays :data:`~hybrid_mpc.compare.loops.DRAWN`.
 
     Example: ``step_responses(scenario.control, scenario.prior(), row.arrays)``
@@ -130,6 +129,6 @@ def step_responses(problem: OCP, machine: Prior, loop: Mapping[str, Array]) -> d
 
 
 def _moves(reference: Array) -> bool:
-    """Whether a reference ``(n,)`` changes over two periods in a row: a step changes over one."""
+    """Whether a reference ``(n,)`` changes in two successive periods; a step changes in one period only."""
     changes = np.abs(np.diff(reference)) > STILL * max(1.0, float(np.nanmax(np.abs(reference), initial=0.0)))
     return bool(np.any(changes[1:] & changes[:-1]))

@@ -1,4 +1,4 @@
-"""What a study is: the loops that it expands to, the things it draws, its YAML file, and the built-in studies."""
+"""Studies: settings, the loops that they expand to, random draws, the YAML file, and the built-in studies."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ from hybrid_mpc.rules import MOST_SEED, Duration, Label, Name, NameOrNone, Numbe
 from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
 
 LATE = "late"
-"""A target beside those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
+"""An additional target to those of :class:`~hybrid_mpc.loop.faults.Fault`: solves miss their deadline."""
 DEFAULT_CONTROLLERS = OBSERVERS
 MOST_DRAWS = 1_000_000
-"""Most seeds, and most draws, of a study: all of them are in memory."""
+"""Largest number of seeds, and of draws, of a study: all of them are in memory."""
 AXES = ("models", "tasks", "controllers", "solvers", "horizons", "monitors", "faults", "seeds")
 
 
 @dataclass(frozen=True)
 class FaultKind:
-    """One kind of fault and how large it gets.
+    """One kind of random fault with its range of sizes.
 
     Args:
         target: Target of a :class:`~hybrid_mpc.loop.faults.Fault`, or ``"late"``: solves miss their deadline.
         low: Smallest size.
-        high: Largest size; drawn uniformly between.
-        signed: Whether it takes either sign. Default: no.
-        ramp: Time [s] over which it grows. Default: at once.
-        length: Shortest and longest duration [s] of this kind, which then always ends. Default: the common one.
-        channel: Name of the output or input concerned. Default: the only one.
+        high: Largest size; the size is uniform between both.
+        signed: Whether the sign is random. Default: False.
+        ramp: Time [s] over which the fault grows. Default: 0.
+        length: Shortest and longest duration [s] of this kind, which then always ends. Default: that of all kinds.
+        channel: Name of the output or input. Default: the only one.
 
     Raises:
         InputError: If the target is unknown or a range is empty.
@@ -74,17 +74,17 @@ class FaultKind:
 
 @dataclass(frozen=True)
 class RandomFaults:
-    """Faults that a draw takes at random.
+    """Random faults of a draw.
 
     Args:
-        kinds: What can happen; mappings of :class:`FaultKind`'s fields are taken too.
-        at_once: Fewest and most kinds in one draw. Default: 1 to 3.
-        start: Earliest and latest instant [s] at which one begins. Default: 1.4 to 2.
-        length: Shortest and longest duration [s] of one that ends. Default: 0.2 to 2.
-        lasting: Share of those that never end. Default: a half.
+        kinds: Kinds of faults, also as mappings of :class:`FaultKind`'s fields.
+        at_once: Smallest and largest number of kinds in one draw. Default: 1 to 3.
+        start: Earliest and latest begin [s]. Default: 1.4 to 2.
+        length: Shortest and longest duration [s] of faults that end. Default: 0.2 to 2.
+        lasting: Share of faults that never end. Default: 0.5.
 
     Raises:
-        InputError: If there is no kind, more are asked for than there are, or a range is empty.
+        InputError: If there is no kind, ``at_once`` exceeds the number of kinds, or a range is empty.
 
     Example:
         >>> some = RandomFaults([{"target": "input_gain", "low": 0.7, "high": 0.9}], at_once=(1, 1))
@@ -111,15 +111,16 @@ class RandomFaults:
         object.__setattr__(self, "at_once", (fewest, most))
         if most < 1 or most > len(kinds):
             raise InputError(
-                f"random_faults: at_once goes up to {most}; there are {len(kinds)} kinds [HM-COMPARE-022]"
+                f"random_faults: at_once ends at {most}; give from 1 to the number of kinds, {len(kinds)} "
+                "[HM-COMPARE-022]"
             )
         if not 0.0 <= self.lasting <= 1.0:
             raise InputError(
-                f"random_faults: lasting is a share from 0 to 1, got {self.lasting} [HM-COMPARE-023]"
+                f"random_faults: lasting must be a share from 0 to 1, got {self.lasting} [HM-COMPARE-023]"
             )
 
     def drawn(self, rng: np.random.Generator) -> tuple[tuple[Fault, ...], Intervals]:
-        """Faults, and the intervals [s] in which solves are late."""
+        """Random faults, and the intervals [s] in which solves miss their deadline."""
         n = int(rng.integers(self.at_once[0], self.at_once[1] + 1))
         faults, late = [], []
         for i in rng.choice(len(self.kinds), size=n, replace=False).tolist():
@@ -137,7 +138,7 @@ class RandomFaults:
         return tuple(faults), tuple(late)
 
     def examples(self) -> tuple[Fault, ...]:
-        """The largest fault of each kind, to be checked against a plant."""
+        """The largest fault of each kind, to check whether the plant supports it."""
         found = []
         for kind in self.kinds:
             assert isinstance(kind, FaultKind)
@@ -147,7 +148,7 @@ class RandomFaults:
 
 
 def generator(seed: int, draw: int, what: str) -> np.random.Generator:
-    """Random numbers of one thing in one draw, whatever else is drawn."""
+    """Random number generator for one item ``what`` of one draw, independent of all other items."""
     key = hashlib.sha256(f"{seed}/{draw}/{what}".encode()).digest()
     return np.random.default_rng(int.from_bytes(key[:16], "big"))
 
@@ -162,16 +163,16 @@ def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tu
 def _span(
     values: Sequence[float], what: str, *, least: float = -math.inf, above: float = -math.inf
 ) -> tuple[float, float]:
-    """Two numbers in order, or InputError."""
+    """Two numbers in ascending order; InputError otherwise."""
     try:
         low, high = (float(v) for v in values)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what}: two numbers are needed, got {values!r} [HM-COMPARE-024]") from error
+        raise InputError(f"{what}: give two numbers, got {values!r} [HM-COMPARE-024]") from error
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and low >= least and low > above):
         bounds = f" of {least:g} or more" if math.isfinite(least) else ""
         bounds = f" above {above:g}" if math.isfinite(above) else bounds
         raise InputError(
-            f"{what}: [{low:g}, {high:g}] is no range; needed are two finite numbers{bounds}, the smaller one first"
+            f"{what}: [{low:g}, {high:g}] is not a range; give two finite numbers{bounds}, the smaller one first"
             " [HM-COMPARE-025]"
         )
     return low, high
@@ -194,19 +195,19 @@ class Study:
         monitors: Names in :data:`~hybrid_mpc.compare.loops.MONITORS`. Default: ``"own"``, without thresholds.
         faults: Sets of faults, each one text (``"plant_friction=2@1.5 + input_gain=0.8"``; ``"none"``), a
             :class:`~hybrid_mpc.loop.faults.Fault` or a sequence of either. Default: one empty set.
-        vary: Parameters of the plant, and by what share each is varied at most in either direction. Default: none.
-        random_faults: Faults that a draw takes at random. Default: none.
-        draws: How many times the random things are drawn; all controllers meet the same draws. Default: 1.
-        seeds: Numbers of the loops, or how many. Default: 10.
-        seed: Seed of the draws.
+        vary: Parameters of the plant, and the largest relative variation of each. Default: none.
+        random_faults: Random faults of a draw. Default: none.
+        draws: Number of random draws; all controllers get the same draws. Default: 1.
+        seeds: Seeds of the loops, or their number. Default: 10.
+        seed: Seed of the draws. Default: 0.
         duration: Longest duration of a loop [s]. Default: the task's own.
-        guard: What an alarm does, in :data:`~hybrid_mpc.compare.loops.GUARDS`; it needs monitors that alarm, and
-            hybrids. Default: nothing.
-        run_seed: Times 1000 it is added to the numbers of the loops, as in the main job. Default: 0.
-        name: For tables and the report.
+        guard: Reaction to an alarm, in :data:`~hybrid_mpc.compare.loops.GUARDS`; it needs monitors that alarm, and
+            hybrids. Default: none.
+        run_seed: Seed of the run; 1000 times it is added to the seeds of the loops, as in a run. Default: 0.
+        name: Name in tables and the report. Default: study.
 
     Raises:
-        InputError: If a name is unknown (with the nearest one), a number is impossible, or a combination is.
+        InputError: If a name is unknown (the message names the nearest one), or a number or combination is invalid.
 
     Example:
         >>> study = Study("golf_robot", "runs/golf/model", tasks=["track"], vary={"m": 0.2}, draws=3, seeds=2)
@@ -242,9 +243,9 @@ hybrid, hybrid_observer, oracle, oracle_state
         for name in AXES:
             values = getattr(self, name)
             if not values and name != "tasks":
-                raise InputError(f"study: {name} is empty; leave it out for the default [HM-COMPARE-026]")
+                raise InputError(f"study: {name} is empty; omit it to use the default [HM-COMPARE-026]")
             if len(set(values)) != len(values):
-                raise InputError(f"study: {name} lists something twice: {values} [HM-COMPARE-027]")
+                raise InputError(f"study: {name} has a duplicate: {values}. Remove it [HM-COMPARE-027]")
         for what, table in (("controllers", CONTROLLERS), ("solvers", SOLVERS), ("monitors", MONITORS)):
             for word in getattr(self, what):
                 known(word, table, what[:-1])
@@ -265,12 +266,12 @@ hybrid, hybrid_observer, oracle, oracle_state
 
     @property
     def spans(self) -> tuple[tuple[str, float], ...]:
-        """Varied parameters with their shares."""
+        """Varied parameters with their largest relative variation."""
         return cast("tuple[tuple[str, float], ...]", self.vary)
 
     @property
     def loop_seeds(self) -> tuple[int, ...]:
-        """Numbers of the loops."""
+        """Seeds of the loops."""
         return cast("tuple[int, ...]", self.seeds)
 
     @property
@@ -280,7 +281,7 @@ hybrid, hybrid_observer, oracle, oracle_state
 
     @property
     def axes(self) -> dict[str, int]:
-        """How many of each thing there are; their product is the number of runs."""
+        """Number of levels of each axis; their product is the number of runs."""
         lengths = {name: len(getattr(self, name)) for name in AXES}
         tasks = len(selected_tasks(ready(load_scenario(self.scenario)), self.tasks))
         return {**lengths, "tasks": tasks, "draws": self.draws}
@@ -291,7 +292,7 @@ hybrid, hybrid_observer, oracle, oracle_state
         return math.prod(self.axes.values())
 
     def runs(self) -> Iterator[LoopSpec]:
-        """The runs, one by one, those of a controller next to each other."""
+        """The runs, ordered by controller."""
         tasks = [t.name for t in selected_tasks(ready(load_scenario(self.scenario)), self.tasks)]
         drawn = [self._drawn(i) for i in range(self.draws)]
         outer = product(
@@ -322,7 +323,7 @@ hybrid, hybrid_observer, oracle, oracle_state
                     )
 
     def identity(self) -> dict[str, Any]:
-        """The study as plain data, without where its models lie."""
+        """The study as plain data, without the folders of its models."""
         whole: dict[str, Any] = plain(asdict(self))
         return {**whole, "models": list(self.folders)}
 
@@ -345,59 +346,59 @@ hybrid, hybrid_observer, oracle, oracle_state
                 whole = isinstance(number, int) and not isinstance(number, bool)
                 if not whole or not least <= number <= most:  # type: ignore[operator]
                     raise InputError(
-                        f"study: {name}: whole numbers from {least} to {most} are needed, got {str(number)[:40]}"
+                        f"study: {name}: give whole numbers from {least} to {most}, got {str(number)[:40]}"
                         " [HM-COMPARE-028]"
                     )
         for name, span in self.spans:
             if not (isinstance(span, int | float) and 0.0 < span < 1.0):
                 raise InputError(
-                    f"study: vary {name}: a share between 0 and 1 is needed, got {span!r} [HM-COMPARE-029]"
+                    f"study: vary {name}: give a share between 0 and 1, got {span!r} [HM-COMPARE-029]"
                 )
 
     def _check_combinations(self) -> None:
         oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and set(self.solvers) != {"rti"}:
             raise InputError(
-                f"study: {oracles[0]} has a solver of its own (several starts); leave it or solvers out"
+                f"study: controller {oracles[0]} has a solver of its own (several starts). Remove it, or solvers"
                 " [HM-COMPARE-030]"
             )
         if oracles and self.vary:
             raise InputError(
-                f"study: {oracles[0]} knows the machine as it is built, not as it is drawn; leave it or vary out"
+                f"study: controller {oracles[0]} knows the nominal plant, not the varied one. Remove it, or vary"
                 " [HM-COMPARE-031]"
             )
         if self.draws > 1 and not self.vary and self.random_faults is None:
             raise InputError(
-                f"study: {self.draws} draws, and nothing that is drawn: give vary or random_faults, or use seeds"
+                f"study: draws = {self.draws}, but nothing is random. Give vary or random_faults, or use seeds"
                 " [HM-COMPARE-032]"
             )
         others = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
         alarming = [name for name in self.monitors if name in ALARMING]
         if self.guard and others:
             raise InputError(
-                f"the guard watches with the hybrid, controller {others[0]} has another model; with a guard give the "
-                "controllers hybrid_observer or hybrid alone [HM-COMPARE-033]"
+                f"study: the guard needs a hybrid, but controller {others[0]} has another model. With a guard, use "
+                "only the controllers hybrid_observer or hybrid [HM-COMPARE-033]"
             )
         if self.guard and len(alarming) < len(self.monitors):
             raise InputError(
-                f"study: a guard acts on alarms; give monitors {' or '.join(ALARMING)} [HM-COMPARE-034]"
+                f"study: a guard reacts to alarms; use only monitors {' or '.join(ALARMING)} [HM-COMPARE-034]"
             )
         if alarming and others:
             raise InputError(
-                f"study: monitor {alarming[0]} is calibrated for the hybrid, {others[0]} has none; take monitor own, "
-                "or controllers with a hybrid [HM-COMPARE-035]"
+                f"study: monitor {alarming[0]} has limits of the hybrid, but controller {others[0]} has no hybrid. Use "
+                "monitor own, or controllers with a hybrid [HM-COMPARE-035]"
             )
 
 
 def _normal(s: Study) -> dict[str, Any]:
-    """The fields that may be given in several forms, as tuples."""
+    """Fields that have several input forms, as tuples."""
     models = {"model": s.models} if isinstance(s.models, str | Path) else s.models
     try:
         pairs = tuple((str(k), str(v)) for k, v in _items(models))
         vary = tuple((str(k), v) for k, v in _items(s.vary))
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"study: models and vary are mappings (name: value); {error} [HM-COMPARE-036]"
+            f"study: models and vary must be mappings (name: value); {error} [HM-COMPARE-036]"
         ) from error
     drawn = s.random_faults
     if isinstance(drawn, Mapping):
@@ -409,7 +410,8 @@ def _normal(s: Study) -> dict[str, Any]:
     if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
         if not 1 <= s.seeds <= MOST_DRAWS:
             raise InputError(
-                f"study: seeds: their number must be from 1 to {MOST_DRAWS}, got {str(s.seeds)[:40]} [HM-COMPARE-037]"
+                f"study: seeds: give a number from 1 to {MOST_DRAWS}, or a list, got {str(s.seeds)[:40]} "
+                "[HM-COMPARE-037]"
             )
         seeds: tuple[Any, ...] = tuple(range(s.seeds))
     else:
@@ -424,7 +426,7 @@ def _items(value: Any) -> Any:
 
 def _listed(value: Any, name: str) -> tuple[Any, ...]:
     if isinstance(value, str | Fault) or value is None or not isinstance(value, Sequence):
-        raise InputError(f"study: {name} is a list, got {value!r}; write [{value!r}] [HM-COMPARE-038]")
+        raise InputError(f"study: {name} must be a list, got {value!r}; write [{value!r}] [HM-COMPARE-038]")
     return tuple(value)
 
 
@@ -435,23 +437,25 @@ def _fault_set(entry: Any) -> tuple[Fault, ...]:
         words = [word.strip() for word in entry.split(" + ")]
         return () if words in (["none"], [""]) else tuple(parsed_fault(word) for word in words)
     if not isinstance(entry, Sequence):
-        raise InputError(f"study: faults are texts, lists of texts, or Fault; got {entry!r} [HM-COMPARE-039]")
+        raise InputError(
+            f"study: faults must be texts, lists of texts, or Fault; got {entry!r} [HM-COMPARE-039]"
+        )
     return tuple(fault for part in entry for fault in _fault_set(part))
 
 
 MOST_YAML = 2**16
-"""Largest study [bytes] that is read."""
+"""Largest YAML file of a study [bytes]."""
 
 
 def read_study(path: str | Path, **instead: Any) -> Study:
-    """The study that a YAML file describes: its keys are the fields of :class:`Study`.
+    """Read a study from a YAML file, whose keys are the fields of :class:`Study`.
 
-    Folders of models are meant from the folder of the YAML file; the name is that of the file if it gives none. A
-    settings file runs nothing: its scenario must be registered; a ``.py`` file is given as ``instead["scenario"]``.
+    Folders of models are relative to the folder of the YAML file. The default name is that of the file. A study file
+    executes no code: its scenario must be registered; give a ``.py`` file as ``instead["scenario"]``.
 
     Raises:
-        InputError: If the file is missing or no YAML, its scenario is not registered, a key is unknown (with the
-            nearest valid one), or the study is not valid.
+        InputError: If the file is missing or not YAML, its scenario is not registered, a key is unknown (the message
+            names the nearest one), or the study is invalid.
     """
     path = Path(path)
     keys = _mapping(path)
@@ -465,7 +469,7 @@ def read_study(path: str | Path, **instead: Any) -> Study:
         scenario_of(keys["scenario"], path)
     if "models" not in keys:
         raise InputError(
-            f"{path}: no models; add 'models: {{label: FOLDER}}', or give --model FOLDER [HM-COMPARE-040]"
+            f"{path}: no models; write 'models: {{label: FOLDER}}', or give --model FOLDER [HM-COMPARE-040]"
         )
     study = record(Study, keys, str(path))
     return study if "name" in keys else replace(study, name=path.stem)
@@ -481,21 +485,21 @@ def _mapping(path: Path) -> dict[str, Any]:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{path} is no YAML: {' '.join(str(error).split())[:300]} [HM-COMPARE-041]"
+            f"{path}: not valid YAML: {' '.join(str(error).split())[:300]} [HM-COMPARE-041]"
         ) from error
     if not isinstance(found, dict):
         raise InputError(
-            f"{path}: a mapping of keys to values is needed, got {type(found).__name__} [HM-COMPARE-042]"
+            f"{path}: must be a mapping of keys to values, got {type(found).__name__} [HM-COMPARE-042]"
         )
     return {str(key): value for key, value in found.items()}
 
 
 @cache
 def _loader() -> Any:
-    """A YAML loader of plain data: texts, numbers, true, false, null, lists and mappings with each key once.
+    """A YAML loader of plain data: texts, numbers, true, false, null, lists and mappings without duplicate keys.
 
-    It reads YAML 1.2's core schema: PyYAML's 1.1 makes of ``on`` a flag and of ``1:30`` a number. Anchors and aliases,
-    with which a small file becomes a huge one, are refused.
+    It reads the core schema of YAML 1.2; PyYAML's YAML 1.1 would turn ``on`` into a flag and ``1:30`` into a number.
+    Anchors and aliases are refused, because they can expand a small file to a huge one.
     """
     import yaml
 
@@ -505,7 +509,7 @@ def _loader() -> Any:
         def compose_node(self, parent: Any, index: Any) -> Any:
             event = self.peek_event()
             if getattr(event, "anchor", None) is not None:
-                why = "anchors (&) and aliases (*) are not read; write the value out"
+                why = "anchors (&) and aliases (*) are not supported; write the value itself"
                 raise yaml.composer.ComposerError(None, None, why, event.start_mark)
             return super().compose_node(parent, index)
 
@@ -514,7 +518,7 @@ def _loader() -> Any:
             if len(set(keys)) < len(keys):
                 twice = next(key for key in keys if keys.count(key) > 1)
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"{twice!r} stands twice", node.start_mark
+                    None, None, f"duplicate key {twice!r}", node.start_mark
                 )
             return super().construct_mapping(node, deep)
 
@@ -530,11 +534,11 @@ _PLAIN = (
     ("float", r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
      "-+.0123456789"),
 )  # fmt: skip
-"""Kinds of plain words of YAML 1.2's core schema, with the letters that they begin with."""
+"""Plain scalars of the core schema of YAML 1.2: type, pattern, first characters."""
 
 
 def built_in_studies() -> dict[str, Path]:
-    """Files of the studies that registered scenarios bring, by name; the first line of each says what it is about."""
+    """Files of the studies of registered scenarios, by name; the first line of each file describes it."""
     found: dict[str, Path] = {}
     for place in registered_scenarios().values():
         module = find_spec(place.partition(":")[0])
@@ -544,6 +548,6 @@ def built_in_studies() -> dict[str, Path]:
 
 
 def built_in_study(name: str, models: str | Path | Mapping[str, str | Path]) -> Study:
-    """The built-in study of that name with these models."""
+    """The built-in study ``name`` with these models."""
     files = built_in_studies()
     return read_study(files[known(name, files, "built-in study")], models=models)

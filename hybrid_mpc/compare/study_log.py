@@ -1,6 +1,6 @@
-"""What a study's folder holds: a note of what it is made of, the rows of its runs, and the table of all of them.
+"""Files in the folder of a study: a note with its settings, the log with the rows of its runs, and the final table.
 
-Rows are appended as runs end, and are whole after a kill at any moment; the table is one Parquet file.
+Rows are appended when runs end, and survive a kill at any time; the table is one Parquet file.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
 NOUN = "study"
 SCHEMA_VERSION = 2
 RUNS = "runs"
-"""Folder of the log in that of its study."""
+"""Folder of the log within the study's folder."""
 RESULTS = "results.parquet"
 METADATA = b"hybrid_mpc.study"
 STATUS = ("done", "failed")
 MOST_LINE = 2**24
-"""Largest row [bytes]: a run's figures, or the traceback of one that failed."""
+"""Largest row [bytes]: figures of a run, or traceback of a failed run."""
 SEGMENT_ROWS = 10_000
-"""Rows of one file: a study of a million runs has a hundred of them."""
+"""Rows of one file of the log; a study of a million runs has a hundred files."""
 GROUP_ROWS = 20_000
-"""Rows that are in memory at a time."""
+"""Largest number of rows in memory."""
 
 
 @dataclass(frozen=True)
 class NoiseNote:
-    """Process noise of a model's filters: where it is from, and standard deviations per period by controller."""
+    """Process noise of a model's filters: its source, and standard deviations per period by controller."""
 
     source: str
     sigma_x: Mapping[str, tuple[float, ...]]
@@ -50,7 +50,7 @@ class NoiseNote:
 
 @dataclass(frozen=True)
 class ModelNote:
-    """A model of a study: hash of its folder, what it says of itself, and what its filters assume."""
+    """A model of a study: hash of its folder, provenance, and process noise of its filters."""
 
     sha256: str
     provenance: Mapping[str, Any]
@@ -59,7 +59,7 @@ class ModelNote:
 
 @dataclass(frozen=True)
 class StudyNote:
-    """What a study is made of; ``study`` is its settings as plain data, ``engine`` is empty until it is finished."""
+    """Note of a study: ``study`` are its settings as plain data; ``engine`` is empty until the study is finished."""
 
     study: Mapping[str, Any]
     title: str
@@ -75,14 +75,14 @@ class StudyNote:
 
 
 def study_note(folder: Path) -> StudyNote:
-    """What a study's folder says of itself.
+    """Read the note in a study's folder.
 
     Raises:
-        InputError: If it is no folder of a study, damaged, or of another version.
+        InputError: If the folder belongs to no study, or the note is damaged or of another version.
     """
     if not (folder / f"{NOUN}.json").is_file():
         raise InputError(
-            f"{folder} holds no study; give the folder that 'study run --out' made [HM-COMPARE-043]"
+            f"{folder}: no study in this folder; give the folder of 'study run --out' [HM-COMPARE-043]"
         )
     note = read_note(folder, NOUN)
     del note["settings"]
@@ -90,19 +90,19 @@ def study_note(folder: Path) -> StudyNote:
 
 
 def note_of(data: Mapping[str, Any], where: str) -> StudyNote:
-    """A note from plain data; InputError if it is of another version, or a field does not fit."""
+    """A note from plain data; InputError for another version or an invalid field."""
     if data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(
-            f"{where}: a study of schema version {str(data.get('schema_version'))[:20]}, this version of hybrid-mpc "
-            f"reads {SCHEMA_VERSION}; run it anew [HM-COMPARE-044]"
+            f"{where}: schema version {str(data.get('schema_version'))[:20]}, but this version of hybrid-mpc reads "
+            f"{SCHEMA_VERSION}. Run the study again [HM-COMPARE-044]"
         )
     return record(StudyNote, data, where)
 
 
 @dataclass(frozen=True)
 class RunRow:
-    """The row of a run: what it was and what it found (``columns``), ``"done"`` or ``"failed"``, and then its
-    traceback.
+    """The row of a run: settings and results (``columns``), ``status`` (``"done"`` or ``"failed"``), and the traceback
+    of a failed run.
     """
 
     id: str
@@ -116,10 +116,10 @@ class RunRow:
 
 
 class RunLog:
-    """Append-only JSON lines in a few numbered files, one row a finished run.
+    """Append-only log of JSON lines in numbered files, one row for each finished run.
 
-    What :meth:`append` has returned from is on the disk. A line that a kill tore apart is cut off when the log is
-    opened again: its run counts as not finished. One process at a time may hold the log.
+    After :meth:`append` has returned, its rows are on the disk. An incomplete last line (after a kill) is removed when
+    the log is opened again; its run counts as not finished. Only one process at a time may open the log.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -138,12 +138,12 @@ class RunLog:
         self.close()
 
     def close(self) -> None:
-        """Let go of the files; the log may be opened again."""
+        """Close the files; the log may be opened again."""
         os.close(self._file)
         self._held.close()
 
     def append(self, new: Iterable[RunRow]) -> None:
-        """Add rows; on return they are on the disk. On a full disk what was there before is unharmed."""
+        """Add rows; on return they are on the disk. On a full disk, earlier rows are kept."""
         lines = [json.dumps(plain(row.plain()), separators=(",", ":")) + "\n" for row in new]
         if not lines:
             return
@@ -158,16 +158,16 @@ class RunLog:
                 left = left[os.write(self._file, left) :]
             os.fsync(self._file)
         except OSError as error:
-            os.ftruncate(self._file, end)  # needs no room
+            os.ftruncate(self._file, end)  # possible on a full disk
             raise InputError(
-                f"{self._folder}: cannot write ({error.strerror}); the runs that were finished before are kept. Make "
-                "room, then the same command with --resume goes on [HM-COMPARE-045]"
+                f"{self._folder}: cannot write ({error.strerror}). Finished runs are kept. Free disk space, then "
+                "continue with the same command and --resume [HM-COMPARE-045]"
             ) from error
         self._rows += len(lines)
 
     def _open(self) -> int:
         path = self._folder / f"{self._number:06}.jsonl"
-        binary = getattr(os, "O_BINARY", 0)  # on Windows: line ends as they are written
+        binary = getattr(os, "O_BINARY", 0)  # Windows only: do not translate line ends
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | binary, 0o644)
 
 
@@ -177,10 +177,10 @@ def segments(folder: Path) -> list[Path]:
 
 
 def rows(folder: Path) -> Iterator[RunRow]:
-    """Rows of a log, in the order in which they were written; a torn last line is left out.
+    """Rows of a log in the order of writing, without an incomplete last line.
 
     Raises:
-        InputError: If a line within is damaged.
+        InputError: If another line is damaged.
     """
     for path in segments(folder):
         with path.open("rb") as file:
@@ -196,10 +196,10 @@ def _parsed(line: bytes, path: Path, number: int) -> RunRow:
             raise ValueError(f"longer than {MOST_LINE} bytes [HM-COMPARE-046]")
         row = parse_json(line)
         if not (isinstance(row, dict) and isinstance(row.get("id"), str) and row.get("status") in STATUS):
-            raise ValueError("no row of a run: id and status are needed [HM-COMPARE-047]")
+            raise ValueError("not the row of a run: id or status is missing [HM-COMPARE-047]")
     except ValueError as error:
         raise InputError(
-            f"{path}:{number} is damaged ({error}); delete this line, and --resume runs its run again [HM-COMPARE-048]"
+            f"{path}:{number}: damaged ({error}). Delete this line; then --resume repeats its run [HM-COMPARE-048]"
         ) from error
     name, status, why = (row.pop(key, "") for key in ("id", "status", "error"))
     columns = {key: NUMBERS.get(v, v) if isinstance(v, str) else v for key, v in row.items()}
@@ -207,7 +207,7 @@ def _parsed(line: bytes, path: Path, number: int) -> RunRow:
 
 
 def _repaired(path: Path) -> int:
-    """Rows of a file, after a torn line at its end was cut off."""
+    """Number of rows of a file, after removing an incomplete last line."""
     count = whole = 0
     with path.open("rb") as file:
         for line in file:
@@ -220,7 +220,7 @@ def _repaired(path: Path) -> int:
 
 @named_extra("a study")
 def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
-    """Write the rows of a log as Parquet: all of it or nothing. Of several rows of a run the last counts."""
+    """Write the rows of a log as one Parquet file, whole or not at all; of several rows of a run, the last one."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -245,7 +245,7 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
 
 @named_extra("a study")
 def intact(path: Path) -> bool:
-    """Whether a Parquet file is there and can be read to its end."""
+    """Whether a Parquet file exists and can be read to its end."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -262,24 +262,28 @@ def intact(path: Path) -> bool:
 
 @named_extra("a study")
 def provenance_of(path: Path) -> dict[str, Any]:
-    """What a Parquet file of a study says of itself; InputError if it is no such file."""
+    """The note in a Parquet file of a study; InputError for any other file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         metadata = pq.read_schema(path).metadata or {}
     except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path} is missing or damaged: {error} [HM-COMPARE-049]") from error
+        raise InputError(
+            f"{path}: missing or damaged: {error}. Delete the file; then --resume writes it again [HM-COMPARE-049]"
+        ) from error
     if METADATA not in metadata:
-        raise InputError(f"{path} is no table of a study [HM-COMPARE-050]")
+        raise InputError(f"{path}: not the table of a study; give a file of 'study run' [HM-COMPARE-050]")
     try:
         return dict(parse_json(metadata[METADATA]))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged: {error} [HM-COMPARE-059]") from error
+        raise InputError(
+            f"{path}: damaged: {error}. Delete the file; then --resume writes it again [HM-COMPARE-059]"
+        ) from error
 
 
 def _column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:
-    """Type of a column whose values are of these kinds, and what makes them of it."""
+    """Arrow type of a column with values of these Python types, and the conversion of its values."""
     import pyarrow as pa
 
     if found == {bool}:

@@ -1,4 +1,4 @@
-"""Results of a study: a table with one row a run, means with intervals, paired differences, and the report."""
+"""Results of a study: a table with one row for each run, means with intervals, paired differences, and the report."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ PAIR = ("draw", "seed")
 
 @dataclass(frozen=True, eq=False)
 class StudyResults:
-    """A study's runs.
+    """Results of a study.
 
     Args:
-        table: One row a run: ``id``, the configuration, ``status``, ``error``, results, ``timing_...``.
-        note: What the study is made of: configuration, digests of the models, versions.
-        folder: Where it lies.
+        table: One row for each run: ``id``, configuration, ``status``, ``error``, results, ``timing_...``.
+        note: Configuration of the study, digests of the models, versions.
+        folder: Folder of the study.
 
     Example:
         >>> import pandas as pd
@@ -60,10 +60,10 @@ class StudyResults:
 
     @classmethod
     def load(cls, folder: str | Path) -> StudyResults:
-        """Results of a study's folder; of one that has not ended, what there is.
+        """Read the results of a study's folder; of an unfinished study the finished runs.
 
         Raises:
-            InputError: If it is no folder of a study, or damaged.
+            InputError: If the folder belongs to no study, or is damaged.
         """
         import pyarrow.parquet as pq
 
@@ -80,12 +80,12 @@ class StudyResults:
 
     @property
     def failed(self) -> pd.DataFrame:
-        """Runs that raised, or whose workers died: with the traceback in ``error``."""
+        """Failed runs (exception, or worker died), with the traceback in ``error``."""
         return self.table[self.table["status"] == "failed"] if len(self.table) else self.table
 
     @property
     def missing(self) -> int:
-        """Runs that have not run yet."""
+        """Number of runs that are not finished."""
         return max(0, self.note.runs - len(self.table))
 
     @property
@@ -95,7 +95,7 @@ class StudyResults:
 
     @property
     def figures(self) -> list[str]:
-        """Columns that are results and numbers."""
+        """Numeric columns with results."""
         others = {*FACTORS, *PAIR, "id", "run", "hidden_units"}
         names = self.table.select_dtypes("number").columns
         return [c for c in names if c not in others and not c.startswith("factor_")]
@@ -103,19 +103,19 @@ class StudyResults:
     def summary(self, value: str = "cost", by: Sequence[str] | None = None) -> pd.DataFrame:
         """Mean of a figure with its 95 % interval (Student's t).
 
-        A unit of the statistics is a draw where there are several (its seeds are averaged first: they share the
-        machine), else a seed.
+        With several draws, a statistical unit is a draw (its seeds are averaged first, since they share the plant);
+        else a seed.
 
         Args:
-            value: Column of a figure.
-            by: Columns to group by. Default: what differs between the runs.
+            value: Column of a figure. Default: cost.
+            by: Columns to group by. Default: those that differ between the runs.
 
         Returns:
-            ``by``, ``n`` units, ``mean``, ``low``, ``high`` (NaN for one unit), and ``left_out``: runs that failed or
-            whose figure is not finite.
+            ``by``, ``n`` units, ``mean``, ``low``, ``high`` (NaN for one unit), and ``left_out``: number of failed runs
+            and of runs without a finite figure.
 
         Raises:
-            InputError: If there is no such column.
+            InputError: If the column is unknown.
         """
         table, by = self._checked(value), self.factors if by is None else list(by)
         found = []
@@ -133,21 +133,21 @@ class StudyResults:
         base: object = None,
         by: Sequence[str] | None = None,
     ) -> pd.DataFrame:
-        """Differences to a base on common draws and seeds, with their 95 % intervals.
+        """Paired differences to a base on common draws and seeds, with their 95 % intervals.
 
         Args:
-            value: Column of a figure.
-            over: Column whose levels are compared.
+            value: Column of a figure. Default: cost.
+            over: Column whose levels are compared. Default: controller.
             base: Level that the others are compared with. Default: the first.
-            by: Columns to group by. Default: what else differs between the runs.
+            by: Columns to group by. Default: the other columns that differ between the runs.
 
         Returns:
-            ``by``, ``over``, ``n`` pairs (of draws, where there are several), ``base`` (its mean), ``difference``,
+            ``by``, ``over``, ``n`` pairs (of draws if there are several), ``base`` (its mean), ``difference``,
             ``low``, ``high``, ``relative`` (difference over the base's mean), ``ratio`` (geometric mean of the pairs'
-            ratios; NaN where a value is not positive) and ``better`` (share of pairs with a negative difference).
+            ratios; NaN if a value is not positive) and ``better`` (share of pairs with a negative difference).
 
         Raises:
-            InputError: If there is no such column or level.
+            InputError: If the column or level is unknown.
         """
         table = self._checked(value)
         known(over, table.columns, "column")
@@ -155,7 +155,7 @@ class StudyResults:
         base = levels[0] if base is None else base
         if base not in levels:
             raise InputError(
-                f"no {over} {base!r} in this study; there are: {', '.join(map(str, levels))} [HM-COMPARE-051]"
+                f"{over}: no {base!r} in this study; choose from: {', '.join(map(str, levels))} [HM-COMPARE-051]"
             )
         by = [c for c in self.factors if c != over] if by is None else list(by)
         found = []
@@ -168,17 +168,17 @@ class StudyResults:
         return pd.DataFrame(found, columns=[*by, over, *DIFFERENCE])
 
     def compare(self, other: StudyResults, value: str = "cost") -> pd.DataFrame:
-        """Differences of another study to this one, run by run of the same configuration.
+        """Paired differences of another study to this one, for runs of the same configuration.
 
-        What is one and the same within each study but not between them (the model's label, say) is what is compared;
-        all else must agree for two runs to make a pair.
+        Columns that are constant within each study but differ between both (e.g. the model's label) are compared; all
+        other columns must agree in a pair.
 
         Args:
             other: The other study.
-            value: Column of a figure.
+            value: Column of a figure. Default: cost.
 
         Returns:
-            As :meth:`paired`, of ``other`` against this one; attribute ``attrs["differs"]`` says in what they differ.
+            As :meth:`paired`, of ``other`` against this study; ``attrs["differs"]`` holds the compared columns.
 
         Raises:
             InputError: If the studies have no run in common.
@@ -197,8 +197,8 @@ class StudyResults:
         joined = mine.merge(theirs, on=on, suffixes=("", " "))
         if joined.empty:
             raise InputError(
-                f"{self.folder} and {other.folder} have no run in common: their tasks, controllers, draws or seeds "
-                "differ [HM-COMPARE-052]"
+                f"{self.folder} and {other.folder}: no run in common, because tasks, controllers, draws or seeds "
+                "differ. Compare studies that share them [HM-COMPARE-052]"
             )
         found = []
         for key, group in _groups(joined, by):
@@ -214,7 +214,7 @@ class StudyResults:
         return self.table
 
     def _units(self, group: pd.DataFrame, value: str) -> pd.DataFrame:
-        """One row a unit: a draw where there are several, else a draw and seed."""
+        """One row for each statistical unit: a draw if there are several, else a draw and seed."""
         finite = group[np.isfinite(group[value])]
         keys = [c for c in PAIR if c in finite]
         if "draw" in self.table and self.table["draw"].nunique() > 1:
@@ -226,20 +226,20 @@ DIFFERENCE = ("n", "base", "difference", "low", "high", "relative", "ratio", "be
 
 
 def _groups(table: pd.DataFrame, by: Sequence[str]) -> Any:
-    """Groups in the order in which they come, with their keys; one group for no columns."""
+    """Groups with their keys, in the order of the table; a single group for no columns."""
     if not by:
         return [((), table)]
     return table.groupby(list(by), sort=False, dropna=False)
 
 
 def _interval(values: Any) -> tuple[float, float]:
-    """Mean and half width of its 95 % interval; NaN where there is none."""
+    """Mean and half width of its 95 % interval; NaN if missing."""
     found = interval(np.asarray(values, dtype=float).tolist())
     return (math.nan if found.mean is None else found.mean, math.nan if found.ci95 is None else found.ci95)
 
 
 def _difference(first: pd.DataFrame, second: pd.DataFrame, value: str) -> tuple[float, ...]:
-    """Of units that both have: number, mean of the first, difference with interval, relative, ratio, better."""
+    """Figures of the common units: number, mean of the first, difference with interval, relative, ratio, better."""
     keys = [c for c in first.columns if c != value]
     both = first.merge(second, on=keys, suffixes=("", " "))
     change = both[f"{value} "] - both[value]
@@ -255,7 +255,7 @@ def _difference(first: pd.DataFrame, second: pd.DataFrame, value: str) -> tuple[
 
 STEP = "timing_step_median_ms"
 NEEDED = ("cost", "task", "controller", "share_MPC", "timing_cpu_s", STEP)
-"""Columns that the report is made of, beside those that a study may have."""
+"""Columns that the report needs; further columns are optional."""
 SHOWN_FAILURES = 20
 
 
@@ -263,24 +263,25 @@ def write_study_report(results: StudyResults, path: str | Path | None = None) ->
     """Write the report of a study.
 
     Args:
-        results: The study; it may still run.
+        results: Results of a finished or running study.
         path: File to write. Default: ``report.html`` in the study's folder.
 
     Returns:
         The path.
 
     Raises:
-        InputError: If no run has finished yet.
+        InputError: If no run has succeeded yet.
 
     Example: ``write_study_report(StudyResults.load("studies/first"))``
     """
     if len(results.table) == len(results.failed):
         raise InputError(
-            f"{results.folder}: no run has been done yet, there is nothing to report [HM-COMPARE-053]"
+            f"{results.folder}: no successful run yet, so there is nothing to report [HM-COMPARE-053]"
         )
     if lacking := [column for column in NEEDED if column not in results.table]:
         raise InputError(
-            f"{results.folder}: its rows have no {', '.join(lacking)}; another version wrote them [HM-COMPARE-054]"
+            f"{results.folder}: rows without {', '.join(lacking)}; another version wrote them. Run the study again "
+            "[HM-COMPARE-054]"
         )
     with tempfile.TemporaryDirectory() as folder:
         report = _report(results, Path(folder))
@@ -308,21 +309,21 @@ def _report(results: StudyResults, folder: Path) -> Report:
 
 
 COST_TEXT = (
-    "Closed-loop cost on the plant's true state, with the 95 % interval of the mean (Student's t): squared deviations "
-    "of all signals, each times its weight in the control problem, which brings them to one scale. A unit of the "
-    "statistics is a draw where there are several, for its seeds share one machine; else a seed.",
+    "Closed-loop cost on the plant's true state: sum of the squared deviations of all signals, weighted as in the "
+    "control problem, with the 95 % interval of the mean (Student's t). With several draws, a statistical unit is a "
+    "draw, since its seeds share one plant; else a seed.",
 )
 PAIRED_TEXT = (
-    "Differences between runs that met the same draw and the same sensor noise: what varies from draw to draw alike "
-    "for all cancels, so that the interval is that of the difference itself.",
+    "Differences between runs with the same draw and the same sensor noise. Variation between draws that affects all "
+    "runs alike cancels, so the interval is that of the difference.",
 )
 TRACKING_TEXT = (
-    "Root mean square deviations from the reference, each signal in its own unit: of true states, or of measured "
-    "outputs where references are theirs.",
+    "Root mean square deviations from the reference, each signal in its own unit: of true states, or of outputs if the "
+    "reference is one of outputs.",
 )
 TIME_TEXT = (
-    "Median duration of a whole step (estimate, solve, monitor), averaged over the runs. Runs were computed side by "
-    "side: durations are comparable among each other, and longer than on a machine of one's own.",
+    "Median duration of a controller step (estimate, solve, monitor), averaged over the runs. Runs were computed in "
+    "parallel: durations are comparable with each other, but longer than on an idle computer.",
 )
 
 
@@ -335,13 +336,13 @@ def _head(results: StudyResults) -> list[KeyFigure]:
             "Failed runs", failed, "", "tracebacks below" if failed else "", "bad" if failed else "good"
         ),
         KeyFigure("Periods solved", 100 * solved, "%"),
-        KeyFigure("Computing time", duration_text(spent), "", "of all processes together"),
+        KeyFigure("Computing time", duration_text(spent), "", "sum over all processes"),
     ]
     if "controller" in results.factors:
         base = name_of(str(table["controller"].iloc[0]))
         for name, rows in results.paired().groupby("controller", sort=False):
             ratio = float(np.exp(np.log(rows["ratio"]).mean()))
-            text = f"of its cost with {base}: geometric mean over pairs"
+            text = f"of the cost of {base}: geometric mean over pairs"
             figures.append(KeyFigure(f"Cost: {name_of(str(name))}", 100 * ratio, "%", text))
     return figures
 
@@ -375,7 +376,7 @@ def _cell(value: Any) -> Any:
 
 
 def _over(results: StudyResults) -> str | None:
-    """The column whose levels are compared: controllers where there are several, else what else differs."""
+    """The column whose levels are compared: the controller if it varies, else another varying column."""
     order = ("controller", "model", "solver", "horizon", "faults", "monitor")
     return next((c for c in order if c in results.factors), None)
 
@@ -384,12 +385,12 @@ def _comparison(results: StudyResults, folder: Path) -> list[Section]:
     over = _over(results)
     if over is None:
         return []
-    table = _table(results.paired(over=over), f"Cost of each {over} less that of the first.")
+    table = _table(results.paired(over=over), f"Cost of each {over} minus the cost of the first.")
     return [Section("Paired differences", PAIRED_TEXT, _figure(_differences, results, folder), [table])]
 
 
 TRACKING = "tracking_rmse "
-"""Columns of the tracking errors begin with it; the signal's label follows."""
+"""Begin of the names of columns with tracking errors; the signal's label follows."""
 
 
 def _tracking(results: StudyResults, folder: Path) -> list[Section]:
@@ -406,7 +407,7 @@ def _tracking(results: StudyResults, folder: Path) -> list[Section]:
         values = {task: {str(k): g[column].to_numpy() for k, g in rows} for task, rows in _levels(results)}
         some = {task: row for task, row in values.items() if any(np.isfinite(v).any() for v in row.values())}
         figure = save(studies.distributions(some, label), folder / f"tracking_{i}.png")
-        figures.append((figure, f"How the {label} is distributed over the runs of each task."))
+        figures.append((figure, f"Distribution of the {label} over the runs of each task."))
     return [Section("Tracking", TRACKING_TEXT, figures, tables)] if tables else []
 
 
@@ -429,7 +430,7 @@ def _failures(results: StudyResults) -> list[Section]:
         (*(_cell(row[c]) for c in columns), row["error"].strip().splitlines()[-1])
         for _, row in failed.iterrows()
     ]
-    text = f"{len(failed)} runs have failed; the first are listed. The column 'error' of the table has the tracebacks."
+    text = f"{len(failed)} runs failed; the first are listed. Column 'error' of the table contains the tracebacks."
     return [Section("Failed runs", (text,), (), [Table((*columns, "error"), rows[:SHOWN_FAILURES])])]
 
 
@@ -442,7 +443,7 @@ def _figure(draw: Any, results: StudyResults, folder: Path) -> Sequence[tuple[Pa
 
 
 def _levels(results: StudyResults) -> Any:
-    """Groups of rows by task, and within by all else that differs, with one name each."""
+    """Groups of rows by task and, within a task, by all other varying columns, with a name for each group."""
     others = [c for c in results.factors if c != "task"]
     for task, group in results.table.groupby("task", sort=False):
         named = group[others].astype(str).agg(", ".join, axis=1) if others else group["controller"]
@@ -451,7 +452,7 @@ def _levels(results: StudyResults) -> Any:
 
 def _distributions(results: StudyResults) -> tuple[Any, str]:
     values = {task: {str(k): g["cost"].to_numpy() for k, g in rows} for task, rows in _levels(results)}
-    caption = "How the cost is distributed over the runs of each task."
+    caption = "Distribution of the cost over the runs of each task."
     return studies.distributions(values, "cost [-]"), caption
 
 
@@ -473,12 +474,12 @@ def _pareto(results: StudyResults) -> tuple[Any, str]:
         task: {str(level): (float(g[STEP].mean()), float(g["cost"].mean())) for level, g in rows}
         for task, rows in _levels(results)
     }
-    caption = "Mean cost against the duration of a step; the line joins the front."
+    caption = "Mean cost against the duration of a step; the line is the Pareto front."
     return studies.pareto(points, "cost [-]"), caption
 
 
 def duration_text(seconds: float) -> str:
-    """A duration as people say it.
+    """A duration with a suitable unit.
 
     Example:
         >>> duration_text(42.0), duration_text(600.0), duration_text(7300.0), duration_text(4e5)

@@ -1,4 +1,4 @@
-"""Run a study: every loop once, on the disk as it ends, whatever happens to the process or to its workers."""
+"""Run a study: run every loop once, and write its row when it ends, even if the process or workers are killed."""
 
 from __future__ import annotations
 
@@ -59,20 +59,20 @@ if TYPE_CHECKING:
     from hybrid_mpc.compare.study_results import StudyResults
 
 TIMING = "timing_"
-"""Columns that begin so are durations and places: they differ between two runs, no other does."""
+"""Begin of the names of columns with durations and processes; only these columns differ when a study is repeated."""
 BATCH_S = 0.5
-"""Runs shorter than this are handed to workers several at a time, so that handing over costs little."""
+"""Target duration of a batch [s]: short runs are sent to workers in batches to reduce overhead."""
 BATCHES_A_SECOND = 50.0
-"""Batches of all workers together are this many at most: a dask scheduler and the log take a few ms for each."""
+"""Largest rate of batches of all workers together: a dask scheduler and the log take a few ms for each batch."""
 BATCH_MOST = 500
 AHEAD = 2
-"""Batches a worker: one that it computes, and one that waits for it."""
+"""Batches for each worker: one in progress, and one waiting."""
 TRIES = 3
-"""How many workers may die of a run before it is given up."""
+"""Number of dead workers after which a run counts as failed."""
 THREADS = 1
-"""Of the numerical libraries in each process: runs are small, and as many processes as cores are side by side."""
+"""Threads of the numerical libraries in each process: runs are small, and all cores are used by processes."""
 PROBE_PERIODS = 20
-"""Periods of each kind of run that a dry run times."""
+"""Periods of each kind of run that a dry run measures."""
 
 
 # The models of a study
@@ -80,7 +80,7 @@ PROBE_PERIODS = 20
 
 @dataclass(frozen=True)
 class StudyModel:
-    """A loaded model that fits its study, the hash of its folder, and where its filters' noise is from, in words."""
+    """A loaded and checked model of a study, the hash of its folder, and the source of its filters' noise."""
 
     folder: Path
     sha256: str
@@ -91,15 +91,17 @@ class StudyModel:
 def load_models(
     study: Study, held: Mapping[str, NoiseNote] | None = None, *, plant: bool = True
 ) -> dict[str, StudyModel]:
-    """Load and check everything that a study's loops need, before the first; without ``plant`` a model may stand in for
-    the machine.
+    """Load and check everything that a study's loops need.
 
-    Process noise by label in ``held`` is taken as it is; else it is the artifact's, or, where that holds none,
-    estimated on recordings that the scenario makes (budget quick, seed ``study.run_seed``).
+    Args:
+        study: The study.
+        held: Process noise by label of the model. Default: the artifact's; if it has none, the noise is estimated on
+            simulated recordings (budget quick, seed ``study.run_seed``).
+        plant: Whether the scenario must have a plant; otherwise a model may replace it. Default: True.
 
     Raises:
-        InputError: If the scenario has nothing to run, a folder holds no artifact or another machine's, or a task,
-            fault or parameter does not fit.
+        InputError: If the scenario has nothing to run, a folder holds no artifact of this machine, or a task, fault or
+            parameter is unknown.
     """
     scenario = load_scenario(study.scenario)
     if not plant:
@@ -108,7 +110,8 @@ def load_models(
     selected_tasks(scenario, study.tasks)
     if scenario.oracle is None and (oracles := [c for c in study.controllers if c in ORACLES]):
         raise InputError(
-            f"scenario {scenario.name} has no oracle; leave controller {oracles[0]} out [HM-COMPARE-055]"
+            f"controller {oracles[0]}: scenario {scenario.name} has no oracle. Leave this controller out "
+            "[HM-COMPARE-055]"
         )
     found = {}
     for label, given in study.folders.items():
@@ -129,8 +132,8 @@ def load_models(
 
 
 def _check_plant(scenario: Scenario, study: Study, kit: Kit) -> None:
-    """Refuse faults and parameters that the plant, or a model with its signals, does not have; and controllers that
-    have no model to run on where there is no plant.
+    """Refuse faults and parameters that plant or model do not have and, without a plant, controllers without a model
+    that can replace it.
     """
     own = scenario.plant
     stands = [] if own is not None else [stand_in(kit, name) for name in study.controllers]
@@ -143,12 +146,12 @@ def _check_plant(scenario: Scenario, study: Study, kit: Kit) -> None:
         check_faults(replace(scenario, plant=lambda: plant), faults, model)
 
 
-# What workers get
+# Input of the workers
 
 
 @dataclass(frozen=True)
 class ModelInput:
-    """A model as workers get it; its folder's files are in it for workers that do not see the folder."""
+    """A model for workers; it contains the files of its folder for workers that cannot see the folder."""
 
     label: str
     folder: str
@@ -160,7 +163,7 @@ class ModelInput:
 def load_inputs(
     study: Study, held: Mapping[str, ModelNote] | None = None
 ) -> tuple[LoopRunner, dict[str, ModelNote]]:
-    """What runs a study's loops, and notes of its models by label; ``held`` are those of a study that is resumed."""
+    """Runner of a study's loops, and notes of its models by label; ``held`` are the notes of a resumed study."""
     models, notes = [], {}
     for label, m in load_models(study, {k: note.noise for k, note in (held or {}).items()}).items():
         sigma = {c: tuple(m.kit.noise(c).tolist()) for c in study.controllers if not CONTROLLERS[c].truth}
@@ -171,7 +174,7 @@ def load_inputs(
 
 @dataclass(frozen=True)
 class LoopRunner:
-    """Runs a study's loops; it is sent to each worker once, which then keeps the models loaded."""
+    """Runs a study's loops; each worker gets it once and keeps the models loaded."""
 
     scenario: str
     models: tuple[ModelInput, ...]
@@ -188,27 +191,27 @@ class LoopRunner:
             return row.columns() | {"hidden_units": bench.kits[spec.model].models["hybrid"].n_h} | times
 
     def with_files(self) -> LoopRunner:
-        """The same with the models' files in it, for workers on other machines."""
+        """A copy with the models' files, for workers on other computers."""
         models = tuple(replace(m, files=_files(Path(m.folder))) for m in self.models)
         return replace(self, models=models)
 
 
 @lru_cache(maxsize=1)
 def _bench(runner: LoopRunner) -> tuple[Bench, Lock]:
-    """The bench of a process, and what lets one thread at a time to it."""
+    """The bench of a process, and a lock for its threads."""
     kits = {m.label: load(local_folder(m)).with_noise(dict(m.noise)) for m in runner.models}
     return Bench(load_scenario(runner.scenario), kits), Lock()
 
 
 def local_folder(model: ModelInput) -> Path:
-    """The model's folder if this machine has it, else one that its files are unpacked in."""
+    """The model's folder if this computer has it, else a temporary folder with its files."""
     folder = Path(model.folder)
     if folder.is_dir() and _digest(_files(folder)) == model.digest:
         return folder
     if not model.files:
         raise InputError(
-            f"study: {folder} is not the model {model.label} any more that the study began with; take a copy of the "
-            "folder that nobody changes [HM-COMPARE-056]"
+            f"study: {folder}, model {model.label}, has changed since the study began. Use a copy of the folder that "
+            "does not change [HM-COMPARE-056]"
         )
     unpacked = Path(tempfile.mkdtemp(prefix="hybrid-mpc-model-"))
     for name, content in model.files:
@@ -245,35 +248,35 @@ def run_study(
 ) -> StudyResults:
     """Run a study into a folder and return its results.
 
-    Finished runs are on the disk as they end; after a kill at any moment, Ctrl-C or a full disk ``resume=True`` runs
-    what is missing. Results depend on nothing but the study; only columns that begin with ``timing_`` differ. A run
-    that raises leaves its traceback, and the others go on.
+    Rows are written when runs end; after a kill, Ctrl-C or a full disk, ``resume=True`` runs the missing ones. Results
+    only depend on the study, except for the columns that begin with ``timing_``. A failed run leaves its traceback, and
+    the other runs continue.
 
     Args:
-        study: What to run.
-        out: Folder to make; it must be new or empty unless ``resume``.
-        workers: Processes on this machine.
+        study: The study.
+        out: Folder to write; it must be new or empty unless ``resume``.
+        workers: Number of processes on this computer. Default: 2.
         cluster: Address of a dask scheduler or a ``distributed.Client``, in place of processes. Default: none.
-        resume: Finish the study that ``out`` holds.
-        retry_failed: Run those again that have failed.
-        progress: Where to report; default: nowhere.
+        resume: Whether to continue the study in ``out``. Default: False.
+        retry_failed: Whether to repeat failed runs. Default: False.
+        progress: Where to report. Default: nowhere.
 
     Returns:
         The results, also in ``out/results.parquet``.
 
     Raises:
-        InputError: For any bad input, an unreachable scheduler, or a disk that is full.
+        InputError: For any bad input, an unreachable scheduler, or a full disk.
 
     Example:
         >>> results = run_study(Study("golf_robot", "runs/golf"), "studies/first")  # doctest: +SKIP
     """
     out, say = Path(out), progress or Progress()
     check_out(out, NOUN, resume=resume)
-    say.start("reading the models, and the filters' noise")
+    say.start("reading the models and the observers' noise")
     run, models = load_inputs(study, held_models(out))
     note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
-    if cluster is not None and isinstance(run, LoopRunner):  # its workers may not see the models' folders
+    if cluster is not None and isinstance(run, LoopRunner):  # workers may not see the folders of the models
         run = run.with_files()
     engine = make_engine(partial(run_batch, run), workers, cluster, threads=THREADS)
     try:
@@ -290,7 +293,7 @@ def run_study(
                 compact(out / RUNS, out / RESULTS, plain(made))
     finally:
         engine.close()
-    # plots and pandas: what is refused, is refused before
+    # import plots and pandas only after all checks
     from hybrid_mpc.compare.study_results import StudyResults
 
     return StudyResults.load(out)
@@ -299,14 +302,14 @@ def run_study(
 def make_note(
     study: Mapping[str, Any], models: Mapping[str, ModelNote], runs: int, kind: str = "loops"
 ) -> StudyNote:
-    """What a study of these settings (with its scenario) and models is made of."""
+    """The note of a study with these settings (including its scenario) and models."""
     scenario, path = load_scenario(study["scenario"]), Path(study["scenario"])
     content = sha256(path) if path.suffix == ".py" and path.is_file() else None
     return StudyNote(study, scenario.title, scenario.description, models, runs, versions(), kind, content)
 
 
 def job_note(note: StudyNote) -> JobNote:
-    """What a study's folder says of it."""
+    """The note in a study's folder."""
     models = {f"the content of model {label}": model.sha256 for label, model in note.models.items()}
     settings = {key: value for key, value in note.study.items() if key != "name"}
     settings |= models | {"the content of the scenario's file": note.scenario_sha256}
@@ -314,12 +317,12 @@ def job_note(note: StudyNote) -> JobNote:
 
 
 def held_models(out: Path) -> Mapping[str, ModelNote] | None:
-    """Notes of the models of the study that a folder holds; None if it holds none yet."""
+    """Notes of the models of the study in a folder; None without a study."""
     return study_note(out).models if (out / f"{NOUN}.json").is_file() else None
 
 
 def finished(out: Path, retry_failed: bool) -> set[str]:
-    """Ids of the runs that need not run."""
+    """Ids of the finished runs."""
     status = {row.id: row.status for row in rows(out / RUNS)}
     return {id for id, how in status.items() if how == "done" or not retry_failed}
 
@@ -328,18 +331,18 @@ def finished(out: Path, retry_failed: bool) -> set[str]:
 
 
 class Config(Protocol):
-    """What a run is made of, e.g. a :class:`~hybrid_mpc.compare.loops.LoopSpec`."""
+    """Specification of a run, e.g. a :class:`~hybrid_mpc.compare.loops.LoopSpec`."""
 
     @property
     def id(self) -> str:
-        """Name made of all that decides what it computes."""
+        """Digest of everything that the result of the run depends on."""
 
     def columns(self) -> dict[str, Any]:
-        """What says which run it is."""
+        """Columns that describe the run."""
 
 
 def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Config]) -> list[RunRow]:
-    """Rows of several runs; one that raises leaves its traceback in ``error``."""
+    """Rows of several runs; a failed run has its traceback in ``error``."""
     found = []
     for config in configs:
         begin, cpu = perf_counter(), process_time()
@@ -347,7 +350,7 @@ def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Config]
         try:
             with no_exit():
                 results = dict(run(config))
-        except Exception:  # the study goes on; the traceback is what there is to report
+        except Exception:  # keep the traceback and continue with the other runs
             status, error = "failed", traceback.format_exc()
         times = {f"{TIMING}total_s": perf_counter() - begin, f"{TIMING}cpu_s": process_time() - cpu}
         place = {f"{TIMING}process": f"{socket.gethostname()}:{os.getpid()}"}
@@ -357,7 +360,7 @@ def run_batch(run: Callable[[Any], Mapping[str, Any]], configs: Sequence[Config]
 
 @dataclass
 class Tally:
-    """What became of the runs so far; ``died`` workers have died, and what they were at was begun again."""
+    """Counts of runs: in total, finished, failed; ``died`` is the number of dead workers, whose runs were restarted."""
 
     total: int
     runs: int = 0
@@ -367,7 +370,7 @@ class Tally:
 
     @property
     def text(self) -> str:
-        """In words, with rate and remaining time."""
+        """Text with rate and remaining time."""
         rate = self.runs / max(time.monotonic() - self.begin, 1e-9)
         words = [f"{rate:.3g} runs/s"]
         if 0 < self.runs < self.total:
@@ -377,7 +380,7 @@ class Tally:
         if self.failed:
             words.append(f"{self.failed} failed")
         if self.died:
-            words.append(f"{self.died} workers died, what they were at was begun again")
+            words.append(f"{self.died} workers died, their runs were restarted")
         return ", ".join(words)
 
 
@@ -388,10 +391,10 @@ def execute(
     progress: Progress,
     total: int,
 ) -> Tally:
-    """Run configurations, taken as they are needed, in an engine and log their rows.
+    """Run configurations in an engine and log their rows.
 
-    At any time a few batches are under way; a row is logged before the next batch is asked for. ``total`` is how many
-    there are, for the report.
+    Only a few batches are submitted at any time; rows are logged before the next result is fetched. ``total`` is the
+    number of configurations, for the progress report.
     """
     tally, left, pace = Tally(total, begin=time.monotonic()), iter(configs), _Pace(engine.workers)
     suspects, running = _Suspects(), 0
@@ -420,7 +423,7 @@ def execute(
 
 
 class _Suspects:
-    """Runs whose worker died: they are begun again one at a time with nothing beside them, to find the culprit."""
+    """Runs of dead workers: each is repeated alone, to find the run that kills workers."""
 
     def __init__(self) -> None:
         self.left: list[Config] = []
@@ -428,14 +431,14 @@ class _Suspects:
         self._tries: dict[str, int] = {}
 
     def next(self, running: int) -> tuple[Config, ...]:
-        """The next suspect once nothing else runs; empty if there is none, or something runs."""
+        """The next suspect if nothing else runs; otherwise empty."""
         if running or not self.left:
             return ()
         self.alone = self.left.pop()
         return (self.alone,)
 
     def given_up(self, batch: Sequence[Config], lost: Lost) -> list[RunRow]:
-        """Suspect the runs of a lost batch; rows of those that are given up."""
+        """Add the runs of a lost batch to the suspects; returns the rows of runs that count as failed."""
         found = []
         for config in batch:
             alone = self.alone is not None and config.id == self.alone.id
@@ -443,13 +446,13 @@ class _Suspects:
             if not alone or (tries < TRIES and not lost.final):
                 self.left.append(config)
                 continue
-            error = f"its worker died {tries} times ({lost}); out of memory, or a crash outside Python"
+            error = f"its worker died {tries} times ({lost}): out of memory, or a crash outside Python"
             found.append(RunRow(config.id, "failed", error, config.columns()))
         return found
 
 
 class _Pace:
-    """How many runs make a batch: as many as fit into ``BATCH_S``, more where there are many workers."""
+    """Number of runs in a batch: as many as fit into ``BATCH_S``, more with many workers."""
 
     def __init__(self, workers: int) -> None:
         self.size, self._aim = 1, max(BATCH_S, workers / BATCHES_A_SECOND)
@@ -461,12 +464,12 @@ class _Pace:
             self.size = max(1, min(wanted, 2 * self.size, BATCH_MOST))
 
 
-# What a study would take
+# Dry run: expected time of a study
 
 
 @dataclass(frozen=True)
 class RunKind:
-    """Runs that take about the same time a period."""
+    """Runs with about the same computing time for each period."""
 
     model: str
     controller: str
@@ -476,7 +479,7 @@ class RunKind:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a study would take: seconds of all runs on the given workers, without starting processes, and of a run of
+    """Expected time of a study [s]: of all runs on the given workers, without the start of processes, and of one run of
     each kind, averaged over tasks.
     """
 
@@ -489,16 +492,16 @@ class Plan:
 @no_exit()
 @named_extra("a study")
 def dry_run(study: Study, *, workers: int = 2, say: Callable[[str], None] = lambda text: None) -> Plan:
-    """Check a study as far as running it would, and expect its time from a few periods of each kind of run.
+    """Check a study, and estimate its computing time from a few periods of each kind of run.
 
     Args:
         study: The study.
-        workers: Processes that it is to run in.
-        say: Called with what is timed.
+        workers: Number of processes of the study. Default: 2.
+        say: Called with a text about the run that is measured. Default: nothing.
 
     Returns:
-        Number of ``runs``, how many of each thing (``axes``), expected ``seconds`` of all, and ``kinds`` of runs with
-        the seconds of one.
+        Number of ``runs``, levels of each axis (``axes``), expected ``seconds`` of all runs, and ``kinds`` of runs with
+        the seconds of one run.
 
     Raises:
         InputError: As :func:`run_study`.

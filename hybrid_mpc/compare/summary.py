@@ -1,4 +1,4 @@
-"""Closed loops summed up: means with intervals, by task and controller."""
+"""Summaries of closed loops: means with intervals, by task and controller."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Mean:
     """A mean with its 95 % interval (Student's t).
 
     Args:
-        mean: The mean; None where a value is not finite, or there is none.
-        ci95: Half width of the interval, which holds under stopping where loops stop early; None of a single value.
+        mean: The mean; None if a value is not finite, or without values.
+        ci95: Half width of the interval, valid with early stopping; None for a single value.
         n: Number of values.
     """
 
@@ -33,8 +33,8 @@ def interval(values: Sequence[float], level: float = LEVEL) -> Mean:
 
     Args:
         values: ``(n,)``.
-        level: Probability that the interval holds the mean, of normal values. Default 0.95; more where the number of
-            values was chosen by looking at them (:func:`~hybrid_mpc.compare.sequential.level_at`).
+        level: Probability that the interval contains the mean, for normal values. Default: 0.95. With early stopping
+            it must be higher (:func:`~hybrid_mpc.compare.sequential.level_at`).
 
     Example:
         >>> interval([1.0])
@@ -54,15 +54,15 @@ def interval(values: Sequence[float], level: float = LEVEL) -> Mean:
 
 @dataclass(frozen=True)
 class Summary:
-    """The loops of one task and controller summed up.
+    """Summary of the loops of one task and controller.
 
     Args:
         cost: Closed-loop cost.
         tracking_rmse: Tracking errors by signal.
         figures: The task's own figures.
-        mean_abs_figures: Their magnitudes.
-        sources: Share of periods by what gave the input.
-        limits: Largest share of each limit that any loop used.
+        mean_abs_figures: Magnitudes of these figures.
+        sources: Share of periods by the source of the input.
+        limits: Largest used share of each limit over all loops.
     """
 
     cost: Mean
@@ -74,7 +74,7 @@ class Summary:
 
 
 def by_task(rows: Sequence[LoopRow]) -> dict[str, dict[str, list[LoopRow]]]:
-    """Rows by task and controller, in the order in which they come."""
+    """Rows by task and controller, in their order."""
     table: dict[str, dict[str, list[LoopRow]]] = {}
     for row in rows:
         table.setdefault(row.task, {}).setdefault(row.controller, []).append(row)
@@ -86,21 +86,21 @@ def summaries(rows: Sequence[LoopRow], most: int | None = None) -> dict[str, dic
 
     Args:
         rows: The loops.
-        most: Largest number of seeds where tasks stop early (:mod:`hybrid_mpc.compare.sequential`): intervals then hold
-            together with 95 % at all looks. Default: the number of loops was fixed.
+        most: Largest number of seeds with early stopping (:mod:`hybrid_mpc.compare.sequential`); the intervals of all
+            looks then hold together with 95 %. Default: no early stopping.
 
     Example: ``summaries(rows)["track_sine"]["hybrid"].cost.mean``
     """
     found = {}
     for task, cells in by_task(rows).items():
-        # all controllers of a task stop together, those with fewer seeds of their own too
+        # all controllers of a task stop together, even those with fewer seeds
         level = LEVEL if most is None else level_at(max(map(len, cells.values())), most)
         found[task] = {name: summary(own, level) for name, own in cells.items()}
     return found
 
 
 def summary(rows: Sequence[LoopRow], level: float = LEVEL) -> Summary:
-    """The summary of loops of one task and controller, at least one, with intervals of a ``level``."""
+    """The summary of at least one loop of one task and controller, with intervals of a ``level``."""
 
     def of(
         pick: Callable[[LoopRow], Mapping[str, float]], change: Callable[[float], float] = float

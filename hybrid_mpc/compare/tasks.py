@@ -1,4 +1,4 @@
-"""Tasks of a scenario: chosen by name, or run over and over."""
+"""Tasks of a scenario: selected by name, or repeated in rounds."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ Array = NDArray[np.float64]
 
 
 def ready(scenario: Scenario, values: Mapping[str, float] | None = None) -> Scenario:
-    """The scenario; one with a control problem and neither plant nor tasks gets default tasks, which run on a model.
+    """The scenario, with default tasks if it has a control problem but neither plant nor tasks.
 
-    ``values`` are the fitted parameters of its prior, which say where it rests. Default: the prior's own.
+    Args:
+        scenario: The scenario.
+        values: Fitted parameters of its prior, which determine its equilibrium. Default: the prior's own.
 
     Raises:
-        InputError: If default tasks cannot be made.
+        InputError: If default tasks are impossible.
     """
     if scenario.plant is not None or scenario.control is None or scenario.tasks:
         return scenario
@@ -30,23 +32,23 @@ def ready(scenario: Scenario, values: Mapping[str, float] | None = None) -> Scen
 
 
 def tasks_of(scenario: Scenario, names: Sequence[str] | None) -> tuple[Task, ...]:
-    """The scenario's tasks of exactly these names, all for None; an unknown name is refused."""
+    """The scenario's tasks with these names; None: all. InputError for an unknown name."""
     if names is None:
         return scenario.tasks
     there = {task.name: task for task in scenario.tasks}
     missing = [name for name in names if name not in there]
     if missing:
         raise InputError(
-            f"scenario {scenario.name}: no task {', '.join(missing)}; there are: {', '.join(there)} [HM-COMPARE-057]"
+            f"scenario {scenario.name}: no task {', '.join(missing)}; choose from: {', '.join(there)} [HM-COMPARE-057]"
         )
     return tuple(there[name] for name in names)
 
 
 def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]:
-    """The tasks of these names or, where there is none of a name, those whose names begin so; all for no names.
+    """The tasks with these names, or whose names begin with them; all for no names.
 
     Raises:
-        InputError: If nothing fits a name.
+        InputError: If no task matches a name.
 
     Example:
         >>> from hybrid_mpc.scenario import load_scenario
@@ -61,7 +63,8 @@ def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]
         fitting = [name] if name in there else [t for t in there if name and t.startswith(name)]
         if not fitting:
             raise InputError(
-                f"scenario {scenario.name}: no task {name!r}, none begins so; there are: {', '.join(there) or 'none'}"
+                f"scenario {scenario.name}: no task is called {name!r} or begins with it; choose from: "
+                f"{', '.join(there) or 'none'}"
                 " [HM-COMPARE-058]"
             )
         chosen.update(fitting)
@@ -69,21 +72,21 @@ def selected_tasks(scenario: Scenario, names: Sequence[str]) -> tuple[Task, ...]
 
 
 RETURN_S = 1.0
-"""Shortest way back to the reference's beginning [the machine's seconds]."""
+"""Shortest time of the return to the reference's start [time constants of the machine]."""
 
 
 def repeated(
     task: Task, dt: float, shares: Array, time_unit: float = 1.0, speeds: Mapping[int, int] | None = None
 ) -> Task:
-    """The task over and over: to its end, back to its beginning along a quintic, and again.
+    """The task in several rounds; after each round the reference returns to its start along a quintic polynomial.
 
     Args:
-        task: A task; its reference is asked for within its duration alone.
-        dt: Period [s]; a round takes whole periods, since weights may be of single instants.
-        shares: Factor ``(m,)`` on the distance from the reference's beginning, a round each.
-        time_unit: The machine's second [s]: the way back takes one at least. Default 1.
-        speeds: Places of the columns that are rates of others, by the places of those
-            (:func:`~hybrid_mpc.model.model.kinematics`). Default: none are.
+        task: A task; its reference is only evaluated within its duration.
+        dt: Period [s]; a round takes whole periods, since weights may be those of single samples.
+        shares: Factor ``(m,)`` of each round on the distance from the reference's start.
+        time_unit: Time constant of the machine [s], the shortest return. Default: 1.
+        speeds: Columns that are rates of other columns, by the index of the other column
+            (:func:`~hybrid_mpc.model.model.kinematics`). Default: none.
 
     Returns:
         The task of ``m`` rounds.
@@ -97,7 +100,7 @@ def repeated(
     length, pairs = round(task.duration / dt), dict(speeds or {})
     rows = task.reference(np.arange(length + 1, dtype=np.float64) * dt)
     first, last = rows[0], rows[-1]
-    n = min(len(task.x0), len(first))  # further columns are no reference of states
+    n = min(len(task.x0), len(first))  # further columns are not references of states
     positions, rates = list(pairs), list(pairs.values())
     fastest = np.abs(rows[:, rates]).max(axis=0)
     # a quintic's top speed is 15/8 of its mean
@@ -155,7 +158,9 @@ def repeated(
 
 
 def _quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.polynomial.Polynomial:
-    """From position ``p0`` and speed ``v0`` to ``p1`` and ``v1`` within ``time``, without acceleration at the ends."""
+    """Quintic from position ``p0`` and speed ``v0`` to ``p1`` and ``v1`` within ``time``, without acceleration at its
+    ends: ``p(0) = p0, p'(0) = v0, p''(0) = 0``, and likewise at ``time``.
+    """
     d = p1 - p0
     a3 = (10 * d - time * (6 * v0 + 4 * v1)) / time**3
     a4 = (-15 * d + time * (8 * v0 + 7 * v1)) / time**4

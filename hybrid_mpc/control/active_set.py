@@ -13,19 +13,19 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 Array = NDArray[np.float64]
 Active = NDArray[np.int8]
-"""Where the rows of a QP are: 1 on the upper bound, -1 on the lower, 2 and -2 beyond a penalised one, 0 between."""
+"""State of a QP's rows: 1 on the upper bound, -1 on the lower, 2 and -2 beyond a penalised bound, 0 inactive."""
 
 PRIMAL_TOLERANCE = 1e-9
-"""By which a row is exceeded before it acts."""
+"""Violation above which a row becomes active."""
 CHANGES = 25
-"""Most changes of the whole set; from the last plan's it takes 1 to 10."""
+"""Most changes of the whole active set; a warm start needs 1 to 10."""
 PATIENCE = 3
-"""Changes of the whole set in a row that may leave more rows wrong than there were before: then it goes on row by row
-from the set with the fewest. Of the first plans' QPs that end so, none came to an answer later."""
+"""Consecutive changes of the whole set that may increase the number of wrong rows. After them the row-by-row method
+continues from the best set."""
 STEPS = 10
-"""Most steps of the method that changes a row at a time, for each row."""
+"""Most steps per row of the method that changes one row at a time."""
 DEPENDENT = 1e-12
-"""Share of a row's size in the dual below which its pivot says that it depends on the others."""
+"""Pivot of a row, over its size in the dual, below which it is linearly dependent on the others."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class RowQP:
         return np.concatenate([s, self.a @ s]) if len(self.a) else s.copy()
 
     def excess(self, values: Array) -> Array:
-        """By how much values ``(R,)`` are beyond their bounds, negative where they are not."""
+        """Violation of the bounds by values ``(R,)``; negative inside."""
         return np.maximum(values - self.upper, self.lower - values)
 
-    @np.errstate(invalid="ignore")  # what is not finite is told by the result
+    @np.errstate(invalid="ignore")  # values that are not finite show in the result
     def residuals(self, s: Array, multipliers: Array) -> tuple[float, float, float]:
-        """What unknowns and multipliers ``(R,)`` lack of the optimum: stationarity, penalties, violation of hard rows.
+        """KKT residuals of unknowns and multipliers ``(R,)``: stationarity, penalties, violation of hard rows.
 
         A multiplier must be a slope of its row's penalty: to push the row's value by it and to step back under the
         penalty (a proximal point) changes nothing only there.
@@ -76,7 +76,7 @@ class RowQP:
 
 
 class Found(NamedTuple):
-    """Unknowns, multipliers of all rows, and the rows that act."""
+    """Unknowns, multipliers of all rows, and the active rows."""
 
     s: Array
     multipliers: Array
@@ -84,7 +84,7 @@ class Found(NamedTuple):
 
 
 class _On(NamedTuple):
-    """Acting rows: which, on which side, their rows in the dual, its Cholesky factor and diagonal, multipliers."""
+    """Active rows: indices, sides, their rows in the dual, its Cholesky factor and diagonal, multipliers."""
 
     rows: NDArray[np.int64]
     side: Active
@@ -97,18 +97,17 @@ class _On(NamedTuple):
 class ActiveSet:
     """The method for one QP: ``ActiveSet(qp).solve(active)``.
 
-    A row that does not act costs no more than the look whether it does. :meth:`all_at_once` changes the whole set until
-    the answer on it keeps all other rows and pushes against all of its own: the semismooth Newton method on the KKT
-    conditions, fast where the set is nearly right. A penalised row needs no slack: it does not act, or is met with a
-    multiplier of up to its linear penalty, or is exceeded, in proportion to what its multiplier is beyond that. Where
-    this does not end (rows that depend on each other, a cycle), :meth:`one_at_a_time` ascends the dual, which always
-    ends: the worst row's multiplier grows until the row is kept, while rows whose multipliers come to zero or to their
-    penalty leave the set or give way.
+    An inactive row only costs its check. :meth:`all_at_once` changes the whole set until its solution keeps all other
+    rows and has multipliers of the right sign: the semismooth Newton method on the KKT conditions, fast if the set is
+    nearly right. A penalised row needs no slack: it is inactive, or kept with a multiplier of at most its linear
+    penalty, or violated in proportion to the multiplier's excess over that penalty. If this fails (linearly dependent
+    rows, a cycle), :meth:`one_at_a_time` ascends the dual, which always terminates: the multiplier of the worst row
+    grows until the row is kept, while rows whose multipliers reach zero or their penalty leave the set or are relaxed.
 
     Args:
         qp: The problem.
-        later: For every row that of the same value a period later, itself if there is none: of a stretch of time that
-            exceeds a bound anew, only the worst row joins the set at once. Default: all join.
+        later: For every row the row of the same value one period later, or itself: of several consecutive newly
+            violated rows only the worst one joins the set at once. Default: all join.
         earlier: Likewise.
 
     Source: Hintermüller, Ito, Kunisch, *The primal-dual active set strategy as a semismooth Newton method*, SIAM J.
@@ -138,7 +137,7 @@ class ActiveSet:
         self._wrong = qp.lower.size + 1
 
     def solve(self, active: Active | None = None) -> Found:
-        """The answer, whose residuals are to be looked at; ``active`` are rows to begin with."""
+        """The solution, whose residuals must be checked; ``active`` are rows for a warm start."""
         none = np.zeros(self._qp.lower.size, dtype=np.int8)
         if not self._finite:
             return Found(np.full(self._n, np.nan), np.full(none.size, np.nan), none)
@@ -147,14 +146,14 @@ class ActiveSet:
             return Found(self._free, np.zeros(none.size), none)
         return (
             self.all_at_once(start)
-            or (self.all_at_once(none) if start.any() else None)  # after a jump the last set is of no use
+            or (self.all_at_once(none) if start.any() else None)  # after a jump the last set is useless
             or self.one_at_a_time(self._nearest)
             or self.one_at_a_time(none)
             or Found(self._free, np.zeros(none.size), none)
         )
 
     def all_at_once(self, active: Active) -> Found | None:
-        """The answer by changes of the whole set; None where they do not end, or no longer come nearer."""
+        """The solution by changes of the whole set; None if they do not converge."""
         qp, seen, least, left = self._qp, set(), active.size + 1, PATIENCE
         for _ in range(CHANGES):
             on = self._on(active)
@@ -167,7 +166,9 @@ class ActiveSet:
             after, excess = np.sign(out).astype(np.int8), np.abs(out)
             mine = np.where(on.push * on.side > 0, np.sign(on.side), after[on.rows])
             mine[np.abs(on.push) > qp.linear[on.rows]] *= 2
-            excess[on.rows] = 0.0  # of the others, those join that exceed more than their neighbours in time
+            excess[on.rows] = (
+                0.0  # of the others, rows join whose violation exceeds that of their neighbours in time
+            )
             near = np.maximum(excess[self._later], excess[self._earlier])
             after *= excess >= np.maximum(near, PRIMAL_TOLERANCE)
             after[on.rows] = mine
@@ -186,7 +187,7 @@ class ActiveSet:
         return None
 
     def one_at_a_time(self, active: Active) -> Found | None:
-        """The answer by steps up the dual; None where rounding stands in the way."""
+        """The solution by dual ascent; None if rounding prevents it."""
         start = self._dual_feasible(active)
         if start is None:
             return None
@@ -248,7 +249,7 @@ class ActiveSet:
         return None
 
     def _dual_feasible(self, active: Active) -> Found | None:
-        """The answer on those rows of a set that push the right way, whatever other rows it violates."""
+        """The solution on those rows of a set with multipliers of the right sign; it may violate other rows."""
         for _ in range(CHANGES):
             on = self._on(active)
             if on is None:
@@ -265,7 +266,7 @@ class ActiveSet:
         return None
 
     def _on(self, active: Active) -> _On | None:
-        """Multipliers of acting rows if they are met and all others forgotten; None where they depend on each other."""
+        """Multipliers if the active rows are kept and all others ignored; None if they are linearly dependent."""
         rows, qp = active.nonzero()[0], self._qp
         side = active[rows]
         if rows.size > self._n and np.count_nonzero(np.abs(side) == 1) > self._n:
@@ -290,16 +291,16 @@ class ActiveSet:
 
     @cached_property
     def _inverse(self) -> Array:
-        """Inverse of the Hessian's Cholesky factor; not needed where no row acts."""
+        """Inverse of the Hessian's Cholesky factor; only needed with active rows."""
         return np.asarray(dtrsm(1.0, self._factor, np.eye(self._n), 0, 1, 0, 0, 1))
 
     @cached_property
     def _reduced(self) -> Array:
-        """All rows in the dual ``(R, n)``; not needed where only bounds of the unknowns act."""
+        """All rows in the dual ``(R, n)``; not needed if only bounds of the unknowns are active."""
         return np.vstack([self._inverse.T, dtrmm(1.0, self._inverse, self._qp.a.T, 0, 1).T])
 
     def _refined(self, found: Found) -> Found:
-        """The answer without what rounding left on a long way; multipliers of rows that give way are large."""
+        """The solution, refined after many steps with rounding; multipliers of relaxed rows are large."""
         qp, multipliers = self._qp, found.multipliers.copy()
         on = self._on(found.active)
         if on is None or not on.rows.size:

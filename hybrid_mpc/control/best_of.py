@@ -20,18 +20,18 @@ Start = Callable[[Estimate], Array]
 
 
 class BestOf(Controller):
-    """Solves from several first guesses and returns the cheapest plan; slower than real time is fine.
+    """Solves from several initial guesses and returns the cheapest plan; for use without real-time requirements.
 
-    Guesses are the previous plan, shifted; the given ``starts``; and the plans of ``rivals``, controllers on other
-    models of the same machine. Plans are compared by their cost on a run of the model itself, so the plan is at most
-    as expensive by this model as any rival's. Rivals have no memory here: their hidden state starts at the fixed
-    point at the estimated state, their disturbance is the estimate's own.
+    Guesses are the shifted previous plan, the given ``starts``, and the plans of ``rivals``, controllers on other
+    models of the same machine. Plans are compared by their cost in a run of the model itself, so the result is at most
+    as expensive by this model as any rival's. Rivals have no memory: their hidden state starts settled at the estimated
+    state, their disturbance is the estimate's own.
 
     Args:
-        controller: Solves from every guess, e.g. an :class:`~hybrid_mpc.control.sqp.SQPController`.
+        controller: Solver for every guess, e.g. an :class:`~hybrid_mpc.control.sqp.SQPController`.
         starts: Guesses: input plans ``(N, n_u)``, or functions ``estimate -> (N, n_u)``.
-        rivals: Controllers whose plans are guesses too; same states, inputs and horizon.
-        most: Guesses beside the previous plan that are solved from: those that are cheapest on a run of the
+        rivals: Controllers whose plans are further guesses; same states, inputs and horizon.
+        most: Most guesses, besides the previous plan, that are solved from: those that are cheapest in a run of the
             model. Default: all.
 
     Raises:
@@ -51,21 +51,21 @@ class BestOf(Controller):
         ocp = controller.ocp
         if most is not None and most < 1:
             raise InputError(
-                f"most: 1 or more guesses needed, got {most}; leave it out for all [HM-CONTROL-001]"
+                f"most: must be at least 1, got {most}. Leave it out for all guesses. [HM-CONTROL-001]"
             )
         for rival in rivals:
             given = rival.ocp.n_x, rival.ocp.n_u, rival.ocp.horizon
             if given != (ocp.n_x, ocp.n_u, ocp.horizon):
                 raise InputError(
-                    f"rival on {rival.model.name}: (n_x, n_u, N) = {given}, "
-                    f"needed: {(ocp.n_x, ocp.n_u, ocp.horizon)} [HM-CONTROL-002]"
+                    f"rival on {rival.model.name}: (n_x, n_u, N) must be {(ocp.n_x, ocp.n_u, ocp.horizon)}, "
+                    f"got {given} [HM-CONTROL-002]"
                 )
         for start in starts:
             if not callable(start):
                 input_plan(start, ocp.horizon, ocp.n_u, "start")
         if not starts and not rivals:
             raise InputError(
-                "best of one start is the controller itself; give starts or rivals [HM-CONTROL-003]"
+                "starts, rivals: give at least one; without any use the controller itself [HM-CONTROL-003]"
             )
         self.problem, self._controller = controller.problem, controller
         self._starts, self._rivals, self._most = tuple(starts), tuple(rivals), most
@@ -76,7 +76,7 @@ class BestOf(Controller):
     ) -> Solution:  # fmt: skip
         """The cheapest plan of all guesses; see :meth:`Controller.solve`.
 
-        Its cost is that on a run of the model. If no solve ends well, the one from the previous plan is returned.
+        Its cost is that of a run of the model. If no solve succeeds, the one from the previous plan is returned.
         """
         begin = perf_counter()
         target = self.problem.target(reference, weight, estimate, w, previous.steady)

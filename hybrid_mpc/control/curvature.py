@@ -1,4 +1,4 @@
-"""Second derivatives of the cost that Gauss-Newton leaves out, and Hessians made convex."""
+"""Second derivatives of the cost that Gauss-Newton neglects, and convexified Hessians."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from hybrid_mpc.model.stages import Linearization, Slopes
 Array = NDArray[np.float64]
 
 SHIFT = 1e-5
-"""Step of the difference of two Jacobians, in sizes of states and hidden states and scales of the inputs."""
+"""Step of the finite differences of Jacobians, in sizes of states and hidden states and scales of the inputs."""
 FLOOR = 1e-3
-"""Least curvature along a direction, as a share of Gauss-Newton's."""
+"""Least curvature along any direction, over that of Gauss-Newton."""
 MATTERS = 0.2
-"""Curvature of the hidden state below this share of Gauss-Newton's, along every direction, is left out. Convergence is
+"""Curvature of the hidden state below this share of Gauss-Newton's, along every direction, is neglected. Convergence is
 then linear, with about this rate."""
 AT_ONCE = 200
-"""Periods whose Jacobians are taken in one call: more would not stay in a core's cache."""
+"""Periods per call for Jacobians: more would not fit into a core's cache."""
 
 
 class StageCurvature:
     """Second derivatives of the dynamics by ``(x, u, h)``, weighted with the multipliers of the dynamics.
 
-    They are differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and inputs,
-    in which friction curves sharply, and ``n_h`` for the blocks by the hidden state. Those of soft bounds, weighted
-    with their multipliers, are added. The lengths of the differences go by the states' sizes and the inputs' limits.
+    They are finite differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and
+    inputs, where friction has large curvature, and ``n_h`` for the blocks by the hidden state. Second derivatives of
+    soft bounds, weighted with their multipliers, are added. Steps are scaled by the states' sizes and inputs' limits.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class StageCurvature:
 
     @cached_property
     def _by_few(self) -> Slopes:
-        """Built with the first plan: a loop's start is no part of a kit's."""
+        """Built with the first plan, so that loading a kit stays fast."""
         return self._stages.slopes(self._shift.size)
 
     @cached_property
@@ -59,7 +59,7 @@ class StageCurvature:
         return self._shift.size + self._n_h
 
     def fits(self, curvature: Array, horizon: int) -> bool:
-        """True for second derivatives that can go with this model's stages."""
+        """True for second derivatives that fit this model's stages."""
         return curvature.shape in [(horizon, size, size) for size in (self._shift.size, self.size)]
 
     def of(
@@ -118,14 +118,14 @@ class StageCurvature:
         return rows.transpose(1, 0, 2)
 
     def _of_soft(self, soft: BoundRows, z: Array, u: Array, multipliers: Array, e: Array | None) -> Array:
-        """Second derivatives of the soft bounds' expressions, which know the states and inputs before the last."""
+        """Second derivatives of the soft bounds' expressions, which depend on states and inputs before the last."""
         n, n_x, m = len(u), self._n_x, self._shift.size
 
         def slopes(points: Array) -> Array:
             _, by_x, by_u = soft.linearize(np.vstack([points[:, :n_x], z[-1:, :n_x]]), points[:, n_x:], e)
             total = np.zeros((n + 1, m))
             np.add.at(total, soft.stage, multipliers[:, None] * np.hstack([by_x, by_u]))
-            return total[:-1]  # bounds on states do not curve
+            return total[:-1]  # bounds on states are linear
 
         here = np.hstack([z[:-1, :n_x], u])
         before, rows = slopes(here), []
@@ -137,7 +137,7 @@ class StageCurvature:
         return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
 
     def condensed(self, curvature: Array, from_u: Array, by_inputs: Array) -> Array:
-        """The stages' curvature as that of the inputs ``(N n_u, N n_u)``; ``by_inputs`` as the ``Condenser`` has it."""
+        """The stages' curvature as that of the inputs ``(N n_u, N n_u)``; ``by_inputs`` from the ``Condenser``."""
         if curvature.shape[1] > self._shift.size:
             return condense_all(curvature, by_inputs, self._n_x, self._n_u)
         return condense_hessians(curvature, from_u, self._n_x)
@@ -145,7 +145,7 @@ class StageCurvature:
     def without_what_is_small(
         self, curvature: Array, gauss_newton: Array, from_u: Array, by_inputs: Array
     ) -> Array:
-        """The curvature, the hidden state's left out where it hardly matters to the Hessian."""
+        """The curvature, without the hidden state's if it hardly affects the Hessian."""
         few = self._shift.size
         if curvature.shape[1] == few:
             return curvature
@@ -155,10 +155,10 @@ class StageCurvature:
 
 
 def convex(gauss_newton: Array, rest: Array, held: NDArray[np.bool_] | None = None) -> Array:
-    """``gauss_newton + rest``, positive definite: where the sum curves down or hardly up, its size counts.
+    """``gauss_newton + rest``, made positive definite: small or negative curvature is replaced by its absolute value.
 
-    Along every direction the result has at least the share 0.001 of Gauss-Newton's curvature; directions are the joint
-    eigenvectors of the two. Where the sum curves up as long as the ``held`` unknowns stay, only their block is changed.
+    Along every direction the result has at least 0.001 of Gauss-Newton's curvature; directions are the generalised
+    eigenvectors of the two. If the sum is convex with the ``held`` unknowns fixed, only their block is changed.
     """
     whole = gauss_newton + rest
     try:

@@ -1,4 +1,4 @@
-"""Point-to-point moves: the horizon is free, and the plan ends within a target."""
+"""Point-to-point moves: the horizon is free, and the plan ends in a target."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Move:
 
     Args:
         duration: ``N dt`` [s].
-        t: Times ``(N + 1,)`` from its begin [s].
-        x: States ``(N + 1, n_x)``; a reference of states for a controller that follows.
+        t: Times ``(N + 1,)`` from the start [s].
+        x: States ``(N + 1, n_x)``, e.g. as a reference of states for a tracking controller.
         u: Inputs ``(N, n_u)``.
-        plan: The plan it is.
-        tried: Whether a plan of so many periods keeps all hard bounds, by number.
+        plan: The plan of the move.
+        tried: By number of periods, whether such a plan keeps all hard bounds.
     """
 
     duration: float
@@ -51,36 +51,35 @@ def shortest_move(
     longest: int = 400,
     controller: Callable[[HybridModel, OCP], Controller] = SQPController,
 ) -> Move:
-    """The move of fewest periods that ends within a target and keeps all limits and hard bounds.
+    """The move with the fewest periods that ends in a target and keeps all limits and hard bounds.
 
-    The number of periods is found by doubling and halving: what can be reached in N periods must be reachable in more,
-    as it is where the target can be held or come to more slowly. Of the moves of that length the problem's cost chooses
-    one: it should be small beside the limits, or it makes the move no shorter and only smoother.
+    The number of periods is found by doubling and bisection: if the target is reachable in N periods, it must be
+    reachable in more, as it is if the target can be held or approached more slowly. Among moves of that length the
+    problem's cost decides: it should be small compared to the limits, since it only smooths the move.
 
     Args:
         model: The model, prior or hybrid.
-        ocp: Limits, weights and bounds; its own horizon does not matter.
-        estimate: Where the move begins, hidden state and disturbances included.
-        target: Where it ends, a hard bound with ``at_end``.
-        reference: What the cost counts from, a row ``(n,)`` as controllers take it. Default: the middle of a target of
-            states, and where it has none the state at the begin.
-        price: What a second costs [unit of the problem's cost]: a longer move is taken where it is cheaper with the
-            price of its time. Default: only time counts.
+        ocp: Limits, weights and bounds; its own horizon is ignored.
+        estimate: Start of the move, with hidden state and disturbances.
+        target: End of the move, a hard bound with ``at_end``.
+        reference: Reference of the cost, a row ``(n,)`` as for controllers. Default: the middle of a target of states,
+            or the initial state where the target has no middle.
+        price: Cost of a second [unit of the problem's cost]: a longer move is preferred if it is cheaper including its
+            time. Default: only time counts.
         longest: Most periods.
-        controller: What solves it. Default: :class:`~hybrid_mpc.control.sqp.SQPController`.
+        controller: The solver. Default: :class:`~hybrid_mpc.control.sqp.SQPController`.
 
     Raises:
-        InputError: If the target is none, no reference follows from it, or no move of ``longest`` periods reaches it.
+        InputError: If the target is invalid, has no reference, or is not reached in ``longest`` periods.
 
     Example:
         ``move = shortest_move(model, ocp, estimate, HardBound("x", goal - 0.01, goal + 0.01, at_end=True))``
     """
     if not isinstance(target, HardBound) or not target.at_end:
-        raise InputError(f"target: {target!r} given; needed: a HardBound(..., at_end=True) [HM-CONTROL-004]")
+        raise InputError(f"target: must be a HardBound(..., at_end=True), got {target!r} [HM-CONTROL-004]")
     if reference is None and target.what != "x":
         raise InputError(
-            "reference: none follows from a target that is not of the states; give a row of it"
-            " [HM-CONTROL-005]"
+            "reference: must be given, one row, for a target that is not on the states [HM-CONTROL-005]"
         )
     row = np.atleast_2d(_middle(target, estimate.x) if reference is None else np.asarray(reference, float))
     bounded = ocp.changed(hard=(*ocp.hard, target))
@@ -99,8 +98,8 @@ def shortest_move(
     while not reaches(most):
         if most >= longest:
             raise InputError(
-                f"no move of {longest} periods ({longest * model.dt:g} s) ends within the target; the longest one "
-                f"misses {_missed(plans[most])}. Give a wider target, wider limits, or a larger longest"
+                f"target: no move of {longest} periods ({longest * model.dt:g} s) ends in it; the longest one "
+                f"misses {_missed(plans[most])}. Give a wider target, wider limits, or a larger longest."
                 " [HM-CONTROL-006]"
             )
         least, most = most, min(2 * most, longest)
@@ -132,7 +131,7 @@ def _missed(plan: Solution) -> str:
 
 
 def _cheapest(total: Callable[[int], float], first: int, last: int) -> int:
-    """The number of least total: steps that double until it rises, then halves; there is one valley."""
+    """The number with the smallest total: doubled steps until it rises, then halved ones; assumes a single minimum."""
     step, best = 1, first
     while best + step <= last and total(best + step) < total(best):
         best, step = best + step, 2 * step

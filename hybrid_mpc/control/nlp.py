@@ -21,11 +21,11 @@ from hybrid_mpc.model.stages import stage_step
 Array = NDArray[np.float64]
 NAN = float("nan")
 FEASIBLE = 1e-6
-"""Largest defect and violation of a limit, as a share of its range, that an answer may have."""
+"""Largest defect, and largest violation of a limit over its range, of an accepted solution."""
 
 
 class Rows(NamedTuple):
-    """Constraints ``lower <= value <= upper``, and what counts as one unit of their violation."""
+    """Constraints ``lower <= value <= upper``, and the unit of their violation."""
 
     value: ca.MX
     lower: ArrayLike
@@ -36,17 +36,17 @@ class Rows(NamedTuple):
 class IpoptController(Controller):
     """Nonlinear MPC by IPOPT on the sparse multiple-shooting problem: the reference, slower than real time.
 
-    Inputs count in :attr:`OCP.input_scale`, states in :attr:`Problem.sizes`, soft bounds in half their range.
+    Inputs are scaled by :attr:`OCP.input_scale`, states by :attr:`Problem.sizes`, soft bounds by half their range.
     Unknowns are the inputs, the states and hidden states of every period, and a slack for every soft bound. Second
-    derivatives are exact. Whatever IPOPT reports, the answer counts only if it is finite and keeps model and limits; it
-    is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
+    derivatives are exact. Whatever IPOPT reports, a solution is only accepted if it is finite and satisfies model and
+    limits; its status is SOLVED if IPOPT converged or the KKT residual is small, else STOPPED.
 
     Args:
         model: The deployed model; ``n_h`` may be 0.
         ocp: The problem.
-        tolerance: IPOPT's own, relative to its scaling.
-        iterations: IPOPT's most iterations.
-        options: Further options of IPOPT by name. Default: the adaptive barrier.
+        tolerance: Tolerance of IPOPT, relative to its scaling.
+        iterations: Most iterations of IPOPT.
+        options: Further options of IPOPT by name. Default: adaptive barrier.
 
     Raises:
         InputError: If problem and model do not fit, an option is not positive, or IPOPT does not know it.
@@ -67,7 +67,7 @@ class IpoptController(Controller):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         if not (isinstance(tolerance, int | float) and tolerance > 0):
-            raise InputError(f"tolerance must be positive, got {tolerance!r:.80} [HM-CONTROL-007]")
+            raise InputError(f"tolerance: must be positive, got {tolerance!r:.80} [HM-CONTROL-007]")
         iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         self.problem = Problem(model, ocp)
         self._bounds: dict[str, Array] = {}
@@ -82,19 +82,19 @@ class IpoptController(Controller):
             self._solver = ca.nlpsol("mpc", "ipopt", nlp, settings)
         except RuntimeError as error:
             raise InputError(
-                f"options: IPOPT does not take {dict(options or {})}: {error} [HM-CONTROL-008]"
+                f"options: IPOPT does not accept {dict(options or {})}: {error} [HM-CONTROL-008]"
             ) from error
         w, g = nlp["x"], nlp["g"]
         multipliers = ca.MX.sym("lam", g.shape[0])
         slope = ca.gradient(nlp["f"] + ca.dot(multipliers, g), w)
         self._slope = ca.Function("slope", [w, nlp["p"], multipliers], [slope, ca.gradient(nlp["f"], w), g])
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
         *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
-        """The plan from now on; see :meth:`Controller.solve`. The previous plan, shifted, is the first guess."""
+        """The plan from now on; see :meth:`Controller.solve`. The shifted previous plan is the initial guess."""
         start = perf_counter()
         problem, u_prev = self.problem, previous.u[0]
         target = problem.target(reference, weight, estimate, w, previous.steady)
@@ -132,7 +132,7 @@ class IpoptController(Controller):
         return self._plan(u, z, target, cost, status, kkt, start, count)
 
     def _limited(self, of_inputs: tuple[Array, Array], gives_way: bool) -> dict[str, Array]:
-        """Bounds of unknowns and rows with those of the inputs; hard bounds have slacks only if they give way."""
+        """Bounds of unknowns and rows with those of the inputs; hard bounds only have slacks if they are relaxed."""
         lower, upper = self._bounds["lbx"].copy(), self._bounds["ubx"].copy()
         n = of_inputs[0].size
         lower[:n], upper[:n] = (bound.ravel() / self._scale[:n] for bound in of_inputs)
@@ -143,7 +143,7 @@ class IpoptController(Controller):
     def _check(
         self, w: Array, given: Array, lam_g: Array, lam_x: Array, bounds: dict[str, Array]
     ) -> tuple[float, float]:
-        """Largest violation as a share of its range, and the KKT residual relative to the objective's slope."""
+        """Largest violation over its range, and the KKT residual relative to the objective's gradient."""
         slope, objective, g = (m.full().ravel() for m in self._slope(w, given, lam_g))
         kkt = float(np.max(np.abs(slope + lam_x)) / max(1.0, np.max(np.abs(objective))))
         beyond = np.maximum(bounds["lbg"] - g, g - bounds["ubg"])

@@ -1,4 +1,4 @@
-"""The control problem as plain data, shared by scenarios, tasks and solvers."""
+"""The control problem as plain data, for scenarios, tasks and solvers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hybrid_mpc.control.soft import (
 from hybrid_mpc.errors import Collected, InputError
 from hybrid_mpc.model.limits import input_limits, numbers, vector
 from hybrid_mpc.model.model import output_with_jacobian
-from hybrid_mpc.model.riccati import coming_back, dare, linearization, unmoved
+from hybrid_mpc.model.riccati import dare, linearization, remedy_for_unmoved, unmoved_states
 from hybrid_mpc.records import known
 from hybrid_mpc.rules import LARGEST
 
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Bound = TypeVar("Bound", SoftBound, HardBound)
 MOST_HORIZON = 10_000
-"""Longest horizon [periods]: a plan is in memory with its derivatives."""
+"""Longest horizon [periods]: a plan and its derivatives are kept in memory."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds of the inputs for one solve, tighter than the problem's own: what a guard asks for.
+    """Bounds of the inputs for one solve, tighter than the problem's own, e.g. from a guard.
 
     Args:
         u_min: Lower bounds ``(n_u,)``; ``-inf`` for the problem's own.
@@ -62,7 +62,7 @@ class Limits:
         lower, upper = numbers(u_min, "limits: u_min"), numbers(u_max, "limits: u_max")
         if lower.shape != upper.shape or not np.all(lower <= upper):
             raise InputError(
-                f"limits: u_min {lower}, u_max {upper} given; needed: a u_min <= u_max for each input [HM-CONTROL-009]"
+                f"limits: every input needs u_min <= u_max, got u_min {lower}, u_max {upper} [HM-CONTROL-009]"
             )
         object.__setattr__(self, "u_min", lower)
         object.__setattr__(self, "u_max", upper)
@@ -77,24 +77,24 @@ class OCP:
     (u_k - u_ref_k)' diag(r) (u_k - u_ref_k) + du_k' diag(r_delta) du_k``, ``du_k = u_k - u_{k-1}``, ``k = 0 .. N-1``.
     Only the stages are multiplied by ``dt``.
 
-    What the reference is depends on ``q_y``. Without it references are those of the states, ``x_ref``, and ``u_ref`` is
-    the model's operating point. With it they are those of the outputs, ``y_ref``, and a target calculator finds
-    ``x_ref`` and ``u_ref`` for them, given the estimated disturbances (:class:`~hybrid_mpc.control.targets.Targets`);
-    where a set-point cannot be reached ``y_ref`` is the nearest that can.
+    The meaning of a reference depends on ``q_y``. Without ``q_y`` it is that of the states, ``x_ref``, and ``u_ref`` is
+    the model's operating point. With ``q_y`` it is that of the outputs, ``y_ref``; a target calculator then computes
+    ``x_ref`` and ``u_ref``, given the estimated disturbances (:class:`~hybrid_mpc.control.targets.Targets`). For an
+    unreachable set-point ``y_ref`` is the closest reachable one.
 
     References and weights may vary over time. With weight factors ``w_k`` ``(n_x,)`` in a solve, ``q`` becomes
-    ``w_k q`` at stage k and ``P`` becomes ``S P S`` with ``S = diag(sqrt(w_N))``. "Be at x* at the time t*, no matter
-    how" has factors of zero before ``t*``, large ones at ``t*``, ordinary ones after it, and a horizon that reaches
-    beyond ``t*`` from the start on.
+    ``w_k q`` at stage k and ``P`` becomes ``S P S`` with ``S = diag(sqrt(w_N))``. The task "be at x* at the time t*"
+    has factors of zero before ``t*``, large ones at ``t*``, ordinary ones after it, and a horizon that reaches beyond
+    ``t*`` from the start.
 
     Bounds on states hold for ``x_1 .. x_N`` and are soft: a violation ``s`` costs ``slack_linear s +
     slack_quadratic s^2`` per second, see :class:`~hybrid_mpc.control.soft.SoftBound`. The default is 1,000 times
-    what the tolerated deviation ``1 / sqrt(q)`` costs, far above the multipliers of weights by Bryson's rule; weight
-    factors of more than 100 ask for larger penalties.
+    the cost of the tolerated deviation ``1 / sqrt(q)``, far above the multipliers of weights by Bryson's rule; weight
+    factors above 100 need larger penalties.
 
     A problem is plain data: :func:`hybrid_mpc.records.plain` makes JSON of it and ``record(OCP, data, where)`` reads
-    it. Two problems are equal if their numbers are and their expressions state the same program. The arrays are
-    read-only; :meth:`changed` makes a problem that differs.
+    it. Two problems are equal if their numbers are equal and their expressions are the same programs. The arrays are
+    read-only; :meth:`changed` makes a different problem.
 
     Args:
         horizon: N, number of model periods.
@@ -105,37 +105,37 @@ class OCP:
         u_max: Upper bounds ``(n_u,)``; ``inf`` for none.
         du_max: Largest change per period ``(n_u,)``, positive. Default: none.
         terminal: ``"riccati"``, or a symmetric positive semi-definite ``(n_x, n_x)`` matrix ``P``.
-        working_point: ``(x, u)`` at which ``"riccati"`` and a fallback linearize the model. With a steep friction law
-            take a moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default: the model's operating point.
+        working_point: ``(x, u)`` at which ``"riccati"`` and a fallback linearize the model. With steep friction use a
+            moving point (see :func:`hybrid_mpc.model.riccati.lqr`). Default: the model's operating point.
         x_min: Soft lower bounds of the states ``(n_x,)``; ``-inf`` for none. Default: none.
         x_max: Soft upper bounds of the states ``(n_x,)``; ``inf`` for none. Default: none.
         slack_linear: Penalties ``(n_x,)`` [cost/s/unit], not negative. Default: ``1000 sqrt(q)``.
-        slack_quadratic: Penalties ``(n_x,)`` [cost/s/unit^2], positive. Default: ``1000 q``. Where ``q`` is
-            zero, ``cost / size^2`` stands for it in both: a state off by its size costs as much as any other signal
-            (:class:`~hybrid_mpc.control.sizes.Sizes`).
+        slack_quadratic: Penalties ``(n_x,)`` [cost/s/unit^2], positive. Default: ``1000 q``. For zero ``q`` both
+            defaults use ``cost / size^2`` instead: a deviation of a state by its size costs as much as that of any
+            other signal (:class:`~hybrid_mpc.control.sizes.Sizes`).
         soft: Soft bounds on expressions of ``(x, u)``, ``(x, u, w)`` or ``(x, u, w, p)``. Default: none.
         blocks: Move blocking: numbers of periods over which the input is held, one block after the other,
-            e.g. ``(1, 1, 2, 4)`` for a horizon of 8. Every solve starts its first block now. Default: none.
+            e.g. ``(1, 1, 2, 4)`` for a horizon of 8. The first block starts at every solve. Default: none.
         economic: A further stage cost per second, ``(x, u) -> scalar``, twice differentiable, of ``(x_0, u_0) ..
-            (x_{N-1}, u_{N-1})``; it may be negative and need not be convex. Where it curves down ``rti`` takes it
-            as flat; ``sqp`` and ``ipopt`` know its curvature. With ``(x, u, p) -> scalar`` references have
-            ``n_p`` more columns, the values of ``p``, e.g. prices. Default: none.
-        starts: Input plans ``(horizon, n_u)`` from which the first plan of a loop is sought, too, for a task with
-            several ways (a swing-up); the cheapest plan is taken. Default: none.
-        q_y: Weights of the outputs ``(n_y,)``, not negative. As many can be held without offset as there are inputs.
-            Default: none; references are then those of the states.
-        y_min: Soft lower bounds of the outputs ``y_0 .. y_{N-1}`` ``(n_y,)``; ``-inf`` for none. A violation costs what
-            it does of a state, by ``q_y``. Default: none.
+            (x_{N-1}, u_{N-1})``; it may be negative and nonconvex. ``rti`` replaces negative curvature by zero; ``sqp``
+            and ``ipopt`` use the exact curvature. With ``(x, u, p) -> scalar`` references have ``n_p`` more columns,
+            the values of ``p``, e.g. prices. Default: none.
+        starts: Input plans ``(horizon, n_u)``, further initial guesses of a loop's first plan, for a task with several
+            solutions (a swing-up); the cheapest plan is used. Default: none.
+        q_y: Weights of the outputs ``(n_y,)``, not negative. At most as many outputs as inputs can be held without
+            offset. Default: none; references are then those of the states.
+        y_min: Soft lower bounds of the outputs ``y_0 .. y_{N-1}`` ``(n_y,)``; ``-inf`` for none. Violations are
+            penalised as for states, by ``q_y``. Default: none.
         y_max: Soft upper bounds of the outputs ``(n_y,)``; ``inf`` for none. Default: none.
-        hard: Hard bounds on states, outputs and expressions; only where they cannot all be kept, they give way, in the
-            order of their priorities. Default: none.
-        preview: Whether a loop knows references and weights ahead, or holds those of the instant. Default: ahead.
-        preview_w: Whether a loop knows the measured disturbances ahead, where it is given a forecast, or holds those
-            measured last. Default: it holds them.
+        hard: Hard bounds on states, outputs and expressions. If not all can be kept, they are relaxed in the order of
+            their priorities. Default: none.
+        preview: Whether references and weights are known ahead; else the present values are held. Default: ahead.
+        preview_w: Whether measured disturbances are known ahead if there is a forecast; else the last values are held.
+            Default: held.
 
     Raises:
-        InputError: If an argument is of another kind, shapes do not fit, bounds cross, a weight is negative or not
-            finite, or the blocks' lengths do not sum to the horizon; all of it together.
+        InputError: With all problems: an argument of a wrong kind, shapes that do not fit, bounds that cross, a
+            negative or non-finite weight, blocks whose lengths do not sum to the horizon.
 
     Example:
         >>> from hybrid_mpc.records import plain, record
@@ -245,15 +245,15 @@ class OCP:
             object.__setattr__(self, name, value)
 
     def changed(self, **fields: Any) -> OCP:
-        """The same problem but for some fields, which are given and checked as to a new one.
+        """The same problem with other values of some fields, which are checked as for a new problem.
 
         Raises:
-            InputError: If there is no such field, or the problem would be wrong.
+            InputError: If a field is unknown, or the problem would be invalid.
         """
         names = [field.name for field in dataclass_fields(self)]
         for name in fields:
             known(name, names, "field of a control problem")
-        if "q" in fields and np.size(fields["q"]) != self.n_x:  # bounds that bound nothing have no size
+        if "q" in fields and np.size(fields["q"]) != self.n_x:  # infinite bounds adapt to the new size
             free = (name for name in ("x_min", "x_max") if not np.any(np.isfinite(getattr(self, name))))
             fields = {**dict.fromkeys(free), **fields}
         return replace(self, **fields)
@@ -280,12 +280,12 @@ class OCP:
 
     @property
     def n_y(self) -> int:
-        """Number of outputs where references are the outputs', else 0."""
+        """Number of outputs if references are those of the outputs, else 0."""
         return int(self.q_y.size)
 
     @property
     def columns(self) -> int:
-        """Columns of a reference: those of the states, or of the outputs where ``q_y`` weighs them, and ``n_p``."""
+        """Number of columns of a reference: states, or outputs if ``q_y`` weighs them, and ``n_p``."""
         return (self.n_y or self.n_x) + self.n_p
 
     @property
@@ -297,7 +297,7 @@ class OCP:
 
     @property
     def state_range(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the states ``(n_x,)`` each, soft or hard, whichever are tighter."""
+        """Lower and upper bounds of the states ``(n_x,)`` each: the tighter of soft and hard ones."""
         return tightest(self.x_min, self.x_max, self.hard, "x", self.n_x)
 
     def output_range(self, n_y: int) -> tuple[Array, Array]:
@@ -306,8 +306,8 @@ class OCP:
 
     @property
     def penalties(self) -> tuple[Array, Array]:
-        """Linear and quadratic penalties of the states' bounds ``(n_x,)`` each, the defaults by ``q`` filled in; NaN
-        where the default needs a size, since ``q`` is zero.
+        """Linear and quadratic penalties of the states' bounds ``(n_x,)`` each, with defaults from ``q``; NaN if ``q``
+        is zero, where the default needs a size.
         """
         q = np.where(self.q > 0, self.q, np.nan)
         linear = PENALTY * np.sqrt(q) if self.slack_linear is None else self.slack_linear
@@ -315,18 +315,18 @@ class OCP:
 
     @property
     def input_range(self) -> Array:
-        """Reference size of each input ``(n_u,)``: its range, or twice what its weights tolerate."""
+        """Size of each input ``(n_u,)``: its range, or twice the deviation that its weights tolerate."""
         return 2.0 * self.input_scale
 
     @property
     def input_scale(self) -> Array:
-        """By what solvers scale the inputs ``(n_u,)``: half the range, or, without one, what their weights tolerate."""
+        """Scale of the inputs ``(n_u,)`` in solvers: half the range, else the deviation that their weights tolerate."""
         half = 0.5 * (self.u_max - self.u_min)
         return np.where(np.isfinite(half), half, 1.0 / np.sqrt(self.r + self.r_delta))
 
     @property
     def block_starts(self) -> NDArray[np.int64]:
-        """First period of every move block; all periods where there are none."""
+        """First period of every move block; all periods without blocks."""
         lengths = self.blocks if self.blocks is not None else (1,) * self.horizon
         return np.cumsum((0, *lengths[:-1]))
 
@@ -341,7 +341,7 @@ class OCP:
         """Stage cost ``(...)`` per second of states ``(..., n_x)`` and inputs ``(..., n_u)``.
 
         ``weight`` ``(..., n_x)`` are factors on ``q``, ``u_ref`` ``(..., n_u)`` is the target input, ``y_error``
-        ``(..., n_y)`` are the outputs' deviations. Penalties of soft bounds are not in it.
+        ``(..., n_y)`` are the outputs' deviations. Penalties of soft bounds are not included.
         """
         error = weight * (np.asarray(x) - np.asarray(x_ref)) ** 2
         inputs = np.asarray(np.asarray(u) - u_ref)
@@ -351,8 +351,8 @@ class OCP:
     def bounds(self, u_prev: Array, limits: Limits | None = None) -> tuple[Array, Array]:
         """Lower and upper bounds of a plan's inputs, ``(N, n_u)`` each.
 
-        ``limits`` tighten the problem's own. Where ``du_max`` keeps ``u_prev`` from being within them at once,
-        the bounds go there as fast as ``du_max`` lets them.
+        ``limits`` tighten the problem's own. If ``du_max`` prevents ``u_prev`` from meeting them at once, the bounds
+        approach them as fast as ``du_max`` allows.
 
         Raises:
             InputError: If the limits have another size.
@@ -362,7 +362,7 @@ class OCP:
             return np.broadcast_to(self.u_min, shape), np.broadcast_to(self.u_max, shape)
         if limits.u_min.size != self.n_u:
             raise InputError(
-                f"limits of {limits.u_min.size} inputs given, the problem has {self.n_u} [HM-CONTROL-010]"
+                f"limits: must have {self.n_u} inputs, as the problem, got {limits.u_min.size} [HM-CONTROL-010]"
             )
         lower, upper = (np.clip(v, self.u_min, self.u_max) for v in (limits.u_min, limits.u_max))
         if self.du_max is None:
@@ -385,8 +385,8 @@ class OCP:
         """Terminal matrix ``(n_x, n_x)`` for a model.
 
         ``"riccati"``: the cost-to-go of the LQR at the working point, minimised over the hidden states (Schur
-        complement), so that they need no target. Change weights count as input weights: exact for ``r_delta = 0``.
-        Weights on outputs count as weights on the states that they show there.
+        complement), so they need no target. Change weights are added to the input weights: exact for ``r_delta = 0``.
+        Weights on outputs count as weights on the states that the outputs depend on there.
 
         Raises:
             InputError: If the linearized model is not stabilisable.
@@ -398,11 +398,11 @@ class OCP:
         try:
             p, _ = dare(a, b, q, r)
         except InputError as error:
-            why = coming_back(unmoved(model, a, b))
+            why = remedy_for_unmoved(unmoved_states(model, a, b))
             raise InputError(f"{error}{why and '; ' + why}") from None
         if not model.n_h:
             return p
-        own = np.sqrt(np.diag(p)[:n_x])  # in sizes: rounding must not depend on units
+        own = np.sqrt(np.diag(p)[:n_x])  # scaled, so that rounding does not depend on units
         late, n_own = np.resize(self.input_scale, model.delay_states), model.n_h - model.delay_states
         size = np.concatenate([np.where(own > 0, own, 1.0), 1.0 / late, np.ones(n_own)])
         p = p / np.outer(size, size)
@@ -414,7 +414,7 @@ class OCP:
 
     def point(self, model: HybridModel) -> tuple[Array, Array]:
         """State and input at which terminal weight and fallback are linearized: the working point, else the model's
-        operating point with its input within the limits.
+        operating point with its input clipped to the limits.
         """
         if self.working_point is not None:
             return self.working_point
@@ -423,7 +423,7 @@ class OCP:
     def linear_quadratic(self, model: HybridModel) -> tuple[Array, Array, Array, Array]:
         """``A``, ``B``, ``Q`` ``(n_z, n_z)`` and ``R`` of the linear-quadratic problem at :meth:`point`, per period.
 
-        With weights on outputs ``Q`` has ``C' diag(q_y) C``. What outputs depend on inputs directly is left out.
+        With weights on outputs ``Q`` contains ``C' diag(q_y) C``. A direct effect of inputs on outputs is neglected.
         """
         x, u = self.point(model)
         a, b, _ = linearization(model, x, u)
@@ -438,14 +438,14 @@ def _horizon(value: object) -> int:
     """A number of periods."""
     if not _whole(value) or not 1 <= value <= MOST_HORIZON:  # type: ignore[operator]
         raise InputError(
-            f"horizon must be a whole number of periods, from 1 to {MOST_HORIZON}; got {value!r:.80} [HM-CONTROL-011]"
+            f"horizon: must be an integer from 1 to {MOST_HORIZON} periods, got {value!r:.80} [HM-CONTROL-011]"
         )
     return int(value)  # type: ignore[call-overload]
 
 
 def _flag(value: object, name: str) -> bool:
     if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} must be True or False, got {value!r:.80} [HM-CONTROL-012]")
+        raise InputError(f"{name}: must be True or False, got {value!r:.80} [HM-CONTROL-012]")
     return bool(value)
 
 
@@ -457,29 +457,29 @@ def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:
         else "HardBound(what, lower, upper, ...)"
     )
     if not isinstance(given, tuple | list):
-        raise InputError(f"{name}: {given!r:.80} given; needed: a list of {example} [HM-CONTROL-013]")
+        raise InputError(f"{name}: must be a list of {example}, got {given!r:.80} [HM-CONTROL-013]")
     if wrong := [bound for bound in given if not isinstance(bound, kind)]:
-        raise InputError(f"{name}: {wrong[0]!r:.80} given; needed: {example} [HM-CONTROL-014]")
+        raise InputError(f"{name}: must contain {example}, got {wrong[0]!r:.80} [HM-CONTROL-014]")
     return tuple(given)
 
 
 def _check_hard(hard: Sequence[HardBound], n_x: int, n_y: int) -> None:
-    """Refuse hard bounds of another size than states or outputs."""
+    """Refuse hard bounds whose size differs from that of states or outputs."""
     for bound in hard:
         needed = {"x": n_x, "y": n_y}.get(bound.what if isinstance(bound.what, str) else "", 0)
         if needed and bound.lower.size != needed:
             raise InputError(
-                f"hard bound on {bound.what}: {bound.lower.size} values given, {needed} needed"
+                f"hard bound on {bound.what}: must have {needed} values, got {bound.lower.size}"
                 " [HM-CONTROL-015]"
             )
 
 
 def _check_shared(economic: ca.Function | None, soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> None:
-    """Refuse parameters of different sizes: all costs and bounds that have some share them."""
+    """Refuse parameters of different sizes: all costs and bounds with parameters share them."""
     own = {economic.numel_in(2)} if economic is not None and economic.n_in() > 2 else set()
     if len(given := own | {f.numel_in(3) for f in _parametric(soft, hard)}) > 1:
         raise InputError(
-            f"parameters p of {sorted(given)} numbers given; all costs and bounds that have some share them"
+            f"parameters p: all costs and bounds share them, so their sizes must be equal, got {sorted(given)}"
             " [HM-CONTROL-016]"
         )
 
@@ -488,8 +488,7 @@ def _stage_cost(value: ca.Function | None) -> ca.Function | None:
     """An economic stage cost ``(x, u) -> scalar`` or ``(x, u, p) -> scalar``, or none."""
     if value is not None and not _is_stage_cost(value):
         raise InputError(
-            f"economic: {value!r:.80} given; needed: a function (x, u) or (x, u, p) -> scalar"
-            " [HM-CONTROL-017]"
+            f"economic: must be a function (x, u) or (x, u, p) -> scalar, got {value!r:.80} [HM-CONTROL-017]"
         )
     return value
 
@@ -497,23 +496,23 @@ def _stage_cost(value: ca.Function | None) -> ca.Function | None:
 def _largest_change(value: ArrayLike, n_u: int) -> Array:
     found = vector(numbers(value, "du_max", most=LARGEST), n_u, "du_max")
     if not np.all(found > 0):
-        raise InputError(f"du_max must be positive, got {found}; leave it out for no limit [HM-CONTROL-018]")
+        raise InputError(
+            f"du_max: must be positive, got {found}. Leave it out for no limit. [HM-CONTROL-018]"
+        )
     return found
 
 
 def _plans(starts: object, horizon: int, n_u: int) -> tuple[Array, ...]:
-    """Plans of the inputs, as a tuple."""
+    """Input plans, as a tuple."""
     if not isinstance(starts, tuple | list | np.ndarray):
-        raise InputError(
-            f"starts: {starts!r:.80} given; needed: a list of plans of the inputs [HM-CONTROL-019]"
-        )
+        raise InputError(f"starts: must be a list of input plans, got {starts!r:.80} [HM-CONTROL-019]")
     for i, plan in enumerate(starts):
         numbers(plan, f"starts[{i}]", most=LARGEST)
     return tuple(input_plan(s, horizon, n_u, f"starts[{i}]") for i, s in enumerate(starts))
 
 
 def _parametric(soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> list[ca.Function]:
-    """The bounded expressions that have parameters."""
+    """Bounded expressions with parameters."""
     given = [bound.expression for bound in soft] + [b.what for b in hard if not isinstance(b.what, str)]
     return [f for f in given if f.n_in() > 3]
 
@@ -533,10 +532,10 @@ def _diagonal(values: ArrayLike, name: str) -> Array:
     shape = np.shape(values)
     if len(shape) > 1 and max(shape) < array.size:
         raise InputError(
-            f"{name}: shape {shape} given; needed: the diagonal alone, a weight each [HM-CONTROL-020]"
+            f"{name}: must be the diagonal only, one weight per signal, got shape {shape} [HM-CONTROL-020]"
         )
     if not array.size:
-        raise InputError(f"{name}: no weight given; needed: one each [HM-CONTROL-021]")
+        raise InputError(f"{name}: no weight given. Give one per signal. [HM-CONTROL-021]")
     return array
 
 
@@ -549,31 +548,32 @@ def _weights(values: ArrayLike, name: str) -> Array:
 
 
 def _change_weights(values: ArrayLike, r: Array) -> Array:
-    """Weights of input changes, which with those of the inputs determine every input."""
+    """Weights of input changes; with those of the inputs they must determine every input."""
     array = _weights(vector(values, r.size, "r_delta"), "r_delta")
     if not np.all(r + array > 0):
         raise InputError(
-            "every input needs a positive weight in r or r_delta, otherwise it is not determined [HM-CONTROL-023]"
+            "r, r_delta: every input needs a positive weight in one of them; otherwise it is undetermined"
+            " [HM-CONTROL-023]"
         )
     return array
 
 
 def input_plan(value: ArrayLike, horizon: int, n_u: int, name: str) -> Array:
-    """A plan of the inputs ``(horizon, n_u)``, finite."""
+    """A finite input plan ``(horizon, n_u)``."""
     array = numbers(value, name).reshape(np.shape(value))
     if array.shape != (horizon, n_u) or not np.all(np.isfinite(array)):
         raise InputError(
-            f"{name}: shape {array.shape} given; needed: a finite plan of the inputs ({horizon}, {n_u})"
+            f"{name}: must be a finite input plan of shape ({horizon}, {n_u}), got shape {array.shape}"
             " [HM-CONTROL-024]"
         )
     return array
 
 
 def _point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
-    """A state ``(n_x,)`` and an input ``(n_u,)``, finite."""
+    """A finite state ``(n_x,)`` and input ``(n_u,)``."""
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise InputError(
-            f"working_point: {value!r} given; needed: (x, u), a state and an input [HM-CONTROL-025]"
+            f"working_point: must be (x, u), a state and an input, got {value!r} [HM-CONTROL-025]"
         )
     own = Collected()
     x, u = (
@@ -597,7 +597,7 @@ def _block_lengths(blocks: object, horizon: int) -> tuple[int, ...]:
     lengths = tuple(int(length) for length in given if _whole(length))
     if not given or len(lengths) < len(given) or min(lengths) < 1 or sum(lengths) != horizon:
         raise InputError(
-            f"blocks: {blocks!r:.80} given; needed: whole numbers of at least 1 that sum to the horizon of {horizon}"
+            f"blocks: must be positive integers that sum to the horizon of {horizon}, got {blocks!r:.80}"
             " [HM-CONTROL-026]"
         )
     return lengths
@@ -609,19 +609,19 @@ def _terminal_matrix(value: ArrayLike, n_x: int) -> Array | Literal["riccati"]:
         return "riccati"
     if isinstance(value, str):
         raise InputError(
-            f"terminal: {value!r} given; needed: 'riccati' or an ({n_x}, {n_x}) matrix [HM-CONTROL-027]"
+            f"terminal: must be 'riccati' or an ({n_x}, {n_x}) matrix, got {value!r} [HM-CONTROL-027]"
         )
     matrix = numbers(value, "terminal", most=LARGEST).reshape(np.shape(value))
     fits = matrix.shape == (n_x, n_x) and bool(np.all(np.isfinite(matrix)))
     size = np.sqrt(np.abs(np.diag(matrix))) if fits else np.ones(n_x)
     size = np.where(size > 0, size, 1.0)
-    scaled = matrix / np.outer(size, size) if fits else matrix  # entries have units of their own
+    scaled = matrix / np.outer(size, size) if fits else matrix  # entries have different units
     if not fits or not np.allclose(scaled, scaled.T):
         raise InputError(
-            f"terminal: shape {matrix.shape} given; needed: a finite symmetric ({n_x}, {n_x}) matrix [HM-CONTROL-028]"
+            f"terminal: must be a finite symmetric ({n_x}, {n_x}) matrix, got shape {matrix.shape} [HM-CONTROL-028]"
         )
     if np.min(np.linalg.eigvalsh(scaled)) < -1e-9 * float(np.max(np.abs(scaled))):
         raise InputError(
-            "terminal: the matrix has a negative eigenvalue; needed: positive semi-definite [HM-CONTROL-029]"
+            "terminal: must be positive semi-definite, but has a negative eigenvalue [HM-CONTROL-029]"
         )
     return matrix

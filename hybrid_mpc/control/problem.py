@@ -1,4 +1,4 @@
-"""A model and a control problem made ready for a solver: free run, targets, cost, first plan."""
+"""A model and a control problem prepared for a solver: free run, targets, cost, first plan."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ if TYPE_CHECKING:  # BLAS takes long to import
 
 Array = NDArray[np.float64]
 KEPT = 1e-7
-"""Share of its size by which a hard bound may be exceeded and counts as kept: solvers keep it to their tolerance."""
+"""Violation, over its size, up to which a hard bound counts as kept: the tolerance of the solvers."""
 KNOTS = 8
-"""Most set-points of one preview that get a steady state of their own. Of a reference that moves all the time so many
-rows are taken, and between them steady states are interpolated."""
+"""Most set-points of one preview with a steady state of their own. For a reference that changes all the time, steady
+states are interpolated between so many rows."""
 
 
 class Status(Enum):
-    """How a solve ended; the value is the message."""
+    """Result of a solve; the value is the message."""
 
     INITIAL = "a first plan, not optimised"
     SOLVED = "the QP was solved and its solution checked"
-    NOT_FINITE = "the estimate, the reference, the model or the plan holds a value that is not finite"
-    STOPPED = "the iterations ended before convergence; the plan keeps the model and the limits"
+    NOT_FINITE = "the estimate, the reference, the model or the plan contains a value that is not finite"
+    STOPPED = "the iterations ended before convergence; the plan satisfies the model and the limits"
     INFEASIBLE = "the solution violates an input bound or the limit of its change"
     INACCURATE = "the solution fails the KKT check"
-    NLP_FAILED = "the nonlinear solver's answer keeps neither the model nor the limits"
+    NLP_FAILED = "the nonlinear solver's solution violates the model or the limits"
     LATE = "the solve missed its deadline"
 
     @property
@@ -53,27 +53,27 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Solution:
-    """A plan from ``t_k`` on, and how it was found.
+    """A plan from ``t_k`` on, and the result of its solve.
 
     Args:
         u: Inputs ``(N, n_u)``; ``u[0]`` is the one to hold now.
         x: Predicted states ``(N + 1, n_x)``.
         h: Predicted hidden states ``(N + 1, n_h)``.
-        d: Unmeasured disturbances ``(n_d,)`` that the prediction assumes.
+        d: Unmeasured disturbances ``(n_d,)`` assumed by the prediction.
         cost: Cost of the plan (see :class:`~hybrid_mpc.control.ocp.OCP`); NaN if it was not solved.
-        status: How the solve ended.
-        kkt: KKT residual in the QP's scaling, relative to its gradient [-]; of ``ipopt`` that of the NLP.
+        status: Result of the solve.
+        kkt: KKT residual in the QP's scaling, relative to its gradient [-]; for ``ipopt`` that of the NLP.
         defect: Largest defect ``|x_{k+1} - f(x_k, h_k, u_k)|`` at the last linearization, over (x, h).
-        timing: Durations [ms] by name (``prepare``, ``feedback``); recorded, never used to decide.
+        timing: Durations [ms] by name (``prepare``, ``feedback``); for information only.
         excess: Largest violation of a soft bound in the plan [its unit].
         iterations: Linearizations (or iterations of the nonlinear solver) of this solve.
-        curvature: Second derivatives of the stages by ``(x, u, h)`` ``(N, n, n)``, or by ``(x, u)`` where the
-            hidden state's hardly matter, that ``sqp`` starts its next solve with; None from other solvers.
-        w: Measured disturbances ``(N, n_w)`` that the prediction assumes.
-        steady: The steady state for the first row of an outputs' reference; None where references are the states'.
-        active: Rows of the QP that act: where the next solve begins. None: it begins without.
-        given_way: Hard bounds that the plan exceeds, since none keeps them all: largest violation by name. A state is
-            named as in the model, an output ``output`` and its name, an expression by its function's name.
+        curvature: Second derivatives of the stages by ``(x, u, h)`` ``(N, n, n)``, or by ``(x, u)`` if those of the
+            hidden state hardly matter, with which ``sqp`` starts its next solve; None from other solvers.
+        w: Measured disturbances ``(N, n_w)`` assumed by the prediction.
+        steady: The steady state for the first row of an outputs' reference; None if references are the states'.
+        active: Active rows of the QP, the warm start of the next solve. None: cold start.
+        given_way: Hard bounds that are infeasible and relaxed in the plan: largest violation by name. A state has its
+            name in the model, an output is ``output`` and its name, an expression has its function's name.
     """
 
     u: Array
@@ -95,17 +95,17 @@ class Solution:
 
     @property
     def following(self) -> Array:
-        """Inputs ``(N, n_u)`` of the plan one period later, the last one repeated."""
+        """Inputs ``(N, n_u)`` of the plan one period later, with the last one repeated."""
         return np.vstack([self.u[1:], self.u[-1:]])
 
     def beginning_with(self, u: Array) -> Solution:
-        """The plan with ``u`` ``(n_u,)`` as its first input."""
+        """The plan with first input ``u`` ``(n_u,)``."""
         return replace(self, u=np.vstack([u[None], self.u[1:]]))
 
     def delayed(self, u_held: Array) -> Solution:
-        """The plan one period earlier, with ``u_held`` ``(n_u,)`` held in it: a solve that shifts it has this plan.
+        """The plan one period earlier, with ``u_held`` ``(n_u,)`` in that period: a solve that shifts it has this plan.
 
-        It loses its last period, which the shift appends anew.
+        It loses its last period, which the shift appends again.
         """
         x, h, w = (np.vstack([v[:1], v[:-1]]) for v in (self.x, self.h, self.w))
         c = self.curvature
@@ -116,20 +116,20 @@ class Solution:
 
 
 class BoundRows:
-    """The M soft and hard bounds of a problem along a trajectory, one row a bound and period.
+    """The M soft and hard bounds of a problem along a trajectory, one row per bound and period.
 
     Bounds on states hold for ``x_1 .. x_N`` (``x_0`` is given), those on outputs and expressions for ``(x_0, u_0) ..
-    (x_{N-1}, u_{N-1})``. Outputs and expressions of ``w`` or ``p`` depend on more, ``e`` ``(N, n_d + n_w + n_p)``: the
-    unmeasured and the measured disturbances and the parameters of each period; without it they are zero.
+    (x_{N-1}, u_{N-1})``. Outputs and expressions of ``w`` or ``p`` also depend on ``e`` ``(N, n_d + n_w + n_p)``: the
+    unmeasured and measured disturbances and the parameters of each period, by default zero.
 
-    Hard bounds are rows with exact penalties, a factor of :data:`~hybrid_mpc.control.soft.HIGHER` apart from one
-    priority to the next. Rows that no input reaches have no bounds.
+    Hard bounds are rows with exact penalties, which grow by :data:`~hybrid_mpc.control.soft.HIGHER` from one priority
+    to the next. Rows that no input reaches have no bounds.
     """
 
     stage: NDArray[np.int64]
-    """State ``(M,)`` of the trajectory that a row looks at."""
+    """Index ``(M,)`` of the state in the trajectory that a row bounds."""
     later: NDArray[np.int64]
-    """The row ``(M,)`` of the same value a period later; the last rows are their own."""
+    """Index ``(M,)`` of the row of the same value one period later; the last rows refer to themselves."""
     hard: NDArray[np.bool_]
     """Which rows ``(M,)`` are hard bounds."""
     names: tuple[str, ...]
@@ -186,7 +186,7 @@ class BoundRows:
         return int(self.stage.size)
 
     def _reached(self, model: HybridModel, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Bounds without those of hard rows that no input reaches; InputError if there is no other row of a name."""
+        """Bounds without those of hard rows that no input reaches; InputError if a name has no other row."""
         n = self._horizon
         states, values = _first_stages(model, self.functions)
         out = self.hard & (
@@ -195,8 +195,8 @@ class BoundRows:
         kept = {self.names[row] for row in np.flatnonzero(self.hard & ~out)}
         if lost := {self.names[row] for row in np.flatnonzero(out)} - kept:
             raise InputError(
-                f"hard bound on {', '.join(sorted(lost))}: no input of the plan reaches it; needed: a value that "
-                "inputs change within the horizon [HM-CONTROL-030]"
+                f"hard bound on {', '.join(sorted(lost))}: no input of the plan affects it. Bound a value that "
+                "inputs change within the horizon. [HM-CONTROL-030]"
             )
         return np.where(out, -np.inf, lower), np.where(out, np.inf, upper)
 
@@ -267,10 +267,10 @@ class BoundRows:
 
 @dataclass(frozen=True)
 class _Bounded:
-    """What is bounded in a period: states, or the values of a function ``(x, u, e)``.
+    """Bounded values in a period: states, or the values of a function ``(x, u, e)``.
 
-    ``rows`` ``(7, n)`` are lower and upper bounds, linear and quadratic penalties, 1 for hard bounds, 1 for those of
-    the end alone, and sizes of what is bounded.
+    ``rows`` ``(7, n)`` are lower and upper bounds, linear and quadratic penalties, 1 for hard bounds, 1 for bounds only
+    at the end, and sizes of the bounded values.
     """
 
     function: ca.Function | None
@@ -280,7 +280,7 @@ class _Bounded:
 
 
 def _bounded(ocp: OCP, model: HybridModel, sizes: Sizes) -> list[_Bounded]:
-    """All that a problem bounds besides its inputs; states first."""
+    """All bounds of a problem except those of its inputs; states first."""
     y_names = tuple(f"output {s.name}" for s in model.outputs)
     none = np.zeros(0, dtype=np.int64)
 
@@ -333,8 +333,8 @@ def _bounded(ocp: OCP, model: HybridModel, sizes: Sizes) -> list[_Bounded]:
 
 
 def _weights(weight: Array, lower: Array, upper: Array, size: Array, sizes: Sizes, what: str) -> Array:
-    """Weights that the penalties of bounds ``(n,)`` go by: the signals' own; without one, that by which a signal off by
-    its size costs as much as any other that is.
+    """Weights for the penalties of bounds ``(n,)``: the signals' own; without one, the weight by which a deviation of a
+    signal by its size costs as much as that of any other signal.
     """
     own = np.where(weight > 0, weight, 1.0) if weight.size else np.ones(lower.size)
     open_ = (np.isfinite(lower) | np.isfinite(upper)) & ~(
@@ -344,8 +344,8 @@ def _weights(weight: Array, lower: Array, upper: Array, size: Array, sizes: Size
         return own
     if lost := np.flatnonzero(open_ & np.isnan(size)).tolist():
         raise InputError(
-            f"soft bounds: how large {what} {lost[0]} may be is not known, so neither what a violation costs; give its "
-            "signal a range, or it a weight [HM-CONTROL-031]"
+            f"soft bounds: the size of {what} {lost[0]} is unknown, so a violation cannot be weighted. Give its "
+            "signal a range, or the signal a weight. [HM-CONTROL-031]"
         )
     return np.where(open_, sizes.cost / size**2, own)
 
@@ -353,10 +353,10 @@ def _weights(weight: Array, lower: Array, upper: Array, size: Array, sizes: Size
 def _violations(
     lower: Array, upper: Array, size: Array, what: str, other: NDArray[np.bool_] | bool = False
 ) -> Array:
-    """What counts as one violation of bounds ``(n,)``: half the range, else the bound's value, else the size of what is
-    bounded.
+    """The unit of violation of bounds ``(n,)``: half the range, else the bound's value, else the size of the bounded
+    value.
 
-    ``other`` says where it does not matter.
+    ``other`` marks values whose unit does not matter.
     """
     half = 0.5 * (upper - lower)
     value = np.abs(np.where(np.isfinite(upper), upper, lower))
@@ -365,16 +365,14 @@ def _violations(
         np.isnan(found) & (np.isfinite(lower) | np.isfinite(upper)) & ~np.asarray(other)
     ).tolist():
         raise InputError(
-            f"{what}: how large value {lost[0]} may be is not known: nothing moves it at the operating point. Give it "
-            "both bounds [HM-CONTROL-032]"
+            f"{what}: the size of value {lost[0]} is unknown, since nothing moves it at the operating point. Give both "
+            "of its bounds. [HM-CONTROL-032]"
         )
-    return np.where(np.isnan(found), 1.0, found)  # of what is not bounded, or does not matter
+    return np.where(np.isnan(found), 1.0, found)  # unbounded values, or units that do not matter
 
 
 def _hard_rows(bound: HardBound, ocp: OCP, sizes: Array, weights: Array | None = None) -> list[Array]:
-    """Bounds of a hard bound, the penalties by which it gives way, that it is hard, of the end, and sizes, ``(n,)``
-    each.
-    """
+    """Rows ``(n,)`` of a hard bound: bounds, penalties of its relaxation, the hard flag, the end flag, and sizes."""
     name = bound.what if isinstance(bound.what, str) else bound.what.name()
     ranks, range_ = sorted({b.priority for b in ocp.hard}), ocp.input_range
     size = _violations(bound.lower, bound.upper, sizes, f"hard bound {name}")
@@ -387,9 +385,9 @@ def _hard_rows(bound: HardBound, ocp: OCP, sizes: Array, weights: Array | None =
 
 
 def _first_stages(model: HybridModel, functions: tuple[ca.Function, ...]) -> tuple[Array, list[Array]]:
-    """The first stage of each state, and of each value of functions ``(x, u, e)``, that an input of the plan reaches.
+    """The first stage of each state, and of each value of functions ``(x, u, e)``, that an input of the plan affects.
 
-    By the structure of the model's equations; infinite where there is none.
+    From the sparsity of the model's equations; infinite if there is none.
     """
     step = stage_step(model)
     by_z, by_v = (np.array(ca.DM(step.jac_sparsity(0, i), 1).full(), dtype=bool) for i in (0, 1))
@@ -412,10 +410,10 @@ def _of_point(f: ca.Function, ocp: OCP, model: HybridModel) -> ca.Function:
     wanted = [(ocp.n_x, 1), (ocp.n_u, 1), (n_w, 1), (n_p, 1)][: f.n_in()]
     if [f.size_in(i) for i in range(f.n_in())] != wanted:
         raise InputError(
-            f"soft bound: expression {f} does not take (x, u) of {ocp.n_x} states and {ocp.n_u} inputs, nor these "
-            f"and w of {n_w} measured disturbances, nor these and p [HM-CONTROL-033]"
+            f"soft bound: expression {f} must take (x, u) of {ocp.n_x} states and {ocp.n_u} inputs, or (x, u, w) with "
+            f"{n_w} measured disturbances, or (x, u, w, p) [HM-CONTROL-033]"
         )
-    # in scalar code where the expression is some
+    # in scalar code if the expression is scalar code
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     x, u, e = kind.sym("x", ocp.n_x), kind.sym("u", ocp.n_u), kind.sym("e", n_e)
     given = (x, u, e[n_e - n_p - n_w : n_e - n_p], e[n_e - n_p :])
@@ -423,9 +421,9 @@ def _of_point(f: ca.Function, ocp: OCP, model: HybridModel) -> ca.Function:
 
 
 def _outputs(model: HybridModel, n_p: int = 0) -> ca.Function:
-    """Outputs of a model as a function of ``(x, u, e)``, with what unmeasured disturbances add.
+    """Outputs of a model as a function of ``(x, u, e)``, with the effect of unmeasured disturbances.
 
-    The last ``n_p`` of ``e`` do not matter.
+    The last ``n_p`` entries of ``e`` are ignored.
     """
     on_u, _, on_y = (ca.DM(m) for m in model.disturbed)
     n_e = model.n_d + model.n_w + n_p
@@ -438,7 +436,7 @@ def _outputs(model: HybridModel, n_p: int = 0) -> ca.Function:
 def _with_slopes(f: ca.Function) -> ca.Function:
     """``(x, u, e)`` to the expression and its derivatives by ``x`` and by ``u``."""
     n_x, n_u, n_e = (f.size1_in(i) for i in range(3))
-    # One Jacobian by both, in scalar code where the expression is some: two would run through its calls twice.
+    # one Jacobian by both in one call: two Jacobians would evaluate the expression's calls twice
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     z, inner = kind.sym("z", n_x + n_u), kind.sym("e", n_e)
     x, u, e = ca.MX.sym("x", n_x), ca.MX.sym("u", n_u), ca.MX.sym("e", n_e)
@@ -450,10 +448,10 @@ def _with_slopes(f: ca.Function) -> ca.Function:
 
 
 def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None:
-    """The stage cost that is no square of states or inputs, ``(x, u, p) -> scalar``: the economic one and the outputs'.
+    """The non-quadratic stage cost, ``(x, u, p) -> scalar``: the economic cost plus that of the outputs.
 
-    ``p`` are the economic cost's own parameters, then, where outputs are weighed, ``y_ref``, ``d`` and ``w``. None
-    where there is no such cost.
+    ``p`` are the economic cost's own parameters, then, if outputs are weighed, ``y_ref``, ``d`` and ``w``. None if
+    there is no such cost.
     """
     f = ocp.economic
     n_x, n_u = ocp.n_x, ocp.n_u
@@ -461,7 +459,7 @@ def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None
         (f.size_in(0), f.size_in(1)) != ((n_x, 1), (n_u, 1)) or (f.n_in() > 2 and f.size2_in(2) != 1)
     ):
         raise InputError(
-            f"economic: {f} does not take (x, u) of {n_x} states and {n_u} inputs, nor these and a column p"
+            f"economic: {f} must take (x, u) of {n_x} states and {n_u} inputs, or these and a column p"
             " [HM-CONTROL-034]"
         )
     if not ocp.n_y or model is None:
@@ -477,14 +475,14 @@ def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None
 
 
 class StageCost:
-    """:func:`stage_cost` along a trajectory, with first and second derivatives; zero where there is none."""
+    """:func:`stage_cost` along a trajectory, with first and second derivatives; zero without such a cost."""
 
     def __init__(
         self, ocp: OCP, dt: float, model: HybridModel | None = None, sizes: Array | None = None
     ) -> None:
         self.function, self._dt, self._n = stage_cost(ocp, model), dt, ocp.horizon
         self.size: Array = np.concatenate([np.ones(ocp.n_x) if sizes is None else sizes, ocp.input_scale])
-        """In what directions ``(n_x + n_u,)`` of state and input count."""
+        """Scales ``(n_x + n_u,)`` of directions in state and input."""
         f, n_x, n_u = self.function, ocp.n_x, ocp.n_u
         self.n_p = int(f.numel_in(2)) if f is not None and f.n_in() > 2 else 0
         """Number of its parameters."""
@@ -515,9 +513,9 @@ class StageCost:
         return slope, self._dt * f.outputs[1].reshape(n, slope.shape[1], -1)
 
     def convex(self, x: Array, u: Array, p: Array | None = None) -> tuple[Array, Array]:
-        """The same, second derivatives made positive semi-definite: what curves down counts as flat.
+        """The same with positive semi-definite second derivatives: negative curvature is replaced by zero.
 
-        Directions are those of states and inputs in their sizes: which curve down must not depend on units.
+        Eigenvectors are those of the scaled matrix, so the result does not depend on units.
         """
         slope, curvature = self.derivatives(x, u, p)
         if not np.all(np.isfinite(curvature)):
@@ -535,7 +533,7 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Target:
-    """What a plan is to follow, over the horizon; the last values hold where a preview ends.
+    """The goal of a plan over the horizon; beyond a preview its last values hold.
 
     Args:
         x: Reference of the states ``(N + 1, n_x)``.
@@ -544,9 +542,9 @@ class Target:
         u: Target inputs ``(N, n_u)``.
         w: Measured disturbances ``(N, n_w)``.
         d: Unmeasured disturbances ``(n_d,)``.
-        y: Reference of the outputs ``(N + 1, n_y)``, or the nearest that can be reached; no columns where references
-            are the states'.
-        e: What bounded values depend on beside state and input, see :class:`BoundRows`: ``(N, n_d + n_w + n_p)``.
+        y: Reference of the outputs ``(N + 1, n_y)``, or the closest reachable one; no columns if references are the
+            states'.
+        e: Further arguments of bounded values, see :class:`BoundRows`: ``(N, n_d + n_w + n_p)``.
         steady: Steady state of the first row of such a reference.
     """
 
@@ -562,7 +560,7 @@ class Target:
 
     @property
     def ok(self) -> bool:
-        """True if all is finite and no factor is negative."""
+        """True if all values are finite and no factor is negative."""
         finite = all(np.all(np.isfinite(v)) for v in (self.x, self.p, self.u, self.w, self.d))
         return bool(finite and weights_ok(self.weight))
 
@@ -573,34 +571,34 @@ def weights_ok(weight: Array) -> bool:
 
 
 class Problem:
-    """A model with an :class:`~hybrid_mpc.control.ocp.OCP`, and what every solver needs of the two.
+    """A model with an :class:`~hybrid_mpc.control.ocp.OCP`, and the functions that every solver needs.
 
     Raises:
-        InputError: If problem and model do not fit, the terminal weight cannot be found, or the size of a state or of
-            what is bounded is not known.
+        InputError: If problem and model do not fit, the terminal weight cannot be computed, or the size of a state or a
+            bounded value is unknown.
     """
 
     def __init__(self, model: HybridModel, ocp: OCP) -> None:
         if (ocp.n_x, ocp.n_u) != (model.n_x, model.n_u):
             raise InputError(
-                f"the problem has {ocp.n_x} states and {ocp.n_u} inputs, model {model.name} has "
+                f"the problem has {ocp.n_x} states and {ocp.n_u} inputs, but model {model.name} has "
                 f"{model.n_x} and {model.n_u} [HM-CONTROL-035]"
             )
         for name, values in (("q_y", ocp.q_y), ("y_min", ocp.y_min), ("y_max", ocp.y_max)):
             if values.size not in (0, model.n_y):
                 raise InputError(
-                    f"{name} has {values.size} values, model {model.name} {model.n_y} outputs; give one each"
+                    f"{name}: must have {model.n_y} values, one per output of model {model.name}, got {values.size}"
                     " [HM-CONTROL-036]"
                 )
         for bound in ocp.hard:
             if isinstance(bound.what, str) and bound.what == "y" and bound.lower.size != model.n_y:
                 raise InputError(
-                    f"hard bound on y: {bound.lower.size} values given, model {model.name} has {model.n_y} outputs"
+                    f"hard bound on y: must have {model.n_y} values, as model {model.name}, got {bound.lower.size}"
                     " [HM-CONTROL-037]"
                 )
         self.model, self.ocp, self.sizes = model, ocp, Sizes(model, ocp)
         self.targets = Targets(model, ocp, self.sizes) if ocp.n_y else None
-        """Steady states for set-points; None where references are the states'."""
+        """Steady states for set-points; None if references are the states'."""
         self.terminal = ocp.terminal_weight(model)
         self.soft = BoundRows(ocp, model, self.sizes)
         self.economic = StageCost(ocp, model.dt, model, self.sizes.states)
@@ -615,10 +613,10 @@ class Problem:
         """Input ``(n_u,)`` of the operating point, within the limits."""
 
     def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan, of status INITIAL: the model run freely from the estimate on ``u`` ``(N, n_u)``.
+        """A first plan, of status INITIAL: a free run of the model from the estimate with ``u`` ``(N, n_u)``.
 
-        ``u[0]`` counts as the input held before the next solve; without ``u`` it is the operating point's. Where the
-        free run diverges, the state is held at the estimate.
+        ``u[0]`` is the input held before the next solve; without ``u`` it is the operating point's. If the free run
+        diverges, the state is held at the estimate.
         """
         n, ocp = self.ocp.horizon, self.ocp
         start = np.tile(self.u_rest, (n, 1)) if u is None else input_plan(u, n, ocp.n_u, "u")
@@ -642,21 +640,17 @@ class Problem:
         )
 
     def target(
-        self,
-        reference: ArrayLike,
-        weight: ArrayLike | None = None,
-        estimate: Estimate | None = None,
-        w: ArrayLike | None = None,
-        start: Steady | None = None,
-    ) -> Target:
-        """What a plan is to follow; the last value holds where the preview is shorter.
+        self, reference: ArrayLike, weight: ArrayLike | None = None, estimate: Estimate | None = None,
+        w: ArrayLike | None = None, start: Steady | None = None,
+    ) -> Target:  # fmt: skip
+        """The goal of a plan; beyond a shorter preview its last value holds.
 
         Args:
             reference: See :meth:`Controller.solve`.
             weight: Likewise.
-            estimate: Its disturbances are those that steady states are found for. Default: none, and the usual ``w``.
+            estimate: Its disturbances are used for steady states. Default: none, and the nominal ``w``.
             w: See :meth:`Controller.solve`.
-            start: Steady state from which those of an outputs' reference are sought.
+            start: Steady state from which those of an outputs' reference are searched.
         """
         n, m, ocp = self.ocp.horizon, self.model, self.ocp
         rows = self._preview(reference, "reference", ocp.columns)
@@ -677,9 +671,9 @@ class Problem:
         return Target(x=x, weight=weights, p=own, u=u[:-1], w=ahead, d=d, y=y, e=e, steady=steady)
 
     def around(self, d: Array, w: Array, p: Array | None = None) -> Array:
-        """What bounded values depend on besides ``(x, u)``: ``(N, n_d + n_w + n_p)``; ``p`` has a row more, or is 0.
+        """Further arguments of bounded values: ``(N, n_d + n_w + n_p)``; ``p`` has one more row, or is 0.
 
-        Zeros where none depends on it.
+        Zeros if no bounded value depends on them.
         """
         if not self.soft.parametric:
             return self._no_e
@@ -691,7 +685,7 @@ class Problem:
         return e
 
     def standing(self) -> Array:
-        """The reference ``(1, columns)`` that is the operating point; the economic cost's parameters are zero."""
+        """The reference ``(1, columns)`` of the operating point; parameters of the economic cost are zero."""
         m, ocp = self.model, self.ocp
         goal = m.output(m.x0, m.u0, m.w, m.p).full().ravel() if ocp.n_y else m.x0
         return np.concatenate([goal, np.zeros(ocp.n_p)])[None]
@@ -699,7 +693,7 @@ class Problem:
     def _steady(
         self, y_ref: Array, d: Array, w: Array, start: Steady | None
     ) -> tuple[Array, Array, Array, Steady]:
-        """States, inputs and outputs of the steady states for each row; exact ones at no more than :data:`KNOTS`."""
+        """States, inputs and outputs of the steady states for each row; at most :data:`KNOTS` are computed."""
         assert self.targets is not None
         rows = np.hstack([y_ref, w])
         new = np.flatnonzero(np.any(np.diff(rows, axis=0) != 0, axis=1)) + 1
@@ -710,7 +704,7 @@ class Problem:
         )
         found: list[Steady] = []
         for k in knots:
-            # where nothing was found once, the rest of the horizon is not searched as widely again
+            # if nothing was found once, the rest of the horizon is searched less widely
             wide = not found or found[-1].steady
             found.append(self.targets.at(y_ref[k], d, w[k], start, wide=wide))
             start = found[-1] if found[-1].steady else start
@@ -733,7 +727,7 @@ class Problem:
         return x, u, y_ref + off, found[0]
 
     def forecast(self, w: ArrayLike | None, estimate: Estimate | None) -> Array:
-        """Measured disturbances ``(N, n_w)`` from ``(m, n_w)``, the last ones held; None: those of the estimate."""
+        """Measured disturbances ``(N, n_w)`` from ``(m, n_w)``, the last value held; None: those of the estimate."""
         n, n_w = self.ocp.horizon, self.model.n_w
         if w is None and not n_w:
             return self._no_w
@@ -755,7 +749,7 @@ class Problem:
         array = np.asarray(values, dtype=float)
         if array.ndim != 2 or len(array) < 1 or array.shape[1] != columns:
             raise InputError(
-                f"{name}: shape {array.shape} given, (m, {columns}) with m > 0 needed [HM-CONTROL-038]"
+                f"{name}: must have shape (m, {columns}) with m > 0, got {array.shape} [HM-CONTROL-038]"
             )
         return array.take(self._rows, axis=0, mode="clip")
 
@@ -767,12 +761,12 @@ class Problem:
         return weight[:-1] * (self.ocp.q * self.model.dt), self.terminal * root * root[:, None]
 
     def is_even(self, weight: Array) -> bool:
-        """Whether these are the factors of 1 that :meth:`weights` gives where there are no others."""
+        """Whether these are the default factors of 1 from :meth:`weights`."""
         return weight is self._even
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def cost(self, z: Array, u: Array, u_prev: Array, target: Target, excess: Array | None = None) -> float:
-        """Cost of a plan with the trajectory ``z`` ``(N + 1, n_x)`` or longer rows, penalties of soft bounds included.
+        """Cost of a plan with the trajectory ``z`` ``(N + 1, n_x)`` or longer rows, with penalties of soft bounds.
 
         ``excess`` ``(M,)`` are the violations of the soft bounds. Default: those of the trajectory.
         """
@@ -793,12 +787,12 @@ class Problem:
 
 
 class Controller(Protocol):
-    """What every solver offers. Built once; no method changes it or raises on the numbers it is given."""
+    """The interface of every solver. Built once; methods do not change it, and no number makes them raise."""
 
     problem: Problem
-    """Problem and model made ready."""
+    """Problem and model, prepared."""
     converges: bool = True
-    """False where a solve improves the last plan only a little: the first plan is then another solver's."""
+    """False if a solve only improves the last plan a little: then another solver makes the first plan."""
 
     @property
     def model(self) -> HybridModel:
@@ -811,30 +805,30 @@ class Controller(Protocol):
         return self.problem.ocp
 
     def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
-        """A first plan: the model run freely from the estimate; see :meth:`Problem.initial`."""
+        """A first plan: a free run of the model from the estimate; see :meth:`Problem.initial`."""
         return self.problem.initial(estimate, u)
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
         *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
-        """The plan from now on; ``previous.u[0]`` is the input that is being held.
+        """The plan from now on; ``previous.u[0]`` is the input being held.
 
         Args:
-            previous: The last plan; shifted by one period it is the first guess.
+            previous: The last plan; shifted by one period it is the initial guess.
             estimate: The state now; its ``d`` is assumed constant over the horizon.
-            reference: ``(m, n_x)``, or ``(m, n_y)`` where the problem weighs outputs, from now on in steps of ``dt``;
-                if ``m < N + 1`` its last value holds. Where the economic stage cost has parameters, ``n_p`` more
-                columns are their values.
-            weight: Factors on ``q`` ``(m, n_x)``, not negative, as the reference. Default: 1.
+            reference: ``(m, n_x)``, or ``(m, n_y)`` if the problem weighs outputs, from now on in steps of ``dt``;
+                if ``m < N + 1`` its last value holds. If the economic stage cost has parameters, ``n_p`` more columns
+                are their values.
+            weight: Factors on ``q`` ``(m, n_x)``, not negative, like the reference. Default: 1.
             limits: Bounds of the inputs for this solve. Default: the problem's own.
-            w: Measured disturbances ``(m, n_w)`` from now on, as the reference. Default: those of the estimate, held.
+            w: Measured disturbances ``(m, n_w)`` from now on, like the reference. Default: those of the estimate, held.
         """
         ...
 
 
 class SplitController(Controller):
-    """A solver whose work is mostly done before the measurement: the loop prepares while the last input acts."""
+    """A solver that does most of its work before the measurement: the loop prepares while the last input acts."""
 
     def prepare(self, previous: Solution, weight: Array | None = None) -> Any:
         """The part of the next :meth:`solve` that needs no measurement; arguments as there."""
@@ -844,5 +838,5 @@ class SplitController(Controller):
         self, prepared: Any, estimate: Estimate, reference: Array, limits: Limits | None = None,
         w: Array | None = None,
     ) -> Solution:  # fmt: skip
-        """The rest of it, given what :meth:`prepare` made."""
+        """The remaining part, with the result of :meth:`prepare`."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""The condensed QP over the inputs, and the check of its answer."""
+"""The condensed QP over the inputs, and the check of its solution."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Array = NDArray[np.float64]
 Soft = tuple[Array, Array] | None
 
 KKT_TOLERANCE = 1e-5
-"""Relative to the gradient's size."""
+"""Largest KKT residual, relative to the gradient's size."""
 BOUND_TOLERANCE = 1e-6
-"""Share of an input's range; what is left of it is clipped away."""
+"""Largest violation of an input bound, over its range; the input is then clipped."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A QP's answer: the step of the inputs ``(N n_u,)``, and what it is worth.
+    """A QP's solution: the step of the inputs ``(N n_u,)``, and the result of its check.
 
-    ``multipliers`` ``(M,)`` are those of the soft bounds, ``active`` the rows that act, to begin the next QP with.
+    ``multipliers`` ``(M,)`` are those of the soft bounds, ``active`` the active rows, for the next warm start.
     """
 
     step: Array
@@ -38,19 +38,18 @@ class Answer:
 class InputQP:
     """``min 1/2 s'Hs + g's + penalties`` over input steps ``s`` within the limits of inputs and changes.
 
-    Where the problem has move blocks, the unknowns are the blocks' inputs; all that comes in and goes out is by
-    period. Inputs are scaled by :attr:`OCP.input_scale`, soft bounds by :attr:`BoundRows.scale`. Bounds that do not act
-    cost no more than the look whether they do (:class:`~hybrid_mpc.control.active_set.ActiveSet`, which begins with the
-    last plan's active rows). The answer is checked, however it was found.
+    For a problem with move blocks the unknowns are the blocks' inputs; arguments and results are by period. Inputs are
+    scaled by :attr:`OCP.input_scale`, soft bounds by :attr:`BoundRows.scale`. Inactive bounds only cost their check
+    (:class:`~hybrid_mpc.control.active_set.ActiveSet`, warm-started from the last plan). Every solution is checked.
     """
 
     def __init__(self, ocp: OCP, soft: BoundRows | None = None, dt: float = 1.0) -> None:
         self._starts, n_u = ocp.block_starts, ocp.n_u
         n = self._starts.size * n_u
         self._ocp, self._n = ocp, n
-        self._own_bounds = ocp.bounds(ocp.u_min)  # without limits of a solve they depend on no input
+        self._own_bounds = ocp.bounds(ocp.u_min)  # without limits of a solve they do not depend on the input
         self.scale: Array = np.tile(ocp.input_scale, self._starts.size)
-        """What 1 means in the scaled QP, by the blocks' inputs ``(M n_u,)`` [input units]."""
+        """Unit of the scaled QP's unknowns, the blocks' inputs ``(M n_u,)`` [input units]."""
         rows = np.eye(n) - np.eye(n, k=-n_u) if ocp.du_max is not None else np.zeros((0, n))
         self._changes = rows * self.scale / self.scale[:, None] if len(rows) else rows
         self._products = self.scale * self.scale[:, None]
@@ -75,29 +74,29 @@ class InputQP:
             self._soft_scale, self._lower, self._upper = scale, soft.lower / scale, soft.upper / scale
 
     def by_blocks(self, slopes: Array) -> Array:
-        """Derivatives by the inputs, the last axis ``N n_u``, as those by the blocks' inputs ``M n_u``."""
+        """Derivatives by the inputs (last axis ``N n_u``) as derivatives by the blocks' inputs ``M n_u``."""
         if self._ocp.blocks is None:
             return slopes
         each = slopes.reshape(*slopes.shape[:-1], self._ocp.horizon, self._ocp.n_u)
         return np.add.reduceat(each, self._starts, axis=-2).reshape(*slopes.shape[:-1], self._n)
 
     def blocked_hessian(self, hessian: Array) -> Array:
-        """A Hessian by the inputs as that by the blocks' inputs."""
+        """A Hessian by the inputs as one by the blocks' inputs."""
         return hessian if self._ocp.blocks is None else self.by_blocks(self.by_blocks(hessian).T)
 
     def later(self, active: Active | None) -> Active | None:
-        """Rows that act, a period later; None where they are another problem's."""
+        """Active rows shifted by one period; None if they belong to another problem."""
         return None if active is None or active.size != self._later.size else active[self._later]
 
     def solve(
         self, hessian: Array, gradient: Array, u: Array, u_prev: Array, soft: Soft = None,
         limits: Limits | None = None, active: Active | None = None, *, strict: bool = False,
     ) -> Answer:  # fmt: skip
-        """Solve from a plan ``u`` ``(N, n_u)``, with ``u_prev`` held before, and check the answer.
+        """Solve from a plan ``u`` ``(N, n_u)``, with ``u_prev`` held before, and check the solution.
 
-        The Hessian is symmetric positive definite. ``soft`` are the values of the soft bounds without a step ``(M,)``,
-        and their derivatives by it ``(M, N n_u)``. ``active`` are rows to begin with. Default: none. ``strict``: hard
-        bounds among them give way only if there is no answer that keeps them, whatever that costs.
+        The Hessian is symmetric positive definite. ``soft`` are the values of the soft bounds without a step ``(M,)``
+        and their derivatives by it ``(M, N n_u)``. ``active`` are rows for a warm start. Default: none. ``strict``:
+        hard bounds are only relaxed if they are infeasible, whatever they cost.
         """
         scale, hard = self.scale, self._hard
         own = self._own_bounds if limits is None else self._ocp.bounds(u_prev, limits)
@@ -137,7 +136,7 @@ class InputQP:
         return Answer(step.ravel(), status, kkt, of_soft, active)
 
     def _check(self, qp: RowQP, s: Array, multipliers: Array) -> tuple[Status, float]:
-        """What an answer is worth, and its KKT residual, relative to the inputs' gradient."""
+        """The status of a solution, and its KKT residual relative to the inputs' gradient."""
         slope, wrong, violation = qp.residuals(s, multipliers)
         kkt = max(slope, wrong) / max(1.0, float(np.abs(qp.g).max()))
         if not all(map(isfinite, (slope, wrong, violation))):

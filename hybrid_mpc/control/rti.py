@@ -22,19 +22,19 @@ from hybrid_mpc.model.stages import Derivatives, stages
 Array = NDArray[np.float64]
 NAN = float("nan")
 GROUP = 10
-"""Periods whose second derivatives are condensed by one product."""
+"""Periods whose second derivatives are condensed in one matrix product."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Everything of an iteration that needs neither the estimate nor the reference, linearized at ``u, z, d, w``.
+    """The part of an iteration that needs neither estimate nor reference, linearized at ``u, z, d, w``.
 
     With ``dz = (x, h) - (x_bar, h_bar)`` the linearized prediction is ``dz_{k+1} = A_k dz_k + B_k (du_k + dd) +
     defect_k``; ``a_t`` holds the transposed ``A_k``. By the inputs' change, ``x`` has the derivative ``from_u``
     ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is it times the state weights, ``direct``
-    the gradient of the costs of inputs and changes, targets left out. ``soft`` is what :meth:`BoundRows.condensed`
-    gives, ``economic`` the first derivatives ``(N, n_x + n_u)`` of the economic stage costs and their convex second
-    ones; None where there are none. ``e`` is what bounded values depend on besides state and input.
+    the gradient of the costs of inputs and changes without targets. ``soft`` is the result of
+    :meth:`BoundRows.condensed`, ``economic`` are the first derivatives ``(N, n_x + n_u)`` of the economic stage costs
+    and their convexified second derivatives, or None. ``e`` are further arguments of the bounded values.
     """
 
     u: Array
@@ -59,9 +59,9 @@ class Prepared:
 
 
 class Condenser:
-    """Derivative of the states by the inputs, on scratch memory of its own: not for several threads at once.
+    """Derivatives of the states by the inputs, in its own scratch memory: not thread-safe.
 
-    A period's array is written by one product from the one before. They cost ``N^2 n_u n_z^2`` operations. The states
+    Each period's array is one product with the previous one; all cost ``N^2 n_u n_z^2`` operations. The states
     are the first ``n_x`` of z.
     """
 
@@ -69,7 +69,7 @@ class Condenser:
     """Derivatives ``(N + 1, n_z, N n_u)`` of ``z_0 .. z_N`` by the inputs; the next call overwrites them."""
 
     def __init__(self, n: int, n_z: int, n_u: int, n_x: int) -> None:
-        by_rows = np.zeros((n + 1, n * n_u, n_z))  # by later inputs they stay zero
+        by_rows = np.zeros((n + 1, n * n_u, n_z))  # derivatives by later inputs are zero
         self.by_inputs = by_rows.transpose(0, 2, 1)
         self._newest = by_rows[1:].reshape(n, n, n_u, n_z)
         self._stages = np.arange(n)
@@ -88,7 +88,7 @@ class Condenser:
 
 
 def _columns(a_t: Array) -> tuple[list[Array], int]:
-    """Matrices that are column by column in memory, and whether they are transposed ``A_k`` (1) or ``A_k`` (0)."""
+    """Matrices in column-major order, and whether they are transposed ``A_k`` (1) or ``A_k`` (0)."""
     if a_t.flags.c_contiguous:
         return list(a_t.transpose(0, 2, 1)), 0
     return list(a_t), 1
@@ -143,7 +143,7 @@ def condense_all(stages: Array, by_inputs: Array, n_x: int, n_u: int) -> Array:
     z = np.r_[:n_x, few : stages.shape[1]]
     by_z, mixed = stages[:, z[:, None], z], stages[:, n_x:few][:, :, z]
     total, one_sided = np.zeros((n * n_u, n * n_u)), np.zeros((n * n_u, n * n_u))
-    for first in range(1, n, GROUP):  # the first state knows no input, later ones only those before them
+    for first in range(1, n, GROUP):  # a state only depends on earlier inputs
         last = min(first + GROUP, n)
         m = (last - 1) * n_u
         states = np.ascontiguousarray(by_inputs[first:last, :, :m])
@@ -161,19 +161,19 @@ class CondensedController(SplitController):
     :meth:`prepare` shifts the previous plan, linearizes the model along it in one call and condenses states and
     hidden states away; their multiple-shooting trajectory and its defects are kept. :meth:`feedback` embeds the
     estimate, solves the QP of ``N n_u`` unknowns (and a slack for every soft bound and period where one acts) and
-    checks its answer, whatever status its solver reports. The scratch buffers are not for several threads at once.
+    checks its solution. The scratch buffers are not thread-safe.
 
     Args:
         model: The deployed model; ``n_h`` may be 0.
         ocp: The problem.
-        iterations: Linearizations per solve; 1 is the RTI, more converge to the NLP's solution.
-        compiled: Whether what is evaluated period by period is compiled as C, cached as
+        iterations: Linearizations per solve: 1 is the RTI, more converge to the solution of the NLP.
+        compiled: Whether functions evaluated period by period are compiled as C, cached as
             :func:`nn_export.compile_function` says: the runs of a model with a ``side_by_side``, else its
             Jacobians too. Default: no.
 
     Raises:
-        InputError: If problem and model do not fit, ``iterations < 1``, the terminal weight cannot be found,
-            or the model is to be compiled and cannot be.
+        InputError: If problem and model do not fit, ``iterations < 1``, the terminal weight cannot be computed,
+            or compilation fails.
 
     Source: Diehl, Bock, Schlöder, *A real-time iteration scheme for nonlinear optimization in optimal
     feedback control*, SIAM J. Control Optim. 43 (2005).
@@ -209,7 +209,7 @@ class CondensedController(SplitController):
         self.condenser = Condenser(n, ocp.n_x + model.n_h, n_u, ocp.n_x)
         self._evaluate_once()
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def prepare(self, previous: Solution, weight: Array | None = None) -> Prepared:
         """Linearize and condense along the previous plan, shifted by one period; its last input is repeated.
 
@@ -243,12 +243,12 @@ class CondensedController(SplitController):
         derivatives = self.stages.at(z[:-1], self.model.acting(u, d, w))
         return self.condense(u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady, active=active)
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def feedback(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
         w: Array | None = None,
     ) -> Solution:  # fmt: skip
-        """Embed the estimate and the reference, solve the QP and check its answer.
+        """Embed the estimate and the reference, solve the QP and check its solution.
 
         Arguments as :meth:`Controller.solve` takes them. If the plan's status is not ``ok`` its inputs are the shifted
         previous plan. Where measured disturbances are others than those that were prepared for, it linearizes anew.
@@ -301,7 +301,7 @@ class CondensedController(SplitController):
         if not np.isfinite(cost):
             return self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
         lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
-        u = np.minimum(np.maximum(u, lower), upper)  # the QP keeps them to its tolerance only
+        u = np.minimum(np.maximum(u, lower), upper)  # the QP only keeps them within its tolerance
         return Solution(
             u=u,
             x=z[:, :n_x],
@@ -384,13 +384,13 @@ class CondensedController(SplitController):
         )  # fmt: skip
 
     def _of_inputs(self, b: Array, u: Array) -> Array:
-        """What inputs ``(n_u,)``, the same in every period, or ``(N, n_u)`` add to the next states ``(N, n_z)``."""
+        """Effect of inputs ``(n_u,)`` (constant) or ``(N, n_u)`` on the next states ``(N, n_z)``."""
         if b.shape[2] == 1:
             return np.asarray(b[:, :, 0] * u)
         return np.asarray(np.einsum("kij,j->ki" if u.ndim == 1 else "kij,kj->ki", b, u))
 
     def _at_parameters(self, prepared: Prepared, target: Target) -> tuple[Array, tuple[Array, Array] | None]:
-        """Hessian and economic derivatives, those that wait for the parameters' values included."""
+        """Hessian and economic derivatives, including those that depend on the parameters' values."""
         if not self.problem.economic.n_p:
             return prepared.hessian, prepared.economic
         if not target.ok:
@@ -410,7 +410,7 @@ class CondensedController(SplitController):
         return value + moved, slope
 
     def _evaluate_once(self) -> None:
-        """Solve once at the operating point, so that no later call is the first of a CasADi function, which is slow."""
+        """Solve once at the operating point, since the first call of a CasADi function is slow."""
         m = self.model
         x, h, d, p = m.x0, np.zeros(m.n_h), np.zeros(m.n_d), np.zeros((0, 0))
         rest = Estimate(0.0, x, h, d, p, np.zeros(0), NAN, w=m.w)

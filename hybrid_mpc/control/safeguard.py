@@ -1,4 +1,4 @@
-"""A controller that always returns an admissible input and says where it came from."""
+"""A controller that always returns an admissible input, with its source."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ Array = NDArray[np.float64]
 
 
 class Source(Enum):
-    """Where an applied input came from; the value is the message."""
+    """Source of an applied input; the value is the message."""
 
     MPC = "the checked solution of the MPC"
     PLAN = "the previous plan, shifted: the solve failed"
     FALLBACK = "the stabilising feedback on the prior: the solve failed and the plan is used up"
-    SAFE = "the declared safe input: nothing else was finite, or the sensor cannot be believed"
-    HELD = "the last input, held: nothing else was finite, and no safe input is declared; or none was decided yet"
+    SAFE = "the declared safe input: no other input was finite, or the sensor failed"
+    HELD = "the last input, held: no other input was finite and no safe input is declared, or none was decided yet"
     MANUAL = "the operator"
 
 
@@ -37,8 +37,8 @@ class Source(Enum):
 class Decision:
     """The input ``(n_u,)`` of one period, always within the bounds and the limit of its change.
 
-    ``solution`` is the plan to go on from; its ``u[0]`` is ``u``. ``status`` says how this period's solve ended,
-    ``age`` counts the periods since the last successful one.
+    ``solution`` is the plan for the next solve; its ``u[0]`` is ``u``. ``status`` is the result of this period's solve,
+    ``age`` is the number of periods since the last successful one.
     """
 
     u: Array
@@ -49,27 +49,26 @@ class Decision:
 
 
 class SafeController:
-    """Guards a controller: checked solution, else the shifted plan, else a fallback, else the safe input.
+    """Guards a controller: it applies a checked solution, else the shifted plan, else a fallback, else the safe input.
 
-    What is safe nobody can guess: zero is no safe thrust, and no safe valve. Where no safe input is declared, the last
-    input stays.
+    The safe input must be declared: zero may be an unsafe thrust or valve position. Without a safe input the last input
+    is held.
 
-    Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever the solver, the model or
-    the estimate do. The object keeps nothing between calls: the held input, the plan and its age are in the
-    :class:`Decision`.
+    Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever solver, model and estimate
+    return. The object has no state: the held input, the plan and its age are in the :class:`Decision`.
 
     Args:
         controller: The controller to guard.
-        fallback: Model, usually the fitted prior, whose LQR at the problem's working point takes over, around the
-            steady state of the reference. Default: none, then the safe input follows.
-        max_age: Periods a plan may be followed without a successful solve.
-        first: Controller that makes the first plan, before the loop starts; an
-            :class:`~hybrid_mpc.control.sqp.SQPController` converges it. Default: ``controller``.
-        safe_input: Input ``(n_u,)`` within the limits that is applied where nothing is known: nothing is finite, the
-            sensor is lost, a run ends. Default: none is declared.
+        fallback: Model, usually the fitted prior, whose LQR at the problem's working point is applied around the
+            steady state of the reference. Default: none; then the safe input follows.
+        max_age: Most periods that a plan is followed without a successful solve.
+        first: Controller that makes the first plan, before the loop starts, e.g. a converging
+            :class:`~hybrid_mpc.control.sqp.SQPController`. Default: ``controller``.
+        safe_input: Input ``(n_u,)`` within the limits for emergencies: nothing is finite, the sensor is lost, a run
+            ends. Default: none.
 
     Raises:
-        InputError: If the fallback does not fit the problem or cannot be stabilised, or the safe input is outside the
+        InputError: If the fallback does not fit the problem or is not stabilisable, or the safe input is outside the
             limits.
 
     Example:
@@ -99,30 +98,30 @@ class SafeController:
         max_age = whole(max_age, "max_age [periods]", 0, 10**9)
         check_part(controller, "controller", "a controller", "model", "ocp", "solve")
         if not isinstance(fallback, HybridModel | None):
-            raise InputError(f"fallback: a model is needed, got {type(fallback).__name__} [HM-CONTROL-039]")
+            raise InputError(f"fallback: must be a model, got {type(fallback).__name__} [HM-CONTROL-039]")
         ocp = controller.ocp
         self.controller, self.max_age, self.fallback = controller, max_age, fallback
-        self.safe_input = None if safe_input is None else checked_safe_input(safe_input, ocp)
+        self.safe_input = None if safe_input is None else check_safe_input(safe_input, ocp)
         self._split = controller if isinstance(controller, SplitController) else None
         self._first = controller if first is None else first
         sizes = [(c.model.n_x, c.model.n_h, c.ocp.n_u, c.ocp.horizon) for c in (self._first, controller)]
         if sizes[0] != sizes[1]:
             raise InputError(
-                f"first: (n_x, n_h, n_u, N) = {sizes[0]}, the controller has {sizes[1]}; "
-                "give both the same model and problem [HM-CONTROL-040]"
+                f"first: (n_x, n_h, n_u, N) = {sizes[0]}, but the controller has {sizes[1]}. "
+                "Give both the same model and problem. [HM-CONTROL-040]"
             )
         self._rest_input = None
         if fallback is not None:
             if (fallback.n_x, fallback.n_u) != (ocp.n_x, ocp.n_u):
                 raise InputError(
-                    f"fallback {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
-                    f"the problem {ocp.n_x} and {ocp.n_u} [HM-CONTROL-041]"
+                    f"fallback: model {fallback.name} has {fallback.n_x} states and {fallback.n_u} inputs, "
+                    f"but the problem has {ocp.n_x} and {ocp.n_u} [HM-CONTROL-041]"
                 )
             gain = dare(*ocp.linear_quadratic(fallback))[1]
             self._gain = gain[:, : ocp.n_x]
             self._late = gain[:, ocp.n_x : ocp.n_x + fallback.delay_states]
             self._rest_input = equilibrium_input(fallback, Sizes(fallback, ocp).states, ocp.input_scale)
-            self._rest_input(fallback.x0, fallback.w)  # a CasADi function's first call is slow
+            self._rest_input(fallback.x0, fallback.w)  # the first call of a CasADi function is slow
 
     def initial(
         self,
@@ -132,18 +131,18 @@ class SafeController:
         weight: Array | None = None,
         w: Array | None = None,
     ) -> Decision:
-        """Decision before the first: an input is held, and there is a plan to go on from.
+        """The decision before the first period: a held input, and a plan to start from.
 
-        A real-time iteration improves a plan a little in every period, and the first plan has no predecessor: make it
-        here, while the machine rests and no deadline presses.
+        A real-time iteration improves a plan only a little per period, and the first plan has no predecessor: make it
+        here, while the machine rests and there is no deadline.
 
         Args:
-            estimate: Where the plan starts.
-            u: Input ``(n_u,)`` that is held. Default: that of the model's operating point.
-            reference: As :meth:`Controller.solve` takes it, from the first period on: the plan is optimised for it.
+            estimate: Start of the plan.
+            u: Held input ``(n_u,)``. Default: that of the model's operating point.
+            reference: As for :meth:`Controller.solve`, from the first period on; the plan is optimised for it.
                 Default: none; the plan holds ``u``.
-            weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
-            w: Measured disturbances ``(m, n_w)``, as the reference. Default: those of the estimate, held.
+            weight: Factors on ``q`` ``(m, n_x)``, like the reference. Default: 1.
+            w: Measured disturbances ``(m, n_w)``, like the reference. Default: those of the estimate, held.
         """
         ocp, rest = self.controller.ocp, self.controller.model.u0
         held = np.clip(rest if u is None else vector(u, ocp.n_u, "u"), ocp.u_min, ocp.u_max)
@@ -162,10 +161,10 @@ class SafeController:
         Args:
             previous: The last decision.
             estimate: The state now.
-            reference: As :meth:`Controller.solve` takes it.
-            weight: Factors on ``q`` ``(m, n_x)``, as the reference. Default: 1.
-            limits: Bounds of the inputs for this period, as :meth:`OCP.bounds` has them. Default: the problem's own.
-            prepared: What :meth:`prepare` made of ``previous`` and ``weight``. Default: it is made now.
+            reference: As for :meth:`Controller.solve`.
+            weight: Factors on ``q`` ``(m, n_x)``, like the reference. Default: 1.
+            limits: Bounds of the inputs for this period, as for :meth:`OCP.bounds`. Default: the problem's own.
+            prepared: Result of :meth:`prepare` for ``previous`` and ``weight``. Default: computed now.
             w: Measured disturbances ``(m, n_w)`` from now on. Default: those of the estimate, held.
         """
         if prepared is not None and self._split is not None:
@@ -181,14 +180,14 @@ class SafeController:
     def prepare(self, previous: Decision, weight: Array | None = None) -> Any:
         """The linearization, condensed: the part of the next :meth:`decide` that needs no measurement.
 
-        ``weight`` is that of the next period. None for a solver without such a part.
+        ``weight`` is that of the next period. None for a solver without preparation.
         """
         return None if self._split is None else self._split.prepare(previous.solution, weight)
 
     def late(
         self, previous: Decision, estimate: Estimate, reference: Array, *, limits: Limits | None = None
     ) -> Decision:
-        """The input to hold where the solve has not come in time: as after a failed solve, status LATE."""
+        """The input to hold if the solve is late: as after a failed solve, with status LATE."""
         failed = replace(previous.solution, u=previous.solution.following, status=Status.LATE)
         return self._without(previous, estimate, reference, failed, limits)
 
@@ -196,7 +195,7 @@ class SafeController:
         self, previous: Decision, estimate: Estimate, reference: Array, solution: Solution,
         limits: Limits | None,
     ) -> Decision:  # fmt: skip
-        """The decision where no solution may be applied; ``solution`` holds the shifted plan and why."""
+        """The decision if no solution may be applied; ``solution`` has the shifted plan and the reason."""
         ocp, held = self.controller.ocp, previous.u
         u, source = self._instead(solution, estimate, reference, previous.age + 1, held)
         u = ocp.saturate(u, held, limits)
@@ -205,7 +204,7 @@ class SafeController:
         plan = self.controller.initial(estimate, inputs) if estimate.finite else replace(solution, u=inputs)
         return Decision(u, source, plan, solution.status, previous.age + 1)
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def _instead(
         self, failed: Solution, estimate: Estimate, reference: Array, age: int, held: Array
     ) -> tuple[Array, Source]:
@@ -214,7 +213,7 @@ class SafeController:
         if self._rest_input is not None and estimate.finite:
             goal, best = self._goal(estimate, reference, failed)
             u = best - self._gain @ (estimate.x - goal)
-            if self._late.size:  # what is under way to the machine already
+            if self._late.size:  # inputs that are still delayed
                 u = u - self._late @ (
                     estimate.h[: self._late.shape[1]] - np.tile(best, self._late.shape[1] // u.size)
                 )
@@ -223,7 +222,7 @@ class SafeController:
         return (held, Source.HELD) if self.safe_input is None else (self.safe_input, Source.SAFE)
 
     def _goal(self, estimate: Estimate, reference: Array, failed: Solution) -> tuple[Array, Array]:
-        """State and input ``(n_x,)``, ``(n_u,)`` that the fallback holds: the reference's, else the operating point."""
+        """State and input ``(n_x,)``, ``(n_u,)`` of the fallback: the reference's, else the operating point's."""
         problem, m = self.controller.problem, self.controller.model
         assert self._rest_input is not None
         target = problem.target(np.asarray(reference, dtype=float)[:1], None, estimate, None, failed.steady)
@@ -236,13 +235,13 @@ class SafeController:
 
 
 def _ahead(w: Array | None) -> dict[str, Any]:
-    """The forecast as an argument, where there is one."""
+    """The forecast as a keyword argument, if there is one."""
     return {} if w is None else {"w": w}
 
 
-def checked_safe_input(given: ArrayLike, ocp: OCP) -> Array:
+def check_safe_input(given: ArrayLike, ocp: OCP) -> Array:
     """The safe input ``(n_u,)`` of a problem, within its limits."""
     u = vector(given, ocp.n_u, "safe_input")
     if np.any(u < ocp.u_min) or np.any(u > ocp.u_max):
-        raise InputError(f"safe_input {u} is outside the limits {ocp.u_min} to {ocp.u_max} [HM-CONTROL-042]")
+        raise InputError(f"safe_input: {u} is outside the limits {ocp.u_min} to {ocp.u_max} [HM-CONTROL-042]")
     return u

@@ -1,4 +1,4 @@
-"""Sizes of states, outputs and bounded values of a control problem: what solvers and targets count in, in any unit."""
+"""Sizes of states, outputs and bounded values of a control problem: the scales of solvers and targets in any units."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 PERIODS, RUNS = 50, 4
-"""Length of the model's own runs [periods] at most, and how many of them have random inputs: without recordings and
-ranges they show how far a state moves."""
+"""Longest of the model's own runs [periods], and the number of runs with random inputs: without recordings and ranges
+they show how far a state moves."""
 
 
 class Sizes:
-    """Sizes of a problem's signals. They change with the units of the signals as the signals do.
+    """Sizes of a problem's signals; they scale with the units of the signals.
 
-    The *natural* size of a state or output is its spread in the recordings, which the kit holds
-    (``HybridModel.state_spread`` and ``output_spread``). Without it: half the signal's range. Without both: how far the
-    model itself moves it from the operating point within the horizon, under inputs and disturbances of all their range.
-    A state's size is its natural one, at most what its weight tolerates, ``1 / sqrt(q)``.
+    The *natural* size of a state or output is its spread in the recordings, stored in the kit
+    (``HybridModel.state_spread`` and ``output_spread``), else half the signal's range, else how far the model moves it
+    from the operating point within the horizon, under inputs and disturbances over their whole range. A state's size is
+    its natural size, but at most the deviation that its weight tolerates, ``1 / sqrt(q)``.
 
     Args:
         model: The model.
@@ -56,24 +56,24 @@ class Sizes:
         if np.any(np.isnan(size)):
             names = ", ".join(model.states[i].name for i in np.flatnonzero(np.isnan(size)))
             raise InputError(
-                f"control problem: how large {names} may be is not known: no weight in q, no range, no recordings, and "
-                f"nothing moves it. Give the signal a range, Signal({names.split(',')[0]!r}, unit, lower, upper)"
+                f"control problem: the size of {names} is unknown: no weight in q, no range, no recordings, and "
+                f"nothing moves it. Give the signal a range: Signal({names.split(',')[0]!r}, unit, lower, upper)"
                 " [HM-CONTROL-043]"
             )
         self.states: Array = size
         """Sizes of the states ``(n_x,)``."""
         delayed = np.resize(ocp.input_scale, model.delay_states)
         self.hidden: Array = np.concatenate([delayed, np.ones(model.n_h - model.delay_states)])
-        """Sizes of the hidden states ``(n_h,)``: inputs on their way count as inputs; a network's have no unit."""
+        """Sizes of the hidden states ``(n_h,)``: delayed inputs have the inputs' sizes, those of a network are 1."""
 
     @cached_property
     def outputs(self) -> Array:
-        """Sizes of the outputs ``(n_y,)``: natural ones, at most ``1 / sqrt(q_y)``; NaN where none is known."""
+        """Sizes of the outputs ``(n_y,)``: natural ones, at most ``1 / sqrt(q_y)``; NaN for unknown ones."""
         return np.fmin(self._natural_outputs, _tolerated(self._ocp.q_y) if self._ocp.n_y else np.nan)
 
     def values(self, f: ca.Function) -> Array:
-        """Sizes of the values of ``f(x, u, e)``, a column ``(n,)``: how far they move where states and inputs move by
-        their natural sizes from the operating point, one of them or all; NaN where they do not.
+        """Sizes of the values of ``f(x, u, e)``, a column ``(n,)``: how far they move when states and inputs move by
+        their natural sizes from the operating point, one at a time or all; NaN if they do not move.
         """
         m, around = self._model, np.zeros(f.numel_in(2))
         around[m.n_d : m.n_d + m.n_w] = m.w[: max(around.size - m.n_d, 0)]
@@ -86,14 +86,14 @@ class Sizes:
         def at(v: Array) -> Array:
             return np.asarray(f(v[: m.n_x], v[m.n_x :], around)).ravel()
 
-        with np.errstate(invalid="ignore", over="ignore"):  # where it is not finite it tells nothing
+        with np.errstate(invalid="ignore", over="ignore"):  # values that are not finite are ignored
             moved = np.abs(np.array([at(point + step) for step in (*steps, *-steps)]) - at(point))
         return _largest(moved)
 
     @cached_property
     def cost(self) -> float:
-        """What a signal costs per second that is off by all of its size: the largest of all, at least 1, what a
-        tolerated deviation costs.
+        """Cost per second of a signal's deviation by its size: the largest of all signals, at least 1, the cost of a
+        tolerated deviation.
         """
         ocp = self._ocp
         parts = [ocp.q * self._natural**2, (ocp.r + ocp.r_delta) * ocp.input_range**2]
@@ -102,7 +102,7 @@ class Sizes:
 
     @cached_property
     def _natural(self) -> Array:
-        """Natural sizes of the states ``(n_x,)``; NaN where there is none."""
+        """Natural sizes of the states ``(n_x,)``; NaN for unknown ones."""
         m = self._model
         known = _known(m.state_spread, [s.upper - s.lower for s in m.states])
         return np.where(np.isnan(known), self._moved, known) if np.any(np.isnan(known)) else known
@@ -123,7 +123,7 @@ class Sizes:
 
     @cached_property
     def _moved(self) -> Array:
-        """How far the model's own runs move the states from the operating point ``(n_x,)``; NaN: not at all."""
+        """How far the model's own runs move the states from the operating point ``(n_x,)``; NaN for no motion."""
         m, ocp, rng = self._model, self._ocp, np.random.default_rng(0)
         n, u0, scale = min(ocp.horizon, PERIODS), self._held, ocp.input_scale
         run = free_run(m, n)
@@ -136,7 +136,7 @@ class Sizes:
         for plan in plans:
             u = np.clip(u0 + scale * plan, ocp.u_min, ocp.u_max)
             d, w = (size * rng.uniform(-1.0, 1.0, size.size) for size in (load, inflow))
-            with np.errstate(invalid="ignore", over="ignore"):  # a run that diverges is finite at first
+            with np.errstate(invalid="ignore", over="ignore"):  # a diverging run is finite at first
                 found.append(np.abs(run(z0, m.acting(u, d, np.tile(m.w + w, (n, 1))))[:, : m.n_x] - m.x0))
         moved = _largest(np.vstack(found))
         rounding = 1e-12 * np.abs(m.x0)

@@ -1,4 +1,4 @@
-"""Soft and hard bounds on states, outputs and expressions of them, as plain data that can be compared."""
+"""Soft and hard bounds on states, outputs and expressions, as plain data that can be compared."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from nn_export import ExportError, program_of
 
 Array = NDArray[np.float64]
 PENALTY = 1e3
-"""Default penalty of a bound's violation, in multiples of what the tolerated deviation ``1 / sqrt(q)`` costs."""
+"""Default penalty of a bound's violation, over the cost of the tolerated deviation ``1 / sqrt(q)``."""
 
 
 EXPRESSION = "(x, u), (x, u, w) or (x, u, w, p) -> column"
 MOST_PRIORITY = 10_000
-"""Largest priority of a hard bound: it is a place in an order."""
+"""Largest priority of a hard bound, which only determines an order."""
 GIVES_WAY = 1e5
-"""Penalty of a hard bound's violation by its size, where it cannot be kept, in multiples of what inputs over their
-whole range, or states off by that size, cost: far above the multipliers of a bound that can."""
+"""Penalty of a relaxed hard bound's violation by its size, over the cost of inputs over their whole range, or of states
+off by that size: far above the multipliers of a feasible bound."""
 HIGHER = 1e2
-"""Factor of that penalty from one priority to the next."""
+"""Factor between the penalties of successive priorities."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +35,23 @@ class SoftBound:
     """``lower <= expression(x, u) <= upper`` (or of ``(x, u, w)`` or ``(x, u, w, p)``) in every period of the horizon,
     as a penalty on its violation.
 
-    A violation ``s`` costs ``linear s + quadratic s^2`` per second. With ``linear`` above the largest multiplier of
-    the hard bound (cost per second and unit by which the bound is moved) the penalty is exact: where the
-    bound can be met it acts as a hard one, else it is violated as little as the cost allows. There is always a plan.
+    A violation ``s`` costs ``linear s + quadratic s^2`` per second. If ``linear`` exceeds the largest multiplier of the
+    hard bound (cost per second and unit by which the bound is moved), the penalty is exact: a feasible bound acts like
+    a hard one, an infeasible one is violated as little as the cost allows. A plan always exists.
 
-    Two bounds are equal if their numbers are and their expressions state the same program.
+    Two bounds are equal if their numbers are equal and their expressions are the same program.
 
     Args:
-        expression: ``(x, u) -> e``, a column of ``n_e``; ``(x, u, w) -> e`` where measured disturbances matter,
-            ``(x, u, w, p) -> e`` where the bound moves: ``p`` are further columns of the reference, as those of an
-            economic stage cost.
+        expression: ``(x, u) -> e``, a column of ``n_e``; ``(x, u, w) -> e`` with measured disturbances,
+            ``(x, u, w, p) -> e`` for a moving bound: ``p`` are further columns of the reference, as for an economic
+            stage cost.
         lower: ``(n_e,)``; ``-inf`` for none.
         upper: ``(n_e,)``; ``inf`` for none.
         linear: Penalties ``(n_e,)`` [cost/s/unit], not negative.
         quadratic: Penalties ``(n_e,)`` [cost/s/unit^2], positive: they make the QP strictly convex.
 
     Raises:
-        InputError: If shapes do not fit, bounds cross, or a penalty is not as said.
+        InputError: If shapes do not fit, bounds cross, or a penalty is out of range.
 
     Source: Nocedal and Wright, *Numerical Optimization*, 2006, theorem 17.3.
 
@@ -79,7 +79,7 @@ class SoftBound:
         own = Collected()
         fits = _is_expression(expression)
         if not fits:
-            own.add(f"soft bound: {expression} given; needed: a function {EXPRESSION} [HM-CONTROL-044]")
+            own.add(f"soft bound: must be a function {EXPRESSION}, got {expression} [HM-CONTROL-044]")
         n = int(expression.size1_out(0)) if fits else None
         arrays = own(_checked, "soft bound", n, lower, upper, linear, quadratic)
         own.refuse()
@@ -101,26 +101,26 @@ class SoftBound:
 
 @dataclass(frozen=True, eq=False)
 class HardBound:
-    """``lower <= what <= upper`` in every period of the horizon that an input can reach, kept wherever it can be.
+    """``lower <= what <= upper`` in every period of the horizon that an input can affect, kept whenever feasible.
 
-    States are bounded in ``x_1 .. x_N``, outputs and expressions in periods ``0 .. N-1``, from the first period on in
-    which an input shows there. Where no plan keeps all hard bounds, those of the lowest priority give way first, and as
-    little as can be: the plan says which, in :attr:`~hybrid_mpc.control.problem.Solution.given_way`. Limits of inputs
-    and of their changes never do.
+    States are bounded in ``x_1 .. x_N``, outputs and expressions in periods ``0 .. N-1``, from the first period in
+    which an input affects them. If no plan keeps all hard bounds, those of the lowest priority are relaxed first and as
+    little as possible; :attr:`~hybrid_mpc.control.problem.Solution.given_way` of the plan lists them. Limits of inputs
+    and of their changes are never relaxed.
 
-    Two bounds are equal if their numbers are and their expressions state the same program.
+    Two bounds are equal if their numbers are equal and their expressions are the same program.
 
     Args:
-        what: ``"x"`` for all states, ``"y"`` for all outputs, or an expression as :class:`SoftBound` takes it, e.g. one
-            of ``(x, u, w, p)`` for an obstacle that moves.
+        what: ``"x"`` for all states, ``"y"`` for all outputs, or an expression as in :class:`SoftBound`, e.g. of
+            ``(x, u, w, p)`` for a moving obstacle.
         lower: ``(n,)``; ``-inf`` for none.
         upper: ``(n,)``; ``inf`` for none.
-        priority: Bounds with a higher one are kept longer. Default: 0.
-        at_end: Whether it holds at the end of the plan alone: states in ``x_N``, outputs and expressions in the last
-            period. A target, or a set from which the rest is safe. Default: everywhere.
+        priority: Bounds with a higher priority are relaxed later. Default: 0.
+        at_end: Whether it only holds at the end of the plan: states in ``x_N``, outputs and expressions in the last
+            period. For a target, or a set from which safety is guaranteed. Default: everywhere.
 
     Raises:
-        InputError: If shapes do not fit, bounds cross, the priority is no whole number, or ``at_end`` is neither.
+        InputError: If shapes do not fit, bounds cross, or ``priority`` or ``at_end`` is of a wrong kind.
 
     Example:
         >>> level = HardBound("x", [0.0, 0.0], [0.5, np.inf])
@@ -146,11 +146,11 @@ class HardBound:
         fits = what in ("x", "y") if isinstance(what, str) else _is_expression(what)
         if not fits:
             own.add(
-                f"hard bound: {what!r:.80} given; needed: 'x', 'y', or a function {EXPRESSION} [HM-CONTROL-045]"
+                f"hard bound: must be on 'x', 'y', or a function {EXPRESSION}, got {what!r:.80} [HM-CONTROL-045]"
             )
         if not isinstance(priority, int) or isinstance(priority, bool) or abs(priority) > MOST_PRIORITY:
             own.add(
-                f"hard bound: priority must be a whole number of at most {MOST_PRIORITY} in size, got {priority!r:.80}"
+                f"hard bound: priority must be an integer of at most {MOST_PRIORITY} in size, got {priority!r:.80}"
                 " [HM-CONTROL-046]"
             )
         if not isinstance(at_end, bool):
@@ -189,7 +189,7 @@ def _is_expression(f: object) -> bool:
 
 
 def tightest(lower: Array, upper: Array, hard: Sequence[HardBound], what: str, n: int) -> tuple[Array, Array]:
-    """Bounds ``(n,)`` of states or outputs, soft ones (which may be empty) and hard ones of all periods."""
+    """Bounds ``(n,)`` of states or outputs: soft ones (which may be empty) and hard ones of all periods."""
     low = lower.copy() if lower.size else np.full(n, -np.inf)
     up = upper.copy() if upper.size else np.full(n, np.inf)
     for bound in hard:
@@ -205,9 +205,7 @@ def state_bounds(
     linear: ArrayLike | None,
     quadratic: ArrayLike | None,
 ) -> tuple[Array, Array, Array, Array]:
-    """Bounds on the states and their penalties ``(n_x,)`` each, the defaults by positive ``weights`` filled in, checked
-    as a soft bound's.
-    """
+    """Checked bounds on the states and their penalties ``(n_x,)`` each, with defaults from positive ``weights``."""
     n = weights.size
     return _checked(
         "state bounds", n,
@@ -219,8 +217,8 @@ def state_bounds(
 
 
 def output_bounds(weights: Array, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Array, Array]:
-    """Bounds on the outputs and their penalties ``(n_y,)`` each, by positive ``weights`` (none: 1); empty where there
-    are none.
+    """Bounds on the outputs and their penalties ``(n_y,)`` each, from positive ``weights`` (none: 1); empty without
+    bounds.
     """
     given = [numbers(v, name, most=LARGEST) for v, name in ((lower, "y_min"), (upper, "y_max"))]
     n = max(v.size for v in given)
@@ -228,7 +226,7 @@ def output_bounds(weights: Array, lower: ArrayLike, upper: ArrayLike) -> tuple[A
         return tuple(np.zeros(0) for _ in range(4))  # type: ignore[return-value]
     if weights.size not in (0, n):
         raise InputError(
-            f"output bounds: {n} values given, q_y has {weights.size}; give one for each output"
+            f"output bounds: {n} values given, but q_y has {weights.size}. Give one for each output."
             " [HM-CONTROL-048]"
         )
     low, up = (v if v.size else np.full(n, side) for v, side in zip(given, (-np.inf, np.inf), strict=True))
@@ -239,7 +237,7 @@ def output_bounds(weights: Array, lower: ArrayLike, upper: ArrayLike) -> tuple[A
 def _checked(
     what: str, n: int | None, lower: ArrayLike, upper: ArrayLike, linear: ArrayLike, quadratic: ArrayLike
 ) -> tuple[Array, Array, Array, Array]:
-    """Bounds and penalties, ``(n,)`` each; None for ``n``: as many as there are lower bounds."""
+    """Bounds and penalties, ``(n,)`` each; ``n`` None: as many as lower bounds."""
     own = Collected()
     low, up = own(_range, what, n, lower, upper) or (None, None)
     lin, quad = (
@@ -259,14 +257,12 @@ def _checked(
 
 
 def _range(what: str, n: int | None, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
-    """Lower and upper bounds, ``(n,)`` each; None for ``n`` as in :func:`_checked`."""
+    """Lower and upper bounds, ``(n,)`` each; ``n`` None as in :func:`_checked`."""
     own = Collected()
     low = own(_sized, lower, n, f"{what}: lower")
     up = own(_sized, upper, n if n is not None or low is None else low.size, f"{what}: upper")
     if low is not None and up is not None and low.shape == up.shape and not np.all(low < up):
-        own.add(
-            f"{what} cross: lower {low}, upper {up}; every lower must be below its upper [HM-CONTROL-051]"
-        )
+        own.add(f"{what}: every lower must be below its upper, got lower {low}, upper {up} [HM-CONTROL-051]")
     own.refuse()
     assert low is not None
     assert up is not None
@@ -274,21 +270,21 @@ def _range(what: str, n: int | None, lower: ArrayLike, upper: ArrayLike) -> tupl
 
 
 def _sized(values: ArrayLike, n: int | None, name: str) -> Array:
-    """``values`` as a vector ``(n,)``, or of any size where none is known."""
+    """``values`` as a vector ``(n,)``, or of any size if ``n`` is None."""
     array = numbers(values, name, most=LARGEST)
     if n is not None and array.shape != (n,):
-        raise InputError(f"{name} has {array.size} values, {n} needed [HM-CONTROL-052]")
+        raise InputError(f"{name}: must have {n} values, got {array.size} [HM-CONTROL-052]")
     return array
 
 
 def fixed(array: Array) -> Array:
-    """The array, which may not be written into any more."""
+    """The array, made read-only."""
     array.flags.writeable = False
     return array
 
 
 def number_content(holder: Any) -> tuple[Any, ...]:
-    """All fields of a dataclass by value, expressions left out: what can be hashed."""
+    """All fields of a dataclass by value, without expressions; hashable."""
     return tuple(_content(getattr(holder, field.name)) for field in fields(holder))
 
 
@@ -301,10 +297,10 @@ def _content(value: Any) -> Any:
 
 
 def same_expression(a: ca.Function | None, b: ca.Function | None) -> bool:
-    """Whether two functions are one, or state the same program; what cannot be stated equals itself alone."""
+    """Whether two functions are the same object or program; one that cannot be traced only equals itself."""
     if a is None or b is None:
         return a is b
-    if a.__hash__() == b.__hash__():  # one object of CasADi
+    if a.__hash__() == b.__hash__():  # the same CasADi object
         return True
     try:
         return program_of(a) == program_of(b)

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """What one solve is given: disturbance, input held before, targets, and limits tighter than the problem's."""
+    """Arguments of one solve: disturbance, input held before, targets, and limits tighter than the problem's."""
 
     d: Array
     u_prev: Array
@@ -48,7 +48,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Point:
-    """A run with its first derivatives, soft bounds left out of multipliers ``(N, n_z)`` and gradient ``(N n_u,)``."""
+    """A run with its first derivatives; multipliers ``(N, n_z)`` and gradient ``(N n_u,)`` without soft bounds."""
 
     run: Rollout
     derivatives: Derivatives
@@ -57,7 +57,7 @@ class Point:
 
 
 class ReducedCost:
-    """Cost and derivatives as functions of the inputs alone, the model run on them. Built once for all cases."""
+    """Cost and derivatives as functions of the inputs only, by runs of the model. Built once for all cases."""
 
     def __init__(self, inner: CondensedController) -> None:
         self.inner, self.problem = inner, inner.problem
@@ -74,11 +74,11 @@ class ReducedCost:
         return Rollout(u, z, soft, problem.cost(z, u, case.u_prev, case.target, excess))
 
     def acting(self, u: Array, case: Case) -> Array:
-        """All that acts along a run ``(N, n_v)``."""
+        """All inputs along a run ``(N, n_v)``."""
         return self.problem.model.acting(u, case.d, case.target.w)
 
     def at(self, run: Rollout, case: Case) -> Point:
-        """What is known along a run."""
+        """First derivatives along a run."""
         problem, n_x = self.problem, self.inner.ocp.n_x
         derivatives = self.inner.stages.at(run.z[:-1], self.acting(run.u, case))
         stages, terminal = problem.state_weights(case.target.weight)
@@ -93,7 +93,7 @@ class ReducedCost:
         return Point(run, derivatives, multipliers, gradient)
 
     def lagrangian(self, at: Point, soft: Array) -> tuple[Array, Array]:
-        """Multipliers of the dynamics and gradient with the soft bounds in, whose multipliers are ``soft``."""
+        """Multipliers of the dynamics and gradient, including the soft bounds with multipliers ``soft``."""
         acting = np.flatnonzero(soft)
         if not acting.size:
             return at.multipliers, at.gradient
@@ -122,13 +122,13 @@ class ReducedCost:
         )  # fmt: skip
 
     def rounding(self, values: Array) -> float:
-        """What penalties of values ``(M,)`` may differ by where the QP's rows are exact to its tolerance."""
+        """Error of the penalties of values ``(M,)`` due to the QP's tolerance."""
         soft = self.problem.soft
         beyond = soft.excess(values) > 0
         return PRIMAL_TOLERANCE * self.problem.model.dt * float((soft.linear * soft.scale)[beyond].sum())
 
     def penalty(self, values: Array) -> float:
-        """What values of the soft bounds cost."""
+        """Cost of the soft bounds' values."""
         soft = self.problem.soft
         return self.problem.model.dt * soft.penalty(soft.excess(values))
 
@@ -145,9 +145,9 @@ class ReducedCost:
         return self.penalty(values) - float(proven)
 
     def rest(self, prepared: Prepared, curvature: Array, case: Case) -> Array:
-        """What the exact Hessian has besides ``prepared``'s; nothing was condensed since."""
+        """The exact Hessian minus that of ``prepared``; nothing may be condensed in between."""
         rest = self.stages.condensed(curvature, prepared.from_u, self.inner.condenser.by_inputs)
-        if prepared.economic is not None:  # what curves down, which the convex model takes as flat
+        if prepared.economic is not None:  # negative curvature, which the convex model replaces by zero
             n_x = self.inner.ocp.n_x
             exact = self.problem.economic.derivatives(prepared.z[:, :n_x], prepared.u, case.target.p)[1]
             rest = rest + condense_hessians(exact - prepared.economic[1], prepared.from_u, n_x)
@@ -160,28 +160,28 @@ KKT = 1e-6
 ATTEMPTS = 15
 """Most QPs of an iteration, each damped more than the one before."""
 MORE = 4.0
-"""Factor of the damping from one attempt to the next; a good step takes as much away."""
+"""Factor by which damping grows between attempts, and falls after a good step."""
 POOR, GOOD = 0.25, 0.5
 """Ratios of actual to predicted decrease: below the first damping is raised, above the second it is lowered."""
 CORRECTIONS = 2
-"""Most corrections of a step by what it was found to bend."""
+"""Most second-order corrections of a step."""
 SLOW = 0.1
-"""Share of the residual that the Hessian got wrong, above which second derivatives are taken anew."""
+"""Relative prediction error of the residual above which second derivatives are computed again."""
 LIFTED = 14
-"""Most linearizations of a first plan that keep the states as unknowns, with defects, before all iterates are runs."""
+"""Most multiple-shooting linearizations of a first plan, before all iterates are runs."""
 AGREES = 0.01
-"""Share by which the cost of a run may differ from what the QP said of it for that to end."""
+"""Relative difference between the cost of a run and the QP's prediction at which multiple shooting ends."""
 AGAIN = (1, 4, 16, 64)
-"""Times at which a hidden state's curvature that hardly mattered is looked at again."""
+"""Iterations at which a neglected curvature of the hidden state is checked again."""
 
 
 @dataclass(frozen=True)
 class _Step:
-    """What a search has found.
+    """Result of a search.
 
-    ``run`` is None if no step lowers the cost; ``hessian`` is the damped one that the QP's answer belongs to.
-    ``promised`` is what the model without damping promises of the step before its correction, ``own`` that model's
-    curvature along it, in the damping's metric.
+    ``run`` is None if no step lowers the cost; ``hessian`` is the damped Hessian of the QP's solution. ``promised`` is
+    the decrease predicted by the undamped model for the step before its correction, ``own`` that model's curvature
+    along the step, in the damping's metric.
     """
 
     run: Rollout | None
@@ -192,7 +192,7 @@ class _Step:
 
 
 class Descent:
-    """The steps of one solve, from a first point on, whose cost is finite."""
+    """The steps of one solve, from a first point with finite cost."""
 
     def __init__(
         self, cost: ReducedCost, case: Case, at: Point, curvature: Array | None, tolerance: float,
@@ -219,7 +219,7 @@ class Descent:
             self._go(hessian, found, found.run)
 
     def _go(self, hessian: Array, found: _Step, run: Rollout) -> None:
-        """Make a step, and find by the QP's multipliers what is left to do there."""
+        """Make a step, and compute the residual there with the QP's multipliers."""
         answer, cost = found.answer, self._cost
         before = max(answer.kkt, self._residual(hessian, found.hessian @ answer.step))
         gained = self.at.run.cost - run.cost
@@ -239,7 +239,7 @@ class Descent:
             self._damping = self._damping / MORE if self._damping > 0.1 * found.own else 0.0
 
     def _search(self, prepared: Prepared, hessian: Array) -> _Step:
-        """The first step, damped more and more, that lowers the cost enough, if there is one."""
+        """The first step, with growing damping, that lowers the cost enough, if any."""
         first = None
         for _ in range(ATTEMPTS):
             damped = hessian
@@ -265,7 +265,7 @@ class Descent:
     def _along(
         self, prepared: Prepared, damped: Array, answer: Answer, promised: float
     ) -> tuple[Rollout | None, Answer]:
-        """The run on a step if it lowers the cost enough, or on the step corrected by what it was found to bend."""
+        """The run of a step, or of the corrected step, if it lowers the cost enough."""
         start, bounds = self.at.run, self._cost.inner.ocp.bounds(self._case.u_prev, self._case.limits)
         least, before = start.cost - ARMIJO * promised, np.inf
         for i in range(1 + CORRECTIONS):
@@ -281,7 +281,7 @@ class Descent:
         return None, answer
 
     def _corrected(self, prepared: Prepared, damped: Array, answer: Answer, run: Rollout) -> Answer:
-        """The QP once more, with what states and soft bounds were found to be beside the last answer's line."""
+        """The QP again, with the curvature of states and soft bounds along the last step (second-order correction)."""
         old, n_x, (value, _, slope) = self.at.run, self._cost.inner.ocp.n_x, prepared.soft
         bend = (run.z[:, :n_x] - old.z[:, :n_x]).ravel() - prepared.from_u @ answer.step
         if len(slope):
@@ -289,7 +289,7 @@ class Descent:
         return self._answer(damped, self.at.gradient + 2 * bend @ prepared.weighted, value, slope)
 
     def _answer(self, hessian: Array, gradient: Array, value: Array, slope: Array) -> Answer:
-        """The QP's answer within the inputs' bounds: what rounding puts beyond them promises what no run can keep."""
+        """The QP's solution clipped to the inputs' bounds; beyond them it predicts a decrease that no run achieves."""
         soft = (value, slope) if value.size else None
         case, u, inner = self._case, self.at.run.u, self._cost.inner
         found = inner.qp.solve(hessian, gradient, u, case.u_prev, soft, case.limits, self.active)
@@ -297,7 +297,7 @@ class Descent:
         return replace(found, step=(within - u).ravel())
 
     def _promised(self, prepared: Prepared, hessian: Array, step: Array) -> float:
-        """By how much the convex model falls along a step."""
+        """Decrease of the convex model along a step."""
         value, _, slope = prepared.soft
         lowers = -float(step @ (self.at.gradient + 0.5 * (hessian @ step)))
         if value.size:
@@ -305,7 +305,7 @@ class Descent:
         return lowers
 
     def _promise(self, hessian: Array, left: Array) -> float:
-        """What the convex model at the point promises at most (weak duality), ``left`` of the stationarity."""
+        """Upper bound of the decrease of the convex model (weak duality), with ``left`` of the stationarity."""
         qp = self._cost.inner.qp
         left, hessian = qp.by_blocks(left), qp.blocked_hessian(hessian)
         promise = 0.5 * float(left @ np.linalg.solve(hessian, left))
@@ -334,7 +334,7 @@ class Descent:
         )
 
     def _taken_anew(self, prepared: Prepared, multipliers: Array) -> Array:
-        """Second derivatives here; the hidden state's, which change slowly, from the second time on."""
+        """Second derivatives here; those of the hidden state, which change slowly, from the second time on."""
         cost, old = self._cost, self.curvature
         small = old is not None and old.shape[1] < cost.stages.size
         if old is not None and (self._taken in AGAIN if small else self._taken > 0):
@@ -348,7 +348,7 @@ class Descent:
         return curvature
 
     def _held(self, slope: Array) -> NDArray[np.bool_] | None:
-        """Inputs that lie on a bound against which the cost pushes them."""
+        """Inputs on a bound with a cost gradient that points outwards."""
         ocp, u = self._cost.inner.ocp, self.at.run.u
         if ocp.blocks is not None:
             return None
@@ -357,7 +357,7 @@ class Descent:
         return (((u <= lower + near) & (s > 0)) | ((u >= upper - near) & (s < 0))).ravel()
 
     def _lost(self, found: _Step) -> None:
-        """No step lowers the cost: where it is flat what is left is rounding, else start anew."""
+        """No step lowers the cost: at a stationary point only rounding is left, else restart."""
         self.kkt = max(found.answer.kkt, self._residual(found.hessian, found.hessian @ found.answer.step))
         flat = found.promised <= self._enough + self._cost.rounding(self.at.run.soft[0])
         self.ended = (flat and self.kkt <= KKT) or self._plain
@@ -365,7 +365,7 @@ class Descent:
         self._stale, self._plain, self._damping = not self._fresh, self._fresh, 0.0
 
     def _refused(self, status: Status) -> None:
-        """The QP's answer is no good: Gauss-Newton's Hessian is better conditioned, then it is over."""
+        """The QP's solution is invalid: retry with the better conditioned Gauss-Newton Hessian, then stop."""
         self.ended = self._plain
         self._plain, self._damping = True, 0.0
         if self.ended:
@@ -376,28 +376,27 @@ class SQPController(Controller):
     """Nonlinear MPC by SQP to convergence with exact second derivatives, globalised by damping.
 
     Every iterate is a run of the model: the dynamics hold exactly, limits of inputs and changes are linear and kept by
-    every QP, soft bounds are penalties within the cost. So the cost is the merit function: a step is made when it
-    lowers the cost by a share (1e-4) of what the QP's convex model promises. One that does not is first corrected by
-    what states and soft bounds were found to bend along it (Fletcher's second-order correction), then the QP is solved
-    again with more damping (Levenberg and Marquardt), which carries over and falls where steps keep their promise.
+    every QP, soft bounds are penalties in the cost. So the cost is the merit function: a step is accepted if it lowers
+    the cost by at least 1e-4 of the decrease predicted by the QP's convex model. Otherwise it is first corrected for
+    the curvature of states and soft bounds along it (Fletcher's second-order correction), then the QP is solved again
+    with more damping (Levenberg and Marquardt). Damping carries over and falls after well-predicted steps.
 
-    The QP's Hessian is Gauss-Newton's and the second derivatives of dynamics and soft bounds, weighted with their
-    multipliers: under a steep friction law or a trained network Gauss-Newton alone converges slowly. They are
-    differences of the exact Jacobians, come along with a plan, shifted by a period, and are taken anew where the
-    Hessian got more than a tenth of the residual wrong. Where the sum is not convex it is made so, if possible in the
-    inputs alone that lie on a bound. The plan is independent of the first guess but for the basin it lies in.
+    The QP's Hessian is that of Gauss-Newton plus second derivatives of dynamics and soft bounds, weighted with their
+    multipliers: with steep friction or a trained network Gauss-Newton alone converges slowly. They are finite
+    differences of the exact Jacobians, are shifted by a period with the plan, and are computed again if the Hessian
+    mispredicted more than a tenth of the residual. If the sum is not convex it is convexified, if possible only in
+    inputs on a bound. The plan depends on the initial guess only through the basin of attraction.
 
     Args:
         model: The deployed model; ``n_h`` may be 0. It must not be so unstable that a run over the horizon
             overflows: then no line search finds a finite cost.
         ocp: The problem.
-        tolerance: Converged when the convex model promises to lower the cost by less than this share, and
+        tolerance: Converged if the convex model predicts a relative decrease of the cost below this value, and
             the KKT residual is at most 1e-6.
-        iterations: Most linearizations; the plan then reached has the status STOPPED and may be applied.
+        iterations: Most linearizations; a plan that ends there has status STOPPED and may be applied.
         compiled: As in :class:`~hybrid_mpc.control.rti.CondensedController`.
-
-        inner: A real-time iteration of the same model and problem, whose functions are used: half the time to build.
-            Default: one is made.
+        inner: A real-time iteration of the same model and problem whose functions are reused, which halves the
+            construction time. Default: a new one.
 
     Raises:
         InputError: As :class:`~hybrid_mpc.control.rti.CondensedController`, or if an option is not positive.
@@ -420,13 +419,13 @@ class SQPController(Controller):
         inner: CondensedController | None = None,
     ) -> None:
         if not (isinstance(tolerance, int | float) and tolerance > 0):
-            raise InputError(f"tolerance must be positive, got {tolerance!r:.80} [HM-CONTROL-053]")
+            raise InputError(f"tolerance: must be positive, got {tolerance!r:.80} [HM-CONTROL-053]")
         iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         inner = CondensedController(model, ocp, compiled=compiled) if inner is None else inner
         self.problem, self._cost = inner.problem, ReducedCost(inner)
         self._tolerance, self._iterations = tolerance, iterations
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
         *, limits: Limits | None = None, w: Array | None = None,
@@ -441,7 +440,7 @@ class SQPController(Controller):
         u = self._admissible(previous.following, case)
         run = self._cost.run(np.concatenate([estimate.x, estimate.h]), u, case)
         active, lifted = self._cost.inner.qp.later(previous.active), 0
-        # a first plan, far from any that is good; who asks for few iterations improves the guess that was given
+        # a first plan, far from a good one; with few iterations the given guess is only improved
         if not np.isfinite(previous.cost) and case.target.ok and self._iterations > LIFTED:
             given = estimate, reference, weight, limits, w
             run, active, lifted = self._lifted(previous, run, case, given)
@@ -458,10 +457,10 @@ class SQPController(Controller):
         self, previous: Solution, run: Rollout, case: Case,
         given: tuple[Estimate, Array, Array | None, Limits | None, Array | None],
     ) -> tuple[Rollout, Active | None, int]:  # fmt: skip
-        """Where to begin: the cheapest run on the plans of Gauss-Newton's multiple shooting, and how many there were.
+        """Start of the descent: the cheapest run among the plans of Gauss-Newton multiple shooting, and their number.
 
-        Its states leave the model's equations on the way, so that a swing that runs from rest could only creep towards
-        is found in some steps.
+        Multiple shooting may violate the model's equations in between, so it finds e.g. a swing-up in a few steps that
+        runs from rest would only approach slowly.
         """
         inner, (estimate, reference, weight, limits, w) = self._cost.inner, given
         best, active, count = run, None, 0
@@ -483,14 +482,14 @@ class SQPController(Controller):
         return best, active, count
 
     def _shifted(self, previous: Solution) -> Array | None:
-        """Second derivatives along the previous plan, a period later; None if it has none that fit."""
+        """Second derivatives of the previous plan, shifted by a period; None if they do not fit."""
         given = previous.curvature
         if given is None or not self._cost.stages.fits(given, self.ocp.horizon):
             return None
         return np.concatenate([given[1:], given[-1:]]) if np.all(np.isfinite(given)) else None
 
     def _admissible(self, u: Array, case: Case) -> Array:
-        """``u`` held over its blocks and moved into the limits, one input after the other: QPs keep what it keeps."""
+        """``u`` held over its blocks and clipped to the limits, one input after the other, as the QPs need it."""
         u_prev = case.u_prev
         lower, upper = self.ocp.bounds(u_prev, case.limits)
         if self.ocp.du_max is None:

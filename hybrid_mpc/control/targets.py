@@ -1,4 +1,4 @@
-"""Target calculator: the steady state at which the outputs are a set-point, or as near to it as the limits allow."""
+"""Target calculator: the steady state with the outputs at a set-point, or as close to it as the limits allow."""
 
 from __future__ import annotations
 
@@ -25,45 +25,43 @@ from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 HEED = 0.2
-"""Rest of a state counts as much as this share of it in a hidden state: of a network that rests hardly, or anywhere
-(its gates are shut), the states' equations are to hold first."""
+"""Factor on the states' scales in the steady-state equations, relative to those of hidden states: near a network that
+hardly settles, or settles anywhere (its gates are shut), the states' equations take precedence."""
 ASIDE = 0.1
-"""Distance of further starts from the operating point's input, in scales of the input. A network that has learned how a
-machine sticks feels no input between the two on which the machine breaks loose, and Newton's method stops there."""
+"""Distance of further starts from the operating point's input, in scales of the input. A network that has learned
+sticking friction has zero slope between the two breakaway inputs, where Newton's method stops."""
 FLAT = 0.01
-"""Share of the outputs' slopes at the operating point below which they do not answer to the inputs as they do there: a
-speed whose size alone is measured, at a standstill and beyond; the top of a curve. A descent does not leave such a
-point."""
+"""Share of the outputs' slopes at the operating point below which the outputs no longer respond as they do there: the
+absolute value of a speed at standstill and beyond; the top of a curve. A descent does not leave such a point."""
 NEARER = 1e-3
-"""Largest lack of a steady state, in the states' scales, of an operating point that nearly rests."""
+"""Largest residual, in the states' scales, of an operating point that is nearly steady."""
 
 
 class Targets:
     """Steady states for set-points of outputs: ``y_ref`` to ``(x_ref, u_ref)``.
 
-    It solves ``min |y - y_ref|^2`` in the weights ``q_y`` over steady states ``z = F(z, u, w, d)`` with inputs, states
-    and outputs within the problem's bounds and the signals' ranges. Of several inputs that do equally well the one
-    nearest to the operating point's is taken, in the inputs' scales. A set-point that cannot be reached gives the
-    nearest that can, and ``reached`` is False. Where no steady state keeps the bounds of states and outputs, they are
-    left out.
+    It solves ``min |y - y_ref|^2``, weighted by ``q_y``, over steady states ``z = F(z, u, w, d)`` with inputs, states
+    and outputs within the problem's bounds and the signals' ranges. Of several equally good inputs the one closest to
+    the operating point's is taken, in the inputs' scales. For an unreachable set-point the closest reachable one is
+    returned, with ``reached`` False. If no steady state keeps the bounds of states and outputs, these are ignored.
 
-    The search is :class:`~hybrid_mpc.model.equilibrium.SteadySearch`. It begins where it is told to. Where there is no
-    such start, or Newton's method does not contract from it, set-point and disturbances are led there from the
-    operating point, by parts of the way that keep Newton's method contracting: the answer is on the operating point's
-    branch, whatever the rounding. Where that branch ends, the branch of the start is followed. Where it ends too,
-    descents begin at the operating point, beside it, and where the model's own run from there ends; of the steady
-    states found that are equally near to the set-point the one nearest to the operating point counts. All counts in
-    the :class:`~hybrid_mpc.control.sizes.Sizes` of the problem, so that no answer depends on units. No method changes
-    the object's answers; not for several threads at once.
+    The search is :class:`~hybrid_mpc.model.equilibrium.SteadySearch`, from the given start. Without a start, or if
+    Newton's method does not contract from it, set-point and disturbances are continued from the operating point in
+    steps for which Newton's method contracts: the result is on the operating point's branch, whatever the rounding. If
+    that branch ends, the branch of the start is followed. If it ends, too, descents start at the operating point,
+    beside it, and where the model's own run from there ends; of the steady states equally close to the set-point, the
+    one closest to the operating point is returned. All quantities are scaled by the problem's
+    :class:`~hybrid_mpc.control.sizes.Sizes`, so results do not depend on units. The object has no state, but reuses
+    its buffers: it is not thread-safe.
 
     Args:
         model: The model, with its disturbance model.
         ocp: A problem with weights on outputs.
-        sizes: Sizes of the signals. Default: made of the two.
+        sizes: Sizes of the signals. Default: from model and problem.
 
     Raises:
-        InputError: If the problem has no weights on outputs, or they are another number than the model's; if the size
-            of a state is not known.
+        InputError: If the problem has no weights on outputs, or another number of them than the model has outputs; if
+            the size of a state is unknown.
 
     Example:
         >>> import casadi as ca
@@ -80,7 +78,7 @@ class Targets:
     def __init__(self, model: HybridModel, ocp: OCP, sizes: Sizes | None = None) -> None:
         if ocp.q_y.size != model.n_y or not ocp.n_y:
             raise InputError(
-                f"targets: the problem has q_y = {ocp.q_y}, model {model.name} {model.n_y} outputs; give a weight each"
+                f"targets: q_y must have {model.n_y} weights, one per output of model {model.name}, got {ocp.q_y}"
                 " [HM-CONTROL-054]"
             )
         self.model, self._ocp = model, ocp
@@ -88,9 +86,9 @@ class Targets:
         self._tracked = np.flatnonzero(ocp.q_y > 0)
         sizes = Sizes(model, ocp) if sizes is None else sizes
         self.scale: Array = np.concatenate([sizes.states, sizes.hidden, ocp.input_scale])
-        """What 1 means of the unknowns ``(x, h, u)`` ``(n_z + n_u,)``."""
+        """Scales of the unknowns ``(x, h, u)`` ``(n_z + n_u,)``."""
         self.heed: Array = np.concatenate([np.full(n_x, HEED), np.ones(model.n_h)])
-        """Shares ``(n_z,)`` of these that count as much in the equations of rest."""
+        """Factors ``(n_z,)`` on the scales of the steady-state equations."""
         ranges = [np.array([(s.lower, s.upper) for s in group]).T for group in (model.states, model.outputs)]
         x_min, x_max = ocp.state_range
         y_min, y_max = ocp.output_range(model.n_y)
@@ -123,26 +121,26 @@ class Targets:
         """The steady state for a set-point.
 
         Args:
-            y_ref: Outputs ``(n_y,)``; those without a weight do not matter and may be NaN.
+            y_ref: Outputs ``(n_y,)``; those without a weight are ignored and may be NaN.
             d: Unmeasured disturbances ``(n_d,)``. Default: zero.
             w: Measured disturbances ``(n_w,)``. Default: those of the operating point.
-            start: Where to begin, e.g. the last answer. Default: the operating point.
-            wide: Whether to begin elsewhere where a steady ``start`` does not lead to one. Default: yes.
+            start: Start of the search, e.g. the last result. Default: the operating point.
+            wide: Whether to search from other points if a steady ``start`` does not lead to a solution. Default: yes.
 
         Raises:
-            InputError: If a size does not fit, or a value that is needed is not finite.
+            InputError: If a size does not fit, or a required value is not finite.
         """
         m, search = self.model, self._search
         goal = np.asarray(y_ref, dtype=float).ravel()
         if goal.size != m.n_y or not np.all(np.isfinite(goal[self._tracked])):
             raise InputError(
-                f"y_ref {goal} given; needed: {m.n_y} outputs, finite where q_y weighs them [HM-CONTROL-055]"
+                f"y_ref: must have {m.n_y} outputs, finite where q_y weighs them, got {goal} [HM-CONTROL-055]"
             )
         d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
         w = m.w if w is None else vector(w, m.n_w, "w")
         given = start.unknowns if start is not None and start.steady else None
         if given is None:
-            _ = self.begun  # thousands of periods: at the first plan, not in some later period
+            _ = self.begun  # takes thousands of periods: computed with the first plan, not in a later period
         self._equations.d, self._equations.w = d, w
         first = self.beside[0] if given is None else given
         tried: list[Descent] = []
@@ -172,8 +170,8 @@ class Targets:
     def _followed(
         self, goal: Array, d: Array, w: Array, given: Array | None = None, *, sure: bool = True
     ) -> Descent | None:
-        """Where set-points on the way lead: from ``given`` under the disturbances at hand; without it from the
-        operating point, or where its run ends, and with the disturbances from none.
+        """The end of a continuation of the set-point: from ``given`` at the present disturbances, or from the operating
+        point (or the end of its run), with the disturbances continued from none.
         """
         equations = self._equations
         if given is not None:
@@ -188,7 +186,7 @@ class Targets:
         return found
 
     def _lost(self, found: Descent) -> bool:
-        """Whether a descent missed its set-point where outputs do not answer to inputs as at the operating point."""
+        """Whether a descent missed its set-point at a point where outputs do not respond as at the operating point."""
         return found.steady and found.off > REACHED and bool(np.vdot(found.slopes, self.slopes) < self.flat)
 
     def _steady(self, found: Descent) -> Steady:
@@ -201,7 +199,7 @@ class Targets:
 
     @cached_property
     def slopes(self) -> Array:
-        """How the weighed outputs answer to the inputs ``(n, n_u)`` along steady states, at the operating point."""
+        """Derivatives of the weighed outputs by the inputs ``(n, n_u)`` along steady states, at the operating point."""
         kept = self._equations.d, self._equations.w
         self._undisturbed()
         slopes = self._search.slopes(self.beside[0])
@@ -210,13 +208,13 @@ class Targets:
 
     @cached_property
     def flat(self) -> float:
-        """Product with :attr:`slopes` of slopes that count as none."""
+        """Product with :attr:`slopes` below which slopes count as zero."""
         return FLAT * float(np.vdot(self.slopes, self.slopes))
 
     @cached_property
     def beside(self) -> list[Array]:
-        """The operating point, and points with one input more or less; hidden states, which may take a thousand steps
-        to settle, at rest there.
+        """The operating point, and points with one input increased or decreased; hidden states, which may take a
+        thousand steps to settle, are settled there.
         """
         m, ocp = self.model, self._ocp
         u0 = np.clip(m.u0, ocp.u_min, ocp.u_max)
@@ -226,11 +224,11 @@ class Targets:
 
     @cached_property
     def run_out(self) -> list[Array]:
-        """Where the model's own run from the operating point comes nearly to rest under its input; nothing where it
-        does not, or nearly rests there from the first.
+        """The nearly steady end of the model's own run from the operating point; empty if the run does not settle, or
+        the operating point is nearly steady already.
 
-        The operating point may be far from rest in a state that no sensor shows. Hidden states that a descent moves
-        there leave what a network ever reaches: their gates are shut, and they rest anywhere.
+        The operating point may be far from steady in a state that no sensor measures. A descent there may move hidden
+        states out of the range that a network ever reaches, where its gates are shut and it settles anywhere.
         """
         self._undisturbed()
         if self._search.lacks(self.beside[0]) < NEARER:
@@ -240,7 +238,7 @@ class Targets:
 
     @cached_property
     def begun(self) -> tuple[Array, Array]:
-        """Where continuations begin: the run's end, else the operating point, and the outputs ``(n_y,)`` there."""
+        """Start of continuations: the run's end, else the operating point, and the outputs ``(n_y,)`` there."""
         nearest = (self.run_out or self.beside)[0]
         self._undisturbed()
         return nearest, self._equations.shown(nearest)[0]

@@ -1,6 +1,7 @@
 """Cells of one column as numbers: decimal marks, dates and times of day, numbers with a unit, words for a switch.
 
-A column is read in one way throughout. What fits no way, or two, is left as it is, for a message.
+All cells of a column are read in the same way. If no way fits, or more than one, the cells stay unread and a message
+says why.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.machine.units import parsed
+from hybrid_mpc.machine.units import parse_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Count = NDArray[np.int64]
 BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---")
-"""Cells that say that there is no value, in small letters."""
+"""Cells that mark a missing value, in small letters."""
 PAIRS = (  # words for the two positions of a switch, 0 and 1, in small letters
     ("off", "on"), ("false", "true"), ("no", "yes"), ("closed", "open"), ("low", "high"), ("aus", "ein"), ("aus", "an"),
     ("zu", "auf"), ("nein", "ja"), ("falsch", "wahr"), ("arrêt", "marche"), ("non", "oui"),
@@ -31,8 +32,8 @@ PAIRS = (  # words for the two positions of a switch, 0 and 1, in small letters
 SWITCH = frozenset(word for pair in PAIRS for word in pair)
 DAY = 86400.0
 FAR = 20.0
-"""Usual steps of dates by which none is away from the next one, where the order of day and month must be told."""
-SEEN = 100  # cells that are looked at before all are read as dates of ISO 8601
+"""Longest step between dates, in median steps, with which an order of day and month is accepted."""
+SEEN = 100  # cells that are inspected before all are read as dates of ISO 8601
 ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}(:\d{2}([.,]\d{1,9})?)?(Z|[+-]\d{2}:?\d{2})?")
 TIMES = "times of day read as seconds"
 MONTHS = (  # how the names of months begin, in small letters
@@ -51,7 +52,7 @@ _DAYS = (  # a day: year first, year last, with the month's name, in eight digit
 DATES = tuple(re.compile(rf"{day}(?:[T _,-]\s*{_CLOCK}{_ZONE})?") for day in _DAYS)
 TIME_OF_DAY = re.compile(_CLOCK)
 MINUTES = re.compile(r"(?P<M>\d{1,3}):(?P<S>\d{2})[.,](?P<f>\d{1,9})")
-"""Minutes and seconds: two numbers of which the second has decimals."""
+"""Minutes and seconds: two numbers, the second with decimals."""
 WITH_UNIT = re.compile(
     r"(?P<number>[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\W\d_][^\d_,;]{0,11}|%|°\w?)"
 )
@@ -60,10 +61,10 @@ THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?P<mark>[.,'’ \u00a0\u202f])\d{3})(?:
 
 
 class Cells(NamedTuple):
-    """A column's numbers ``(m,)``, NaN where there is none, and which of its cells are ``blank``.
+    """A column's numbers ``(m,)``, NaN where a cell has none, and which of its cells are ``blank``.
 
-    ``unit`` is the one that every cell has, ``"s"`` of dates; ``done`` says what was done to make numbers of them, and
-    ``fault`` why that failed for all, with a remedy.
+    ``unit`` is the unit that every cell has, ``"s"`` for dates. ``done`` describes the conversion to numbers. ``fault``
+    says why the conversion failed for the whole column, with a remedy.
     """
 
     values: Array
@@ -74,7 +75,7 @@ class Cells(NamedTuple):
 
 
 def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
-    """The numbers in a column as pandas has it: numbers, dates, or texts with the file's decimal mark."""
+    """Convert a column of pandas to numbers: numbers, dates, or texts with the file's decimal mark."""
     import pandas as pd
 
     kind, none = column.dtype.kind, np.zeros(len(column), bool)
@@ -89,7 +90,7 @@ def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
         values = np.where(blank, np.nan, since / 1e9)
         return Cells(values, blank, "s", f"dates read as seconds since {begin}" if kind == "M" else "")
     if kind == "c":
-        return Cells(np.full(len(column), np.nan), none, fault="it holds complex numbers")
+        return Cells(np.full(len(column), np.nan), none, fault="it holds complex numbers. Write real numbers")
     first = [one for one in column.iloc[:SEEN] if isinstance(one, str)]
     texts = len(first) == min(SEEN, len(column)) > 0
     if texts and all(map(ISO.fullmatch, first)):
@@ -98,7 +99,7 @@ def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
             return cells_of(dates)
     found, words = None, column.tolist() if texts and all(map(is_stamp, first)) else list[Any]([None])
     if all(isinstance(one, str) for one in words):
-        found = _stamps(words, np.zeros(0), ".")  # all are dates that are written in one way
+        found = _stamps(words, np.zeros(0), ".")  # all cells are dates in one format
     if found is None or found.fault:
         codes, uniques = pd.factorize(column, use_na_sentinel=False)
         found = _of_objects(list(uniques), decimal)
@@ -112,7 +113,7 @@ def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
 
 
 def number(cell: str) -> float:
-    """The number in a cell; NaN for what is no finite one.
+    """The number in a cell; NaN if the cell holds no finite number.
 
     Example:
         >>> number("1e3"), number("1_000")
@@ -131,9 +132,9 @@ def is_number(cell: str, decimal: str = ".") -> bool:
 
 
 def is_value(cell: str, comma: bool = True) -> bool:
-    """Whether a cell is one of a row of values, and no name: a number, a date, a switch, a number with a unit.
+    """Whether a cell belongs to a row of values, not of names: a number, a date, a switch, a number with a unit.
 
-    ``comma``: the decimal mark may be one.
+    ``comma``: a decimal comma is allowed.
     """
     return (
         is_number(cell) or (comma and is_number(cell, ",")) or is_stamp(cell) or cell.casefold() in SWITCH
@@ -149,28 +150,30 @@ def is_stamp(cell: str) -> bool:
 
 
 def is_unit(cell: str) -> bool:
-    """Whether a cell names a unit, in brackets or without, and is no mark for a missing value."""
+    """Whether a cell names a unit, with or without brackets; marks of missing values are no units."""
     bare = cell.strip().strip("[]()").strip()
     return (
         re.search(r"[^\W\d_]|[%°]", bare) is not None
         and bare.casefold() not in BLANK
-        and parsed(bare) is not None
+        and parse_unit(bare) is not None
     )
 
 
 def cause(cell: str) -> str:
-    """What a cell that is no number is, and what to write; empty where nobody knows."""
+    """Why a cell is not a number, and what to write instead; empty if the cause is unknown."""
     if THOUSANDS.fullmatch(cell):
-        return "it has a mark between thousands. Write numbers without that, with a decimal point"
+        return "the number has a mark between thousands. Delete the mark and write a decimal point"
     if re.fullmatch(r"[+-]?\d*,\d+", cell):
-        return "it has a decimal comma. Write a decimal point, or separate cells by semicolons"
+        return "the number has a decimal comma. Write a decimal point, or separate cells by semicolons"
     if is_stamp(cell):
-        return "it is a date or a time of day, and other cells are not. Write one of both in all rows"
+        return "the cell is a date or a time of day, and other cells are not. Write all rows of the column in one way"
     if cell.casefold() in SWITCH:
-        return "it is a word for a switch. Write 1 and 0"
+        return "the cell is a word for a switch. Write 1 and 0"
     if found := WITH_UNIT.fullmatch(cell):
         unit = found["unit"].strip()
-        return f"it is a number with a unit. Write the number alone and the unit into the header, e.g. 'name [{unit}]'"
+        return (
+            f"the cell has a unit. Write the number alone and the unit into the header, e.g. 'name [{unit}]'"
+        )
     return ""
 
 
@@ -179,7 +182,7 @@ def _pointed(cell: str, decimal: str) -> str:
 
 
 def _of_objects(cells: Sequence[Any], decimal: str) -> Cells:
-    """The same for different cells of any kind: texts, and what a spreadsheet holds."""
+    """Numbers of distinct cells of any kind: texts, and the types of a spreadsheet."""
     import pandas as pd
 
     dates = (datetime.datetime, datetime.date, pd.Timestamp)
@@ -204,7 +207,7 @@ def _of_objects(cells: Sequence[Any], decimal: str) -> Cells:
 
 
 def _text(cell: Any) -> str:
-    """A cell as text; a whole number as a spreadsheet has it keeps all its digits."""
+    """A cell as text; a whole number of a spreadsheet keeps all its digits."""
     if cell is None or (isinstance(cell, float) and math.isnan(cell)):
         return ""
     if isinstance(cell, datetime.timedelta):
@@ -232,10 +235,10 @@ def _with_units(words: Sequence[str], others: Array, decimal: str) -> Cells | No
 
 
 def _thousands(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
-    """Numbers between whose thousands is a mark that cannot be a decimal one."""
+    """Numbers with a mark between thousands that cannot be the decimal mark."""
     mark = "." if decimal == "," else ","
     sure = re.compile(rf"[+-]?\d{{1,3}}(?:([{mark}'’ \u00a0\u202f])\d{{3}})(?:\1\d{{3}})*(?:[{decimal}]\d*)?")
-    # that it stands between thousands is shown twice in a cell, or beside the decimal mark
+    # a mark is surely between thousands if a cell has two of them, or one and a decimal mark
     told = any(mark not in word or word.count(mark) > 1 or decimal in word for word in words)
     if not told or not all(map(sure.fullmatch, words)):
         return None
@@ -248,7 +251,7 @@ def _thousands(words: Sequence[str], others: Array, decimal: str) -> Cells | Non
 
 
 def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
-    """Dates as seconds since the first row's; times of day as seconds."""
+    """Dates as seconds since the date in the first row; times of day as seconds."""
     import pandas as pd
 
     if len(others):
@@ -267,7 +270,9 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     hours = count.get("H", none)
     if "ap" in parts and parts["ap"].notna().any():
         if parts["ap"].isna().any() or (hours > 12).any() or (hours < 1).any():
-            return Cells(np.full(len(words), np.nan), none > 0, fault="AM and PM do not fit all of its cells")
+            return Cells(
+                np.full(len(words), np.nan), none > 0, fault="AM and PM do not fit all cells. Write 24 hours"
+            )
         hours = hours % 12 + 12 * parts["ap"].str.upper().str.startswith("P").to_numpy()
     fraction = none
     if "f" in parts and parts["f"].notna().any():
@@ -280,24 +285,24 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     if pattern is TIME_OF_DAY:
         if parts["S"].notna().any():
             return Cells(within / 1e9, none > 0, "s", TIMES)
-        fault = "hours and minutes, or minutes and seconds? Write hours, minutes and seconds"
+        fault = "either hours and minutes, or minutes and seconds. Write hours, minutes and seconds"
     elif (offsets := _zone(parts)) is None:
-        fault = "the names of their time zones differ. Write the offset, e.g. +02:00"
+        fault = "time zones have different names. Write the offset, e.g. +02:00"
     else:
         zone, ways = offsets, _days(parts)
-        fault = "one of these days does not exist. Correct that row" if not ways else ""
+        fault = "a date does not exist in the calendar. Correct that row" if not ways else ""
     ways = [days * 86400 * 10**9 + within - zone for days in ways]
     if any((np.diff(way) != np.diff(ways[0])).any() for way in ways[1:]):
         ways = [way for way in ways if _goes_on(way)]
         if len(ways) != 1:
-            fault = "day or month first? Write year, month and day, e.g. 2024-01-31"
+            fault = "day or month may come first. Write year, month and day, e.g. 2024-01-31"
     if fault:
-        return Cells(np.full(len(words), np.nan), fault=f"its dates, as {words[0]!r}: {fault}")
+        return Cells(np.full(len(words), np.nan), fault=f"dates such as {words[0]!r}: {fault}")
     return Cells((ways[0] - ways[0][0]) / 1e9, none > 0, "s", f"dates read as seconds since {words[0]}")
 
 
 def _fixed(words: Sequence[str], pattern: re.Pattern[str]) -> pd.DataFrame | None:
-    """The parts of dates of which only digits differ, and these stand in the same places; None of any others."""
+    """Parts of dates that differ only in digits at fixed positions; None for all other dates."""
     import pandas as pd
 
     first = pattern.fullmatch(words[0])
@@ -325,14 +330,14 @@ def _fixed(words: Sequence[str], pattern: re.Pattern[str]) -> pd.DataFrame | Non
 
 
 def _goes_on(stamps: Count) -> bool:
-    """Whether stamps of different rows increase, and none by far more than usual."""
+    """Whether distinct stamps increase, without a step far longer than the median step."""
     steps = np.diff(stamps)
     steps = steps[steps != 0]
     return bool(len(steps) and (steps > 0).all() and steps.max() <= FAR * np.median(steps))
 
 
 def _days(parts: pd.DataFrame) -> list[Count]:
-    """Days since 1970, by every way to read the dates: none where there are no such days."""
+    """Days since 1970 for every possible order of day, month and year; empty if no order gives valid dates."""
     year = parts["Y"].to_numpy(np.int64)
     if "name" in parts:
         begins = {begin: k + 1 for k, names in enumerate(MONTHS) for begin in names}
@@ -359,7 +364,7 @@ def _since_1970(year: Count, month: Count, day: Count) -> list[Count]:
 
 
 def _zone(parts: pd.DataFrame) -> Count | None:
-    """Offsets of the time zones [ns]; None where they are names that differ."""
+    """Offsets of the time zones [ns]; None if the zones are names and the names differ."""
     codes, zones = parts["z"].fillna("").factorize()
     found = [re.fullmatch(r"([+-])(\d{2}):?(\d{2})", zone) for zone in zones]
     names = {zone for zone, match in zip(zones, found, strict=True) if not match} - {"Z", "UTC", "GMT"}

@@ -1,6 +1,6 @@
-"""Smoothing and differentiation of sampled signals: methods that say their bandwidth, delay and noise.
+"""Smoothing and differentiation of sampled signals, with known bandwidth, delay and noise gain.
 
-:func:`local_polynomial` is what the main job uses; :func:`differentiate` takes any method.
+Runs use :func:`local_polynomial`; :func:`differentiate` accepts any method.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from hybrid_mpc.errors import InputError
 Array = NDArray[np.float64]
 HALF_POWER = math.sqrt(0.5)
 ROOM = math.sqrt(2.0) - 1.0  # ``1 / (1 + ROOM)`` is a gain of -3 dB
-POINTS = 2**15  # points of the transform in which a bandwidth is looked for: steps of 3 mHz at 100 Hz
+POINTS = 2**15  # points of the transform from which a bandwidth is read: steps of 3 mHz at 100 Hz
 DECAYS = 28.0  # time constants after which a kernel is below 1e-12 of its peak: rounding
 SLOWEST = 2e-4
-"""Lowest cutoff of a smoothing spline over the sampling rate: below it the spline's equations lose four digits."""
+"""Lowest cutoff of a smoothing spline over the sampling rate: below it, the spline's equations lose four digits."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class Differentiator(ABC):
 
     @abstractmethod
     def derivatives(self, y: Array, dt: float) -> Derivatives:
-        """Value and derivatives of samples ``(n,)`` or ``(n, n_y)``; NaN where too little past is known."""
+        """Value and derivatives of samples ``(n,)`` or ``(n, n_y)``; NaN where the past is too short."""
 
     @abstractmethod
     def reach(self, dt: float) -> int:
-        """Samples before and after a row beyond which nothing acts on it (for recursions: but rounding)."""
+        """Samples before and after a row that can affect it (in recursions: more than rounding)."""
 
     def delay(self, dt: float) -> float:
-        """Time [s] from the instant of an estimate to the sample in whose row it stands; 0 for all that look ahead."""
+        """Delay [s] of the estimate in a row behind the row's sample; 0 for all methods that look ahead."""
         return 0.0
 
     def kernel(self, dt: float, derivative: int = 0) -> Array:
@@ -57,7 +57,7 @@ class Differentiator(ABC):
         return (d.value, d.first, d.second)[derivative][reach : 3 * reach + 1]
 
     def response(self, f: Array, dt: float, derivative: int = 0) -> NDArray[np.complex128]:
-        """Gain and phase at ``f`` ``(m,)`` [Hz] over those of the exact derivative, delay taken off; 1 at ``f = 0``."""
+        """Response at ``f`` ``(m,)`` [Hz] over that of the exact derivative, delay removed; 1 at ``f = 0``."""
         s = 2 * np.pi * np.asarray(f, dtype=float)
         reach = self.reach(dt)
         phase = np.exp(-1j * np.outer(s, np.arange(-reach, reach + 1)) * dt)
@@ -85,14 +85,14 @@ def differentiate(y: Array, dt: float, method: Differentiator) -> Derivatives:
         y: Samples ``(n,)`` or ``(n, n_y)`` on a uniform grid, finite.
         dt: Period [s].
         method: :class:`LocalPolynomial`, :class:`SmoothingSpline`, :class:`ZeroPhaseFilter`, or
-            :class:`CausalPolynomial` for what can be known at each sample.
+            :class:`CausalPolynomial`, which uses only past samples.
 
     Returns:
-        Arrays of the shape of ``y``. Row ``k`` belongs to the instant ``k dt - method.delay(dt)``; where a causal
-        method has too little past it is NaN.
+        Arrays of the shape of ``y``. Row ``k`` is the estimate at time ``k dt - method.delay(dt)``, NaN where the past
+        of a causal method is too short.
 
     Raises:
-        InputError: If ``y`` is no such array, ``dt`` is not positive, or the signal is too short for the method.
+        InputError: If ``y`` or ``dt`` is invalid, or the signal is too short for the method.
 
     Example:
         >>> t = 0.01 * np.arange(300)
@@ -103,24 +103,24 @@ def differentiate(y: Array, dt: float, method: Differentiator) -> Derivatives:
     y = real_numbers(y, "differentiate: samples")
     if not hasattr(method, "derivatives") or isinstance(method, type):
         raise InputError(
-            f"differentiate: a method such as LocalPolynomial(0.2) is needed, got {method!r:.80} [HM-DATA-001]"
+            f"differentiate: method must be one such as LocalPolynomial(0.2), got {method!r:.80} [HM-DATA-001]"
         )
     if y.ndim not in (1, 2) or not y.size:
         raise InputError(
-            f"differentiate: needs samples (n,) or (n, n_y), got an array of shape {y.shape} [HM-DATA-002]"
+            f"differentiate: samples must have shape (n,) or (n, n_y), got {y.shape} [HM-DATA-002]"
         )
     if not positive(dt):
-        raise InputError(f"differentiate: the period must be positive, got {dt} s [HM-DATA-003]")
+        raise InputError(f"differentiate: period dt must be positive, got {dt} s [HM-DATA-003]")
     if not np.isfinite(y).all():
         row = int(np.argwhere(~np.isfinite(y))[0, 0])
         raise InputError(
-            f"differentiate: sample {row} is not finite; cut the signal there or repair it [HM-DATA-004]"
+            f"differentiate: sample {row} is not finite. Cut the signal there or correct the sample. [HM-DATA-004]"
         )
     return method.derivatives(y, dt)
 
 
 def positive(value: object) -> bool:
-    """Whether something is a finite number above zero."""
+    """Whether a value is a positive finite number."""
     if not isinstance(value, float | int | np.floating | np.integer) or isinstance(value, bool):
         return False
     return bool(0 < value < 1e300)
@@ -134,12 +134,12 @@ def window_samples(length: float, dt: float, order: int = 4) -> int:
         11
     """
     if not positive(length):
-        raise InputError(f"smoothing: a length above 0 s is needed, got {length!r:.80} [HM-DATA-005]")
+        raise InputError(f"smoothing: length must be positive [s], got {length!r:.80} [HM-DATA-005]")
     n = 2 * int(np.floor(length / (2 * dt) + 1e-6)) + 1
     if n <= order + 1:
         need = 2 * (order // 2 + 1) * dt
         raise InputError(
-            f"smoothing of {length:g} s holds {n} samples at {dt:g} s; a polynomial of order {order} needs "
+            f"smoothing of {length:g} s covers {n} samples at {dt:g} s, but a polynomial of order {order} needs "
             f"at least {need:g} s. Raise smoothing in the DataSpec or record faster. [HM-DATA-006]"
         )
     return n
@@ -153,12 +153,14 @@ def local_polynomial(y: Array, dt: float, length: float, order: int = 4) -> Deri
 
     Source: A. Savitzky and M. J. E. Golay, Analytical Chemistry 36 (1964) 1627.
     """
-    from scipy.signal import savgol_filter  # half a second to import, which listing scenarios need not take
+    from scipy.signal import (
+        savgol_filter,
+    )  # takes half a second to import; commands such as scenarios do without
 
     n = window_samples(length, dt, order)
     if n > len(y):
         raise InputError(
-            f"smoothing of {length:g} s needs {n} samples, the signal has {len(y)}. Shorten smoothing or "
+            f"smoothing of {length:g} s needs {n} samples, but the signal has {len(y)}. Shorten smoothing or "
             "give a longer recording. [HM-DATA-007]"
         )
     value, first, second = (
@@ -172,10 +174,10 @@ def local_polynomial(y: Array, dt: float, length: float, order: int = 4) -> Deri
 class LocalPolynomial(Differentiator):
     """Savitzky-Golay: a polynomial fitted around each sample (:func:`local_polynomial`).
 
-    Exact for polynomials up to ``order``; nothing outside its window acts on an estimate.
+    Exact for polynomials up to ``order``; an estimate depends only on samples in its window.
 
     Args:
-        length: Length of the window [s]; it looks ahead by half of it.
+        length: Length of the window [s], half of it ahead.
         order: Order of the polynomial, default 4.
 
     Example:
@@ -197,13 +199,13 @@ class LocalPolynomial(Differentiator):
 
 @dataclass(frozen=True)
 class CausalPolynomial(Differentiator):
-    """A polynomial through the last samples: for use while they come in.
+    """A polynomial fitted to the latest samples, for use in real time.
 
     Args:
         length: Length of the window [s].
         order: Order of the polynomial, default 2.
-        lag: Time [s] before the newest sample at which the polynomial is evaluated, rounded to whole periods. Take
-            order 3 with 0, and expect much more noise. Default: half the window.
+        lag: Time [s] before the newest sample at which the polynomial is evaluated, rounded to whole periods. A lag of
+            0 needs order 3 and is much noisier. Default: half the window.
 
     Example:
         >>> d = differentiate(0.01 * np.arange(8.0) ** 2, 0.1, CausalPolynomial(0.4))
@@ -216,7 +218,7 @@ class CausalPolynomial(Differentiator):
     lag: float | None = None
 
     def derivatives(self, y: Array, dt: float) -> Derivatives:
-        """Estimates from the window that ends with each row."""
+        """Estimates from the window that ends at each row."""
         from scipy.signal import savgol_coeffs
 
         n, back = self._samples(dt)
@@ -233,7 +235,7 @@ class CausalPolynomial(Differentiator):
         return Derivatives(value, first, second)
 
     def reach(self, dt: float) -> int:
-        """The window."""
+        """The whole window."""
         return self._samples(dt)[0] - 1
 
     def delay(self, dt: float) -> float:
@@ -245,8 +247,8 @@ class CausalPolynomial(Differentiator):
         back = n // 2 if self.lag is None else round(self.lag / dt)
         if not 0 <= back < n:
             raise InputError(
-                f"causal polynomial: its lag of {self.lag:g} s must be within the {self.length:g} s window"
-                " [HM-DATA-008]"
+                f"causal polynomial: lag of {self.lag:g} s must lie within the window of {self.length:g} s. Shorten "
+                "the lag or lengthen the window. [HM-DATA-008]"
             )
         return n, back
 
@@ -256,7 +258,7 @@ class SmoothingSpline(Differentiator):
     """Cubic smoothing spline: least squares with a penalty on the second derivative.
 
     On a uniform grid, away from the ends, the samples' spline has the gain ``B / (B + lam D^2)`` with
-    ``B = (4 + 2 cos w) / 6``, ``D = 2 - 2 cos w``, ``w = 2 pi f dt``: the penalty follows from the bandwidth.
+    ``B = (4 + 2 cos w) / 6``, ``D = 2 - 2 cos w``, ``w = 2 pi f dt``; the penalty ``lam`` follows from the bandwidth.
 
     Args:
         cutoff: Frequency [Hz] at which the smoothed value has lost 3 dB; :func:`gcv_cutoff` proposes one.
@@ -276,8 +278,8 @@ class SmoothingSpline(Differentiator):
         _check_cutoff(self.cutoff, dt, len(y))
         if self.cutoff * dt < SLOWEST:
             raise InputError(
-                f"smoothing spline: cutoff of {self.cutoff:g} Hz at {1 / dt:g} Hz is too low to be computed. Raise it "
-                f"to {SLOWEST / dt:g} Hz, take ZeroPhaseFilter, or keep fewer samples. [HM-DATA-009]"
+                f"smoothing spline: a cutoff of {self.cutoff:g} Hz at {1 / dt:g} Hz is too low to compute. Raise it "
+                f"to {SLOWEST / dt:g} Hz, use ZeroPhaseFilter, or keep fewer samples. [HM-DATA-009]"
             )
         k = np.arange(len(y), dtype=float)
         lam = ROOM * _spline_ratio(np.array(2 * np.pi * self.cutoff * dt)).item()
@@ -292,7 +294,7 @@ class SmoothingSpline(Differentiator):
         return Derivatives(value, first, second)
 
     def reach(self, dt: float) -> int:
-        """The kernel falls by e in ``ROOM^(1/4) sqrt(2) / (2 pi cutoff)``."""
+        """The kernel decays by a factor of e in ``ROOM^(1/4) sqrt(2) / (2 pi cutoff)``."""
         return math.ceil(DECAYS * ROOM**0.25 * math.sqrt(2) / (2 * math.pi * self.cutoff * dt))
 
 
@@ -301,7 +303,7 @@ class ZeroPhaseFilter(Differentiator):
     """Butterworth low-pass run forwards and backwards, then differentiated through a cubic spline.
 
     The spline interpolates: its derivatives at the samples are compact differences, of order 4 and 2 in ``dt``.
-    At the ends the signal is continued by its point reflection, as far as the filter reaches.
+    At the ends the signal is continued by point reflection, over the filter's whole reach.
 
     Args:
         cutoff: Frequency [Hz] at which both runs together have lost 3 dB.
@@ -324,13 +326,13 @@ class ZeroPhaseFilter(Differentiator):
         from scipy.signal import butter, sosfiltfilt
 
         sos = butter(self.order, self._run(dt), output="sos")
-        pad = min(len(y) - 1, self.reach(dt))  # so far that the recursion's start has died away
+        pad = min(len(y) - 1, self.reach(dt))  # the transient of the recursion's start has decayed by then
         spline = CubicSpline(dt * np.arange(len(y)), sosfiltfilt(sos, y, axis=0, padlen=pad))
         t = spline.x
         return Derivatives(spline(t), spline(t, 1), spline(t, 2))
 
     def reach(self, dt: float) -> int:
-        """Until the slowest pole has died away, or the interpolating spline's, ``sqrt(3) - 2``."""
+        """Until the slowest pole, or that of the interpolating spline (``sqrt(3) - 2``), has decayed."""
         from scipy.signal import butter
 
         _, poles, _ = butter(self.order, self._run(dt), output="zpk")
@@ -340,17 +342,17 @@ class ZeroPhaseFilter(Differentiator):
     def _run(self, dt: float) -> float:
         """Cutoff of one run over half the sampling rate.
 
-        Each run alone has the gain ``1 / sqrt(1 + (W / W_d)^(2 order))`` in ``W = tan(pi f dt)``, both its square.
+        Each run has the gain ``1 / sqrt(1 + (W / W_d)^(2 order))`` in ``W = tan(pi f dt)``, both together its square.
         """
         warped = math.tan(math.pi * self.cutoff * dt) / ROOM ** (0.5 / self.order)
         return 2 / math.pi * math.atan(warped)
 
 
 def gcv_cutoff(y: Array, dt: float) -> float:
-    """Cutoff [Hz] of a smoothing spline by generalised cross-validation: for white noise of unknown size.
+    """Cutoff [Hz] of a smoothing spline by generalised cross-validation: for white noise of unknown variance.
 
-    It minimises ``n |y - y_hat|^2 / (n - tr)^2``, where the trace of the smoother is the sum of its gains over the
-    frequencies ``k / (2 n dt)``. Quantisation is no white noise where the signal is slow.
+    It minimises ``n |y - y_hat|^2 / (n - tr)^2``; the trace ``tr`` of the smoother is the sum of its gains at the
+    frequencies ``k / (2 n dt)``. Quantisation of a slow signal is not white noise.
 
     Source: P. Craven and G. Wahba, Numerische Mathematik 31 (1979) 377.
     """
@@ -358,7 +360,7 @@ def gcv_cutoff(y: Array, dt: float) -> float:
     n = len(y)
     if y.ndim != 1 or n < 16:
         raise InputError(
-            f"gcv_cutoff: needs at least 16 samples of one signal, got an array of shape {y.shape} [HM-DATA-010]"
+            f"gcv_cutoff: at least 16 samples (n,) of one signal are needed, got shape {y.shape} [HM-DATA-010]"
         )
     ratio = 1 / _spline_ratio(np.pi * np.arange(1, n) / n)
 
@@ -369,7 +371,7 @@ def gcv_cutoff(y: Array, dt: float) -> float:
         left = y - SmoothingSpline(cutoff).derivatives(y, dt).value
         return float(n * (left @ left) / (n - trace) ** 2)
 
-    # the score may have several minima: the best point of a grid, refined between its neighbours
+    # the score may have several minima: search a grid, then refine between the neighbours of its best point
     grid = np.log(np.geomspace(max(2 / n, SLOWEST) / dt, 0.45 / dt, 40))
     scores = [score(point) for point in grid]
     k = min(max(int(np.argmin(scores)), 1), len(grid) - 2)
@@ -386,7 +388,7 @@ def _spline_ratio(w: Array) -> Array:
 
 def _check_cutoff(cutoff: float, dt: float, n: int) -> None:
     if not positive(cutoff):
-        raise InputError(f"cutoff: a positive frequency [Hz] is needed, got {cutoff!r:.80} [HM-DATA-011]")
+        raise InputError(f"cutoff: must be a positive frequency [Hz], got {cutoff!r:.80} [HM-DATA-011]")
     if not 0 < cutoff < 0.5 / dt:
         raise InputError(
             f"cutoff of {cutoff:g} Hz must be positive and below {0.5 / dt:g} Hz, half the sampling rate of "
@@ -399,6 +401,6 @@ def _check_cutoff(cutoff: float, dt: float, n: int) -> None:
 
 def _too_short(need: int, got: int) -> str:
     return (
-        f"differentiate: the method needs {need} samples, the signal has {got}. Give more or smooth less. "
+        f"differentiate: the method needs {need} samples, but the signal has {got}. Give more samples or smooth less. "
         "[HM-DATA-115]"
     )

@@ -1,4 +1,4 @@
-"""Input signals that excite a machine, and whether recordings excite it enough for its parameters to be found."""
+"""Input signals that excite a machine, and a check whether recordings excite it enough to identify its parameters."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from hybrid_mpc.machine.specification import DataSpec
 
 Array = NDArray[np.float64]
 ROUNDING = 1e-12
-"""Span of a signal over its largest value at or below which it is constant: what is left of equal numbers after they
-are converted and interpolated. Any larger span is a motion, however small beside the level or the range."""
-WEAKEST = 0.1  # amplitude of a spectral line over that of the strongest, from which on it counts
-LOBE = 2  # bins to either side of a line that its Hann window fills above WEAKEST
+"""Largest span of a constant signal, over its largest value: the rounding of conversion and interpolation. Any larger
+span is a motion, however small beside the level or the range."""
+WEAKEST = 0.1  # least amplitude of a spectral line over that of the strongest
+LOBE = 2  # bins on either side of a line that its Hann window fills above WEAKEST
 
 
 def sinusoid(
@@ -44,7 +44,7 @@ def sinusoid(
 def chirp(
     t: Array, amplitude: float, start_frequency: float, end_frequency: float, *, offset: float = 0.0
 ) -> Array:
-    """Sine whose frequency moves linearly from the first to the last time; it starts at the offset.
+    """Sine whose frequency changes linearly from the first to the last time; it starts at the offset.
 
     Over ``T`` seconds its amplitude spectrum is flat at ``amplitude / sqrt(T |f1 - f0|)`` between its two frequencies,
     with ripples near them, and falls off outside. Its crest factor is that of a sine, 1.41.
@@ -66,7 +66,7 @@ def chirp(
     """
     s = np.asarray(t, dtype=float) - t[0]
     if not s[-1] > 0:
-        raise InputError("chirp: its times must span more than one instant [HM-DATA-013]")
+        raise InputError("chirp: t must span more than one instant. Give increasing times. [HM-DATA-013]")
     cycles = start_frequency * s + (end_frequency - start_frequency) * s**2 / (2 * s[-1])
     return offset + amplitude * np.sin(2 * np.pi * cycles)
 
@@ -83,7 +83,7 @@ def random_steps(
         lower: Smallest level [input unit].
         upper: Largest level [input unit].
         hold: Shortest and longest hold [s], uniform between them.
-        rng: Source of the randomness; the same state gives the same signal.
+        rng: Random generator; equal states give equal signals.
 
     Raises:
         InputError: If a range is empty or the shortest hold is not positive.
@@ -96,7 +96,7 @@ def random_steps(
     shortest, longest = hold
     if not (lower <= upper and 0 < shortest <= longest):
         raise InputError(
-            f"random_steps: need lower <= upper and 0 < shortest <= longest hold, got levels "
+            f"random_steps: lower <= upper and 0 < shortest <= longest hold must hold, got levels "
             f"{lower:g} to {upper:g} and holds {shortest:g} to {longest:g} s [HM-DATA-014]"
         )
     t = np.asarray(t, dtype=float)
@@ -110,11 +110,11 @@ def multisine(
     t: Array, amplitude: float, lower_frequency: float, upper_frequency: float, *, period: float | None = None,
     odd: bool = False, offset: float = 0.0,
 ) -> Array:  # fmt: skip
-    """Sum of cosines of one size at all multiples of ``1 / period`` in a band, with Schroeder's phases.
+    """Sum of cosines of equal amplitude at all multiples of ``1 / period`` in a band, with Schroeder phases.
 
-    Power lies at these lines alone, evenly. Between them an FFT over whole periods shows noise and what the machine's
-    nonlinearity makes. Phases ``-pi i (i - 1) / n`` keep the peaks low:
-    the crest factor is 1.6 to 2 for ten lines or more, where random phases mostly give above 2.3.
+    Power lies only at these lines, evenly. Between the lines, an FFT over whole periods shows noise and the distortion
+    of the machine's nonlinearity. The phases ``-pi i (i - 1) / n`` keep the peaks low: the crest factor is 1.6 to 2
+    for ten lines or more, with random phases mostly above 2.3.
 
     Args:
         t: Times ``(n,)`` [s], evenly spaced.
@@ -122,7 +122,7 @@ def multisine(
         lower_frequency: Lower end of the band [Hz].
         upper_frequency: Upper end of the band [Hz], below half the sampling rate.
         period: Period [s]; the lines are ``1 / period`` apart. Default: the length of ``t``.
-        odd: Odd multiples only: what appears at the even ones is nonlinear distortion of even order.
+        odd: Odd multiples only: lines at even ones then show nonlinear distortion of even order.
         offset: Mean [input unit].
 
     Raises:
@@ -140,17 +140,17 @@ def multisine(
     period = len(t) * dt if period is None else period
     if not (period > 0 and 0 < lower_frequency <= upper_frequency < 0.5 / dt):
         raise InputError(
-            f"multisine: need a positive period and 0 < lower <= upper frequency < {0.5 / dt:g} Hz (half the sampling "
-            f"rate), got {period:g} s and {lower_frequency:g} to {upper_frequency:g} Hz [HM-DATA-015]"
+            f"multisine: a positive period and 0 < lower <= upper frequency < {0.5 / dt:g} Hz (half the sampling "
+            f"rate) are needed, got {period:g} s and {lower_frequency:g} to {upper_frequency:g} Hz [HM-DATA-015]"
         )
-    near = 1e-9  # a multiple on the band's edge belongs to it, rounded or not
+    near = 1e-9  # tolerance: a multiple on the band's edge belongs to the band
     lines = np.arange(
         math.ceil(lower_frequency * period - near), math.floor(upper_frequency * period + near) + 1
     )
     lines = lines[lines % 2 == 1] if odd else lines
     if not len(lines):
         raise InputError(
-            f"multisine: no line between {lower_frequency:g} and {upper_frequency:g} Hz; they are {1 / period:g} Hz "
+            f"multisine: no line between {lower_frequency:g} and {upper_frequency:g} Hz; lines are {1 / period:g} Hz "
             f"apart{' and odd multiples only' if odd else ''}. Lengthen the period or widen the band. [HM-DATA-016]"
         )
     i = np.arange(1, len(lines) + 1)
@@ -163,22 +163,23 @@ def multisine(
 def prbs(
     t: Array, lower: float, upper: float, *, clock: float, bits: int | None = None, shift: int = 0
 ) -> Array:
-    """Pseudo-random binary sequence of maximum length: two levels, which may change at every tick of the clock.
+    """Pseudo-random binary sequence of maximum length: two levels that may change at every tick of the clock.
 
-    It repeats after ``N = 2^bits - 1`` ticks. With ``a`` half the distance of the levels its mean is ``a / N`` off
-    their middle, and at the lines ``k / (N clock)`` stands the amplitude ``2 a sqrt(N + 1) / N |sinc(k / N)|``: flat
-    at low frequencies, -3 dB at ``0.44 / clock``, nothing at multiples of ``1 / clock``.
+    The sequence repeats after ``N = 2^bits - 1`` ticks. With ``a`` half the distance of the levels, its mean is
+    ``a / N`` off their middle, and its lines ``k / (N clock)`` have the amplitude
+    ``2 a sqrt(N + 1) / N |sinc(k / N)|``: flat at low frequencies, -3 dB at ``0.44 / clock``, zero at multiples of
+    ``1 / clock``.
 
     Args:
         t: Times ``(n,)`` [s], increasing.
         lower: Lower level [input unit].
         upper: Upper level [input unit].
-        clock: Time of a tick [s]: a multiple of the sampling time, about a third of the machine's time constant.
+        clock: Duration of a tick [s]: a multiple of the sampling period, about a third of the machine's time constant.
         bits: Length of the shift register, 2 to 32. Default: the shortest that does not repeat within ``t``.
-        shift: Ticks by which the sequence is advanced, to give several inputs ones of their own.
+        shift: Ticks by which the sequence is advanced, to give several inputs different sequences.
 
     Raises:
-        InputError: If the levels are not in order, the clock is shorter than the sampling time, or ``bits`` is out of
+        InputError: If the levels are not in order, the clock is shorter than the sampling period, or ``bits`` is out of
             range.
 
     Source: S. W. Golomb, Shift Register Sequences, 1967; W. D. T. Davies, System Identification for Self-Adaptive
@@ -193,15 +194,15 @@ def prbs(
     dt = _period_of("prbs", t)
     if not (lower < upper and clock >= dt * (1 - 1e-6)):
         raise InputError(
-            f"prbs: need lower < upper and a clock of at least the sampling time {dt:g} s, got levels {lower:g} to "
-            f"{upper:g} and a clock of {clock:g} s [HM-DATA-017]"
+            f"prbs: lower < upper and a clock of at least the sampling period {dt:g} s are needed, got levels "
+            f"{lower:g} to {upper:g} and a clock of {clock:g} s [HM-DATA-017]"
         )
     ticks = np.floor((t - t[0]) / clock + 1e-6).astype(int)  # 1e-6: rounding of the times
     if bits is None:
         bits = max(2, math.ceil(math.log2(ticks[-1] + 2)))
     if not 2 <= bits <= 32:
         raise InputError(
-            f"prbs: a shift register has 2 to 32 bits, got {bits}. Lengthen the clock or give bits. [HM-DATA-018]"
+            f"prbs: bits must be 2 to 32, got {bits}. Lengthen the clock or give bits. [HM-DATA-018]"
         )
     length = 2**bits - 1
     first = shift % length
@@ -213,16 +214,16 @@ def prbs(
 
 def _period_of(what: str, t: Array) -> float:
     if len(t) < 2 or not t[-1] > t[0]:
-        raise InputError(f"{what}: its times must span more than one instant [HM-DATA-019]")
+        raise InputError(f"{what}: t must span more than one instant. Give increasing times. [HM-DATA-019]")
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """What one input does over a set of trajectories: its standard deviation [input unit] and its spectral lines.
+    """Motion of one input over a set of trajectories: its standard deviation [input unit] and its spectral lines.
 
-    ``lines`` are the frequencies [Hz] of sines that the recordings tell apart, increasing; the mean is none of them.
-    Each sine gives two numbers of a linear machine's response, its gain and its phase.
+    ``lines`` are the increasing frequencies [Hz] of the sines that the recordings resolve, without the mean. Each sine
+    determines two numbers of a linear machine's response, gain and phase.
     """
 
     name: str
@@ -235,9 +236,9 @@ def excitation_of(
 ) -> tuple[Excitation, ...]:
     """Spread and spectral lines of each input.
 
-    Each trajectory's spectrum is taken under a Hann window. Lines are counted from the strongest on, each with the two
-    bins to either side that it fills, down to a tenth of the strongest of all trajectories; lines of several
-    trajectories closer than these bins are one. So the count is low rather than high.
+    Each trajectory's spectrum uses a Hann window. Lines are counted from the strongest on, each with the two bins on
+    either side that it fills, down to a tenth of the strongest of all trajectories. Lines of several trajectories
+    closer than these bins count once. So the count is a lower bound.
 
     Args:
         trajectories: At least one.
@@ -255,7 +256,7 @@ def excitation_of(
         [0.5, 2.0]
     """
     if not trajectories:
-        raise InputError("excitation: no trajectories given [HM-DATA-020]")
+        raise InputError("excitation: no trajectories given. Give at least one. [HM-DATA-020]")
     found = []
     for j in range(trajectories[0].u.shape[1]):
         name = inputs[j].name if j < len(inputs) else f"input {j + 1}"
@@ -271,14 +272,14 @@ def check_excitation(
     outputs: Sequence[Signal] = (),
     parameters: int = 0,
 ) -> tuple[str, ...]:
-    """Refuse inputs that excite nothing; return warnings of ones that excite too little for a number of parameters.
+    """Refuse inputs without excitation; warn of inputs with too little excitation for a number of parameters.
 
     Args:
-        trajectories: All that a model is fitted to; one input at rest in some of them is no fault.
-        inputs: Signals of the inputs, for names and for the size of what counts as constant. Default: unnamed.
+        trajectories: All data of a fit; an input may be constant in some of them.
+        inputs: Signals of the inputs, for their names. Default: unnamed.
         outputs: Signals of the outputs, likewise.
-        parameters: Number of parameters to be fitted. A linear model needs a sine for every two of them; a nonlinear
-            one may get by with fewer, so this is a warning. Default: not checked.
+        parameters: Number of parameters to fit. A linear model needs one sine per two parameters; a nonlinear one may
+            need fewer, so this is only a warning. Default: not checked.
 
     Raises:
         InputError: If there is no trajectory, an input is constant over all of them, or an output is.
@@ -301,19 +302,19 @@ def check_excitation(
         if is_constant(np.concatenate([piece.u[:, j] for piece in trajectories])):
             level = trajectories[0].u[0, j]
             problems.append(
-                f"{names}: the input {one.name} is {level:.10g} throughout; its effect cannot be identified. Add a "
+                f"{names}: the input {one.name} is constant at {level:.10g}, so its effect cannot be identified. Add a "
                 "recording in which it moves, or check that the DataSpec names the right column. [HM-DATA-021]"
             )
     for j in range(trajectories[0].y.shape[1]):
         every = np.concatenate([piece.y[:, j] for piece in trajectories])
         every = every[np.isfinite(every)]
         if not len(every):
-            continue  # not measured here, perhaps elsewhere: nothing to say
+            continue  # not measured in these trajectories
         if is_constant(every):
             name = outputs[j].name if j < len(outputs) else f"output {j + 1}"
             problems.append(
-                f"{names}: the output {name} is {every[0]:.10g} throughout: the machine never moved. Excite it harder "
-                "than its friction, or check that the DataSpec names the right column. [HM-DATA-022]"
+                f"{names}: the output {name} is constant at {every[0]:.10g}: the machine never moved. Excite it beyond "
+                "its friction, or check that the DataSpec names the right column. [HM-DATA-022]"
             )
     refuse(problems)
     need = -(-parameters // 2)
@@ -321,7 +322,7 @@ def check_excitation(
 
 
 def is_constant(values: Array) -> bool:
-    """Whether numbers ``(m,)`` are one and the same but for rounding.
+    """Whether numbers ``(m,)`` are equal up to rounding.
 
     Example:
         >>> is_constant(np.array([0.1 + 0.2, 0.3])), is_constant(1e6 + np.array([0.0, 1e-3]))
@@ -345,7 +346,7 @@ def _lines(pieces: Sequence[tuple[Array, float]]) -> tuple[float, ...]:
     spectra = [_hann_spectrum(u, dt) for u, dt in pieces if len(u) > 2 * LOBE]
     strongest = max((float(a.max()) for _, a in spectra), default=0.0)
     if strongest <= ROUNDING * max(float(np.abs(u).max()) for u, _ in pieces):
-        return ()  # constants, and what rounding makes of them
+        return ()  # constants, up to rounding
     found: list[tuple[float, float]] = []
     for f, amplitude in spectra:
         left = amplitude.copy()
@@ -363,7 +364,7 @@ def _lines(pieces: Sequence[tuple[Array, float]]) -> tuple[float, ...]:
 def _hann_spectrum(u: Array, dt: float) -> tuple[Array, Array]:
     """Frequencies ``(n // 2 + 1,)`` [Hz] and amplitudes under a Hann window of samples ``(n,)`` with period ``dt`` [s].
 
-    A sine of amplitude 1 gives 0.85 to 1 at its peak and fills the two bins to either side; the mean is left out.
+    A sine of amplitude 1 gives 0.85 to 1 at its peak and fills the two bins on either side; the mean is subtracted.
     """
     n = len(u)
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n)
@@ -374,7 +375,7 @@ def _hann_spectrum(u: Array, dt: float) -> tuple[Array, Array]:
 
 
 def short_runs(spec: DataSpec, test: Sequence[Trajectory]) -> tuple[str, ...]:
-    """A warning if no test recording is as long as free runs are to be; the empty tuple if one is.
+    """A warning if no test recording is as long as the requested free runs; else the empty tuple.
 
     Example:
         >>> spec = DataSpec("t", ("u",), ("y",), dt=1, max_gap=2, smoothing=5, warm_up=10, free_run=100)
@@ -385,7 +386,7 @@ def short_runs(spec: DataSpec, test: Sequence[Trajectory]) -> tuple[str, ...]:
     if not spec.free_run or not test or longest >= 0.95 * spec.free_run:
         return ()
     return (
-        f"free runs of {spec.free_run:g} s are asked for (DataSpec.free_run); the longest piece of test data leaves "
-        f"{max(longest, 0.0):.4g} s behind its warm-up of {spec.warm_up:g} s: models are evaluated by shorter runs. "
-        "Give longer recordings, or windows of your own",
+        f"DataSpec.free_run asks for free runs of {spec.free_run:g} s, but the longest piece of test data leaves "
+        f"{max(longest, 0.0):.4g} s after its warm-up of {spec.warm_up:g} s: models are evaluated on shorter runs. "
+        "Give longer recordings, or name windows in the DataSpec",
     )

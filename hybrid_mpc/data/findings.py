@@ -1,6 +1,6 @@
-"""What is doubtful about the channels of recordings: codes, outliers, angles that jump, stuck sensors, absurd speeds.
+"""Doubtful data in recordings: codes for missing values, outliers, wrapped angles, stuck sensors, absurd speeds.
 
-A sensor is stuck where it repeats itself although the machine cannot stand still (docs/data-checks.md).
+A sensor is stuck if it repeats a value although the machine cannot stand still (docs/data-checks.md).
 """
 
 from __future__ import annotations
@@ -25,67 +25,72 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-ABSURD = 1e100  # no machine has a value beyond: the square of its square must be finite
-MIN_SCORED = 10  # fewest samples after the warm-up that make a piece worth a free run
+ABSURD = 1e100  # largest absolute value of any signal: its fourth power is still finite
+MIN_SCORED = 10  # fewest samples after the warm-up of a piece that is used
 
 # Codes for missing values, and outliers
 FAR_OFF = 3.0
-"""Times the span and the size of all other values by which a code for missing ones is away from them."""
+"""Least distance of a code for missing values from all other values, in spans and in sizes of these."""
 _CODE = re.compile(
     r"999+(\.9+|\.25)?|9\.9+e\+\d\d+|9\.96921e\+36|32767|32768|65535|8388607|8388608|2147483647|2147483648|4294967295|"
     r"1e\+[1-3]\d|3\.402(82|823|823466)e\+38"
 )
 _NEVER = re.compile(r"9999+(\.9+|\.25)?|999\.25|9\.9.*e\+\d\d+|[13].*e\+[2-9]\d")
-"""Codes that are no position of a switch, where they are negative or larger than ``LARGER``."""
-LARGER = 1e15  # no number of a machine that switches is larger
-SEVERAL = 4  # most codes that one column is looked at for
-OUTLYING = 10.0  # spans of all other values by which an outlier is away from them
-MOST_ODD = 5  # most outliers of a column, and at most one sample of a hundred: more are a motion
+"""Codes that are no position of a switch, if they are negative or larger than ``LARGER``."""
+LARGER = 1e15  # largest number of a machine that switches
+SEVERAL = 4  # most codes that are looked for in one column
+OUTLYING = 10.0  # least distance of an outlier from all other values, in spans of these
+MOST_ODD = 5  # most outliers of a column, and at most one sample in a hundred: more are a motion
 
 # Jumps
 NEARLY = 0.25
-"""Share of a full turn within which a jump is one: what the angle truly moves from one sample to the next is less."""
+"""Largest deviation of a jump from a full turn, in turns: the angle itself moves less than this between samples."""
 SPAN = 1.05
-"""Turns that a wrapped angle spans at most: one, and some noise. An angle that counts on and turns fast spans more."""
-HOLE = 1.5  # usual distances of the time stamps from which on samples are missing between two
+"""Largest span of a wrapped angle in turns: one turn and some noise. An unwrapped angle usually spans more."""
+HOLE = 1.5  # time step, in median steps, above which samples are missing between two stamps
 UNSURE = 0.4
-"""Share of a turn by which the way over missing samples may differ from that at the speeds before and after: at half a
-turn another number of turns would fit as well."""
+"""Largest deviation, in turns, of the way over missing samples from the way at the speeds before and after. At half a
+turn another number of turns would fit equally well."""
 PARTS = (2, 3, 4, 6, 8)
-"""Parts of a turn after which a sensor may begin anew: half turns of an arctangent, pole pairs."""
+"""Fractions of a turn at which a sensor may restart: half turns of an arctangent, pole pairs."""
 BITS = (8, 10, 12, 14, 16, 20, 24, 32)  # of counters that overflow
-LIKE = 0.03  # share by which a jump, the motion around it taken off, may differ from such a part
+LIKE = 0.03  # largest relative deviation of a jump, the motion around it subtracted, from such a fraction
 
 # Stuck sensors
-SHORTEST = 5  # fewest equal samples in a row that count; fewer are a telegram that was lost
+SHORTEST = 5  # fewest equal consecutive samples of a stuck sensor; fewer are a lost telegram
 SPANS = (1, 2, 5)
-"""Samples over which speeds are taken: steps of the sensor hide a slow motion in one, a fast one is over in five."""
+"""Distances [samples] over which speeds are computed: a sensor's steps hide slow motions in one sample, and fast
+motions end within five."""
 ABRUPT = 3.0
-"""A stop this many times sharper than any ordinary change of speed is a sensor's fault, not the machine's. In the
-recordings of five machines whose sensors work it is 1.5 at most (docs/results/data_checks.md)."""
-ORDINARY = 0.99  # share of the changes of speed, and of the times between two changes, that are ordinary
-STEP = 0.1  # quantile of the changes that is the sensor's step; the least one may be a rounding of the file
-FEW = 20  # fewest changes of speed in full motion from which the ordinary ones follow
-FEWER = 0.1  # share of all of them that these must be
+"""Least sharpness of a stop, over any ordinary change of speed, that indicates a sensor fault. In recordings of five
+machines with sound sensors it is 1.5 at most (docs/results/data_checks.md)."""
+ORDINARY = 0.99  # quantile of the changes of speed, and of the times between two changes, that is ordinary
+STEP = (
+    0.1  # quantile of the changes that is the sensor's step; the smallest change may be rounding of the file
+)
+FEW = 20  # fewest changes of speed in full motion that define the ordinary ones
+FEWER = 0.1  # their least share of all changes of speed
 WHITE = 0.6
-"""Error of a cubic through four neighbours over that of a line through two, from which on these are noise: 1.1 for
-white noise, (w dt)^2 / 3 for a motion of angular frequency w, which is below 0.06 from 15 samples a period on."""
-FLICKER = 2.0  # noise, in steps of the sensor, from which on the sensor flickers at rest too
-CHANCE = 1e-3  # probability with which such noise may repeat itself for so long anywhere in the recording
+"""Error of a cubic through four neighbours over the error of a line through two, above which the errors are noise. The
+ratio is 1.1 for white noise and ``(w dt)^2 / 3`` for a motion of angular frequency w: below 0.06 from 15 samples per
+period on."""
+FLICKER = 2.0  # noise, in steps of the sensor, above which the sensor flickers also at rest
+CHANCE = 1e-3  # probability that such noise repeats a value for so long anywhere in the recording
 STIRRED = 0.5
-"""Standard deviation of an input within a stretch, over that in all recordings, from which on the machine is driven."""
-PATIENCE = 10.0  # times the longest ordinary time without a change that a driven machine may rest
-LENGTHS = 5.0  # smoothing lengths that it may rest in any case: in each of them a motion shows
+"""Standard deviation of an input within a stretch, over that in all recordings, above which the machine is driven."""
+PATIENCE = 10.0  # longest rest of a driven machine, in longest ordinary times without a change
+LENGTHS = 5.0  # rest that is always allowed, in smoothing lengths: a motion shows in each of them
 Kind = Literal["read", "clock", "wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
-LEAVE_OUT = "Leave such stretches out (windows in the DataSpec, or delete the rows: longer gaps are cut out), or record"
+LEAVE_OUT = "Leave out such stretches (by windows in the DataSpec, or delete the rows: longer gaps are cut), or record"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What is doubtful about one channel of one recording; ``refused`` where nothing can be identified from it as is.
+    """Doubtful data in one channel of one recording; ``refused`` if the recording cannot be used as it is.
 
-    ``start`` is the time [s] of the first sample concerned, in the recording's own time; ``count`` the samples
-    concerned, of a wrapped angle its jumps. ``message`` says what was found, the likely cause, and what to do.
+    ``start`` is the time [s] of the first sample concerned, in the recording's own time; ``count`` is the number of
+    samples concerned, for a wrapped angle the number of jumps. ``message`` names the finding, the likely cause and the
+    remedy.
     """
 
     kind: Kind
@@ -102,7 +107,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Channel:
-    """Samples ``(m,)`` of one channel, and where they come from."""
+    """Samples ``(m,)`` of one channel, with file, column name and signal."""
 
     file: str
     name: str
@@ -111,19 +116,19 @@ class Channel:
     y: Array
 
     def finding(self, kind: Kind, first: int, count: int, message: str, refused: bool = False) -> Finding:
-        """A finding of ``count`` samples from the index ``first`` on."""
+        """A finding about ``count`` samples from index ``first`` on."""
         told = f"column {self.name!r}{message}"
         return Finding(kind, self.file, self.name, float(self.t[first]), count, told, refused)
 
     def odd(self, there: Mask) -> list[Finding]:
-        """Findings of outliers, and of rows without a number if the channel has numbers ``there`` ``(m,)`` alone."""
+        """Findings of outliers and of rows without a number; ``there`` ``(m,)`` are the rows with a number."""
         found, y, t = list[Finding](), self.y, self.t
         if (far := outliers(y)) is not None:
             rest = np.delete(y, far)
             message = (
                 f" is {y[far[0]]:.6g} {self.signal.unit} at {t[far[0]]:.6g} s: {len(far)} of {len(t)} samples are far "
-                f"from all others, {np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}. A code for a missing value, or a "
-                "lost digit? Leave these cells blank, or delete the rows."
+                f"from all others, {np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}. Likely causes are a code for a "
+                "missing value or a lost digit. Leave these cells blank, or delete the rows."
             )
             found.append(self.finding("outlier", far[0], len(far), message))
         if there.any() and not there.all():
@@ -131,46 +136,48 @@ class Channel:
             longest = float(np.diff(np.r_[t[0], t[there], t[-1]]).max())
             message = (
                 f" has no number in {count} of {len(t)} rows ({100 * count / len(t):.3g} %), first at "
-                f"{t[first]:.6g} s; the longest time without one is {longest:.4g} s. These samples count as missing. "
-                "If that is wrong, check the cells."
+                f"{t[first]:.6g} s; the longest time without a number is {longest:.4g} s. These samples count as "
+                "missing. If they were measured, check the cells."
             )
             found.append(self.finding("missing", first, count, message))
         return found
 
     def jumps(self, raw: Array, max_gap: float) -> tuple[list[Finding], Unwrapped | None]:
-        """Findings of turns, of parts of a turn, and of overflows of what was recorded, ``raw`` ``(m,)``;
-        and the angle counted on, where it was wrapped and is periodic.
+        """Findings of jumps by turns, by parts of a turn and by overflows in the recorded numbers ``raw`` ``(m,)``;
+        and the unwrapped angle, if a periodic signal was wrapped.
         """
         found, signal, angle, t = list[Finding](), self.signal, None, self.t
-        again = "Record one that counts on, or unwrap it before: numpy.unwrap(..., period="
+        again = "Record an angle without jumps, or unwrap it first: numpy.unwrap(..., period="
         if (turn := turn_of(signal)) is not None:
-            angle = unwrapped(t, self.y, turn, max_gap, periodic=signal.periodic)
+            angle = unwrap(t, self.y, turn, max_gap, periodic=signal.periodic)
             if len(angle.jumps):
-                told = "a wrapped angle, which no smooth motion explains. Declare Signal(..., periodic=True) for "
-                told += (
-                    f"{signal.name} in the prior, and it is made to count on; or record an angle that does."
+                told = (
+                    "no smooth motion explains such jumps, so the angle is wrapped. Declare Signal(..., periodic=True) "
+                    f"for {signal.name} in the prior to unwrap it, or record an angle without jumps."
                 )
                 if signal.periodic:
                     told = (
-                        f"a wrapped angle. {signal.name} is periodic, so the turns were added up and the angle counts "
-                        "on. An estimator or monitor that runs on the sensor itself needs an angle that counts on, too."
+                        f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped. An estimator or "
+                        "monitor that runs on the sensor itself needs an angle without jumps, too."
                     )
                 if signal.periodic and len(angle.unclear):
                     told += (
-                        f" Before {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} s) too many "
-                        "are missing to count its turns: the recording is cut there."
+                        f" Before {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} s) too many samples "
+                        "are missing to count the turns: the recording is cut there."
                     )
                 found.append(_jumping(self, angle.jumps, "a full turn", 4, told, not signal.periodic))
-            elif parted := folded(t, self.y, turn, max_gap):
+            elif parted := find_folding(t, self.y, turn, max_gap):
                 part = f"1/{parted[0]} of a turn"
-                told = f"an angle that restarts after each {part}, or a wrong unit. {again}{turn / parted[0]:.6g})."
+                told = (
+                    f"the angle restarts after {part}, or its unit is wrong. {again}{turn / parted[0]:.6g})."
+                )
                 found.append(_jumping(self, parted[1], f"{part} against its motion", 4, told, True))
-        # whole numbers of b bits span less than 2^b
+        # integers of b bits span less than 2^b
         if (raw == np.round(raw)).all() and (
-            over := _anew(t, raw, [2.0**b for b in BITS], 1 - 1e-10, max_gap)
+            over := _find_restarts(t, raw, [2.0**b for b in BITS], 1 - 1e-10, max_gap)
         ):
             bits = BITS[over[0]]
-            told = f"a counter of {bits} bits that overflows. {again}{2**bits})."
+            told = f"a counter of {bits} bits overflows. {again}{2**bits})."
             counts = Channel(self.file, self.name, signal, t, raw)
             found.append(_jumping(counts, over[1], f"{2**bits} against its motion", 10, told, True))
         return found, angle if angle is not None and len(angle.jumps) and signal.periodic else None
@@ -185,10 +192,10 @@ def gaps(t: Array, max_gap: float) -> Mask:
 
 
 def missing_code(column: Array) -> float | None:
-    """A number that logging programs write for a missing value, as the file has it, be it once, far from all others.
+    """A code that logging programs write for missing values, as in the file; None without one. One sample suffices.
 
-    It is far where it is ``FAR_OFF`` spans of the others away, and as many of their sizes, or negative where all others
-    are positive. None without.
+    The code must be away from all other values by ``FAR_OFF`` times their span, and either by ``FAR_OFF`` times their
+    largest size or negative where all others are not.
     """
     others, found = column[np.abs(column) <= ABSURD], list[float]()
     while len(others) and len(found) < SEVERAL:
@@ -211,12 +218,12 @@ def missing_code(column: Array) -> float | None:
 
 
 def _spelled(pattern: re.Pattern[str], value: float) -> bool:
-    """Whether a number, or the one of single precision that it was, is written so, whatever its sign."""
+    """Whether a number, in double or single precision and without its sign, is written as the pattern says."""
     return any(pattern.fullmatch(f"{abs(value):.{digits}g}") for digits in (10, 7))
 
 
 def outliers(column: Array) -> Indices | None:
-    """The few samples that are away from all others by ``OUTLYING`` times what these span; None without."""
+    """The few samples that are away from all others by ``OUTLYING`` times their span; None without any."""
     known = np.abs(column) <= ABSURD
     others, most = np.sort(column[known]), max(1, min(MOST_ODD, int(0.01 * known.sum())))
     best, count = None, len(others)
@@ -236,8 +243,8 @@ def outliers(column: Array) -> Indices | None:
 
 @dataclass(frozen=True)
 class Unwrapped:
-    """An angle ``(m,)`` that counts on, the samples before which it jumped by whole turns as it was recorded, and those
-    before which so many were lost that nobody knows how many turns it made.
+    """An unwrapped angle ``(m,)``; the samples before which the recorded angle jumped by whole turns; and the samples
+    before which so many are missing that the number of turns is unknown.
     """
 
     angle: Array
@@ -245,13 +252,13 @@ class Unwrapped:
     unclear: Indices
 
 
-def unwrapped(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: bool = True) -> Unwrapped:
-    """The samples that are there of an angle, counted on.
+def unwrap(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: bool = True) -> Unwrapped:
+    """Unwrap an angle; missing samples are left out of ``angle``.
 
-    An angle is wrapped if it keeps within one turn and moves by more than half a turn between neighbouring samples;
-    one that is not declared periodic must jump by about a full one. From one sample to the next it is taken to move by
-    less than half a turn. Where samples are missing it may move by more at the speeds that it has: there the speeds
-    before and after say how many turns it makes, if they agree.
+    An angle is wrapped if it stays within one turn and moves by more than half a turn between neighbouring samples; if
+    the signal is not declared periodic, the jump must be about a full turn. Between neighbouring samples the true
+    motion is assumed to be less than half a turn. Over missing samples it may be more: there the speeds before and
+    after give the number of turns, if they agree.
     """
     step, none = np.diff(angle), np.zeros(0, dtype=np.intp)
     near = ~gaps(t, max_gap)
@@ -268,7 +275,7 @@ def unwrapped(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: 
         at = np.searchsorted(known, k)
         sides = (
             speed[known[max(at - 1, 0) : at + 1]] * span[k]
-        )  # the way at the speed before, and at that after
+        )  # the way at the speeds before and after the gap
         turns[k] = np.round((sides.mean() - step[k]) / turn) if len(sides) else 0.0
         off = abs(step[k] + turn * turns[k] - sides.mean()) if len(sides) else math.inf
         if off + np.ptp(sides) > UNSURE * turn:
@@ -277,13 +284,14 @@ def unwrapped(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: 
     return Unwrapped(counted, np.flatnonzero(turns) + 1, np.array(unclear, dtype=np.intp))
 
 
-def _anew(
+def _find_restarts(
     t: Array, x: Array, sizes: Sequence[float], most: float, max_gap: float
 ) -> tuple[int, Indices] | None:
-    """By which of the ``sizes`` a signal ``(m,)`` jumps back against its motion, and the samples before which it does.
+    """Which of the ``sizes`` a signal ``(m,)`` jumps by against its motion, and the samples before which it jumps.
 
-    A jump leads from one end of the range to the other, the motion before and after goes on, and is taken off it. The
-    signal spans ``most`` sizes at most. None where it does not jump so: a machine that steps goes with its motion.
+    A jump leads from one end of the range to the other while the motion before and after continues; the motion is
+    subtracted from the jump. The signal spans at most ``most`` sizes. None without such jumps: the steps of a machine
+    have the direction of its motion.
     """
     step, span = np.diff(x), float(np.ptp(x)) if len(x) else 0.0
     if len(step) < 3 or not span > 0:
@@ -305,16 +313,16 @@ def _anew(
     return None
 
 
-def folded(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, Indices] | None:
-    """Into how many parts of a turn an angle is folded that begins anew after one, and the samples before which it
-    jumps; None where it is not.
+def find_folding(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[int, Indices] | None:
+    """Number of parts of a turn after each of which an angle restarts, and the samples before which it jumps; None if
+    it never restarts.
     """
-    found = _anew(t, angle, [turn / parts for parts in PARTS], SPAN, max_gap)
+    found = _find_restarts(t, angle, [turn / parts for parts in PARTS], SPAN, max_gap)
     return found and (PARTS[found[0]], found[1])
 
 
 def _jumping(channel: Channel, jumps: Indices, size: str, digits: int, told: str, refused: bool) -> Finding:
-    """The finding of a channel that jumps, as it was recorded."""
+    """The finding about a channel with jumps, from its recorded numbers."""
     y, k, count, unit = channel.y, int(jumps[0]), len(jumps), f" {channel.signal.unit}" * (digits < 10)
     message = (
         f" jumps {count} time{'s' * (count > 1)} by about {size} (first from {y[k - 1]:.{digits}g} to "
@@ -324,7 +332,7 @@ def _jumping(channel: Channel, jumps: Indices, size: str, digits: int, told: str
 
 
 def turn_of(signal: Signal) -> float | None:
-    """A full turn in the signal's unit; None if the unit is none of an angle."""
+    """A full turn in the signal's unit; None if the unit is not one of an angle."""
     found = conversion("rev", signal.unit)
     angle = isinstance(found, Conversion) and signal.unit not in ("-", "1", "%", "ppm")
     return found.factor if isinstance(found, Conversion) and angle else None
@@ -341,10 +349,10 @@ def findings_of(
     outputs: Sequence[Signal],
     states: Sequence[Signal] = (),
 ) -> tuple[Finding, ...]:
-    """All that is doubtful about the recordings of one run, file by file, with their own findings.
+    """All findings about the recordings of a run, file by file, including those of the recordings themselves.
 
-    ``motions`` are times ``(n,)`` [s] and states ``(n, n_x)`` of each recording, smoothed; ``n = 0`` where that could
-    not be. Speeds are checked if ``states``, the prior's signals, are given.
+    ``motions`` are smoothed times ``(n,)`` [s] and states ``(n, n_x)`` of each recording; ``n = 0`` if smoothing was
+    impossible. Speeds are checked if ``states``, the prior's signals, are given.
     """
     spreads = np.std(np.concatenate([r.u for r in recordings]), axis=0) if recordings else np.zeros(0)
     patience = [_patience(recordings, j, spec) for j in range(len(outputs))]
@@ -370,7 +378,7 @@ def findings_of(
 
 
 def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
-    """Time [s] that a driven machine may rest, by the times between two changes of an output in all recordings."""
+    """Longest rest [s] of a driven machine, from the times between two changes of an output in all recordings."""
     waits = []
     for recording in recordings:
         known = np.isfinite(recording.y[:, j])
@@ -383,11 +391,11 @@ def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
 
 @dataclass(frozen=True)
 class Still:
-    """Equal samples in a row, from index ``first`` to ``last``, that are no rest.
+    """Equal consecutive samples, from index ``first`` to ``last``, that are not a rest of the machine.
 
-    ``"abrupt"``: it begins or ends in full motion; ``"noise"``: the sensor's noise stops, too; ``"driven"``: the
-    inputs go on. ``amount`` is the speed right before or after [unit/s], the standard deviation of the noise [unit],
-    the length [s].
+    ``"abrupt"``: the stretch begins or ends in full motion; ``"noise"``: the sensor's noise stops as well;
+    ``"driven"``: the inputs keep moving. ``amount`` is the speed just before or after [unit/s], the standard deviation
+    of the noise [unit], or the length [s].
     """
 
     first: int
@@ -399,18 +407,17 @@ class Still:
 def still_stretches(
     t: Array, y: Array, u: Array, *, max_gap: float, patience: float, spreads: Array
 ) -> tuple[Still, ...]:
-    """Stretches of equal samples that no rest of the machine explains; an encoder, however coarse, at rest is none.
+    """Stretches of equal samples that no rest of the machine explains; a coarse encoder at rest is no such stretch.
 
-    ``"abrupt"``: a machine comes to rest and starts from it with changes of speed that it also makes elsewhere, and
-    this one is ``ABRUPT`` times as sharp. Steps of the sensor count as changes; where an input steps, a machine may
-    start or stop as sharply as it likes. ``"noise"``: a sensor whose noise is larger than its steps flickers at
-    rest, and here it does not; exact zeros, which speeds made from counts have at rest, do not count. ``"driven"``:
-    the inputs go on for longer than ``patience``.
+    ``"abrupt"``: the change of speed at the stretch is ``ABRUPT`` times sharper than any ordinary one. Steps of the
+    sensor count as ordinary changes; next to a step of an input any change is allowed. ``"noise"``: a sensor whose
+    noise exceeds its steps flickers even at rest, and here it does not; exact zeros are exempt, since speeds computed
+    from counts are exactly zero at rest. ``"driven"``: the inputs keep moving for longer than ``patience``.
     """
     step, bridged = np.diff(y), ~gaps(t, max_gap)
     edges = np.flatnonzero(np.diff(np.r_[False, (step == 0) & bridged, False].astype(np.int8)))
     first, last = edges[::2], edges[1::2]
-    # in bursts of samples a sensor does not change either: they are to last as long as usual ones
+    # bursts of samples repeat a value, too: a stretch must last as long as samples at the usual rate
     usual = np.diff(t)[bridged]
     long = last - first + 1 >= SHORTEST
     long &= t[last] - t[first] >= (SHORTEST - 1.5) * (float(usual.mean()) if len(usual) else 0.0)
@@ -420,7 +427,7 @@ def still_stretches(
     ordinary = _elsewhere(len(step), first, last) & bridged
     resolution = float(np.quantile(np.abs(step[step != 0]), STEP)) if step.any() else math.inf
     moving = spreads > 0
-    # where an input becomes another one by half of its spread, the machine is free to start or stop
+    # after an input's step of at least half its spread the machine may start or stop sharply
     stepped = (np.abs(np.diff(u[:, moving], axis=0)) > STIRRED * spreads[moving]).any(axis=1)
     at = _abrupt(t, y, first, last, ordinary, resolution, np.flatnonzero(stepped) + 1)
     noise, longest = _noise(t, y, ordinary, resolution)
@@ -440,11 +447,11 @@ def still_stretches(
 def _abrupt(
     t: Array, y: Array, first: Indices, last: Indices, ordinary: Mask, resolution: float, stepped: Indices
 ) -> Array:
-    """Speed right before or after each stretch if neither an ordinary change of speed nor a step of an input explains
-    it, else zero.
+    """Speed just before or after each stretch, if neither an ordinary change of speed nor a step of an input explains
+    the stop; else zero.
     """
 
-    def explained(at: Indices, span: int) -> Mask:  # by a step up to a span and two samples away
+    def explained(at: Indices, span: int) -> Mask:  # a step of an input at most a span and two samples away
         near = np.searchsorted(stepped, at - span - 2), np.searchsorted(stepped, at + span + 3)
         return np.asarray(near[0] < near[1])
 
@@ -458,7 +465,7 @@ def _abrupt(
         moving = (speed[span:] != 0) & (speed[:-span] != 0)
         chosen = moving & (near[2 * span :] == near[: -2 * span])
         if chosen.sum() < max(FEW, FEWER * moving.sum()):
-            chosen = change > 0  # a sensor slower than its recording repeats itself always
+            chosen = change > 0  # a sensor slower than its recording repeats values all the time
         most = float(np.quantile(change[chosen], ORDINARY)) if chosen.any() else 0.0
         limit = ABRUPT * max(most, resolution / (span * period))
         begins = (first >= span) & ~explained(first, span)
@@ -479,7 +486,7 @@ def _elsewhere(n: int, first: Indices, last: Indices) -> Mask:
 
 
 def _noise(t: Array, y: Array, ordinary: Mask, resolution: float) -> tuple[float, float]:
-    """Standard deviation of the noise, and fewest equal samples in a row that it never makes; infinite without."""
+    """Standard deviation of the noise, and the fewest equal samples it practically never produces (else infinity)."""
     inner = ordinary[:0]
     if len(ordinary) > 3:
         inner = ordinary[:-3] & ordinary[1:-2] & ordinary[2:-1] & ordinary[3:]
@@ -487,16 +494,18 @@ def _noise(t: Array, y: Array, ordinary: Mask, resolution: float) -> tuple[float
         return 0.0, math.inf
     line = float(np.median(np.abs(_misfit(t, y, (-1, 1))[inner])))
     cubic = float(np.median(np.abs(_misfit(t, y, (-2, -1, 1, 2))[inner])))
-    sigma = line / (0.6745 * math.sqrt(1.5))  # median of a Gaussian; variances of a sample and of two halves
+    # median of |e| of a Gaussian: 0.6745 sigma_e; sigma_e^2 = (1 + 2 / 4) sigma^2 for a sample less the mean of two
+    sigma = line / (0.6745 * math.sqrt(1.5))
     if cubic < WHITE * line or sigma < FLICKER * resolution:
         return 0.0, math.inf
     repeated = float((np.diff(y)[ordinary] == 0).mean())
+    # a run of n equal samples at one of m places: m p^n = CHANCE with p the share of repeated values
     least = math.log(CHANCE / len(y)) / math.log(repeated) if repeated else 0.0
     return sigma, max(SHORTEST, least)
 
 
 def _misfit(t: Array, y: Array, places: tuple[int, ...]) -> Array:
-    """Samples less the polynomial through their neighbours at ``places``; ``(m - 4,)``, from the third sample on."""
+    """Samples minus the Lagrange polynomial through their neighbours at ``places``; ``(m - 4,)``, from sample 2 on."""
 
     def at(z: Array, place: int) -> Array:
         return z[2 + place : len(z) - 2 + place]
@@ -512,7 +521,7 @@ def _misfit(t: Array, y: Array, places: tuple[int, ...]) -> Array:
 
 
 def _stuck(channel: Channel, still: Sequence[Still]) -> list[Finding]:
-    """Clipped at the largest and smallest value, and frozen anywhere else."""
+    """Findings of stuck stretches: clipped at the largest and smallest value, frozen anywhere else."""
     y, found, ends = channel.y, list[Finding](), list[float]()
     if len(y) and np.ptp(y) > 0:
         ends = [float(y.max()), float(y.min())]
@@ -530,9 +539,9 @@ def _clipped(channel: Channel, first: Still, upper: bool) -> Finding:
     low, high = signal.saturation or (-math.inf, math.inf)
     ends = f"({low:g}, {value:g})" if upper else f"({value:g}, {high:g})"
     message = (
-        f" stands at its {'largest' if upper else 'smallest'} value, {value:.6g} {signal.unit}, for {count} samples, "
+        f" stays at its {'largest' if upper else 'smallest'} value, {value:.6g} {signal.unit}, for {count} samples, "
         f"first from {t[first.first]:.6g} to {t[first.last]:.6g} s, {_why(first, signal)}. The sensor is clipped, or "
-        f"the machine rests against a stop, which a prior does not know of. If the sensor ends there, declare "
+        f"the machine rests against a stop that the prior does not model. If the sensor's range ends there, declare "
         f"Signal(..., saturation={ends.replace('inf', 'math.inf')}) for {signal.name}: these samples then count as 'at "
         f"{'least' if upper else 'most'}'. {LEAVE_OUT} within the sensor's range."
     )
@@ -555,16 +564,16 @@ def _frozen(channel: Channel, still: Sequence[Still]) -> Finding:
 def _why(still: Still, signal: Signal) -> str:
     if still.why == "abrupt":
         return (
-            f"although it moves at {still.amount:.3g} {signal.unit}/s right before or after, and changes its speed "
-            "like that nowhere else"
+            f"although it moves at {still.amount:.3g} {signal.unit}/s just before or after, and such a sharp change of "
+            "speed occurs nowhere else"
         )
     if still.why == "noise":
-        return f"although its noise is {still.amount:.2g} {signal.unit} elsewhere"
-    return "while the inputs move as they do elsewhere"
+        return f"although its noise elsewhere is {still.amount:.2g} {signal.unit}"
+    return "while the inputs move as elsewhere"
 
 
 def _too_fast(channel: Channel) -> list[Finding]:
-    """Speeds ``(n,)`` out of their plausible range; refused where even the mean one (rms) is."""
+    """Speeds ``(n,)`` outside their plausible range; refused if even their mean (rms) is outside."""
     v, speed = channel.y, channel.signal
     bad = np.flatnonzero((v < speed.lower) | (v > speed.upper))
     if not len(bad):
@@ -573,9 +582,9 @@ def _too_fast(channel: Channel) -> list[Finding]:
     absurd = mean > max(abs(speed.lower), abs(speed.upper))
     message = (
         f", differentiated, reaches {v[worst]:.4g} {speed.unit} at {channel.t[worst]:.6g} s; the plausible range of "
-        f"{speed.name} is {speed.lower:g} to {speed.upper:g} {speed.unit} ({len(bad)} of {len(v)} samples are beyond"
-        f"{f', and so is its mean, {mean:.4g} (rms)' if absurd else ''}). Mostly a unit is wrong (deg for "
-        "rad, rpm, ms for s): name it in DataSpec.units. Else look for jumps of the sensor, or widen the range in the "
-        "prior."
+        f"{speed.name} is {speed.lower:g} to {speed.upper:g} {speed.unit} ({len(bad)} of {len(v)} samples are outside"
+        f"{f', and so is the mean, {mean:.4g} (rms)' if absurd else ''}). The usual cause is a wrong unit (deg for "
+        "rad, rpm, ms for s): name the unit in DataSpec.units. Otherwise look for jumps of the sensor, or widen the "
+        "range in the prior."
     )
     return [channel.finding("speed", int(bad[0]), len(bad), message, refused=absurd)]

@@ -1,4 +1,4 @@
-"""Tables as sources: each column is read in one way, dates become seconds, in long form every tag is a column."""
+"""Tables as sources: columns read as numbers, dates as seconds; a table in long form gives one column per signal."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-HEAD = 200  # rows of a column that show what it holds
+HEAD = 200  # rows of a column that show its kind
 TAGS = words_of(
     "tag tagname name variable signal channel sensor sensorid sensorname parameter point pointname kanal messstelle "
     "metric item measurement quantity node device attribute series messgroesse"
 )
-"""Names of the column of a table in long form that names what each row measured, in small letters."""
+"""Names of the column, in a table in long form, that names the signal of each row; in small letters."""
 VALUES = words_of("value val values wert messwert reading data valeur valor result")
-"""Names of the column that holds the value."""
+"""Names of the column that holds the values."""
 MOST_TAGS = 500
 
 
 @dataclass
 class Frame:
-    """A table: names, how its columns are read, and the numbers of its rows.
+    """A table: names and numbers of its rows, and functions that read its columns.
 
-    ``columns(places)`` gives pandas' columns; ``head`` is the beginning of each, as text. ``text(k, place)`` is a cell
-    as the file has it. ``fault(place, values)`` says what else is wrong with a column. ``places`` are those of the
-    columns of its source by name, two of a date and a time of day; each is read once.
+    ``columns(places)`` gives columns of pandas; ``head`` is the beginning of each column, as text. ``text(k, place)``
+    is a cell as written in the file. ``fault(place, values)`` describes further faults of a column. ``places`` are the
+    positions of each named column of the source; a date and a time of day in two columns have two. Each column is read
+    once and then kept in ``done``.
     """
 
     path: Path
@@ -54,7 +55,7 @@ class Frame:
     done: dict[str, Cells] = field(default_factory=dict)
 
     def source(self, sha256: str) -> Source:
-        """The table as a source: dates are seconds, in long form every tag is a column."""
+        """The table as a source; dates become seconds, a table in long form one column per signal."""
         notes, header = list(self.notes), list[str]()
         heads = [cells_of(head, self.decimal) if len(head) else None for head in self.head]
         dates, clocks = ([_holds(head, date) for head in self.head] for date in (True, False))
@@ -64,7 +65,7 @@ class Frame:
             date = near[0] if clocks[j] and near else None
             if date is not None:
                 taken.add(date)
-                notes.append(f"columns {shown(self.names[date])} and {shown(name)} are one time")
+                notes.append(f"columns {shown(self.names[date])} and {shown(name)} together are the time")
                 if (gone := _in_seconds(self.names[date])) in header:
                     header.remove(gone)
             elif j in taken:
@@ -81,7 +82,7 @@ class Frame:
         return self.in_long_form(source) or source
 
     def read(self, time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
-        """As :class:`Source` says."""
+        """Read columns, as :class:`Source` describes."""
         names, faults = [*([] if time is None else [time]), *wanted], {}
         missing = [name for name in dict.fromkeys(names) if name not in self.done]
         places = list(dict.fromkeys(place for name in missing for place in self.places[name]))
@@ -99,7 +100,7 @@ class Frame:
         return Columns(np.where(np.isfinite(table), table, np.nan), "row", self.numbers, faults)
 
     def fault_of(self, name: str, one: Cells, may_be_blank: bool) -> str:
-        """What is wrong with a column's cells; empty if nothing is."""
+        """The fault of a column's cells; empty without one."""
         if one.fault:
             return f"column {shown(name)}: {one.fault}. [HM-DATA-122]"
         bad = np.flatnonzero(~np.isfinite(one.values) & ~(one.blank & may_be_blank))
@@ -110,11 +111,11 @@ class Frame:
         such = f" ({len(bad)} such rows)" if len(bad) > 1 else ""
         what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
         why = cause(cell)
-        remedy = f": {why}." if why else ". Delete the row (longer gaps are cut out) or repair the value."
+        remedy = f": {why}." if why else ". Correct the value or delete the row (longer gaps are cut out)."
         return f"row {self.numbers[int(bad[0])]}, column {shown(name)} {what}{such}{remedy} [HM-DATA-123]"
 
     def in_long_form(self, source: Source) -> Source | None:
-        """The source where each row names what it measured; None where rows do not."""
+        """The source of a table in long form, where each row names its signal; None for other tables."""
         header = source.header
         small = {name: re.sub(r"[\W_]", "", name_and_unit(name)[0].casefold()) for name in header}
         tags = [name for name in header if small[name] in TAGS]
@@ -149,7 +150,7 @@ class Frame:
                 at, x = time.values[rows, 0], one.values[rows, 0]
                 order = np.argsort(at, kind="stable")
                 found.append(Series(name, at[order], x[order], one.faults.get(value, "")))
-        note = f"long form: {len(several)} signals by column {shown(tags[0])}"
+        note = f"long form: {len(several)} signals, named in column {shown(tags[0])}"
         return replace(clocked(source.path, source.sha256, found, times[0]), notes=(*source.notes, note))
 
     def is_measured(self, name: str) -> bool:
@@ -159,7 +160,7 @@ class Frame:
 
 
 def _joined(columns: Sequence[pd.Series]) -> pd.Series:
-    """One column; of a date and a time of day both."""
+    """One column; a column of dates and one of times of day are joined."""
     if len(columns) == 1:
         return columns[0]
     date, time = (column.astype(str).str.strip() for column in columns)
@@ -167,12 +168,12 @@ def _joined(columns: Sequence[pd.Series]) -> pd.Series:
 
 
 def _in_seconds(name: str) -> str:
-    """A column's name with seconds in place of its own unit."""
+    """A column's name with the unit seconds instead of its own."""
     return f"{name_and_unit(name)[0]} [s]"
 
 
 def _holds(head: pd.Series, date: bool) -> bool:
-    """Whether a column begins with dates, or with times of day."""
+    """Whether a column begins with dates (``date``), or with times of day."""
     if head.dtype.kind == "M":
         return date
     cells = [str(cell).strip() for cell in head if not is_blank(cell)]
@@ -182,5 +183,5 @@ def _holds(head: pd.Series, date: bool) -> bool:
 
 
 def is_blank(cell: object) -> bool:
-    """Whether a cell of any kind says that there is no value."""
+    """Whether a cell of any kind marks a missing value."""
     return cell is None or str(cell).strip().casefold() in (*BLANK, "nat", "<na>")

@@ -1,6 +1,6 @@
-"""HDF5 files as named vectors, and MATLAB's v7.3, which are such: datasets, columns of matrices, fields of tables.
+"""HDF5 files (also MATLAB v7.3) as named vectors: datasets, columns of matrices, fields of tables.
 
-Links to other files are left alone.
+Links to other files are ignored.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from hybrid_mpc.data.source import Source, line_of
 from hybrid_mpc.data.vectors import CONVERT, MOST_STRUCTS, OBJECTS, Leaf, budget_of, leaf_source
 from hybrid_mpc.errors import InputError, named_extra
 
-DEEPEST = 8  # deepest groups in groups that are read
-MOST_ITEMS = 10_000  # most groups and datasets that are looked at: some seconds of work
+DEEPEST = 8  # deepest nesting of groups that is read
+MOST_ITEMS = 10_000  # most groups and datasets that are visited: some seconds of work
 
 
 def hdf5_source(path: Path, content: bytes, sha256: str) -> Source:
-    """A file as a source."""
+    """Open a file as a source."""
     matlab = path.suffix.lower() == ".mat" or content.startswith(b"MATLAB")
     with named_extra(f"{path}: reading {'.mat files of version 7.3' if matlab else 'HDF5 files'}"):
         import h5py
     try:
         file = h5py.File(io.BytesIO(content), "r")
         leaves = list(_Walk(file, matlab).fields("", file, 0))
-    except Exception as error:  # a damaged file raises nearly anything
+    except Exception as error:  # h5py raises many kinds of exceptions for a damaged file
         what, again = "HDF5 file", "Write it again."
         if matlab:
             what, again = ".mat file", f"Save it again in MATLAB with save('{path.name}', ..., '-v7')."
         raise InputError(
-            f"{path}: is no {what} or damaged ({line_of(error)}). {again} [HM-DATA-034]"
+            f"{path}: not a valid {what}, or damaged ({line_of(error)}). {again} [HM-DATA-034]"
         ) from error
     return leaf_source(path, content, sha256, leaves, matlab)
 
 
 class _Walk:
-    """A walk through a file; links may lead to one group again and again, so the steps are counted."""
+    """A walk through a file; links may form cycles, so visited items are counted."""
 
     def __init__(self, file: Any, matlab: bool) -> None:
         self.file, self.matlab, self.left = file, matlab, MOST_ITEMS
 
     def fields(self, prefix: str, group: Any, depth: int) -> Iterator[Leaf]:
-        """What a group holds."""
+        """The contents of a group."""
         import h5py
 
         for name in group:
@@ -63,7 +63,7 @@ class _Walk:
                 yield from self.item(full, item, depth)
 
     def referred(self, item: Any, name: str, form: str, what: str, depth: int) -> Iterator[Leaf]:
-        """What references point at, named by ``form`` with the number of each for the null."""
+        """The targets of references; ``form`` is the name of each, with the null replaced by its number."""
         if item.size > MOST_STRUCTS or depth > DEEPEST:
             yield Leaf(name, what=what)
             return
@@ -76,7 +76,7 @@ class _Walk:
 
         self.left -= 1
         if self.left < 0:
-            raise ValueError(f"it has more than {MOST_ITEMS} groups and datasets [HM-DATA-035]")
+            raise ValueError(f"more than {MOST_ITEMS} groups and datasets [HM-DATA-035]")
         kind = _class(item) if self.matlab else ""
         if self.matlab and (item.attrs.get("MATLAB_object_decode", 0) or kind in CONVERT):
             yield Leaf(name, what=f"{OBJECTS} of class {kind}", kind=kind)
@@ -114,9 +114,10 @@ def _class(item: Any) -> str:
 
 
 def _numbers(item: Any, field: str = "") -> NDArray[Any]:
-    """A dataset's numbers, or those of a field of its records; what it declares is looked at first."""
+    """Numbers of a dataset, or of one field of its records; the declared size is checked first."""
     if max(8, item.dtype.itemsize) * item.size > budget_of(item.file.id.get_filesize()):
         raise InputError(
-            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from such a file [HM-DATA-036]"
+            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from a file of this size"
+            " [HM-DATA-036]"
         )
     return np.asarray(item[()][field] if field else item[()])

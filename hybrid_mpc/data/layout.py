@@ -1,4 +1,4 @@
-"""Where the table stands in the first rows of a file: header, row of units, first row of values."""
+"""Find the table in the first rows of a file: header, row of units, first row of values."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from hybrid_mpc.data.names import name_and_unit, said_by
 from hybrid_mpc.machine.units import Conversion, conversion
 from hybrid_mpc.records import shown
 
-MOST_SEEN = 1000  # rows at the beginning of a file that show where its table begins
-STEADY = 3  # fewest rows that show a table
+MOST_SEEN = 1000  # rows at the beginning of a file that are searched for the table
+STEADY = 3  # fewest rows of a table
 COMMENTS = ("#", "%", "//", ";;")
-"""How comments begin."""
+"""First characters of a comment."""
 
 
 class Look(NamedTuple):
-    """A row of the sample: its index among the rows, its cells without blanks around them."""
+    """A row of the sample: its index and its cells, stripped of blanks."""
 
     row: int
     cells: list[str]
 
     @property
     def filled(self) -> list[str]:
-        """Cells that are not blank."""
+        """Cells with text."""
         return [cell for cell in self.cells if cell]
 
     def values(self, comma: bool) -> int:
-        """How many cells are values."""
+        """Number of cells that are values."""
         return sum(is_value(cell, comma) for cell in self.cells if cell)
 
     def is_data(self, comma: bool) -> bool:
-        """Whether it may be a row of a table: half of its cells are values, and one a number or a date."""
+        """Whether the row may belong to a table: half of its cells are values, at least one a number or a date."""
         filled = self.filled
         if not filled or 2 * self.values(comma) < len(filled):
             return False
@@ -43,10 +43,10 @@ class Look(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a table stands: row index of its header (-1 without) and of its ``first`` row of values.
+    """Position of a table: row index of its header (-1 without a header) and of its ``first`` row of values.
 
-    ``names`` are those of its columns, with units; ``width`` is the number of cells of its rows. ``clock`` is the
-    time of the sample 0 and the sampling time [s], where the first column counts samples and the header says so.
+    ``names`` are the column names with units; ``width`` is the number of cells of a row. ``clock`` is the time of
+    sample 0 and the sampling period [s], if the first column counts samples and the header gives both.
     """
 
     header: int
@@ -60,12 +60,12 @@ class Layout:
 def layout_of(
     rows: Sequence[Look], comma: bool, split: Callable[[int], list[list[str]]], number: Callable[[int], int]
 ) -> tuple[float, Layout | str]:
-    """The table in the first rows of a file, how well they fit it; or why there is none.
+    """The table in the first rows of a file and its score; or the reason why there is none.
 
-    ``split(row)`` gives the cells of a row as other separators split it, ``number(row)`` the row's number.
+    ``split(row)`` gives the cells of a row for other separators, ``number(row)`` the row's number.
     """
     runs: list[list[Look]] = []
-    whole = False  # whether the last row goes on
+    whole = False  # whether the current run of rows continues
     for look in rows:
         if look.is_data(comma):
             if whole and len(runs[-1][-1].cells) == len(look.cells):
@@ -76,7 +76,7 @@ def layout_of(
         elif look.filled and not look.cells[0].startswith(COMMENTS):
             whole = False
     best = max(runs, key=len, default=[])
-    # words in a row, or the header again, part a table in two: it begins with the first part
+    # words in a row, or a repeated header, split a table: the table begins with the first part
     best = next((run for run in runs if len(run) >= STEADY and _alike(run, best, comma)), best)
     top = best and not any(look.filled for look in rows if look.row < best[0].row)
     while len(best) > 1 and _words_over_numbers(best[0], best[1:4], comma, bool(top)):
@@ -97,8 +97,8 @@ def _alike(one: Sequence[Look], other: Sequence[Look], comma: bool) -> bool:
 
 
 def _words_over_numbers(look: Look, below: Sequence[Look], comma: bool, top: bool) -> bool:
-    """Whether a row is none of values: it has words where all rows below have numbers, and is the first one of the
-    file (``top``), or all of its other cells may be units, too (``s,1,1``).
+    """Whether a row is a header or units instead of values: it has words where all rows below have numbers, and it is
+    the file's first row (``top``), or all of its other cells may be units (``s,1,1``).
     """
 
     def number(cell: str) -> bool:
@@ -120,7 +120,7 @@ def _headed(
     split: Callable[[int], list[list[str]]],
     number: Callable[[int], int],
 ) -> Layout | str:
-    """The layout by the rows above the first row of values; or why nobody knows which column is which."""
+    """The layout from the rows above the first row of values; or the reason why the columns cannot be named."""
     if scope := _of_a_scope(above, body[0].row, width):
         return scope
     first, notes = body[0].row, list[str]()
@@ -148,8 +148,8 @@ def _headed(
             count = max(counts)
             if count > 1 and max(width, count) > 2 and (count > 2 or width <= 2 * count):
                 return (
-                    f"row {number(first)} has {width} cells, the header (row {number(last.row)}) has {count}. Separate "
-                    "all cells in one way, write decimals with a point, and complete or delete the row."
+                    f"row {number(first)} has {width} cells, but the header (row {number(last.row)}) has {count}. "
+                    "Use one separator for all cells and a decimal point, and complete or delete the row."
                 )
     if header < 0:
         counted = (
@@ -159,11 +159,11 @@ def _headed(
         )
         if width > 2 and body[0].cells in counted:
             return (
-                f"row {number(first)} counts columns: a header, or values? Write a first row with a name for each "
-                "column, e.g. 'time [s]'."
+                f"row {number(first)} counts the columns: it may be a header or values. Write a first row with a name "
+                "for each column, e.g. 'time [s]'."
             )
         names = [f"column {j + 1}" if j < spare else "" for j in range(width)]
-        notes.append("no header; columns are named by their number")
+        notes.append("no header: columns are named by their number")
     before = [look for look in above if look.row < header] if header >= 0 else list(above)
     if before:
         till = number(header) - 1 if header >= 0 else number(first) - 1
@@ -180,7 +180,7 @@ def _headed(
 
 
 def _of_a_scope(above: Sequence[Look], first: int, width: int) -> Layout | None:
-    """The layout of an oscilloscope's file, whose header names start and increment of the time (Rigol)."""
+    """The layout of an oscilloscope's file (Rigol), whose header gives start and increment of the time."""
     if len(above) < 2 or not {"start", "increment"} <= {cell.casefold() for cell in above[-2].cells}:
         return None
     header, values = above[-2], above[-1].cells
@@ -192,12 +192,12 @@ def _of_a_scope(above: Sequence[Look], first: int, width: int) -> Layout | None:
         f"{name} [{unit}]" for name, unit in zip(header.cells[1 : at["start"]], values[1:], strict=False)
     ]
     names = ["time [s]", *names, *[""] * (width - len(names) - 1)]
-    note = f"row {first} gives the time: from {start} s, every {step} s"
+    note = f"row {first} gives the time: start {start} s, step {step} s"
     return Layout(header.row, first, tuple(names[:width]), width, (note,), (float(start), float(step)))
 
 
 def _names_in(look: Look, width: int, spare: int, split: Callable[[int], list[list[str]]]) -> list[str]:
-    """The names in a header of a table ``width`` cells wide, of which the last may be blank; none if it is none."""
+    """Names in the header of a table of ``width`` cells, the last of which may be blank; empty if it is no header."""
     for cells in (look.cells, *split(look.row)):
         if cells and (mark := next((mark for mark in COMMENTS if cells[0].startswith(mark)), "")):
             cells = [cells[0].removeprefix(mark).strip(), *cells[1:]]
@@ -215,10 +215,10 @@ def _names_in(look: Look, width: int, spare: int, split: Callable[[int], list[li
 
 
 def _are_units(look: Look, above: Look, width: int) -> bool:
-    """Whether a row holds the units of the names ``above`` it, and is no header below a preamble.
+    """Whether a row holds the units of the names in the row ``above``.
 
-    All of its cells are units, or dashes, and one at least is more. ``T``, ``V`` may be names, too: of two rows the
-    names are where the time is.
+    All of its cells are units or dashes, at least one a unit. ``T`` and ``V`` may be names as well: of two such rows,
+    the one that names the time is the header.
     """
     filled = look.filled
     known = [cell for cell in filled if is_unit(cell)]
@@ -230,11 +230,11 @@ def _are_units(look: Look, above: Look, width: int) -> bool:
 
 
 def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | str:
-    """Names with the units of the row below; or a contradiction between the two."""
+    """Names with the units of the row below; or a message if the two rows contradict each other."""
     found = []
     for name, cell in zip(names, [*units, *[""] * (len(names) - len(units))], strict=True):
         unit, said = cell.strip("[]()").strip(), name_and_unit(name)[1]
         if said and unit and conversion(said, unit) != Conversion(1.0):
-            return f"column {shown(name)} is {shown(unit)}, and the header has {shown(said)}. Delete the wrong one."
+            return f"column {shown(name)} has the unit {shown(unit)}, but the header says {shown(said)}. Delete one."
         found.append(f"{name} [{unit}]" if unit not in ("", "-") and not said and name else name)
     return found

@@ -1,6 +1,6 @@
-"""Files of measuring programs and robots: MDF, TDMS, ROS bags, MCAP, PX4 logs, CAN logs. All signals keep their clocks.
+"""Files of data loggers and robots: MDF, TDMS, ROS bags, MCAP, PX4 logs, CAN logs. Each signal keeps its own clock.
 
-Each is read by its format's own library, of the extra ``loggers``; none may run code that a file brings.
+Each format is read by its own library, part of the extra ``loggers``; none of them runs code from a file.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from hybrid_mpc.errors import InputError, MissingPackage, named_extra
 from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
-MOST_FIELDS = 64  # longest array in a message whose elements are signals
+MOST_FIELDS = 64  # longest array in a message that is read as signals
 NUMBERS = {"2": (0, 1, 2, 6, 7, 8, 9, 65535), "3": (0, 1, 2, 6, 7, 8, 9, 65535), "4": (0, 1, 2, 4, 5, 6)}
-"""Conversions of a channel's raw numbers into numbers, by the version of an MDF file; tables of texts are not used."""
-FORMULAS = {"2": 10, "3": 10, "4": 3}  # the conversion that is a formula as text
+"""Conversions of raw to physical numbers that are used, by the version of an MDF file; tables of texts are not."""
+FORMULAS = {"2": 10, "3": 10, "4": 3}  # the conversion that is a formula in a text
 
 
 def logger_source(path: Path, content: bytes, sha256: str) -> Source:
-    """A logger's file as a source."""
+    """Open a logger's file as a source."""
     begins = (one[1:] for one in _READERS if content.startswith(one[0]))
     reader, what = next(begins, (_can, "CAN log"))
     try:
@@ -40,9 +40,9 @@ def logger_source(path: Path, content: bytes, sha256: str) -> Source:
             return reader(path, content, sha256)
     except (MissingPackage, InputError):
         raise
-    except Exception as error:  # a damaged file raises nearly anything
+    except Exception as error:  # the libraries raise many kinds of exceptions for a damaged file
         raise InputError(
-            f"{path}: is no {what} or damaged ({line_of(error)}). Record or export it again. [HM-DATA-037]"
+            f"{path}: not a valid {what}, or damaged ({line_of(error)}). Record or export it again. [HM-DATA-037]"
         ) from error
 
 
@@ -52,7 +52,7 @@ def _named(name: str, unit: object) -> str:
 
 
 def _distinct(pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Names of signals: their own, with the group's before it where several have it, with a number behind it else."""
+    """Distinct names of signals: prefixed by the group if several groups share a name, else numbered."""
     counts, seen, found = Counter(own for _, own in pairs), Counter[str](), list[str]()
     for group, own in pairs:
         name = own if counts[own] == 1 else f"{group}.{own}"
@@ -68,22 +68,22 @@ def _source(
     unread: Sequence[str] = (),
     note: str = "",
 ) -> Source:
-    """A source of signals: group, name, unit, stamps [s], numbers; times begin with the file's first stamp."""
+    """A source of signals: group, name, unit, stamps [s], numbers; time begins at the file's first stamp."""
     found = [one for one in found if len(one[3])]
     if not found:
         raise InputError(
-            f"{path}: has no signal with numbers. Record some, or export them as CSV. [HM-DATA-038]"
+            f"{path}: no signal with numbers. Record numeric signals, or export them as CSV. [HM-DATA-038]"
         )
     names, twice, series = _distinct([(group, own) for group, own, *_ in found]), 0, list[Series]()
     for name, (_, _, unit, t, values) in zip(names, found, strict=True):
-        last = np.r_[np.diff(t) != 0, True]  # of samples with one stamp the last one
+        last = np.r_[np.diff(t) != 0, True]  # the last of the samples with equal stamps
         twice += int((~last).sum())
         series.append(Series(_named(name, unit), t[last], np.asarray(values, np.float64)[last]))
-    told = f" Not read are {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
+    told = f" Not read: {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
     clocks = len({(len(one.t), *one.t[[0, -1]]) for one in series})
     notes = (*([note] if note else []), f"{len(series)} signals, {clocks} clock{'s' * (clocks > 1)}")
     if twice:
-        notes = (*notes, f"of samples with the same stamp the last one is read: {twice} are left out")
+        notes = (*notes, f"{twice} samples are left out: a later sample has the same stamp")
     return replace(clocked(path, sha256, series, note=told), unread=tuple(unread), notes=notes)
 
 
@@ -100,7 +100,7 @@ def _mdf(path: Path, content: bytes, sha256: str) -> Source:
                 if j == file.masters_db.get(k):
                     continue
                 kind = getattr(channel.conversion, "conversion_type", 0)
-                if kind == FORMULAS[file.version[0]]:  # it would be evaluated
+                if kind == FORMULAS[file.version[0]]:  # the library would evaluate the formula
                     unread.append(channel.name)
                     continue
                 signal = file.get(group=k, index=j, raw=kind not in NUMBERS[file.version[0]])
@@ -146,7 +146,7 @@ def _tdms(path: Path, content: bytes, sha256: str) -> Source:
 
 
 def _seconds(stamps: NDArray[Any], name: str) -> Array:
-    """Time stamps [s]: dates since the first, numbers in the unit of their name."""
+    """Time stamps [s]: dates since the first stamp, numbers in the unit of their name."""
     if stamps.dtype.kind == "M":
         return (stamps - stamps[0]).astype("timedelta64[ns]").astype(np.float64) / 1e9
     return np.asarray(stamps, np.float64) * (said_by(name).seconds or 1.0)
@@ -156,7 +156,7 @@ def _seconds(stamps: NDArray[Any], name: str) -> Array:
 
 
 def _of_messages(path: Path, sha256: str, messages: Iterable[tuple[str, str, Any, int, bytes]]) -> Source:
-    """Numbers of messages by topic and field; of each message its topic, encoding, schema, stamp [ns] and bytes."""
+    """Numbers of messages by topic and field; a message is its topic, encoding, schema, stamp [ns] and bytes."""
     from mcap_ros1.decoder import DecoderFactory as First
     from mcap_ros2.decoder import DecoderFactory as Second
 
@@ -177,7 +177,9 @@ def _of_messages(path: Path, sha256: str, messages: Iterable[tuple[str, str, Any
         for field, value in _fields_of(decode(data), ""):
             left -= 1
             if left < 0:
-                raise InputError("it holds more numbers than are read. Split the recording [HM-DATA-039]")
+                raise InputError(
+                    "more numbers than are read from one file. Split the recording [HM-DATA-039]"
+                )
             stamps, values = fields.setdefault(field, ([], []))
             stamps.append(stamp)
             values.append(value)
@@ -188,11 +190,11 @@ def _of_messages(path: Path, sha256: str, messages: Iterable[tuple[str, str, Any
             t = (np.array(stamps, dtype=np.int64) - begin) / 1e9
             order = np.argsort(t, kind="stable")
             signals.append((topic, f"{topic}.{field}", "", t[order], np.array(values)[order]))
-    return _source(path, sha256, signals, sorted(unread), "times as recorded, since the first message")
+    return _source(path, sha256, signals, sorted(unread), "times since the first message, as recorded")
 
 
 def _fields_of(value: Any, name: str) -> Iterator[tuple[str, float]]:
-    """Numbers in a message, by the path of their field."""
+    """Numbers in a message, each with the path of its field."""
     if isinstance(value, bool | int | float | np.number | np.bool_):
         yield name, float(value)
     elif isinstance(value, dict):
@@ -231,7 +233,7 @@ def _bag(path: Path, content: bytes, sha256: str) -> Source:
 
 
 def _db3(path: Path, content: bytes, sha256: str) -> Source:
-    """The database of a ROS 2 bag; definitions of messages that it lacks are those of ROS 2 itself."""
+    """The database of a ROS 2 bag; message definitions that it lacks are taken from ROS 2."""
     from mcap.records import Schema
     from rosbags.typesys import Stores, get_typestore
 
@@ -268,17 +270,17 @@ def _ulog(path: Path, content: bytes, sha256: str) -> Source:
 
 
 def _can(path: Path, content: bytes, sha256: str) -> Source:
-    """A CAN log, decoded by the database beside it: of the same name, or the only one in the folder."""
+    """A CAN log, decoded by the database beside it: the file of the same name, or the only one in the folder."""
     import can
     import cantools
 
     near = sorted(path.parent.glob("*.dbc"))
     own = [one for one in near if one.stem == path.stem] or near
     if len(own) != 1:
-        there = f"; that folder has {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
+        there = f"; its folder holds {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
         raise InputError(
-            f"{path}: needs the database of its messages: put {path.stem}.dbc beside it{there}. Its bytes "
-            "have no meaning without it. [HM-DATA-040]"
+            f"{path}: the database of the CAN messages is missing{there}. Put {path.stem}.dbc beside the log: its "
+            "bytes have no meaning without the database. [HM-DATA-040]"
         )
     base = cantools.database.load_string(own[0].read_text(encoding="cp1252"), "dbc", strict=False)
     known = {message.frame_id: message for message in base.messages}
@@ -304,7 +306,7 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     return _source(path, sha256, found, list(unread), f"messages decoded by {own[0].name}")
 
 
-_READERS = (  # how files begin, what reads them, and what they are; all others are CAN logs
+_READERS = (  # first bytes, function that reads the file, name of the format; all other logs are CAN logs
     (b"MDF     ", _mdf, "MDF file"), (b"TDSm", _tdms, "TDMS file"), (b"\x89MCAP0", _mcap, "MCAP file"),
     (b"#ROSBAG", _bag, "ROS bag"), (b"SQLite", _db3, "ROS 2 bag"), (b"ULog", _ulog, "PX4 log"),
 )  # fmt: skip

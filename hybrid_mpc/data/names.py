@@ -1,7 +1,7 @@
-"""What a column's name says of it: that it is the time, that it counts samples, its unit and its role.
+"""Read a column's name: time, count of samples, unit and role.
 
-Names are compared word by word, in small letters, without accents. What may say something else as well (``T``, ``n``,
-``valve_time``) is decided by the numbers.
+Names are compared word by word, in small letters, without accents. An ambiguous name (``T``, ``n``, ``valve_time``) is
+decided by the column's numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def words_of(text: str) -> frozenset[str]:
     return frozenset(_plain(text).split())
 
 
-TIME = words_of(  # words for time; a name of these, of units and of ``AROUND`` says time
+TIME = words_of(  # words for time; a name made only of these, units and ``AROUND`` is the time
     "time times timestamp timestamps stamp tout datetime date dates clock elapsed runtime uptime walltime simtime "
     "rostime systime daytime epoch t zeit zeiten zeitstempel zeitpunkt zeitachse uhrzeit datum messzeit laufzeit "
     "systemzeit versuchszeit temps heure horodatage horodate tiempo tempo hora fecha instante orario tijd "
@@ -36,41 +36,43 @@ TIME = words_of(  # words for time; a name of these, of units and of ``AROUND`` 
     "secondi"
 )
 STAMPS = words_of("timestamp timestamps datetime zeitstempel horodatage tijdstempel tidsstempel")
-"""Words that say time whatever stands beside them."""
+"""Words that mean time whatever stands beside them."""
 WITHIN = tuple(_plain(text) for text in ("时间", "時間", "时刻", "時刻", "시간"))
-"""The same where a language does not separate words."""
+"""The same for languages that do not separate words."""
 DATES = words_of("datetime date dates datum fecha дата")  # words for dates: their numbers may count days
-AROUND = words_of(  # what may stand beside them
+AROUND = words_of(  # words that may stand beside words for time
     "elapsed relative rel absolute abs sim simulation simulated ros unix posix utc gmt local system sys since "
     "start from begin recording recorded record log logger logging measurement measured meas test run real wall "
     "host pc plc device header stamp field total global master base axis vector in the of at and day"
 )
-PERHAPS = words_of("T ts s ms us ns min h d data")  # single words that may say time: decided by their numbers
+PERHAPS = words_of("T ts s ms us ns min h d data")  # single words that may mean time: the numbers decide
 COUNT = words_of(  # words for a count of samples
     "index indices idx sample samples row rows record records seq sequence unnamed datapoint datapoints messpunkt "
     "zeile"
 )
 PAIRS = ({"data", "point"}, {"data", "points"}, {"lfd", "nr"}, {"step", "number"}, {"line", "number"})
-"""Pairs of words for the same."""
+"""Pairs of words for a count of samples."""
 STEP = (  # words for the sampling time
     {"dt"}, {"ts"}, {"timestep"}, {"delta", "t"}, {"time", "step"}, {"delta", "time"}, {"step", "size"},
     {"sampling", "time"}, {"sample", "time"}, {"sampling", "period"}, {"sample", "period"}, {"sampling", "interval"},
 )  # fmt: skip
-BESIDE = words_of("number no nr num nummer id count counter of the s ms")  # what may stand beside them
-COUNT_PERHAPS = words_of(  # single words that may be a count: decided by their numbers
+BESIDE = words_of(
+    "number no nr num nummer id count counter of the s ms"
+)  # words that may stand beside a count
+COUNT_PERHAPS = words_of(  # single words that may mean a count: the numbers decide
     "n i j k no nr num number nummer count counter id step steps point points frame scan cycle line x"
 )
 ALONE = ("s", "ms", "us", "ns", "min", "mins", "h", "d", "day", "days")
-"""Units of time that as a whole name, or behind a ``t``, may be something else (a minimum, a height)."""
+"""Units of time that may mean something else (a minimum, a height) as a whole name or behind a ``t``."""
 
 
 FIELD = re.compile(r"(?:[^\W\d]\w*\.)+([^\W\d]\w*)")  # a field of a struct, ``run.phi``, and its own name
 
 
 def name_and_unit(column: str) -> tuple[str, str]:
-    """A column's name and the unit that stands behind it in brackets; ``""`` if there is none.
+    """A column's name and the unit in brackets behind it; ``""`` without a unit.
 
-    A whole number in brackets is an index, as in ``state[0]`` and ``y(1)``; ``[1]`` behind a blank is the unit 1.
+    A whole number in brackets is an index, as in ``state[0]`` and ``y(1)``; ``[1]`` after a blank is the unit 1.
 
     Example:
         >>> name_and_unit("level [mm]"), name_and_unit("time (s)"), name_and_unit("phi")
@@ -87,10 +89,10 @@ def name_and_unit(column: str) -> tuple[str, str]:
 
 
 class Said(NamedTuple):
-    """What a name says: ``kind``, whether its numbers must bear that out, and the unit of time [s]; None: not known.
+    """The meaning of a name: ``kind``, whether its numbers must confirm it, and the unit of time [s] (None: unknown).
 
-    A ``step`` is the sampling time; it may be a time stamp, too, where its numbers increase. ``unit`` is the unit as it
-    was written, empty if there is none; ``is_date`` that it speaks of dates.
+    A ``step`` is the sampling period; if its numbers increase it may be a time stamp as well. ``unit`` is the unit as
+    written, empty without one; ``is_date``: the name means dates.
     """
 
     kind: Kind = ""
@@ -101,7 +103,7 @@ class Said(NamedTuple):
 
 
 def said_by(column: str) -> Said:
-    """What a column's name says of it.
+    """The meaning of a column's name.
 
     Example:
         >>> said_by("Time (ms)").kind, said_by("Time (ms)").seconds, said_by("t_us").seconds
@@ -127,7 +129,7 @@ def said_by(column: str) -> Said:
 
 
 def _of(words: list[str], first: str, unit: str, behind: bool) -> Said:
-    """The same by its words, the first as it was written, and a unit in brackets or ``behind`` the name."""
+    """The meaning of ``words`` (``first`` as written) and a unit in brackets or ``behind`` the name."""
     seconds = time_factor(unit) if unit else None
     zone = unit.casefold().split("+")[0] in ("utc", "gmt", "local", "cet", "cest", "est", "pst", "z")
     unit, seen = "" if zone or unit in ("-", "1") else unit, set(words)
@@ -160,10 +162,10 @@ def _of(words: list[str], first: str, unit: str, behind: bool) -> Said:
 Role = Literal[
     "set-point", "flag", "label", "command", "actuator", "answer", "disturbance", "measured", "quantity", ""
 ]
-"""What a column is by its name: ``command`` is an input for certain, ``actuator`` probably; ``answer`` is what an
-actuator's sensor shows, ``label`` an entry about the recording (a fault, a correction), ``measured`` what a sensor
-shows, ``quantity`` something that machines reach and surroundings have, too."""
-SET_POINT = words_of(  # words for what a machine is asked to reach
+"""Role of a column by its name: ``command`` is surely an input, ``actuator`` probably; ``answer`` is the sensor of an
+actuator, ``label`` an annotation of the recording (a fault, a correction), ``measured`` a sensor's output, ``quantity``
+a physical quantity that may belong to the machine or to its surroundings."""
+SET_POINT = words_of(  # words for a set-point
     "ref refs reference references referencia referencias referenz set setpoint setpoints setpt setvalue sp target "
     "targets desired des goal goals wanted soll sollwert fuhrungsgrosse consigne consigna riferimento demand planned "
 )
@@ -171,38 +173,38 @@ FLAG = words_of(  # words for switches of the recording or the controller
     "flag enable enabled enabling status alarm valid invalid active mode trigger event marker bool boolean ok ready "
     "fehler freigabe moving running busy"
 )
-LABEL = words_of(  # words for what somebody computed, noted down, or adds to a command
+LABEL = words_of(  # words for what is computed, noted by hand, or added to a command
     "feedforward ff offset fault faults label anomaly correction bias calibration error err residual residuum deviation"
 )
-COMMAND = words_of(  # words for what somebody commands
+COMMAND = words_of(  # words for a command
     "u command commands cmd commanded control controle controller ctrl input inputs eingang stellgrosse stellwert "
     "steuerung manipulated mv op actuation actuator excitation entrada entree commande comando mando pwm duty dac"
 )
-ACTUATOR = words_of(  # words for what moves a machine
+ACTUATOR = words_of(  # words for an actuator
     "pump valve heater heating cooler cooling coolant voltage volt volts torque tau force thrust throttle "
     "steering steer brake fan pumpe ventil heizung spannung drehmoment moment kraft bomba valvula tensao "
     "tension chauffage pompe vanne power burner damper rudder elevator aileron propeller rotor"
 )
-DISTURBANCE = words_of(  # words for what acts on a machine and is not commanded
+DISTURBANCE = words_of(  # words for what acts on a machine without being commanded
     "ambient outside outdoor environment umgebung aussen weather wind disturbance disturbances disturb supply battery "
     "mains reservoir storung sun solar radiation irradiance push kick"
 )
-MEASURED = words_of(  # words for what a sensor shows, whatever it measures
+MEASURED = words_of(  # words for a sensor's output, whatever it measures
     "output outputs ausgang saida sortie salida measured measure measurement meas mes actual ist istwert sensor pv "
     "feedback fb encoder enc tacho gyro imu"
 )
-QUANTITY = words_of(  # words for what machines reach
+QUANTITY = words_of(  # words for quantities of a machine
     "temperature temp temperatur temperatura level fullstand niveau nivel position pos angle ang winkel angulo "
     "speed vel velocity geschwindigkeit drehzahl velocidade rate pressure druck concentration height altitude "
     "heading yaw pitch roll theta phi psi alpha beta gamma q dq qd x z omega distance displacement "
     "acceleration acc accel hohe weg pendulum cart"
 )
 ANGLES = ("rad", "mrad", "deg", "°", "rev", "turn")
-"""Units in which a column may be an angle that jumps by full turns."""
-DRIVING_UNITS = frozenset(  # units in which machines are mostly driven
+"""Units of a column that may be an angle with jumps by full turns."""
+DRIVING_UNITS = frozenset(  # units of most inputs
     ("V", "mV", "kV", "%", "N m", "Nm", "mNm", "Ncm", "kNm", "N", "kN", "mN", "W", "kW")
 )
-REACHED_UNITS = frozenset((  # units in which machines are mostly measured
+REACHED_UNITS = frozenset((  # units of most outputs
     "rad", "deg", "°", "mrad", "rev", "turn", "m", "mm", "cm", "km", "K", "degC", "°C", "degF", "rad/s", "deg/s",
     "m/s", "mm/s", "cm/s", "km/h", "rpm", "rad/s^2", "deg/s^2", "m/s^2", "mol/l",
 ))  # fmt: skip
@@ -219,27 +221,27 @@ ENDINGS = {  # units by the last words of a name, in small letters
     "mol l": "mol/l", "w m2": "W/m^2",
 }  # fmt: skip
 LETTERS = {"K": "K", "V": "V", "A": "A", "N": "N", "W": "W", "m": "m"}
-"""Units of a single letter, which may be an index as well: the letter as it is written."""
+"""Units of a single letter, as written; the letter may also be an index."""
 
 
 class Ending(NamedTuple):
-    """The unit at the end of a column's name, empty if there is none; whether it may be something else."""
+    """The unit at the end of a column's name, empty without one; ``perhaps``: the end may be something else."""
 
     unit: str = ""
     perhaps: bool = False
 
 
 def _written(name: str, camel: bool) -> list[str]:
-    """The words of a name as they are written; ``camel``: a capital letter within one begins another."""
+    """The words of a name as written; ``camel``: a capital letter within a word begins another."""
     text = unicodedata.normalize("NFKC", name)
     text = re.sub(r"(?<=[^\W\d_A-Z])(?=[A-Z])", " ", text) if camel else text
     return [word for word in re.split(r"[\W_]+", text) if word and word.casefold() != "per"]
 
 
 def unit_behind(name: str, small: bool = False) -> Ending:
-    """The unit that a name ends with, ``_deg``, ``_rad_s``, ``_pct``; a single letter (``_K``) may be an index.
+    """The unit at the end of a name, as in ``_deg``, ``_rad_s``, ``_pct``; a single letter (``_K``) may be an index.
 
-    ``small``: letters may be small ones, ``_v``, where other names of the recording end with units, too.
+    ``small`` also accepts small letters (``_v``), if other names of the recording end with units, too.
 
     Example:
         >>> unit_behind("angle_deg").unit, unit_behind("vel_rad_s").unit, unit_behind("T_K")
@@ -256,7 +258,7 @@ def unit_behind(name: str, small: bool = False) -> Ending:
 
 
 def _parted(name: str) -> tuple[list[str], Ending]:
-    """The words of a name before its unit, and the unit; first as blanks and underscores part them (``_degC``)."""
+    """The words of a name before its unit, and the unit; blanks and underscores separate first (``_degC``)."""
     for camel in (False, True):
         words = _written(name, camel)
         for count in (2, 1):
@@ -268,7 +270,7 @@ def _parted(name: str) -> tuple[list[str], Ending]:
 
 
 def is_named(column: str, name: str) -> bool:
-    """Whether a column has this name but for the unit behind it.
+    """Whether ``column`` is ``name``, apart from the unit at its end.
 
     Example:
         >>> is_named("level_m", "level"), is_named("clock_ms", "clock"), is_named("temp_min", "temp")
@@ -281,10 +283,11 @@ def is_named(column: str, name: str) -> bool:
 
 
 def role_said_by(column: str, unit: str = "", switches: bool = False) -> Role:
-    """What a column's words say that it is; empty where they say nothing, or two things.
+    """The role of a column by the words of its name; empty if they say nothing, or contradict each other.
 
-    Words for a function (a set-point, a command) decide before words for a quantity. A ``unit`` only contradicts:
-    a heater in degC is its temperature. Words for flags count where the numbers are a few whole ones, ``switches``.
+    Words for a function (a set-point, a command) take precedence over words for a quantity. A ``unit`` can only
+    contradict: a heater in degC is its temperature. Words for flags count if the numbers are a few whole ones
+    (``switches``).
 
     Example:
         >>> role_said_by("Referencia"), role_said_by("tau1_command_nm"), role_said_by("tau_meas_Nm", "N m")
@@ -313,12 +316,12 @@ def role_said_by(column: str, unit: str = "", switches: bool = False) -> Role:
         return "command"
     if whole & ACTUATOR:
         return "" if unit in REACHED_UNITS or whole & (QUANTITY | {"y"}) else "actuator"
-    # a sensor gives V or % of whatever it measures; a heat flow q [W] is no position
+    # a sensor may give V or % for any quantity; a heat flow q [W] is no position
     return "quantity" if whole & QUANTITY and unit not in DRIVING_UNITS - {"V", "%"} else ""
 
 
 def is_command_of(command: str, other: str) -> bool:
-    """Whether two names differ by words for a command alone: ``tau1_command_nm`` and ``tau1_nm``.
+    """Whether two names differ only by words for a command: ``tau1_command_nm`` and ``tau1_nm``.
 
     Example:
         >>> is_command_of("tau1_command_nm", "tau1_nm"), is_command_of("tau1_command_nm", "tau2_nm")

@@ -1,6 +1,6 @@
-"""Recordings read: columns found, units turned into the signals' own, times and ranges checked.
+"""Read recordings: find columns, convert units to those of the signals, check times and ranges.
 
-:func:`read_recording` reads one file. Everything that is wrong with the files of a run is named in one message.
+:func:`read_recording` reads one file. All problems of the files of a run are listed in one message.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.int8]
-PROPOSED = (  # units that are proposed for a column that leaves its signal's range
+PROPOSED = (  # units that are proposed for a column outside its signal's range
     "ms", "us", "min", "h", "deg", "mrad", "rev", "deg/s", "rpm", "Hz", "rev/s", "mm", "cm", "um", "km", "mm/s", "cm/s",
     "km/h", "mN m", "N cm", "N mm", "kN m", "mN", "kN", "mV", "kV", "mA", "Pa", "kPa", "mbar", "bar", "g", "kg", "mW",
     "kW", "K", "degC", "degF", "%", "-", "l/min", "l/s", "m^3/h",
 )  # fmt: skip
-FILLED = 0.01  # share of a signal's range that a column would have to fill in another unit
-SHARE = 0.05  # share of the samples beyond the range: a wrong unit is wrong in all rows
-BEYOND = 4.0  # times the range's limit that a column must reach: less may be a wrong range
-DIGITS = 1e-9  # share by which equal numbers differ in files of other formats: ten digits
-ALIKE = 0.8  # how alike the names of two recordings are that are one, misspelt
-FEWEST = 10  # fewest time stamps that show whether they are even
-UNEVEN = 1e-3  # share of a step from which on a step is another one
-PAUSE = 20.0  # usual steps without a sample that are a pause
-SLACK = 0.05  # what a grid that is fitted to rounded stamps may be off beyond their rounding, in roundings
-COARSE = 1.5  # model periods from one sample to the next beyond which what lies between would be made up
-ROUNDING = 1e-9  # share of the end of a sensor's range within which a sample is at that end
+FILLED = 0.01  # least share of a signal's range that a column fills in a proposed unit
+SHARE = 0.05  # least share of samples outside the range: a wrong unit affects all rows
+BEYOND = 4.0  # least ratio of a column's largest value to the range's limit: below, the range may be wrong
+DIGITS = 1e-9  # relative deviation of equal numbers in files of different formats: ten digits
+ALIKE = 0.8  # least similarity of two recording names that differ by a typo
+FEWEST = 10  # fewest time stamps that show whether the sampling is uniform
+UNEVEN = 1e-3  # relative deviation above which two steps differ
+PAUSE = 20.0  # time step, in median steps, above which the recording pauses
+SLACK = 0.05  # allowed deviation of a fitted grid beyond the rounding of the stamps, in roundings
+COARSE = 1.5  # largest sampling period in model periods: beyond it, interpolation would invent samples
+ROUNDING = 1e-9  # relative distance from an end of a sensor's range within which a sample is at that end
 TIME = Signal("time", "s")
 
 
 class Samples:
-    """Frozen samples ``(n,)`` that get their ``w`` ``(n, 0)`` and their ``censored`` of zeros where they have none.
+    """Frozen samples ``(n,)``; a missing ``w`` becomes ``(n, 0)``, a missing ``censored`` zeros.
 
     Raises:
-        ValueError: If they have some, of another length or shape.
+        ValueError: If ``w`` or ``censored`` have another length or shape.
     """
 
     t: Array
@@ -68,20 +68,20 @@ class Samples:
             object.__setattr__(self, "censored", np.zeros(self.y.shape, dtype=np.int8))
         if len(self.w) != n or self.censored.shape != self.y.shape:
             raise ValueError(
-                f"{n} samples with w {self.w.shape}, y {self.y.shape} and censored {self.censored.shape}: w needs "
-                "a row, censored a number for each [HM-DATA-062]"
+                f"{n} samples with w {self.w.shape}, y {self.y.shape} and censored {self.censored.shape}: w needs one "
+                "row per sample, censored the shape of y [HM-DATA-062]"
             )
 
 
 @dataclass(frozen=True)
 class Recording(Samples):
-    """One recording as it was written, checked: ``m`` samples; its ``name`` is the file's stem.
+    """One checked recording of ``m`` samples, not resampled; ``name`` is the file's stem.
 
-    ``t`` ``(m,)`` [s] increases strictly; inputs ``u`` ``(m, n_u)`` are held from each time stamp to the next;
-    outputs ``y`` ``(m, n_y)`` of periodic signals count on. ``w`` ``(m, n_w)`` are the disturbances, by default none.
-    ``y`` and ``w`` are NaN where a sample is missing. ``censored`` ``(m, n_y)`` is -1 where an output is at the lower
-    end of its sensor's range, +1 at the upper end, else 0, the default. It is cut before the samples ``cuts``: nobody
-    knows how many turns an angle made before them.
+    ``t`` ``(m,)`` [s] increases strictly. Inputs ``u`` ``(m, n_u)`` are held from each time stamp to the next. Outputs
+    ``y`` ``(m, n_y)`` of periodic signals are unwrapped. ``w`` ``(m, n_w)`` are the disturbances, default none. ``y``
+    and ``w`` are NaN at missing samples. ``censored`` ``(m, n_y)`` is -1 where an output is at the lower end of its
+    sensor's range, +1 at the upper end, else 0 (default). The recording is cut before the samples ``cuts``: the number
+    of turns of an angle is unknown there.
     """
 
     name: str
@@ -97,12 +97,12 @@ class Recording(Samples):
 
     @property
     def dt(self) -> float:
-        """Median distance [s] of the time stamps."""
+        """Median step [s] of the time stamps."""
         return float(np.median(np.diff(self.t)))
 
 
 class Signals(Protocol):
-    """Whatever names a machine's signals: a prior, its class, a model."""
+    """Anything with a machine's signals: a prior, its class, a model."""
 
     @property
     def states(self) -> Sequence[Signal]:
@@ -110,24 +110,24 @@ class Signals(Protocol):
 
     @property
     def inputs(self) -> Sequence[Signal]:
-        """Signals of what is commanded."""
+        """Signals of the inputs (commands)."""
 
     @property
     def outputs(self) -> Sequence[Signal]:
-        """Signals of what is measured."""
+        """Signals of the measured outputs."""
 
     @property
     def disturbances(self) -> Sequence[Signal]:
-        """Signals of what is measured and not commanded."""
+        """Signals of the measured disturbances."""
 
 
 def read_recording(path: Path | str, prior: Signals, spec: DataSpec) -> Recording:
-    """Read one recording, whatever its format (:func:`hybrid_mpc.data.files.opened`), and check what would mislead.
+    """Read one recording in any format (:func:`hybrid_mpc.data.files.opened`), and refuse misleading data.
 
-    ``spec.units``, or the unit in or behind a column's name, is turned into the signal's own. A blank cell of an output
-    or a disturbance is a missing sample. A wrapped angle counts on if its signal is ``periodic``. A single number as
-    the time is the sampling time; time then begins at 0. Rows are counted as an editor or MATLAB does, from 1, the
-    indices of ``.npz`` from 0.
+    Numbers are converted from the unit in ``spec.units``, or in or behind a column's name, to the signal's own. A blank
+    cell of an output or a disturbance is a missing sample. A wrapped angle is unwrapped if its signal is ``periodic``.
+    If the time is a single number, it is the sampling period, and time begins at 0. Rows are counted from 1 as in an
+    editor or MATLAB, indices of ``.npz`` from 0.
     """
     recordings, problems = read_recordings([path], prior, spec)
     refuse(problems)
@@ -137,9 +137,9 @@ def read_recording(path: Path | str, prior: Signals, spec: DataSpec) -> Recordin
 def read_recordings(
     paths: Sequence[Path | str], prior: Signals, spec: DataSpec
 ) -> tuple[list[Recording], list[str]]:
-    """Read the recordings of one run: :func:`read_recording` for each, and what is wrong with them.
+    """Read the recordings of a run (:func:`read_recording` for each) and collect their problems.
 
-    They may differ in format, length and sampling, and in columns that ``spec`` does not name.
+    Recordings may differ in format, length, sampling, and in columns that ``spec`` does not name.
     """
     refuse(_count_problems(spec, prior) or _name_problems(spec, [*map(Path, paths)]))
     recordings: list[Recording] = []
@@ -150,7 +150,7 @@ def read_recordings(
         try:
             if any("\ud800" <= c <= "\udfff" for c in path.name):
                 raise InputError(
-                    f"{str(path)!a}: the file's name is no text (UTF-8). Rename the file. [HM-DATA-063]"
+                    f"{str(path)!a}: the file's name is not valid text (UTF-8). Rename the file. [HM-DATA-063]"
                 )
             source = opened(path)
             names, lacking = _found(source, spec, there, missing)
@@ -164,25 +164,25 @@ def read_recordings(
         for name, files in missing.items()
         if name in there
     ):
-        told = "Columns differ between the recordings. All need those that the DataSpec names; inputs_of names other "
-        problems.insert(0, f"{told}inputs for single recordings:{differ}")
+        told = "Columns differ between the recordings. Each recording needs the columns named in the DataSpec. Name "
+        problems.insert(0, f"{told}different inputs of single recordings in inputs_of:{differ}")
     for i, one in enumerate(recordings):
         if same := next((other for other in recordings[:i] if _alike(one, other)), None):
             problems.append(
-                f"{one.path} holds the same samples as {same.path.name}. Leave one out: one recording must not "
+                f"{one.path} holds the same samples as {same.path.name}. Leave one of them out: a recording must not "
                 "count twice. [HM-DATA-064]"
             )
     stems = [Path(path).stem for path in paths]
     if len(set(stems)) < len(stems):
         problems.append(
-            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file once, or "
+            f"two recordings have the same file stem: {', '.join(sorted(stems))}. Give each file only once, or "
             "rename one: pieces and windows are named by the stem. [HM-DATA-065]"
         )
     return recordings, problems
 
 
 def _alike(one: Recording, other: Recording) -> bool:
-    """Whether two recordings hold the same numbers, but for the digits of another format."""
+    """Whether two recordings hold the same numbers, up to the digits of another format."""
     pairs = [(getattr(one, key), getattr(other, key)) for key in ("t", "u", "w", "y")]
     return all(a.shape == b.shape for a, b in pairs) and all(
         np.allclose(a, b, rtol=DIGITS, atol=DIGITS * float(np.nanmax(np.abs(a), initial=0.0)), equal_nan=True)
@@ -194,7 +194,7 @@ def _alike(one: Recording, other: Recording) -> bool:
 
 
 def _count_problems(spec: DataSpec, prior: Signals) -> list[str]:
-    """Roles that have more or fewer columns than the prior has signals."""
+    """Roles whose number of columns differs from the prior's number of signals."""
     roles: list[tuple[str, str, Sequence[str], Sequence[Signal]]] = [
         ("inputs", "input", spec.inputs, prior.inputs),
         ("disturbances", "disturbance", spec.disturbances, prior.disturbances),
@@ -204,22 +204,22 @@ def _count_problems(spec: DataSpec, prior: Signals) -> list[str]:
     return [
         f"data specification: {role} has {len(names)} column{'s' * (len(names) != 1)} "
         f"({', '.join(map(repr, names)) or 'none'}) for a prior with {len(signals)} {word}"
-        f"{'s' * (len(signals) != 1)} ({', '.join(s.label for s in signals) or 'none'}). Name one column for each, in "
-        "its order."
+        f"{'s' * (len(signals) != 1)} ({', '.join(s.label for s in signals) or 'none'}). Name one column per signal, "
+        "in the prior's order."
         for role, word, names, signals in roles
         if len(names) != len(signals)
     ]
 
 
 def _settings(spec: DataSpec) -> dict[str, Mapping[str, object]]:
-    """Settings of single recordings, which go by the stems of files."""
+    """Settings of single recordings, by the stems of their files."""
     return {"windows": spec.windows, "inputs_of": spec.inputs_of, "delays_of": spec.delays_of}
 
 
 def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
-    """Columns of two roles, settings of columns that nobody reads, and of recordings by more than the stem.
+    """Columns with two roles, settings of columns without a role, and recordings not named by their stem.
 
-    A file's own inputs in ``inputs_of`` may be disturbances as well: there it was asked for.
+    Inputs in ``inputs_of`` may also be disturbances.
     """
     time = (spec.time,) if isinstance(spec.time, str) else ()
     roles: dict[str, Sequence[str]] = {
@@ -232,19 +232,19 @@ def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
             if also := [other for other in others if other != role and name in roles[other]]:
                 problems.append(
                     f"data specification: column {name!r} is named in {' and '.join(sorted([role, *also]))}. A column "
-                    "holds one signal: name it once. [HM-DATA-066]"
+                    "has one role: name it once. [HM-DATA-066]"
                 )
     signals = spec.columns - set(time)
     any_signal = "Name a column of an input, a disturbance or an output."
-    any_column = "Name a column as inputs, outputs, disturbances and time do."
+    any_column = "Name a column that inputs, outputs, disturbances or time name."
     known: list[tuple[str, Mapping[str, object], frozenset[str], str]] = [
         ("delays", spec.delays, signals, any_signal),
         *((f"delays_of {stem!r}", delays, signals, any_signal) for stem, delays in spec.delays_of.items()),
         ("units", spec.units, spec.columns, any_column),
     ]
     problems += [
-        f"data specification: {role} names column {name!r}, which is none of {', '.join(sorted(map(repr, columns)))}. "
-        f"{remedy} [HM-DATA-067]"
+        f"data specification: {role} names column {name!r}, which is not among "
+        f"{', '.join(sorted(map(repr, columns)))}. {remedy} [HM-DATA-067]"
         for role, names, columns, remedy in known
         for name in names
         if name not in columns
@@ -252,8 +252,8 @@ def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
     stems = {path.stem: path.stem for path in paths}
     meant = {name.casefold(): path.stem for path in paths for name in (path.name, path.stem)}
     problems += [
-        f"data specification: {setting} names the recording {name!r}, and the file's stem is "
-        f"{meant[name.strip().casefold()]!r}. Write it so. [HM-DATA-068]"
+        f"data specification: {setting} names the recording {name!r}, but the file's stem is "
+        f"{meant[name.strip().casefold()]!r}. Write the stem. [HM-DATA-068]"
         for setting, of_files in _settings(spec).items()
         for name in of_files
         if name not in stems and name.strip().casefold() in meant
@@ -261,9 +261,10 @@ def _name_problems(spec: DataSpec, paths: Sequence[Path]) -> list[str]:
     return list(dict.fromkeys(problems))
 
 
-def misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
-    """Settings of recordings that are not given, whose names are nearly those of recordings that are given and have no
-    such settings. Names that differ in their numbers alone are those of several recordings.
+def find_misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
+    """Settings of recordings that are not given, if the name is nearly that of a given recording without such settings.
+
+    Names that differ only in their digits belong to different recordings.
     """
     found = []
     for setting, names in _settings(spec).items():
@@ -272,8 +273,8 @@ def misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
             near = difflib.get_close_matches(name, free, n=1, cutoff=ALIKE)
             if near and re.sub(r"\d+", "", name) != re.sub(r"\d+", "", near[0]):
                 message = (
-                    f"{setting} of the DataSpec names {name!r}, which is not given. Did you mean {near[0]!r}? "
-                    "Settings of recordings go by the stem of the file."
+                    f"{setting} of the DataSpec names {name!r}, but no such recording is given. Did you mean "
+                    f"{near[0]!r}? Settings of recordings are named by the stem of the file."
                 )
                 found.append(Finding("settings", free[near[0]], "", 0.0, 1, message))
     return found
@@ -282,7 +283,7 @@ def misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
 def _found(
     source: Source, spec: DataSpec, there: dict[str, list[str]], missing: dict[str, list[str]]
 ) -> tuple[list[str], list[str]]:
-    """Full names of the columns, and what is wrong with the others; notes which files have which column."""
+    """Full names of the requested columns, and problems with others; records which file has which column."""
     names, problems = [], []
     asked = _asked(source, spec)
     for name in asked:
@@ -298,14 +299,14 @@ def _found(
         same = [name for name, found in by_full.items() if found == full]
         if len(same) > 1:
             problems.append(
-                f"{source.path}: columns {' and '.join(map(repr, same))} are one, {full!r}. A column holds one "
-                "signal: name each whole. [HM-DATA-069]"
+                f"{source.path}: columns {' and '.join(map(repr, same))} are the same column, {full!r}. A column has "
+                "one role: give full names. [HM-DATA-069]"
             )
     return names, problems
 
 
 def _asked(source: Source, spec: DataSpec) -> list[str]:
-    """Columns that are read of a file: time, if it is one, inputs, disturbances, outputs."""
+    """Columns that are read from a file: time (if it is a column), inputs, disturbances, outputs."""
     time = [spec.time] if isinstance(spec.time, str) else []
     return [*time, *spec.inputs_in(source.path.stem), *spec.disturbances, *spec.outputs]
 
@@ -314,7 +315,7 @@ def _asked(source: Source, spec: DataSpec) -> list[str]:
 
 
 def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Signals) -> Recording:
-    """A recording whose columns are all there; every check is made, and all that fails is named."""
+    """A recording whose columns all exist; all checks are made, and all failures are reported together."""
     path, names = source.path, _asked(source, spec)
     signals = [TIME, *prior.inputs, *prior.disturbances, *prior.outputs]
     first, split = 1 + len(prior.inputs), 1 + len(prior.inputs) + len(prior.disturbances)
@@ -329,9 +330,9 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
         told = f"as it was read: {'; '.join(source.notes)}"
         findings.append(Finding("read", path.name, "", float(values[0, 0]), len(source.notes), told))
     problems, raw = list(columns.problems), values.copy()
-    codes = [None, *map(missing_code, raw.T[1:])]  # as the file has them
-    unclear: set[int] = set()  # columns whose unit is none of their signal's
-    with np.errstate(over="ignore"):  # what overflows is out of its range
+    codes = [None, *map(missing_code, raw.T[1:])]  # before conversion of units
+    unclear: set[int] = set()  # columns whose unit cannot be converted to that of their signal
+    with np.errstate(over="ignore"):  # an overflow is reported as out of range
         for j, (name, signal) in enumerate(zip(names, signals, strict=True)):
             to, problem = _converted(spec, name, found[j], signal)
             values[:, j] = to.factor * values[:, j] + to.offset
@@ -339,26 +340,28 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
                 problems.append(problem)
                 unclear.add(j)
     t = values[:, 0]
-    if (np.abs(t) <= ABSURD).all():  # the ranges tell of the others, and of what is no number
+    if (np.abs(t) <= ABSURD).all():  # other times, NaN included, are reported as out of range
         problems += _time_problems(t, columns, spec, path.stem)
     known = np.isfinite(values)
     clean = not problems and bool((np.abs(values[known]) <= ABSURD).all())
-    censored = censored_of(values[:, split:], prior.outputs)  # before angles are unwrapped: none saturates
+    censored = censored_of(
+        values[:, split:], prior.outputs
+    )  # before unwrapping: periodic signals do not saturate
     cuts: set[int] = set()
     for j, (signal, name) in enumerate(zip(signals, names, strict=True)):
         note, there = "", known[:, j]
         faulty = any(f"column {shown(found[j])} " in problem for problem in columns.problems)
         if j >= first and len(t) and not there.any() and not faulty:
             problems.append(
-                f"column {name!r} has no number in any row; {signal.name} was not measured. Record it, or leave this "
-                "recording out. [HM-DATA-070]"
+                f"column {name!r} has no number in any row; {signal.name} was not measured. Record it, or leave out "
+                "this recording. [HM-DATA-070]"
             )
         if clean and j >= split and there.any() and (censored[there, j - split] != 0).all():
             lower, upper = signal.saturation or (-math.inf, math.inf)
             problems.append(
-                f"column {name!r} is at an end of its sensor's range {lower:g} to {upper:g} {signal.unit} or beyond in "
+                f"column {name!r} is at or beyond an end of its sensor's range {lower:g} to {upper:g} {signal.unit} in "
                 f"all rows ({values[there, j].min():.6g} to {values[there, j].max():.6g}): nothing was measured. Check "
-                f"the unit and Signal.saturation of {signal.name}, or leave this recording out. [HM-DATA-071]"
+                f"the unit and Signal.saturation of {signal.name}, or leave out this recording. [HM-DATA-071]"
             )
         if clean and j >= first:
             channel = Channel(path.name, name, signal, t[there], values[there, j])
@@ -375,8 +378,8 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
             rows = np.flatnonzero(raw[:, j] == code)
             problems.append(
                 f"{columns.place(int(rows[0]))}, column {name!r}: {code:.10g}, in {len(rows)} of {len(t)} rows, is far "
-                "from all other values: a code for missing ones? Leave these cells blank; inputs are needed in every "
-                "row. [HM-DATA-072]"
+                "from all other values and probably a code for missing values. Leave these cells blank; inputs need a "
+                "number in every row. [HM-DATA-072]"
             )
         elif j not in unclear:
             problems += _range_problems(channel, columns, note)
@@ -389,7 +392,7 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
 
 
 def censored_of(y: Array, outputs: Sequence[Signal]) -> Flags:
-    """Which samples ``(m, n_y)`` are at an end of their sensor's range or beyond: -1 lower, +1 upper, 0 measured."""
+    """Samples ``(m, n_y)`` at or beyond an end of their sensor's range: -1 lower, +1 upper; else 0."""
     flags = np.zeros(y.shape, dtype=np.int8)
     for j, signal in enumerate(outputs):
         if signal.saturation is not None:
@@ -400,20 +403,20 @@ def censored_of(y: Array, outputs: Sequence[Signal]) -> Flags:
 
 
 def _range_problems(channel: Channel, columns: Columns, note: str) -> list[str]:
-    """What is wrong with values that are there but implausible."""
+    """Problems with implausible values."""
     signal, column = channel.signal, channel.y
     lower, upper = max(signal.lower, -ABSURD), min(signal.upper, ABSURD)
-    bad = np.flatnonzero((column < lower) | (column > upper))  # not NaN, which is a problem already
+    bad = np.flatnonzero((column < lower) | (column > upper))  # NaN is already reported elsewhere
     if not len(bad):
         return []
     first, worst = int(bad[0]), int(bad[np.argmax(np.abs(column[bad]))])
     such = f" ({len(bad)} such rows, the largest {column[worst]:g} in {columns.place(worst)})"
     unit = _likely_unit(column[~np.isnan(column)], signal)
-    hint = f" In {unit} it would be plausible: say units={{{channel.name!r}: {unit!r}}} in the DataSpec."
+    hint = f" In {unit} it would be plausible: write units={{{channel.name!r}: {unit!r}}} in the DataSpec."
     return [
         f"{columns.place(first)}, column {channel.name!r}: {column[first]:g} is outside the plausible range "
         f"{lower:g} to {upper:g} {signal.unit} of {signal.name}{note}{such if len(bad) > 1 else ''}."
-        f"{hint if unit else ''} Check unit and sign, repair the rows, or widen the range of the signal in the "
+        f"{hint if unit else ''} Check unit and sign, correct the rows, or widen the range of the signal in the "
         "scenario's prior. [HM-DATA-118]"
     ]
 
@@ -422,16 +425,16 @@ def _range_problems(channel: Channel, columns: Columns, note: str) -> list[str]:
 
 
 def _stamps(spec: DataSpec) -> str:
-    """What the time stamps come from, as a message names it."""
+    """The source of the time stamps, for a message."""
     return f"column {spec.time!r}" if isinstance(spec.time, str) else f"the sampling time of {spec.time:g} s"
 
 
 def _one_clock(
     file: str, columns: Columns, values: Array, spec: DataSpec, found: str
 ) -> tuple[Columns, Array, list[Finding]]:
-    """The same without rows that stand twice, and with time stamps that count on where they begin anew, behind a gap.
+    """Columns, numbers and findings after removing repeated rows and shifting restarted time stamps behind a gap.
 
-    Stamps that are uneven by rounding alone are made even. ``found`` is the full name of the time's column.
+    Stamps that are uneven only by rounding are made even. ``found`` is the full name of the time's column.
     """
     findings, name, seconds = list[Finding](), _stamps(spec), 1.0
 
@@ -444,32 +447,30 @@ def _one_clock(
         twice = np.r_[False, (values[1:] == values[:-1]).all(axis=1)][: len(values)]
         if twice.any():
             count = int(twice.sum())
-            what = f"{count} rows repeat the row before them, from this one on. They are left out."
+            what = f"{count} rows repeat the previous row, the first is this one. They are left out."
             tell(int(np.argmax(twice)), count, what)
             numbers = [columns.numbers[j] for j in np.flatnonzero(~twice).tolist()]
             columns, values = replace(columns, values=columns.values[~twice], numbers=numbers), values[~twice]
     t, begins = values[:, 0].copy(), restarts(values[:, 0])
     pause = 3 * spec.max_gap / seconds  # in the column's unit
     for a, b in pairwise([0, *begins, len(t)]):
-        own = even(t[a:b])
+        own = make_even(t[a:b])
         values[a:b, 0] = own if a == 0 else own - own[0] + values[a - 1, 0] + pause
     if begins:
         k, count = begins[0], len(begins)
         such = f"; {count} such rows" if count > 1 else ""
-        what = (
-            f"time begins anew ({t[k - 1]:.10g}, then {t[k]:.10g}{such}): the logger was started again. The "
-        )
-        what += f"recording is cut there; its later samples count on from {values[k, 0]:.6g}. Split the file to give "
-        tell(k, count, f"{what}its parts other roles.")
+        what = f"time restarts ({t[k - 1]:.10g}, then {t[k]:.10g}{such}): the logger was started again. The "
+        what += f"recording is cut there; its later samples follow from {values[k, 0]:.6g} on. Split the file to give "
+        tell(k, count, f"{what}its parts different roles.")
     return columns, values, findings
 
 
-def even(t: Array) -> Array:
-    """Time stamps ``(m,)`` whose steps are uneven by rounding alone, made even; all others as they are.
+def make_even(t: Array) -> Array:
+    """Replace time stamps ``(m,)`` that are uneven only by rounding by a uniform grid; return all others unchanged.
 
-    Stamps are rounded to single precision, or to so many decimals. Where a grid of equal steps, with samples missing
-    here and there, is nowhere further from them than that rounding, it is what was sampled. Stretches with a pause
-    between them have grids of their own.
+    Stamps may be rounded to single precision or to decimals. A grid of equal steps, with samples missing here and
+    there, replaces them if it is nowhere farther away than the rounding. Stretches separated by a pause have grids of
+    their own.
     """
     steps = np.diff(t)
     if len(t) < FEWEST or not (np.abs(t) < LARGER).all() or not (steps > 0).all():
@@ -496,7 +497,7 @@ def even(t: Array) -> Array:
 
 
 def _rounding(t: Array) -> Array:
-    """What time stamps ``(m,)`` are rounded to, for each."""
+    """Rounding of each of the time stamps ``(m,)``."""
     found, single, size = np.zeros(len(t)), t.astype(np.float32), float(np.abs(t).max())
     if (single == t).all() or all(float(str(a)) == b for a, b in zip(single, t.tolist(), strict=True)):
         found = np.spacing(np.abs(single)).astype(np.float64)
@@ -508,16 +509,16 @@ def _rounding(t: Array) -> Array:
 
 
 def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> list[str]:
-    """What is wrong with the time stamps, which are finite."""
+    """Problems with finite time stamps."""
     if len(t) < 2:
-        return [f"{len(t)} row(s) of numbers; a recording needs many. Record it again. [HM-DATA-119]"]
+        return [f"{len(t)} row(s) of numbers are too few for a recording. Record it again. [HM-DATA-119]"]
     if disorder := columns.disorder(t, _stamps(spec)):
         return [disorder]
     in_seconds = f"check that {_stamps(spec)} is in seconds (DataSpec.units names another unit)."
     need, length, problems = spec.warm_up + MIN_SCORED * spec.dt, float(t[-1] - t[0]), []
     if gaps(t, spec.max_gap).all():
         problems.append(
-            f"sampling is {np.median(np.diff(t)):g} s, declared max_gap is {spec.max_gap:g} s: every step is a gap. "
+            f"sampling is {np.median(np.diff(t)):g} s, but max_gap is {spec.max_gap:g} s: every step is a gap. "
             f"Record faster, raise max_gap, or {in_seconds} [HM-DATA-073]"
         )
     if length < need:
@@ -527,7 +528,7 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
         )
     return problems + [
         f"the {window.role} window {window.start:g} to {window.end:g} s is not within the "
-        f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording or change the window. [HM-DATA-120]"
+        f"recording ({t[0]:g} to {t[-1]:g} s). Give the whole recording, or change the window. [HM-DATA-120]"
         for window in spec.windows.get(stem, ())
         if window.start < t[0] - spec.dt or window.end > t[-1] + spec.dt
     ]
@@ -537,36 +538,35 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
 
 
 def check_unit(spec: DataSpec, column: str, signal: Signal) -> None:
-    """Refuse a column whose unit, in the specification or behind its name, cannot be turned into its signal's.
+    """Refuse a column whose unit, in the specification or in its name, cannot be converted to its signal's.
 
     Raises:
-        InputError: Naming column, unit and signal.
+        InputError: With column, unit and signal.
     """
     refuse([problem for problem in [_converted(spec, column, column, signal)[1]] if problem])
 
 
 def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[Conversion, str]:
-    """How the numbers of a column, ``name`` in the specification, become those of the signal; and what is wrong with
-    its unit, empty if nothing is.
+    """Conversion of a column, ``name`` in the specification, to the signal's unit; and the problem with its unit,
+    empty without one.
     """
     given = spec.units.get(name)
     if isinstance(given, float | int):
         size = float(given)
-        wrong = "" if math.isfinite(size) and size else "the factor must be finite and not zero"
+        wrong = "" if math.isfinite(size) and size else "the factor must be finite and nonzero"
         return Conversion(
             size
         ), wrong and f"data specification: units={{{name!r}: {given}}}: {wrong}. [HM-DATA-127]"
     unit, index = name_and_unit(column)[1] if given is None else given, False
-    if (
-        given is None and not unit
-    ):  # behind the name; a single letter of a name that is given whole may be an index
+    if given is None and not unit:
+        # the end of the name; a single letter at the end of a full name may be an index
         ending = unit_behind(column)
         unit = (said_by(column).unit if signal is TIME else "") or ending.unit
         index = ending.perhaps and name == column
     found = conversion(unit, signal.unit) if given is not None or unit not in ("", "1") else Conversion(1.0)
     if isinstance(found, Conversion) or index:
         return found if isinstance(found, Conversion) else Conversion(1.0), ""
-    remedy = "Name the column of that signal, correct the unit of one of them, or give the factor"
+    remedy = "Name the column of that signal, correct one of the units, or give the factor"
     return Conversion(1.0), (
         f"column {column!r} is in {unit!r}, {found} for {signal.label}. {remedy}: units={{{name!r}: FACTOR}} in the "
         "DataSpec. [HM-DATA-128]"
@@ -574,7 +574,7 @@ def _converted(spec: DataSpec, name: str, column: str, signal: Signal) -> tuple[
 
 
 def _likely_unit(column: Array, signal: Signal) -> str:
-    """Unit in which a column that leaves its signal's plausible range would keep to it; empty if there is none."""
+    """Unit in which a column outside its signal's plausible range would lie inside; empty without one."""
     limit = max(abs(signal.lower), abs(signal.upper))
     largest = float(np.abs(column).max(initial=0.0))
     beyond = float(((column < signal.lower) | (column > signal.upper)).mean())

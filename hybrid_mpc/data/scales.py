@@ -1,4 +1,4 @@
-"""What recordings say of a machine's own scales: the noise of its sensors, its time scale, its unit of time."""
+"""A machine's own scales from its recordings: noise of the sensors, time scale, unit of time."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 FASTEST, SLOWEST = 0.25, 4.0
-"""Machines with a time scale [s] in this range use 1 s as their second. The library's lengths in seconds (free runs of
-a fit, windows of the monitor, blocks of false alarms) were tried on machines of 0.5 to 2 s; half and twice that are
-left to either side."""
+"""Machines with a time scale [s] in this range use 1 s as their unit of time. The library's lengths in seconds (free
+runs of a fit, windows of the monitor, blocks of false alarms) were tested on machines of 0.5 to 2 s; the range adds a
+factor of two on either side."""
 COARSEST = 10
-"""Fewest periods in a machine's second: the shortest length, a tenth of a second, is then one of them."""
+"""Fewest periods in a machine's unit of time: the shortest length, a tenth of the unit, is then one period."""
+SHORTEST = 5  # half width [samples] of the first window for accelerations: ten periods
 SHORTEST = 5  # half the samples of the first window in which accelerations are looked for: ten periods
 NOISY = 0.02
-"""Share of noise in the power of the acceleration from which on the window is too short: the steps of a coarse sensor
-are no white noise, and up to half of what they make would pass for motion."""
+"""Share of noise in the power of the acceleration above which the window is too short: the steps of a coarse sensor are
+not white noise, and up to half of their power would count as motion."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Natural sizes of a machine's signals, found in its recordings.
+    """Natural sizes of a machine's signals, estimated from its recordings; they do not depend on units.
 
-    ``y`` ``(n_y,)`` are the spreads of the outputs, ``noise`` ``(n_y,)`` what of them is noise. ``x`` ``(n_x,)`` is how
-    far each state alone moves the outputs by their spread, within the machine's second; ``rate`` ``(n_x,)`` is that
-    over this second. They depend on no unit.
+    ``y`` ``(n_y,)`` are the spreads of the outputs, ``noise`` ``(n_y,)`` the standard deviations of their noise. ``x``
+    ``(n_x,)`` is the deviation of each state that alone moves the outputs by their spread within the machine's unit of
+    time; ``rate`` ``(n_x,)`` is ``x`` over this time.
     """
 
     y: tuple[float, ...]
@@ -46,14 +47,14 @@ class Outputs(Protocol):
         """Measured outputs ``(n, n_y)``, NaN where a sample is missing."""
 
 
-def thinned(recordings: Sequence[Outputs], i: int) -> tuple[list[Array], int]:
-    """Samples ``(m,)`` of one output of each recording and how many periods they are apart: one, or those of a sensor
-    that is slower than the grid. Those that are still missing are NaN.
+def thin(recordings: Sequence[Outputs], i: int) -> tuple[list[Array], int]:
+    """Samples ``(m,)`` of one output of each recording, and their distance in periods: one, or more for a sensor that
+    is slower than the grid. Missing samples stay NaN.
 
     Example:
         >>> from types import SimpleNamespace
         >>> run = SimpleNamespace(y=np.where(np.arange(9) % 3 == 1, np.arange(9.0), np.nan)[:, None])
-        >>> thinned([run], 0)
+        >>> thin([run], 0)
         ([array([1., 4., 7.])], 3)
     """
     known = [np.flatnonzero(np.isfinite(r.y[:, i])) for r in recordings]
@@ -66,11 +67,11 @@ def thinned(recordings: Sequence[Outputs], i: int) -> tuple[list[Array], int]:
 def noise_of(recordings: Sequence[Outputs]) -> Array:
     """Standard deviation ``(n_y,)`` of the sensors' noise and steps, from third differences [output units].
 
-    White noise of 1 gives third differences of sqrt(20). What the machine itself does in three periods (of a slower
-    sensor, in three of its own) counts as noise too, so the number is at most too large. Zero where too little is
-    known.
+    Third differences of white noise have the standard deviation ``sqrt(1 + 9 + 9 + 1) = sqrt(20)`` times its own. The
+    machine's motion within three samples counts as noise too, so the estimate is an upper bound. Zero if too few
+    samples are known.
     """
-    return np.array([_noise_of(thinned(recordings, i)[0]) for i in range(recordings[0].y.shape[1])])
+    return np.array([_noise_of(thin(recordings, i)[0]) for i in range(recordings[0].y.shape[1])])
 
 
 def _noise_of(pieces: Sequence[Array]) -> float:
@@ -78,10 +79,10 @@ def _noise_of(pieces: Sequence[Array]) -> float:
     return robust_spread(third) / math.sqrt(20.0)
 
 
-def within(values: Array) -> Array:
-    """Values ``(n,)`` without gross outliers: what lies two ranges beyond that of the middle 80 %.
+def trim_outliers(values: Array) -> Array:
+    """Values ``(n,)`` without gross outliers: more than two ranges of the middle 80 % away from that range.
 
-    Nothing is left out of what is distributed as usual, nor where the middle 80 % are one value.
+    Normally distributed values keep (nearly) all samples. Nothing is removed if the middle 80 % are equal.
     """
     low, high = np.percentile(values, (10, 90)) if len(values) else (0.0, 0.0)
     reach = 2 * (high - low) or math.inf
@@ -89,18 +90,18 @@ def within(values: Array) -> Array:
 
 
 def robust_spread(values: Array) -> float:
-    """Standard deviation of the values ``(n,)`` that are there, without gross outliers; 0 without any.
+    """Standard deviation of the finite values ``(n,)`` without gross outliers; 0 without any.
 
     Example:
         >>> robust_spread(np.array([1.0, 3.0, np.nan, 1.0, 3.0, 1.0, 3.0, 1.0, 3.0, 1.0, 3.0, 1e6]))
         1.0
     """
-    there = within(values[np.isfinite(values)])
+    there = trim_outliers(values[np.isfinite(values)])
     return float(np.std(there)) if len(there) else 0.0
 
 
 def speeds_of(recording: Outputs, dt: float, half: int) -> Array:
-    """Speeds ``(m, n_y)`` at the centres of cubics through ``2 half + 1`` samples each.
+    """Speeds ``(m, n_y)``: derivatives at the centres of cubics fitted to ``2 half + 1`` samples each.
 
     Example:
         >>> from types import SimpleNamespace
@@ -117,13 +118,13 @@ def _derivatives(y: Array, dt: float, half: int, order: int) -> Array:
         return np.zeros((0, y.shape[1]))
     from scipy.signal import savgol_filter  # slow to import, and monitors import this module
 
-    # "nearest" reaches into the ends alone, which are left out; polynomials there would take no NaN
+    # "nearest" only affects the ends, which are cut off; polynomials at the ends would not accept NaN
     found = savgol_filter(y, window, 3, deriv=order, delta=dt, axis=0, mode="nearest")[half : len(y) - half]
     return np.asarray(found[np.isfinite(found).all(axis=1)])
 
 
 def speed_gain(dt: float, half: int, order: int = 1) -> float:
-    """Standard deviation of such a speed [1/s] (acceleration [1/s^2]) per unit of white noise in the samples.
+    """Standard deviation of such a speed [1/s] (order 2: acceleration [1/s^2]) per unit of white noise in the samples.
 
     Example:
         >>> round(speed_gain(0.02, 5), 1)
@@ -135,11 +136,11 @@ def speed_gain(dt: float, half: int, order: int = 1) -> float:
 
 
 def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
-    """Time [s] of one swing of the machine: ``2 pi`` times its root mean square speed over that of its acceleration.
+    """Time [s] of one swing of the machine, ``2 pi rms(v) / rms(a)``, with speed ``v`` and acceleration ``a``.
 
-    For a sinusoid it is the period; a drive that mostly cruises is as slow as its ramps. Noise is taken off: its power
-    follows from third differences, and the window is doubled until the acceleration stands out of it. Of several
-    outputs the fastest decides.
+    For a sinusoid it is the period; for a drive that mostly cruises it is set by the ramps. The power of the noise,
+    known from third differences, is subtracted; the window is doubled until the acceleration stands out of the noise.
+    The fastest output decides.
 
     Source: the mean rate at which a Gaussian process crosses its mean; Rice, *Mathematical analysis of random noise*,
     Bell System Technical Journal 24 (1945).
@@ -151,9 +152,9 @@ def time_scale(recordings: Sequence[Outputs], dt: float) -> float:
 
 
 def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) -> float:
-    """Time scale of one output; NaN where its acceleration never stands out of the noise."""
-    thin, step = thinned(recordings, i)
-    pieces = [_bridged(piece) for piece in thin]
+    """Time scale of one output; NaN if its acceleration never stands out of the noise."""
+    sparse, step = thin(recordings, i)
+    pieces = [_bridged(piece) for piece in sparse]
     half, longest, dt = SHORTEST, max(map(len, pieces)), step * dt
     while 2 * half + 1 <= longest:
         speed, acceleration = (
@@ -171,18 +172,16 @@ def _time_scale(recordings: Sequence[Outputs], dt: float, i: int, sigma: float) 
 
 
 def _bridged(y: Array) -> Array:
-    """Samples ``(m,)`` with straight lines over missing ones; what comes before the first and after the last is cut
-    off.
-    """
+    """Samples ``(m,)`` with straight lines over missing ones, from the first known sample to the last."""
     there = np.flatnonzero(np.isfinite(y))
     return np.interp(np.arange(there[0], there[-1] + 1), there, y[there]) if len(there) else np.zeros(0)
 
 
 def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
-    """The machine's second [s]: what every length that the library writes in seconds is counted in.
+    """The machine's unit of time [s], in which the library counts all of its lengths in seconds.
 
-    1 s for a machine whose :func:`time_scale` lies between 0.25 and 4 s. A slower one has so much longer a second, a
-    faster one so much shorter, to two digits; at least 10 periods, so that no length holds too few samples.
+    1 s for a machine whose :func:`time_scale` lies between 0.25 and 4 s. Slower machines have a proportionally longer
+    unit, faster ones a shorter one, rounded to two digits; at least 10 periods, so that no length has too few samples.
     """
     scale = time_scale(recordings, dt)
     unit = scale / min(max(scale, FASTEST), SLOWEST) if math.isfinite(scale) else 1.0
@@ -190,10 +189,10 @@ def time_unit(recordings: Sequence[Outputs], dt: float) -> float:
 
 
 def periods(seconds: float, dt: float, fewest: int = 1) -> int:
-    """Whole periods of a length, at least ``fewest``."""
+    """Whole periods in a length of time, at least ``fewest``."""
     return max(fewest, round(seconds / dt))
 
 
 def evenly(n: int, most: int) -> list[int]:
-    """At most ``most`` of the places 0 to n - 1, evenly chosen, in order."""
+    """At most ``most`` evenly spaced indices from 0 to n - 1, in order."""
     return list(dict.fromkeys(np.linspace(0, n - 1, min(most, n)).round().astype(int).tolist()))

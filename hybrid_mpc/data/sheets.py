@@ -17,28 +17,28 @@ from hybrid_mpc.records import shown
 if TYPE_CHECKING:
     import pandas as pd
 
-UNPACKED = 50  # most bytes of a workbook's sheets for one byte of the file
+UNPACKED = 50  # largest ratio of unpacked bytes of a workbook to bytes of its file
 MOST_CELLS = 20_000_000  # most cells of a sheet: each takes a hundred bytes of memory
-LONGER = 10  # times as many rows as any other sheet that the one which is read has
+LONGER = 10  # rows of the sheet that is read, over those of any other sheet with a table
 
 
 def excel_source(path: Path, content: bytes, sha256: str) -> Source:
-    """The table of a workbook; its formulas are not computed: their last values are read."""
+    """Read the table of a workbook; formulas are not evaluated, their stored values are read."""
     with named_extra(f"{path}: reading Excel files"):
         import openpyxl
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             size = sum(one.file_size for one in archive.infolist())
         if size > min(LARGEST, max(2**28, UNPACKED * len(content))):
-            raise ValueError(f"it unpacks to {megabytes(size)} [HM-DATA-075]")
+            raise ValueError(f"the workbook unpacks to {megabytes(size)} [HM-DATA-075]")
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
         sheets = {name: _cells_of(book[name]) for name in book.sheetnames if hasattr(book[name], "iter_rows")}
     except InputError:
         raise
-    except Exception as error:  # a damaged workbook raises nearly anything
+    except Exception as error:  # openpyxl raises many kinds of exceptions for a damaged workbook
         raise InputError(
-            f"{path}: is no Excel workbook, damaged or too large ({line_of(error)}). Save the table as CSV (UTF-8)."
-            " [HM-DATA-076]"
+            f"{path}: not a valid Excel workbook, damaged or too large ({line_of(error)}). Save the table as CSV "
+            "(UTF-8). [HM-DATA-076]"
         ) from error
     found = {}
     for name, rows in sheets.items():
@@ -55,8 +55,8 @@ def excel_source(path: Path, content: bytes, sha256: str) -> Source:
         )
     if len(order) > 1 and found[order[0]][0] < LONGER * found[order[1]][0]:
         raise InputError(
-            f"{path}: {len(order)} sheets have tables ({', '.join(map(shown, order[:LISTED]))}). Save the one to "
-            "be read alone. [HM-DATA-078]"
+            f"{path}: {len(order)} sheets have tables ({', '.join(map(shown, order[:LISTED]))}). Save the sheet "
+            "to read in a workbook of its own. [HM-DATA-078]"
         )
     layout = found[order[0]][1]
     if isinstance(layout, str):
@@ -80,7 +80,7 @@ def _written(cell: Any) -> str:
 
 
 def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes: Sequence[str]) -> Frame:
-    """The rows of a sheet below its header, without those that are blank and those behind the table."""
+    """The rows of a sheet below its header, without blank rows and without closing remarks."""
     import pandas as pd
 
     numbers = [k for k in range(layout.first, len(rows)) if any(_written(cell) for cell in rows[k])]
@@ -90,7 +90,7 @@ def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes
         closing.append(numbers.pop() + 1)
     notes = [*notes, *layout.notes]
     if closing:
-        notes.append(f"rows from {closing[-1]} on do not belong to the table: left out")
+        notes.append(f"rows from {closing[-1]} on are not part of the table and are left out")
     seen = [j for j, name in enumerate(layout.names) if name]
 
     def cell(k: int, j: int) -> Any:
@@ -109,7 +109,7 @@ def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes
 
 
 def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
-    """A Parquet or Feather file; what it declares is looked at before any of it is unpacked."""
+    """Read a Parquet or Feather file; its declared size is checked before it is unpacked."""
     with named_extra(f"{path}: reading Parquet and Feather files"):
         import pandas as pd
         import pyarrow
@@ -131,7 +131,7 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
         )
         if 8 * rows * max(1, len(names)) > LARGEST:
             raise InputError(
-                f"{path}: has {rows} rows, more than are read. Split the recording. [HM-DATA-081]"
+                f"{path}: {rows} rows are more than are read from one file. Split the recording. [HM-DATA-081]"
             )
         if file is None:
             own = ipc.IpcReadOptions(included_fields=[schema.get_field_index(name) for name in names])
@@ -141,10 +141,10 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
         whole = [pd.Series(table.column(name).to_pandas()) for name in names]
     except InputError:
         raise
-    except Exception as error:  # a damaged file raises nearly anything
+    except Exception as error:  # pyarrow raises many kinds of exceptions for a damaged file
         raise InputError(
-            f"{path}: is no Parquet or Feather file, or damaged ({line_of(error)}). Write it again, e.g. with pandas."
-            " [HM-DATA-082]"
+            f"{path}: not a valid Parquet or Feather file, or damaged ({line_of(error)}). Write it again, e.g. with "
+            "pandas. [HM-DATA-082]"
         ) from error
     frame = Frame(
         path,

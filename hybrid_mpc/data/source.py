@@ -1,4 +1,4 @@
-"""Columns of a recording's file, whatever its format: names with units, numbers with what is wrong with them."""
+"""Columns of a recording's file in any format: names with units, numbers, and faults of the numbers."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from hybrid_mpc.records import LONGEST, shown
 
 Array = NDArray[np.float64]
 ALIKE = 0.7
-"""How alike a column's name must be to be proposed: ``inflow_degC`` is by 0.6 like ``tank_degC``, by its unit alone."""
+"""Least similarity of a proposed column name: ``inflow_degC`` and ``tank_degC`` have 0.6, from their unit alone."""
 LISTED = 30  # most names that a message lists
-FEWEST = 10  # fewest samples before and behind the place where time begins anew
-COMPARED = 1000  # most names among which a message looks for one that is nearly right
+FEWEST = 10  # fewest samples before and after a restart of the time
+COMPARED = 1000  # most names among which a message looks for a similar one
 EMPTY = "the file is empty. It needs a header line and rows of numbers."
-LARGEST = 2**31  # largest file, and most bytes of numbers in it [byte]: three columns at 1 kHz for a day
+LARGEST = 2**31  # largest file, and largest table of numbers [byte]: three columns at 1 kHz for a day
 ROUNDING, SHARE = 5e-7, 1e-3
-"""Stamps of two clocks are one where they differ by less: in their unit, and in steps of the fastest clock."""
-TIME = "time [s]"  # name of the time of files whose signals have clocks of their own
+"""Stamps of two clocks are equal if they differ by less than this, in their unit and in steps of the fastest clock."""
+TIME = "time [s]"  # name of the time in files whose signals have their own clocks
 
 
 class MissingColumn(InputError):
-    """A column that a file lacks."""
+    """A column is missing in a file."""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Numbers of some columns.
+    """Numbers of some columns of a file.
 
-    ``values`` ``(m, n)`` has a column for each name asked for, NaN where there is no finite number. ``row`` is what
-    the file's own tools call a row, ``"row"`` or ``"index"``, and ``numbers`` are the rows' numbers as they count.
-    ``faults`` say by column what is wrong with its cells, with place and remedy, without the file's name; a blank cell
-    is a fault only in columns that may have none. Those of the name ``""`` concern all columns.
+    ``values`` ``(m, n)`` has a column for each requested name, NaN where a cell holds no finite number. ``row`` is the
+    word for a row in the file's own tools, ``"row"`` or ``"index"``; ``numbers`` are the row numbers in their count.
+    ``faults`` describe, by column, its faulty cells with place and remedy, without the file's name. A blank cell is a
+    fault only in columns without missing samples. Faults of the name ``""`` concern all columns.
     """
 
     values: Array
@@ -52,13 +52,13 @@ class Columns:
         return tuple(self.faults.values())
 
     def place(self, k: int) -> str:
-        """Where sample ``k`` stands in the file, e.g. ``"row 12"``."""
+        """Where sample ``k`` is in the file, e.g. ``"row 12"``."""
         return f"{self.row} {self.numbers[k]}"
 
     def disorder(self, t: Array, stamps: str) -> str:
-        """Where time stamps ``t`` ``(m,)`` [s] do not increase, and what to do; empty where all do, or begin anew.
+        """The first place where time stamps ``t`` ``(m,)`` [s] do not increase; empty without one. Restarts may be.
 
-        ``stamps`` says what they come from, e.g. ``"column 't'"``.
+        ``stamps`` names the source of the time stamps, e.g. ``"column 't'"``.
         """
         wrong = np.diff(t) <= 0
         wrong[[k - 1 for k in restarts(t)]] = False
@@ -68,13 +68,13 @@ class Columns:
         what = "repeats" if t[k] == t[k + 1] else "decreases"
         return (
             f"{self.place(k + 1)}, {stamps}: time {what} ({t[k]:.10g} s, then {t[k + 1]:.10g} s"
-            f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete the repeated rows or "
+            f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete repeated rows or "
             "split the file into recordings. [HM-DATA-116]"
         )
 
 
 def restarts(t: Array) -> list[int]:
-    """Samples at which time stamps ``t`` ``(m,)`` begin anew: they fall back to where they began, and go on from there.
+    """Samples at which time stamps ``t`` ``(m,)`` restart: they fall back to the first stamp and increase again.
 
     Example:
         >>> restarts(np.r_[np.arange(50), np.arange(30)]), restarts(np.r_[np.arange(50), 20, np.arange(51, 90)])
@@ -83,7 +83,7 @@ def restarts(t: Array) -> list[int]:
     falls = (np.flatnonzero(t[1:] < t[:-1]) + 1).tolist()
     if not falls:
         return []
-    with np.errstate(over="ignore"):  # what overflows is out of its range
+    with np.errstate(over="ignore"):  # an overflow is reported as out of range
         near = t[0] + 2 * float(np.median(np.abs(np.diff(t))))
     ends = [*falls[1:], len(t)]
     sound = all(t[k] <= near and end - k >= FEWEST for k, end in zip(falls, ends, strict=True))
@@ -92,11 +92,11 @@ def restarts(t: Array) -> list[int]:
 
 @dataclass(frozen=True)
 class Source:
-    """A recording's file, opened: ``read(full name of the time, full names, blanks)`` gives the columns, time first.
+    """An opened file: ``read(full name of the time or None, full names, blanks)`` gives the columns, time first.
 
-    ``blanks`` are the names of columns that may have blank cells; a time of None is no column. ``sha256`` is that of
-    the file's bytes; ``note`` is what else a user should know who misses a column, ``unread`` the names of variables
-    of kinds that are not read. ``notes`` say what was found and done to read the file.
+    ``blanks`` are the names of columns that may have blank cells. ``sha256`` is the hash of the file's bytes. ``note``
+    is added to messages about missing columns. ``unread`` are names of variables of unsupported kinds. ``notes``
+    describe how the file was read.
     """
 
     path: Path
@@ -108,12 +108,12 @@ class Source:
     notes: tuple[str, ...] = ()
 
     def find(self, name: str) -> str:
-        """Full name of a column: its own, with its unit in brackets or behind (``level [m]``, ``level_m``), or
-        ``struct.field`` where just one struct has it; fields of structs in structs come last.
+        """Full name of a column: equal to ``name``, or with a unit in brackets or behind (``level [m]``,
+        ``level_m``), or ``struct.field`` if only one struct has that field; nested structs are searched last.
 
         Raises:
-            MissingColumn: If there is none.
-            InputError: If there are several.
+            MissingColumn: If no column matches.
+            InputError: If several columns match.
         """
         count = self.header.count(name)
         if count == 1:
@@ -136,16 +136,16 @@ class Source:
             return fields[0]
         if fields:
             raise InputError(
-                f"{self.path}: column {name!r} may be {' or '.join(map(shown, fields[:LISTED]))}. "
-                "Name it whole in the scenario's DataSpec. [HM-DATA-084]"
+                f"{self.path}: column {name!r} is ambiguous: {' or '.join(map(shown, fields[:LISTED]))}. "
+                "Give the full name in the scenario's DataSpec. [HM-DATA-084]"
             )
         near = difflib.get_close_matches(
             name, [c for c in self.header[:COMPARED] if len(c) < LONGEST], n=1, cutoff=ALIKE
         )
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise MissingColumn(
-            f"{self.path}: no column {name!r}; it has {there}.{hint} "
-            f"Rename the column or name yours in the scenario's DataSpec.{self.note} [HM-DATA-085]"
+            f"{self.path}: no column {name!r}; the file has {there}.{hint} "
+            f"Rename the column in the file, or correct the name in the scenario's DataSpec.{self.note} [HM-DATA-085]"
         )
 
 
@@ -155,16 +155,16 @@ def megabytes(size: int) -> str:
 
 
 def line_of(error: BaseException) -> str:
-    """The first line of an error's message, or its kind."""
+    """The first line of an error's message, or the name of its class."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
 
 
-# Signals of one file that have clocks of their own
+# Signals with their own clocks in one file
 
 
 @dataclass(frozen=True)
 class Series:
-    """A signal of a file: its time stamps ``t`` ``(m,)`` [s] and numbers ``(m,)``; ``fault`` is what is wrong."""
+    """A signal of a file: its time stamps ``t`` ``(m,)`` [s], its numbers ``(m,)``, and its fault, if any."""
 
     name: str
     t: Array
@@ -173,11 +173,11 @@ class Series:
 
 
 def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME, note: str = "") -> Source:
-    """A source of signals with clocks of their own.
+    """A source of signals with their own clocks.
 
-    The rows are all stamps of the signals that are asked for. A column that may have blank cells (an output, a
-    disturbance) has a number where it was sampled, and none between; all others (inputs) hold their last number, and
-    rows before their first one are left out.
+    The rows are all stamps of the requested signals. A column that may have blank cells (an output, a disturbance) has
+    a number only where it was sampled. All other columns (inputs) hold their last number; rows before the first number
+    of such a column are left out.
     """
     series = [_once(one) for one in series]
     by_name = {one.name: one for one in series}
@@ -190,8 +190,8 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
         t = _joined([one.t for one in sound or series if one.name not in found])
         if 8 * len(t) * len(names) > LARGEST:
             raise InputError(
-                f"{path}: {len(names)} signals at {len(t)} stamps are more numbers than are read. Name fewer of them."
-                " [HM-DATA-086]"
+                f"{path}: {len(names)} signals at {len(t)} stamps are more numbers than are read at once. Name fewer "
+                "signals, or split the recording. [HM-DATA-086]"
             )
         values, first = np.full((len(t), len(names)), np.nan), t[0] if len(t) else 0.0
         for j, name in enumerate(names):
@@ -202,7 +202,7 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
                 known = np.isfinite(one.values) | (name in blanks)
                 stamps = t[
                     np.searchsorted(t, one.t[known], side="right") - 1
-                ]  # as they stand among those of all
+                ]  # the nearest of all stamps before
                 if name in blanks:
                     values[np.searchsorted(t, stamps), j] = one.values
                 elif known.any():
@@ -214,20 +214,20 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
 
     if len(by_name) < len(series):
         raise InputError(
-            f"{path}: two signals have the same name and the same clock. Rename one. [HM-DATA-087]"
+            f"{path}: two signals have the same name and the same clock. Rename one of them. [HM-DATA-087]"
         )
     return Source(path, sha256, (time, *by_name), read, note)
 
 
 def _once(one: Series) -> Series:
-    """A signal without samples that stand twice."""
+    """A signal without repeated samples."""
     again = (one.t[1:] == one.t[:-1]) & (one.values[1:] == one.values[:-1])
     keep = np.r_[np.ones(min(1, len(one.t)), bool), ~again]
     return one if keep.all() else replace(one, t=one.t[keep], values=one.values[keep])
 
 
 def _joined(stamps: Sequence[Array]) -> Array:
-    """All stamps of several clocks; those that differ by rounding alone are one."""
+    """All stamps of several clocks; stamps that differ only by rounding are merged."""
     t = np.unique(np.concatenate([np.zeros(0), *stamps]))
     steps = [float(np.median(np.diff(one))) for one in stamps if len(one) > 1]
     least = min([ROUNDING, *(SHARE * step for step in steps if step > 0)])
@@ -235,10 +235,10 @@ def _joined(stamps: Sequence[Array]) -> Array:
 
 
 def _disorder(one: Series) -> str:
-    """Where the stamps of a signal do not increase; empty where all do."""
+    """The first place where a signal's stamps do not increase; empty without one."""
     k = int(np.argmax(np.r_[np.diff(one.t) <= 0, True]))
     if k >= len(one.t) - 1:
         return ""
-    stamps = f"sample {k + 2} is at {one.t[k + 1]:.10g} s, the one before at {one.t[k]:.10g} s"
-    remedy = "Time stamps must increase: delete the repeated samples, or split the file."
+    stamps = f"sample {k + 2} is at {one.t[k + 1]:.10g} s, sample {k + 1} at {one.t[k]:.10g} s"
+    remedy = "Time stamps must increase: delete repeated samples, or split the file."
     return f"column {shown(one.name)}: {stamps}. {remedy} [HM-DATA-117]"

@@ -1,7 +1,7 @@
-"""Tables of text as engineers have them: any separator and decimal mark, preambles, closing rows, remarks.
+"""Tables of text: any separator and decimal mark, preambles, closing rows, remarks.
 
-:func:`hybrid_mpc.data.layout.layout_of` looks for the table in the first rows; pandas reads what it found. What is
-unambiguous is done, and ``Source.notes`` says so; what is not is refused.
+:func:`hybrid_mpc.data.layout.layout_of` finds the table in the first rows; pandas reads it. Unambiguous files are read,
+and ``Source.notes`` says how; ambiguous ones are refused.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "vertical bars", " ": "blanks"}
-SAMPLE = 2**17  # bytes at the beginning of a text that show where its table begins
-CLOSING = 50  # most rows behind a table that are no rows of it: means, sums, a remark
-TAIL = 200  # rows before the last one whose decimals are compared with its
-CUT = 3.0  # times the largest step of a column by which its last number must be off to be cut in two
+SAMPLE = 2**17  # bytes at the beginning of a text in which the table is searched
+CLOSING = 50  # most rows behind a table (means, sums, a remark) that are removed
+TAIL = 200  # rows before the last one whose decimals are compared with those of the last row
+CUT = 3.0  # step of the last number over a column's largest step, above which the number may be cut in two
 BLANKS = sorted({form(cell) for cell in BLANK for form in (str, str.upper, str.capitalize)} | {"NaN"})
 UNCLOSED = (
-    "a quotation mark is not closed, and the rows behind it are one cell. Delete the mark, or double it within "
+    "a quotation mark is not closed, so the rows after it form one cell. Delete the mark, or double it within "
     "a text."
 )
 
 
 def text_source(path: Path, content: bytes, sha256: str) -> Source:
-    """A text file as a source."""
+    """Open a text file as a source."""
     with named_extra(f"{path}: reading tables"):
-        import pandas  # noqa: F401  (asked for before anything is done)
+        import pandas  # noqa: F401  (a missing package is reported before any work)
     text, notes = _decoded(path, content)
     if not text.strip():
         raise InputError(f"{path}: {EMPTY} [HM-DATA-088]")
@@ -58,7 +58,7 @@ def text_source(path: Path, content: bytes, sha256: str) -> Source:
         headed, width = isinstance(layout, Layout) and layout.header >= 0, getattr(layout, "width", 0)
         if layout and (best is None or (score, headed, width) > best[:3]):
             best = score, headed, width, separator, layout
-    if best is None:  # no rows of numbers: a header alone
+    if best is None:  # no rows of numbers: only a header
         separator = max([*SEPARATORS][:-1], key=lambda one: len(tops[one].cells))
         separator = separator if len(tops[separator].cells) > 1 else " "
         row, cells = tops[separator]
@@ -70,7 +70,7 @@ def text_source(path: Path, content: bytes, sha256: str) -> Source:
 
 
 def _decoded(path: Path, content: bytes) -> tuple[bytes, list[str]]:
-    """The text as UTF-8, with one end for all rows, and what was done."""
+    """The text as UTF-8 with a line feed as the end of each row, and notes about the conversion."""
     notes, marked = [], content.startswith((b"\xff\xfe", b"\xfe\xff"))
     zeros, seen = content[:4096].count(0), len(content[:4096])
     if marked or 3 * zeros > seen > 2 * zeros - 8 > 0:
@@ -79,7 +79,7 @@ def _decoded(path: Path, content: bytes) -> tuple[bytes, list[str]]:
             content = content.decode(kind).encode()
         except UnicodeDecodeError as error:
             raise InputError(
-                f"{path}: is no UTF-16 text. Export the table as CSV (UTF-8). [HM-DATA-090]"
+                f"{path}: the text is not valid UTF-16. Export the table as CSV (UTF-8). [HM-DATA-090]"
             ) from error
         notes.append("text is UTF-16")
     content = content.removeprefix(b"\xef\xbb\xbf")
@@ -88,8 +88,8 @@ def _decoded(path: Path, content: bytes) -> tuple[bytes, list[str]]:
     if len(odd):
         row = 1 + content.count(b"\n", 0, int(odd[0]))
         raise InputError(
-            f"{path}: row {row} is no text. Export the table as CSV (UTF-8), or give the file the ending of its "
-            "format; unpack it if it is packed. [HM-DATA-091]"
+            f"{path}: row {row} is not text. Export the table as CSV (UTF-8), give the file the ending of its "
+            "format, or unpack a packed file. [HM-DATA-091]"
         )
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").rstrip(b"\x1a")
     try:
@@ -101,9 +101,10 @@ def _decoded(path: Path, content: bytes) -> tuple[bytes, list[str]]:
 
 
 class _Rows:
-    """Rows of a text, split by one separator; quotation marks may hold separators and ends of rows.
+    """Rows of a text, split by one separator; quoted cells may contain separators and ends of rows.
 
-    ``begins``, ``ends`` say where they stand, ``numbers`` count them as an editor does, ``widths`` are their cells.
+    ``begins`` and ``ends`` are byte positions, ``numbers`` the row numbers in an editor, ``widths`` the numbers of
+    cells.
     """
 
     def __init__(self, path: Path, text: bytes, separator: str, whole: bool = True) -> None:
@@ -113,7 +114,7 @@ class _Rows:
         lines = np.flatnonzero(newline)
         visible = (codes > 32) & (codes != 34)
         is_sep = codes == ord(separator)
-        if separator == " ":  # where cells begin
+        if separator == " ":  # a cell begins at a visible character after a blank
             marks = visible | (codes == 34)
             is_sep = marks & ~np.r_[False, marks[:-1]]
         else:
@@ -138,7 +139,7 @@ class _Rows:
         return int(self.numbers[k]) if k < len(self.numbers) else k + 1
 
     def line(self, k: int) -> bytes:
-        """A row as it is written."""
+        """A row as written."""
         return self.text[self.begins[k] : self.ends[k]]
 
     def cells(self, k: int) -> list[str]:
@@ -146,20 +147,20 @@ class _Rows:
         return split(self.line(k).decode(errors="replace"), self.separator) if k < len(self.begins) else []
 
     def splits(self, k: int) -> list[list[str]]:
-        """A row as other separators split it."""
+        """The cells of a row for all other separators."""
         line = self.line(k).decode(errors="replace")
         ways = [split(line, separator) for separator in SEPARATORS if separator != self.separator]
         return [[cell.strip() for cell in re.split(r"\s{2,}|\t", line.strip())], *ways]
 
     def kept(self, keep: Mask) -> bytes:
-        """The text of some of the rows."""
+        """The text of the rows in ``keep``."""
         chosen = np.flatnonzero(keep)
         if len(chosen) and len(chosen) == chosen[-1] - chosen[0] + 1:
             return self.text[self.begins[chosen[0]] : self.ends[chosen[-1]]]
         return b"\n".join(map(self.line, chosen.tolist()))
 
     def of_table(self, layout: Layout, notes: list[str]) -> Mask:
-        """Which rows are the table's; rows of another length are refused."""
+        """Which rows belong to the table; rows with another number of cells are refused."""
         keep, header = ~self.blank, layout.header
         keep[: layout.first] = False
         first = np.frombuffer(self.text, np.uint8)[np.minimum(self.begins, len(self.text) - 1)]
@@ -171,9 +172,9 @@ class _Rows:
             again = [k for k in np.flatnonzero(like).tolist() if self.line(k) == line]
             keep[again] = False
             if again:
-                notes.append(f"row {self.numbers[again[0]]} repeats the header: left out")
+                notes.append(f"row {self.numbers[again[0]]} repeats the header and is left out")
         if remarks.any():
-            notes.append(f"rows of remarks are left out, first row {self.numbers[np.argmax(remarks)]}")
+            notes.append(f"rows of remarks are left out, the first is row {self.numbers[np.argmax(remarks)]}")
         top = self.cells(layout.first) if keep.any() else []
         values, closing = [j for j, cell in enumerate(top) if is_value(cell)], 0
         for k in np.flatnonzero(keep)[::-1][:CLOSING].tolist():
@@ -184,12 +185,12 @@ class _Rows:
                 break
             keep[k], closing = False, k
         if closing:
-            notes.append(f"rows from {self.numbers[closing]} on do not belong to the table: left out")
+            notes.append(f"rows from {self.numbers[closing]} on are not part of the table and are left out")
         self.check(keep, layout)
         return keep
 
     def check(self, keep: Mask, layout: Layout) -> None:
-        """Refuse rows of another length, and cells that hold whole rows: a quotation mark was never closed."""
+        """Refuse rows with another number of cells, and cells that contain whole rows (an unclosed quotation mark)."""
         wrong, header = np.flatnonzero(keep & (self.widths != layout.width)), layout.header
         if len(wrong):
             k, such = int(wrong[0]), f" ({len(wrong)} such rows)" if len(wrong) > 1 else ""
@@ -199,7 +200,7 @@ class _Rows:
                 else f"the header (row {self.numbers[header]})"
             )
             raise InputError(
-                f"{self.path}: row {self.numbers[k]} has {self.widths[k]} cells, {place} has {layout.width}{such}. "
+                f"{self.path}: row {self.numbers[k]} has {self.widths[k]} cells, but {place} has {layout.width}{such}. "
                 f"Separate cells by {SEPARATORS[self.separator]}, write decimals with a point, and complete or delete "
                 "the row. [HM-DATA-093]"
             )
@@ -210,7 +211,7 @@ class _Rows:
 
 
 def split(line: str, separator: str) -> list[str]:
-    """The cells of a row, without blanks around them."""
+    """The cells of a row, stripped of blanks."""
     if separator == " " and '"' not in line:
         return line.split()
     cells = line.split(separator)
@@ -223,13 +224,15 @@ def split(line: str, separator: str) -> list[str]:
 
 
 def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
-    """The table of the whole text; ``done`` was noted before."""
+    """The table of the whole text; ``done`` are earlier notes."""
     path, names, notes = rows.path, layout.names, [*done, *layout.notes]
     keep = rows.of_table(layout, notes)
     chosen, numbers = np.flatnonzero(keep), rows.numbers[keep].tolist()
     count = len(numbers)
     if count * len(names) * 8 > 4 * LARGEST:
-        raise InputError(f"{path}: has {count} rows, more than are read. Split the recording. [HM-DATA-095]")
+        raise InputError(
+            f"{path}: {count} rows are more than are read from one file. Split the recording. [HM-DATA-095]"
+        )
     body = rows.kept(keep)
     decimal, unsure = _decimal(path, body, rows.separator)
     if decimal == ",":
@@ -254,8 +257,8 @@ def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
         before = [text(k, j) for k in range(max(0, count - TAIL), count)] if last else []
         if last and _is_cut(before, values):
             return (
-                f"row {numbers[-1]}, COLUMN is {shown(before[-1])}, where the file ends without the end of the "
-                "row: the number seems to be cut in two. Delete that row, or record it whole. [HM-DATA-125]"
+                f"row {numbers[-1]}, COLUMN is {shown(before[-1])}: the file ends within this row, so the number "
+                "may be cut in two. Delete the row, or copy the whole file again. [HM-DATA-125]"
             )
         return ""
 
@@ -277,7 +280,7 @@ def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
 def _parsed(
     rows: _Rows, text: bytes, width: int, places: Sequence[int], decimal: str, unsure: str
 ) -> pd.DataFrame:
-    """Columns of a text as pandas reads them: numbers, or texts where a cell is none; all texts if ``unsure``."""
+    """Columns of a text as pandas reads them: numbers, or texts if a cell is no number or ``unsure`` is given."""
     import pandas as pd
 
     if not text:
@@ -305,15 +308,15 @@ def _parsed(
 
 
 def _decimal(path: Path, body: bytes, separator: str) -> tuple[str, str]:
-    """The decimal mark, and marks of which nobody knows from single cells whether they stand between thousands."""
+    """The decimal mark, and marks that may stand between thousands (single cells cannot tell)."""
     if separator == ",":
         quoted = re.search(rb'"[+-]?\d+,\d+"', body)
         return ("," if quoted and not re.search(rb"\d\.\d", body) else "."), "," if quoted else ""
     point, comma = (_proven(body, mark) for mark in ".,")
     if point and comma:
         raise InputError(
-            f"{path}: numbers have commas and points, e.g. {point} and {comma}. Write the file with one decimal mark."
-            " [HM-DATA-097]"
+            f"{path}: numbers have both points and commas as decimal marks, e.g. {point} and {comma}. Write the whole "
+            "file with one decimal mark. [HM-DATA-097]"
         )
     between = rb"(?<![\d.,:])\d{1,3}[%s]\d{3}(?![\d:])"
     grouped = "".join(mark for mark in ".," if re.search(between % mark.encode(), body))
@@ -324,7 +327,7 @@ def _decimal(path: Path, body: bytes, separator: str) -> tuple[str, str]:
 
 
 def _proven(body: bytes, mark: str) -> str:
-    """A cell whose mark is a decimal one, since no mark between thousands stands so; empty without."""
+    """A cell in which ``mark`` can only be the decimal mark; empty without one."""
     other = "," if mark == "." else "."
     number = (
         rf"(?<![\d.,:\-/])(?:\d+[{mark}](?:\d{{1,2}}|\d{{4,}})|(?:0\d*|\d{{4,}})[{mark}]\d{{3}}|"
@@ -335,7 +338,7 @@ def _proven(body: bytes, mark: str) -> str:
 
 
 def _grouped(column: pd.Series, unsure: str, decimal: str, numbers: Sequence[int]) -> str:
-    """Whether a column's marks may stand between thousands, and may not: the fault, empty without one."""
+    """The fault of a column whose marks may stand between thousands or before decimals; empty without one."""
     texts = column.astype(str).str.strip()
     if not (found := texts.str.contains(f"[{unsure}]", regex=True)).any():
         return ""
@@ -346,16 +349,16 @@ def _grouped(column: pd.Series, unsure: str, decimal: str, numbers: Sequence[int
         return ""
     k = int(np.argmax(found.to_numpy()))
     return (
-        f"row {numbers[k]}, COLUMN is {shown(texts.iloc[k])}: a mark between thousands, or decimals? Write "
-        "numbers with one decimal mark, as many decimals in all rows, and nothing between thousands. [HM-DATA-126]"
+        f"row {numbers[k]}, COLUMN is {shown(texts.iloc[k])}: the mark may stand between thousands or before decimals. "
+        "Write one decimal mark, equally many decimals in all rows, and no mark between thousands. [HM-DATA-126]"
     )
 
 
 def _is_cut(cells: Sequence[str], values: Array) -> bool:
-    """Whether the last cell is shorter than others, and its number far from what is due."""
+    """Whether the last cell is shorter than others and its number far from the expected one."""
     if len(values) < 4 or not np.isfinite(values[-1]):
         return False
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is out of its range
+    with np.errstate(over="ignore", invalid="ignore"):  # an overflow is reported as out of range
         steps = np.abs(np.diff(values))
     jumps = bool(steps[-1] > CUT * float(np.nanmax(steps[:-1], initial=0.0)))
     decimals = [len(re.split("[.,]", cell)[-1]) if re.search("[.,]", cell) else 0 for cell in cells]

@@ -1,4 +1,4 @@
-"""From recordings to trajectories on the model's uniform grid, with states, derivatives and roles."""
+"""Recordings on the model's uniform grid, as trajectories with states, derivatives and roles."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.differentiate import local_polynomial, window_samples
 from hybrid_mpc.data.findings import MIN_SCORED, Finding, findings_of, gaps
-from hybrid_mpc.data.recording import Flags, Recording, Samples, Signals, misspelt, read_recordings
+from hybrid_mpc.data.recording import Flags, Recording, Samples, Signals, find_misspelt, read_recordings
 from hybrid_mpc.errors import SHOWN, InputError, refuse
 from hybrid_mpc.machine.specification import DataSpec, Role, Window
 
 Array = NDArray[np.float64]
 ROLES: tuple[Role, ...] = ("train", "valid", "test")
-TINY = 1e-6  # tolerance [periods] where periods are counted: above rounding
-NEAR = 5e-5  # tolerance [periods] of comparisons between time stamps, which files round: 1 us at 20 ms
-FINEST = 1000  # most samples of the model's grid for one of the recording: beyond it a unit is wrong
-UNEVEN = 20.0  # largest ratio of mean to median sampling interval: smoothing works on the median
-WORK = 2e10  # most products of smoothing, samples times those in a window: half a minute
+TINY = 1e-6  # tolerance [periods] in counts of periods: above rounding
+NEAR = 5e-5  # tolerance [periods] between time stamps, which files round: 1 us at 20 ms
+FINEST = 1000  # most samples of the model's grid per recorded sample: beyond it a unit is wrong
+UNEVEN = 20.0  # largest ratio of mean to median sampling period: smoothing assumes the median
+WORK = 2e10  # most multiplications of smoothing, samples times samples in a window: half a minute
 
 
 @dataclass(frozen=True)
@@ -33,19 +33,19 @@ class Trajectory(Samples):
     """One contiguous piece of a recording on the uniform grid ``dt``.
 
     Args:
-        name: ``"<file stem>"``, or ``"<file stem>#2"`` for the second piece of that file.
+        name: ``"<file stem>"``; later pieces of the same file are ``"<file stem>#2"`` and so on.
         role: ``"train"``, ``"valid"``, ``"test"``; ``""`` for a whole recording.
         dt: Period [s].
         t: Times ``(n,)`` [s] in the recording's own time.
-        u: Inputs ``(n, n_u)`` held over ``[t_k, t_k + dt)``: the mean of the recorded zero-order hold.
-        y: Measured outputs ``(n, n_y)``, interpolated to the grid and not smoothed; NaN where no sample of that output
-            is within reach (:func:`to_grid`).
-        x: States ``(n, n_x)``, ``[q, v]`` smoothed, where the outputs are the positions ``q``; else NaN.
-        xdot: Derivatives of the states ``(n, n_x)``, ``[v, v_dot]`` smoothed, or NaN.
+        u: Inputs ``(n, n_u)`` over ``[t_k, t_k + dt)``: the mean of the recorded zero-order hold.
+        y: Measured outputs ``(n, n_y)``, interpolated to the grid and not smoothed; NaN where no sample of the output
+            is near (:func:`to_grid`).
+        x: Smoothed states ``(n, n_x)``, ``[q, v]``, if the outputs are the positions ``q``; else NaN.
+        xdot: Smoothed derivatives of the states ``(n, n_x)``, ``[v, v_dot]``, or NaN.
         w: Disturbances ``(n, n_w)`` over ``[t_k, t_k + dt)``: the mean of the straight lines between their samples.
             Default: none, ``(n, 0)``.
-        censored: ``(n, n_y)``: 0 where ``y`` is measured, -1 where the sensor was at its lower end and the truth is at
-            most ``y``, +1 where it was at its upper end and the truth is at least ``y``. Default: zeros.
+        censored: ``(n, n_y)``: 0 where ``y`` is measured, -1 at the sensor's lower end (the true value is at most
+            ``y``), +1 at its upper end (the true value is at least ``y``). Default: zeros.
     """
 
     name: str
@@ -61,20 +61,20 @@ class Trajectory(Samples):
 
     @property
     def file(self) -> str:
-        """Stem of the file that it comes from."""
+        """Stem of the recording's file."""
         return self.name.split("#")[0]
 
     def part(
         self, keep: NDArray[np.bool_] | slice, name: str | None = None, role: str | None = None
     ) -> Trajectory:
-        """The samples of ``keep``, a slice or a mask ``(n,)`` of one contiguous run; a name or a role may be new."""
+        """The samples in ``keep``, a slice or a contiguous mask ``(n,)``, optionally with another name or role."""
         arrays = {key: getattr(self, key)[keep] for key in ("t", "u", "y", "x", "xdot", "w", "censored")}
         name, role = self.name if name is None else name, self.role if role is None else role
         return replace(self, name=name, role=role, **arrays)
 
 
 class Cut(NamedTuple):
-    """A part of a recording that is not used as it was recorded: file name, from and to [s], and why."""
+    """A part of a recording that is left out: file name, start and end [s], and the reason."""
 
     file: str
     start: float
@@ -89,12 +89,12 @@ class Dataset:
     Args:
         trajectories: Pieces for training, validation and test; no sample has two roles.
         whole: The recordings from first to last sample (one for each side of a gap), role ``""``.
-        cuts: What was left out, and why.
+        cuts: Parts that are left out, with reasons.
         files: File names, in the order given.
         sha256: SHA-256 of each file, in the same order.
-        hash: One hash of all files' names and contents; it does not depend on their order or folder.
-        findings: What is doubtful about the recordings (:mod:`hybrid_mpc.data.findings`). Default: nothing.
-        sampling: Median distance [s] of the time stamps of each file, in the same order. Default: not known.
+        hash: One hash of all files' names and contents, independent of their order and folder.
+        findings: Doubtful data (:mod:`hybrid_mpc.data.findings`). Default: none.
+        sampling: Median step [s] of the time stamps of each file, in the same order. Default: unknown.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -114,24 +114,24 @@ class Dataset:
 def load_trajectories(
     paths: Sequence[Path | str], prior: Signals, spec: DataSpec, *, needed: Sequence[Role] = ROLES
 ) -> Dataset:
-    """Read recordings, cut them at gaps, shift known delays out, smooth, resample to ``spec.dt``, give roles.
+    """Read recordings, cut them at gaps, remove known delays, smooth, resample to ``spec.dt``, and assign roles.
 
-    Where the outputs are the positions ``q`` of states ``[q, v]`` (as many, of the same names), ``x`` and ``xdot`` are
-    smoothed before resampling and the split. They depend on half of ``spec.smoothing`` before and after a sample, and
-    are NaN over gaps, and where samples of that output are missing or censored for longer than ``spec.max_gap``. For
-    other outputs they are NaN: states then come from the prior's equations. Parts by ``fractions`` keep
-    ``spec.smoothing`` apart; ``windows`` should, too.
+    If the outputs are the positions ``q`` of states ``[q, v]`` (equal count and names), ``x`` and ``xdot`` are smoothed
+    before resampling and splitting. A smoothed value depends on half of ``spec.smoothing`` before and after it. It is
+    NaN over gaps, and where samples of its output are missing or censored for longer than ``spec.max_gap``. For other
+    outputs ``x`` and ``xdot`` are NaN: states then come from the prior's equations. Parts by ``fractions`` are
+    ``spec.smoothing`` apart; ``windows`` should be, too.
 
     Args:
         paths: Files with different stems, of any formats and lengths.
-        prior: The prior, its class, or a model: its signals say which columns there must be, in which order, whether
-            the outputs are positions, and what is plausible.
+        prior: The prior, its class, or a model. Its signals define the columns and their order, whether the outputs are
+            positions, and the plausible ranges.
         spec: Columns, ``dt``, ``max_gap``, ``smoothing``, ``warm_up`` [s], delays and the split.
         needed: Roles that must not be empty. Default: all three.
 
     Raises:
-        InputError: With all that is wrong with all files: bad recordings
-            (:func:`~hybrid_mpc.data.recording.read_recording`), columns that differ between them, windows that overlap,
+        InputError: With all problems of all files: bad recordings
+            (:func:`~hybrid_mpc.data.recording.read_recording`), columns that differ between them, overlapping windows,
             a role without a trajectory, sampling too coarse or uneven for ``smoothing``, implausible speeds.
 
     Example:
@@ -149,9 +149,9 @@ def load_trajectories(
         [('run', 'train', 299), ('run#2', 'valid', 94), ('run#3', 'test', 94)]
     """
     if isinstance(paths, str | bytes | Path) or not all(isinstance(path, str | Path) for path in paths):
-        raise InputError(f"recordings: a list of paths is needed, got {paths!r:.80} [HM-DATA-098]")
+        raise InputError(f"recordings: must be a list of paths, got {paths!r:.80} [HM-DATA-098]")
     if not paths:
-        raise InputError("no recordings given; name at least one file with --data [HM-DATA-099]")
+        raise InputError("recordings: none given. Name at least one file with --data. [HM-DATA-099]")
     _check_windows(spec)
     recordings, problems = read_recordings(paths, prior, spec)
     outputs, states = prior.outputs, prior.states
@@ -172,7 +172,7 @@ def load_trajectories(
         t, x = [piece.t for piece in own], [piece.x for piece in own]
         motions.append((np.concatenate(t), np.concatenate(x)) if own else (np.zeros(0), np.zeros((0, 0))))
     findings = findings_of(recordings, motions, spec, outputs=outputs, states=states if positions else ())
-    findings = (*findings, *misspelt(spec, [recording.path for recording in recordings]))
+    findings = (*findings, *find_misspelt(spec, [recording.path for recording in recordings]))
     paths_of = {recording.path.name: recording.path for recording in recordings}
     refuse(
         problems + [f"{paths_of[one.file]}: {one.message} [HM-DATA-100]" for one in findings if one.refused]
@@ -192,14 +192,14 @@ def load_trajectories(
 
 
 def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[Cut]) -> Iterator[Trajectory]:
-    """Resampled parts between gaps, numbered; too short ones become cuts.
+    """Resampled parts between gaps, numbered; parts that are too short become cuts.
 
-    They are smoothed if ``n_x`` is None; else their ``n_x`` states are NaN.
+    States are smoothed if ``n_x`` is None; else the ``n_x`` states are NaN.
     """
     times, period, number, file = recording.t, recording.dt, 0, recording.path.name
     ends = np.flatnonzero(gaps(times, spec.max_gap))
     for first in recording.cuts:
-        why = "the number of turns that an angle made while its samples were missing is not known"
+        why = "the number of turns of an angle over missing samples is unknown"
         cuts.append(Cut(file, float(times[first - 1]), float(times[first]), why))
     for k in ends:
         why = f"gap of {times[k + 1] - times[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
@@ -209,7 +209,7 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
     samples = window_samples(spec.smoothing, period) if n_x is None else 0
     _check_sampling(recording, samples, spec)
     shortest = max((samples - 1) * period + spec.dt, shortest) if samples else shortest
-    # an input acts later than it is recorded; what a sensor shows was earlier
+    # an input acts later than recorded; a measured value belongs to an earlier time
     delays = spec.delays_in(recording.name)
     late_u, late_w, late_y = (
         [sign * delays.get(name, 0.0) for name in names]
@@ -217,7 +217,7 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
     )
     for rows in np.split(np.arange(len(times)), ends + 1):
         origin, t = float(times[rows[0]]), times[rows] - times[rows[0]]
-        # what every channel covers; blank outputs count as if they had samples
+        # the time that every channel covers; blank cells of an output do not shorten it
         spans = [(late, t[-1] + late) for late in (*late_u, *late_y)]
         for late, column in zip(late_w, recording.w[rows].T, strict=True):
             known = t[np.isfinite(column)]
@@ -226,12 +226,12 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
         if end - start < shortest - NEAR * spec.dt:
             why = _too_short(shortest, spec)
             if t[-1] >= shortest - NEAR * spec.dt:
-                why = f"what all columns cover, known delays taken off, is {why}"
+                why = f"the time that all columns cover, known delays removed, is {why}"
             cuts.append(Cut(file, origin, origin + float(t[-1]), why))
             continue
         for one, two in ((0.0, start), (end, float(t[-1]))):
             if two - one > NEAR * spec.dt:
-                why = "not covered by all columns once known delays are taken off"
+                why = "not covered by all columns after known delays are removed"
                 cuts.append(Cut(file, origin + one, origin + two, why))
         number += 1
         grid: Array = start + spec.dt * np.arange(
@@ -271,29 +271,29 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
 
 
 def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
-    """Refuse sampling that smoothing over ``samples`` would take gigabytes or minutes for, or too fine a period."""
+    """Refuse sampling that is too uneven, too coarse for the period, or too fine to smooth over ``samples``."""
     steps = np.diff(recording.t)
     mean = float(steps[~gaps(recording.t, spec.max_gap)].mean())  # gaps left out
     if samples and mean > UNEVEN * recording.dt:
         raise InputError(
-            f"sampling is uneven: the time stamps are {recording.dt:.3g} s apart in the median and {mean:.3g} s in "
-            "the mean. Record at one rate, or check the time stamps. [HM-DATA-101]"
+            f"sampling is uneven: the median step of the time stamps is {recording.dt:.3g} s, the mean step {mean:.3g} "
+            "s. Record at a constant rate, or check the time stamps. [HM-DATA-101]"
         )
     if samples * len(recording.t) * mean / recording.dt > WORK:
         raise InputError(
-            f"smoothing of {spec.smoothing:g} s holds {samples} of {len(recording.t)} samples, too many to work "
-            f"with. The model's period is {spec.dt:g} s: give every tenth or hundredth row, or split the recording."
-            " [HM-DATA-102]"
+            f"smoothing of {spec.smoothing:g} s covers {samples} of {len(recording.t)} samples, too many to compute. "
+            f"The model's period is {spec.dt:g} s: keep every tenth or hundredth row, or split the recording. "
+            "[HM-DATA-102]"
         )
     if mean > FINEST * spec.dt:
         raise InputError(
-            f"the model's period of {spec.dt:g} s is more than {FINEST} times finer than the sampling, {mean:.3g} s in "
-            "the mean. Raise dt in the DataSpec, or check that time is in seconds. [HM-DATA-103]"
+            f"the model's period of {spec.dt:g} s is more than {FINEST} times finer than the sampling (mean step "
+            f"{mean:.3g} s). Raise dt in the DataSpec, or check that time is in seconds. [HM-DATA-103]"
         )
 
 
 def _smoothed(t: Array, y: Array, grid: Array, period: float, spec: DataSpec) -> tuple[Array, Array, Array]:
-    """Value and two derivatives of one output on the grid, NaN outside the stretches in which its samples are near."""
+    """Value and two derivatives of one output on the grid; NaN outside stretches with samples."""
     known = np.isfinite(y)
     t, y = t[known], y[known]
     value, first, second = (np.full(len(grid), np.nan) for _ in range(3))
@@ -316,18 +316,17 @@ def _smoothed(t: Array, y: Array, grid: Array, period: float, spec: DataSpec) ->
 def to_grid(
     t: Array, y: Array, censored: Flags, grid: Array, dt: float, max_gap: float
 ) -> tuple[Array, Flags]:
-    """One output's samples on a grid of period ``dt`` [s], without inventing any; what is censored.
+    """One output's samples on a grid of period ``dt`` [s], without invented values; and the censored ones.
 
-    Between two samples that are at most ``max_gap`` [s] apart the grid has the straight line. Elsewhere, as between the
-    samples of a slow analyser, a sample counts for the grid point nearest to it, as it was measured, at most half a
-    period away; all other points are NaN. A straight line to a censored sample is a bound of the same side; it is NaN
-    between the two ends of a sensor.
+    Between two samples at most ``max_gap`` [s] apart the grid has the straight line. Elsewhere, e.g. between samples of
+    a slow analyser, each sample moves to the nearest grid point, at most half a period away; all other points are NaN.
+    A straight line to a censored sample is a bound of the same side; between opposite ends of a sensor it is NaN.
 
     Args:
         t: Times ``(m,)`` [s] of the rows, increasing.
-        y: Samples ``(m,)``; NaN is none.
-        censored: -1, 0 or +1 ``(m,)`` for each.
-        grid: Times ``(n,)`` [s], ``dt`` apart; returned are values ``(n,)`` and -1, 0 or +1 for each.
+        y: Samples ``(m,)``; NaN where missing.
+        censored: -1, 0 or +1 ``(m,)`` for each sample.
+        grid: Times ``(n,)`` [s], ``dt`` apart; the function returns values ``(n,)`` and flags -1, 0 or +1.
         dt: Period [s].
         max_gap: Longest distance [s] that a straight line bridges.
 
@@ -352,21 +351,21 @@ def to_grid(
     two = np.where(share > TINY, censored[left + 1], 0)
     flags[between] = np.where(one == 0, two, one)
     values[np.flatnonzero(between)[one * two < 0]] = np.nan
-    # TINY: a sample in the middle of two points is counted for the earlier one, whatever the rounding
+    # TINY: a sample halfway between two points belongs to the earlier one, whatever the rounding
     nearest = np.floor((t - grid[0]) / dt + 0.5 - TINY).astype(np.int64)
     alone = np.flatnonzero((nearest >= 0) & (nearest < len(grid)))
     alone = alone[~between[nearest[alone]]]
     away = np.abs(t[alone] - grid[nearest[alone]])
-    alone = alone[np.argsort(-away, kind="stable")]  # the nearest one stays
+    alone = alone[np.argsort(-away, kind="stable")]  # the nearest sample is written last and remains
     values[nearest[alone]], flags[nearest[alone]] = y[alone], censored[alone]
     flags[np.isnan(values)] = 0
     return values, flags
 
 
 def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
-    """Mean over ``[T_k, T_k + dt)`` of an input ``(m, n_u)`` recorded as a zero-order hold: exact, whatever the stamps.
+    """Mean over ``[T_k, T_k + dt)`` of an input ``(m, n_u)`` recorded as a zero-order hold; exact for any stamps.
 
-    Each input is held until the next time stamp; it is zero outside the recording.
+    Each input is held until the next time stamp and is zero outside the recording.
     """
     integral = np.vstack([np.zeros((1, u.shape[1])), np.cumsum(u[:-1] * np.diff(t)[:, None], axis=0)])
     means = [(np.interp(grid + dt, t, z) - np.interp(grid, t, z)) / dt for z in integral.T]
@@ -374,9 +373,9 @@ def hold_mean(t: Array, u: Array, grid: Array, dt: float) -> Array:
 
 
 def line_mean(t: Array, w: Array, grid: Array, dt: float) -> Array:
-    """Mean over ``[T_k, T_k + dt)`` of the straight lines between samples ``(m,)``; NaN is none. Exact.
+    """Mean over ``[T_k, T_k + dt)`` of the straight lines between samples ``(m,)``; NaN marks missing ones. Exact.
 
-    Before the first and after the last sample it is that sample.
+    The first sample also holds before it, the last one after it.
 
     Example:
         >>> line_mean(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.0, np.nan, 4.0, 4.0]), np.array([0.0, 1.5]), 1.0)
@@ -396,7 +395,7 @@ def line_mean(t: Array, w: Array, grid: Array, dt: float) -> Array:
 def _pieces(
     recording: Recording, segments: list[Trajectory], spec: DataSpec, cuts: list[Cut]
 ) -> list[Trajectory]:
-    """Intersections of windows and segments, in order of time; too short ones become cuts."""
+    """Intersections of windows and segments, ordered by time; pieces that are too short become cuts."""
     pieces: list[Trajectory] = []
     for window in sorted(_windows(recording, spec), key=lambda window: window.start):
         for segment in segments:
@@ -416,7 +415,7 @@ def _pieces(
 
 
 def _windows(recording: Recording, spec: DataSpec) -> tuple[Window, ...]:
-    """The file's named windows, or its parts by fractions with the smoothing length between them."""
+    """The file's windows from the specification, or its parts by fractions, a smoothing length apart."""
     if recording.name in spec.windows:
         return tuple(spec.windows[recording.name])
     start, length = float(recording.t[0]), float(recording.t[-1] - recording.t[0])
@@ -424,7 +423,7 @@ def _windows(recording: Recording, spec: DataSpec) -> tuple[Window, ...]:
     for role, fraction in zip(ROLES, spec.fractions, strict=True):
         if fraction > 0:
             distance = spec.smoothing if windows else 0.0
-            # a part shorter than that distance becomes one without a sample, which is cut and told as any other
+            # a part shorter than that distance becomes one without samples, which is cut and reported
             end = max(start + fraction * length, math.nextafter(start + distance, math.inf))
             windows.append(Window(start + distance, end, role))
             start += fraction * length
@@ -438,8 +437,8 @@ def _check_windows(spec: DataSpec) -> None:
         for one, two in pairwise(sorted(windows, key=lambda window: window.start)):
             if two.start < one.end:
                 raise InputError(
-                    f"windows overlap in {stem}: {one.role} {one.start:g} to {one.end:g} s, "
-                    f"{two.role} {two.start:g} to {two.end:g} s. A sample can have one role only. [HM-DATA-104]"
+                    f"windows overlap in {stem}: {one.role} {one.start:g} to {one.end:g} s and "
+                    f"{two.role} {two.start:g} to {two.end:g} s. Separate them: a sample has one role. [HM-DATA-104]"
                 )
 
 
@@ -456,15 +455,15 @@ def _check_roles(
     least = (_fewest(spec) + 1) * spec.dt
     needed_s = max((least + distance) / fraction for fraction, distance in zip(used, distances, strict=True))
     raise InputError(
-        f"no piece of {_fewest(spec) * spec.dt:g} s or more is left for {' and '.join(missing)}. "
-        "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec; a recording "
-        f"without gaps that is split by fractions needs {needed_s:.3g} s."
+        f"recordings: no piece of at least {_fewest(spec) * spec.dt:g} s is left for {' and '.join(missing)}. "
+        "Give more or longer recordings, or change windows, fractions or max_gap in the DataSpec. A recording "
+        f"without gaps, split by fractions, needs {needed_s:.3g} s."
         f"{f' Cut out:{dropped}' if dropped else ''} [HM-DATA-114]"
     )
 
 
 def _fewest(spec: DataSpec) -> int:
-    """Fewest samples of a piece: the warm-up and a handful to score."""
+    """Fewest samples of a piece: the warm-up and ``MIN_SCORED`` periods."""
     return int(np.ceil(spec.warm_up / spec.dt - TINY)) + MIN_SCORED
 
 

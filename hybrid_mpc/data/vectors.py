@@ -1,4 +1,4 @@
-"""Files of named vectors, as ``.npz``, ``.mat`` and HDF5 files hold them."""
+"""Files of named vectors: ``.npz``, ``.mat`` and HDF5."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from hybrid_mpc.records import shown
 
 Array = NDArray[np.float64]
 SMALL = 2**26
-"""Bytes of numbers that any file may hold [byte], however well they are compressed: 8 million numbers."""
+"""Bytes of numbers that any file may hold [byte], however well compressed: 8 million numbers."""
 PACKED = 20
-"""Beyond ``SMALL``, most bytes of numbers for one byte of a file. Recorded motions are compressed to a tenth at best,
-zeros to a thousandth."""
+"""Above ``SMALL``, most bytes of numbers per byte of the file. Recorded motions compress to a tenth at best, zeros to a
+thousandth."""
 
 
 def npz_source(path: Path, content: bytes, sha256: str) -> Source:
-    """Named vectors of numpy as a source."""
+    """Open named vectors of numpy as a source."""
     if content.startswith(npy.MAGIC_PREFIX):
         raise InputError(
-            f"{path}: is no .npz file but one array without a name. Write named vectors with numpy.savez(file, "
-            "name=vector, ...). [HM-DATA-105]"
+            f"{path}: the file is one array without a name, not an .npz file. Write named vectors with "
+            "numpy.savez(file, name=vector, ...). [HM-DATA-105]"
         )
     try:
         check_npz(content, 0, ())
         file = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception as error:  # a damaged archive raises nearly anything
+    except Exception as error:  # numpy raises many kinds of exceptions for a damaged archive
         raise InputError(
-            f"{path}: is no .npz file or damaged ({line_of(error)}). Write it with numpy.savez(file, name=vector, ...)."
-            " [HM-DATA-106]"
+            f"{path}: not a valid .npz file, or damaged ({line_of(error)}). Write it with "
+            "numpy.savez(file, name=vector, ...). [HM-DATA-106]"
         ) from error
 
     def lookup(name: str) -> NDArray[Any]:
@@ -50,8 +50,8 @@ def npz_source(path: Path, content: bytes, sha256: str) -> Source:
             return np.asarray(file[name])
         except Exception as error:
             raise InputError(
-                f"{path}: column {shown(name)} cannot be read ({line_of(error)}). Save it as a vector of numbers, "
-                "large ones with numpy.savez and not packed; objects are refused, since loading them could run code."
+                f"{path}: column {shown(name)} cannot be read ({line_of(error)}). Save a vector of numbers; save large "
+                "vectors with numpy.savez, uncompressed. Objects are refused, since loading them could run code."
                 " [HM-DATA-107]"
             ) from error
 
@@ -59,7 +59,7 @@ def npz_source(path: Path, content: bytes, sha256: str) -> Source:
 
 
 def budget_of(size: int) -> int:
-    """Bytes of numbers that a file of this size may hold [byte]."""
+    """Bytes of numbers that a file of ``size`` bytes may hold [byte]."""
     return min(LARGEST, max(SMALL, PACKED * size))
 
 
@@ -74,9 +74,9 @@ def vector_source(
     note: str = "",
     unread: tuple[str, ...] = (),
 ) -> Source:
-    """A source of vectors of one length, whose rows are counted from ``first``.
+    """A source of vectors of equal length; rows are counted from ``first``.
 
-    A single number as the time is the sampling time.
+    If the time is a single number, it is the sampling period.
     """
 
     def read(time: str | None, wanted: Sequence[str], blanks: Collection[str]) -> Columns:
@@ -89,14 +89,14 @@ def vector_source(
                 array = lookup(name)
                 if time is not None and name == names[0] and array.dtype == np.float16 and array.size > 1:
                     raise InputError(
-                        f"{path}: column {shown(name)} has half precision, three digits, which do not tell time stamps "
-                        "apart. Save it in double precision. [HM-DATA-108]"
+                        f"{path}: column {shown(name)} has half precision, too coarse for time stamps (three digits). "
+                        "Save it in double precision. [HM-DATA-108]"
                     )
                 left -= 8 * array.size
                 if left < 0:
                     raise InputError(
-                        f"{path}: its columns take more than the {megabytes(budget)} of numbers that are "
-                        "read from a file of this length. Save it unpacked, or split the recording. [HM-DATA-109]"
+                        f"{path}: the columns take more than {megabytes(budget)} of numbers, the most that is read "
+                        "from a file of this size. Save it uncompressed, or split the recording. [HM-DATA-109]"
                     )
                 columns.append(_vector(path, name, array))
             except InputError as error:
@@ -108,7 +108,7 @@ def vector_source(
         if len(set(lengths.values())) > 1:
             each = ", ".join(f"{shown(name)} {length}" for name, length in lengths.items())
             raise InputError(
-                f"{path}: columns differ in length: {each}. Save vectors of one length. [HM-DATA-110]"
+                f"{path}: columns differ in length: {each}. Save vectors of equal length. [HM-DATA-110]"
             )
         values = np.column_stack(columns)
         found = {}
@@ -117,7 +117,7 @@ def vector_source(
             if len(bad):
                 found[name] = (
                     f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
-                    f"({len(bad)} such). Delete the row (longer gaps are cut out) or repair the value. "
+                    f"({len(bad)} such). Correct the value or delete the row (longer gaps are cut out). "
                     "[HM-DATA-124]"
                 )
         values[~np.isfinite(values)] = np.nan
@@ -135,8 +135,8 @@ def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
         )
     if array.size and sum(length != 1 for length in array.shape) > 1:
         raise InputError(
-            f"{path}: column {shown(name)} has the shape {array.shape}, not that of a vector. Save each of its columns "
-            "under a name of its own. [HM-DATA-112]"
+            f"{path}: column {shown(name)} has shape {array.shape} and is not a vector. Save each of its columns "
+            "under its own name. [HM-DATA-112]"
         )
     return np.asarray(array, dtype=np.float64).ravel()
 
@@ -144,8 +144,8 @@ def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
 def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
-            f"{path}: column {shown(name)} is the single number {dt:g}; as a sampling time [s] it must be positive. "
-            "Give that, or a vector of time stamps. [HM-DATA-113]"
+            f"{path}: column {shown(name)} is the single number {dt:g}, which is not a positive sampling period [s]. "
+            "Give a positive number, or a vector of time stamps. [HM-DATA-113]"
         )
     return dt * np.arange(m, dtype=np.float64)
 
@@ -153,10 +153,10 @@ def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
 # Variables, fields and datasets
 
 
-MOST_WIDE = 64  # most columns of a matrix that are read as columns
-MOST_STRUCTS = 100  # most elements of an array of structs, or of cells, that are read
+MOST_WIDE = 64  # most columns of a matrix that are read as signals
+MOST_STRUCTS = 100  # most elements of an array of structs or cells that are read
 OBJECTS = "objects"
-CONVERT = {  # the line of MATLAB that makes vectors of an object, by its class
+CONVERT = {  # MATLAB code that converts an object to vectors, by its class
     "timeseries": "t = {0}.Time; y = {0}.Data; save('{1}', 't', 'y', '-v7')",
     "timetable": "t = seconds({0}.Properties.RowTimes - {0}.Properties.RowTimes(1)); "
     "s = table2struct(timetable2table({0}, 'ConvertRowTimes', false), 'ToScalar', true); save('{1}', 't', 's', '-v7')",
@@ -170,7 +170,7 @@ CONVERT = {  # the line of MATLAB that makes vectors of an object, by its class
 
 
 class Leaf(NamedTuple):
-    """A variable or a field: its shape, and how its numbers are read; ``what`` it is where it is not read."""
+    """A variable or field: its shape and a function that reads its numbers; ``what`` is the kind of an unread one."""
 
     name: str
     shape: tuple[int, ...] = ()
@@ -182,7 +182,7 @@ class Leaf(NamedTuple):
 def leaf_source(
     path: Path, content: bytes, sha256: str, leaves: Sequence[Leaf], matlab: bool = True
 ) -> Source:
-    """A source of vectors and columns of matrices; in MATLAB's files what is not read is named."""
+    """A source of vectors and columns of matrices; for MATLAB files, unread variables are named in messages."""
     vectors: dict[str, Callable[[], NDArray[Any]]] = {}
     lengths: dict[str, int] = {}
     unread: dict[str, list[str]] = {}
@@ -197,7 +197,7 @@ def leaf_source(
             if leaf.kind in CONVERT:
                 lines.append(CONVERT[leaf.kind].format(leaf.name, f"{path.stem}_vectors.mat"))
     told = [f"{what} ({', '.join(map(shown, names[:LISTED]))})" for what, names in sorted(unread.items())]
-    note = f" Not read are {' and '.join(told)}." if told else ""
+    note = f" Not read: {' and '.join(told)}." if told else ""
     note += f" In MATLAB: {lines[0]}" if lines else " Save their vectors as variables." if told else ""
     lost = tuple(name for names in unread.values() for name in names)
     row, first = ("row", 1) if matlab else ("index", 0)
@@ -209,7 +209,7 @@ def leaf_source(
 
 
 def _columns_of(leaf: Leaf) -> dict[str, Callable[[], NDArray[Any]]]:
-    """A vector; or the columns of a matrix, rows where these are longer."""
+    """A vector, or the columns of a matrix (its rows, if they are longer)."""
     long = [size for size in leaf.shape if size != 1]
     if len(leaf.shape) != 2 or len(long) < 2 or min(long) > MOST_WIDE or 0 in long:
         return {leaf.name: leaf.read}
@@ -224,13 +224,13 @@ def _taken(read: Callable[[], NDArray[Any]], k: int, axis: int) -> NDArray[Any]:
     return read().take(k, axis)
 
 
-# Vectors of several clocks
+# Vectors with several clocks
 
 
 def _with_clocks(source: Source, lengths: dict[str, int], budget: int) -> Source | None:
-    """The same where vectors of different lengths have times of their own: in one struct, or alone of that length.
+    """A source with clocks, if vectors of different lengths have their own times: in one struct, or of equal length.
 
-    None where all have one length, or only one of them is a time.
+    None if all vectors have one length, or only one of them is a time.
     """
     times = [name for name, length in lengths.items() if length > 1 and _is_time(name)]
     if len({lengths[name] for name in times}) < 2:
@@ -246,7 +246,7 @@ def _with_clocks(source: Source, lengths: dict[str, int], budget: int) -> Source
                 break
     if len(set(clocks.values())) < 2 or 16 * sum(lengths[name] for name in clocks) > budget:
         return None
-    clocks |= {clock: clock for clock in clocks.values()}  # times are signals of their own clocks, too
+    clocks |= {clock: clock for clock in clocks.values()}  # a time is a signal of its own clock
     read = {name: source.read(None, [name], [name]) for name in clocks}
     series = [
         Series(
@@ -261,14 +261,14 @@ def _with_clocks(source: Source, lengths: dict[str, int], budget: int) -> Source
     time = f"{own.pop()} [s]" if len(own) == 1 else TIME
     used = ", ".join(map(shown, list(dict.fromkeys(clocks.values()))[:LISTED]))
     lost = [name for name in lengths if name not in clocks]
-    note = f" Without a time of their own are {', '.join(map(shown, lost[:LISTED]))}." if lost else ""
+    note = f" Without a time of their own: {', '.join(map(shown, lost[:LISTED]))}." if lost else ""
     return replace(
         clocked(source.path, source.sha256, series, time, source.note + note),
         unread=(*source.unread, *lost),
-        notes=(f"vectors have times of their own: {used}",),
+        notes=(f"vectors have their own times: {used}",),
     )
 
 
 def _is_time(name: str) -> bool:
-    """Whether a vector's name says time, ``t`` beside other words included: ``t_pos``, ``t2``."""
+    """Whether a vector's name means time; ``t`` beside other words counts: ``t_pos``, ``t2``."""
     return said_by(name).kind == "time" or "t" in re.split(r"[\W_\d]+", name.rpartition(".")[2])

@@ -1,4 +1,4 @@
-"""Consistency of a filter: its innovations on recordings against what its own covariances say of them."""
+"""Consistency of a filter: its innovations on recordings, compared with its own covariances."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
-from hybrid_mpc.estimate.tuning import Recording, surroundings
+from hybrid_mpc.estimate.tuning import Recording, measured_disturbances
 
 Array = NDArray[np.float64]
 LEVEL = 0.95
@@ -19,14 +19,14 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Innovations:
-    """Innovations of a filter along one recording, the first samples left out; ``t`` [s] since the recording's begin.
+    """Innovations of a filter along one recording, without the first samples; ``t`` [s] since the recording's start.
 
     Args:
         normalised: ``L^-1 (y - y_predicted)`` with ``L L' = C P C' + R``, ``(n, n_y)`` [-]; white with unit
             variance if the filter's assumptions hold; NaN in rows with a missing output.
-        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. Of a switching filter they are
-            those of the mixture's mean and covariance: its own ``nis`` favours the mode that fits.
-        degrees: Outputs measured ``(n,)``: degrees of freedom of each NIS.
+        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. For a switching filter they use the
+            mean and covariance of the mixture, since its own ``nis`` favours the fitting mode.
+        degrees: Number of measured outputs ``(n,)``: the degrees of freedom of each NIS.
     """
 
     t: Array
@@ -39,10 +39,10 @@ class Innovations:
 class Consistency:
     """Two tests of a filter's innovations, each passed by 95 % of the consistent filters.
 
-    Above its band the mean NIS says that the filter assumes too little noise (or its model is wrong), below it too
-    much. ``nis_inside`` is the share of single NIS below the 95 % point of their own distribution. Of the normalised
-    innovations there are the autocorrelations ``(lags, n_y)`` at lags 1, 2, ..., with half the width of the 95 % band
-    of one, and the Ljung-Box statistic, summed over the outputs, with its 95 % point; both for white innovations.
+    If the mean NIS is above its band, the filter assumes too little noise (or its model is wrong); below, too much.
+    ``nis_inside`` is the share of single NIS below their 95 % quantile. ``autocorrelation`` ``(lags, n_y)`` are those
+    of the normalised innovations at lags 1, 2, ..., with half the width of the 95 % band of one; the Ljung-Box
+    statistic is summed over the outputs, with its 95 % quantile. Both bands are for white innovations.
     """
 
     runs: tuple[Innovations, ...]
@@ -63,14 +63,14 @@ def consistency(
     skip: int = 25,
     lags: int = 20,
 ) -> Consistency:
-    """Test a filter on recordings, which should be others than those it was tuned on.
+    """Test a filter on recordings, which should differ from those used for tuning.
 
     The mean NIS is compared with its chi-square band, the autocorrelations of the normalised innovations with those of
-    white noise (about zero, not about their mean: an offset fails too). On a nonlinear model both hold approximately. A
-    consistent switching filter has the same mean NIS, but its single NIS scatter more than band and ``nis_inside``
-    assume: its innovations are a mixture of Gaussians.
+    white noise (about zero, not about their mean, so an offset fails, too). For a nonlinear model both are approximate.
+    A consistent switching filter has the same mean NIS, but its single NIS scatter more than band and ``nis_inside``
+    assume, since its innovations are a mixture of Gaussians.
 
-    The first ``skip`` samples of each recording are left out, while the filter settles; ``lags`` is the largest lag.
+    The first ``skip`` samples of each recording are left out while the filter settles; ``lags`` is the largest lag.
 
     Source: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section
     5.4; Ljung, Box, *On a measure of lack of fit in time series models*, Biometrika 65 (1978).
@@ -79,7 +79,7 @@ def consistency(
 
     if skip < 1 or lags < 1:
         raise InputError(
-            f"consistency: skip and lags must be 1 or more, got {skip} and {lags} [HM-ESTIMATE-001]"
+            f"consistency: skip and lags must be at least 1, got {skip} and {lags} [HM-ESTIMATE-001]"
         )
     runs = tuple(innovations(estimator, recording, skip) for recording in recordings)
     nis = np.concatenate([np.zeros(0), *(run.nis for run in runs)])
@@ -88,8 +88,8 @@ def consistency(
     n, freedom = int(seen.sum()), int(degrees[seen].sum())
     if n < 5 * lags:
         raise InputError(
-            f"consistency: {n} samples are left after the first {skip} of each recording, at least {5 * lags} "
-            f"are needed for {lags} lags; give longer recordings or fewer lags [HM-ESTIMATE-002]"
+            f"consistency: {n} samples remain after the first {skip} of each recording, but {lags} lags need at least "
+            f"{5 * lags}. Give longer recordings or fewer lags. [HM-ESTIMATE-002]"
         )
     tail = (1.0 - LEVEL) / 2
     low, high = (float(chi2.ppf(share, freedom)) / n for share in (tail, 1.0 - tail))
@@ -109,14 +109,14 @@ def consistency(
 
 
 def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Innovations:
-    """Innovations of a filter along a recording on the model's grid, the first ``skip`` samples left out."""
+    """Innovations of a filter along a recording on the model's grid, without the first ``skip`` samples."""
     n_y, n = estimator.model.n_y, len(recording.y)
     if recording.y.shape != (n, n_y) or recording.u.shape != (n, estimator.model.n_u) or n == 0:
         raise InputError(
-            f"consistency: y {recording.y.shape} and u {recording.u.shape} given; needed: (n, {n_y}) and "
-            f"(n, {estimator.model.n_u}) with n > 0 [HM-ESTIMATE-003]"
+            f"consistency: y and u must have shapes (n, {n_y}) and (n, {estimator.model.n_u}) with n > 0, got "
+            f"{recording.y.shape} and {recording.u.shape} [HM-ESTIMATE-003]"
         )
-    ws = surroundings(estimator.model, recording)
+    ws = measured_disturbances(estimator.model, recording)
     estimate = estimator.start(recording.y[0], w=ws[0])
     rows: list[Array] = []
     nis: list[float] = []
@@ -144,7 +144,7 @@ def innovations(estimator: Filter, recording: Recording, skip: int = 25) -> Inno
 
 
 def _autocorrelation(runs: Sequence[Array], lags: int) -> tuple[Array, Array]:
-    """Autocorrelations ``(lags, n_y)`` over all runs, never across them, and the pairs of samples at each lag."""
+    """Autocorrelations ``(lags, n_y)`` within the runs, and the number of pairs of samples at each lag."""
     n_y = runs[0].shape[1]
     finite = [np.all(np.isfinite(e), axis=1) for e in runs]
     power = sum((np.sum(e[f] ** 2, axis=0) for e, f in zip(runs, finite, strict=True)), np.zeros(n_y))
@@ -156,7 +156,7 @@ def _autocorrelation(runs: Sequence[Array], lags: int) -> tuple[Array, Array]:
             pairs[lag - 1] += both.sum()
     if np.any(power == 0) or np.any(pairs == 0):
         raise InputError(
-            "consistency: the recordings hold no pairs of samples at some lag; use fewer lags"
+            "consistency: the recordings have no pairs of samples at some lag. Use fewer lags."
             " [HM-ESTIMATE-004]"
         )
     return r / power, pairs

@@ -1,4 +1,4 @@
-"""Estimates for loops with delays: filter what has arrived, then predict to the instant at which the input acts."""
+"""Estimates in loops with delays: filter arrived measurements, then predict to the time at which the input acts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Predictor(Estimator, Protocol):
-    """An estimator that predicts without a measurement and corrects without a prediction."""
+    """An estimator that can predict without a measurement and correct without a prediction."""
 
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """Estimate one period later with ``u`` held."""
@@ -27,10 +27,10 @@ class Predictor(Estimator, Protocol):
 
 @dataclass(frozen=True)
 class DelayedEstimate(Estimate):
-    """An estimate of the instant at which the next input acts, and what it was predicted from.
+    """An estimate at the time at which the next input acts, and its origin.
 
-    ``filtered`` is the estimate of the last measurement's instant, ``inputs`` are those held since, the oldest first.
-    ``missing`` measurements that were taken before the start are still to come.
+    ``filtered`` is the estimate at the time of the last measurement, ``inputs`` are the inputs since then, the oldest
+    first. ``missing`` measurements taken before the start are still to arrive.
     """
 
     filtered: Estimate
@@ -39,15 +39,15 @@ class DelayedEstimate(Estimate):
 
 
 class DelayCompensation:
-    """An estimator for a loop with delays, around one for the loop without.
+    """An estimator for a loop with delays, around an estimator for the loop without.
 
     A measurement arrives ``sensor_delay`` periods after it was taken, an input acts ``input_delay`` periods after it
-    was decided. The wrapped estimator runs on the measurements at their own instants; its model then predicts
-    ``sensor_delay + input_delay`` periods ahead with the inputs decided since. No method changes the object.
+    was decided. The wrapped estimator processes measurements at their own times; its model then predicts
+    ``sensor_delay + input_delay`` periods ahead with the inputs decided since. The object has no state of its own.
 
-    Before the start the machine rests under the input of its operating point: the first measurement counts for the
-    start itself, those that follow until the sensor has caught up are not used. Measured disturbances come with their
-    measurement and are held from then on.
+    Before the start the machine rests under the input of its operating point. The first measurement is used for the
+    start; later ones are ignored until the sensor has caught up. Measured disturbances arrive with their measurement
+    and are held from then on.
 
     Args:
         estimator: The estimator of the loop without delays.
@@ -55,7 +55,7 @@ class DelayCompensation:
         input_delay: Periods.
 
     Raises:
-        InputError: If a delay is not a whole number of periods, or negative.
+        InputError: If a delay is not an integer number of periods, or negative.
 
     Example:
         >>> import casadi as ca
@@ -74,7 +74,7 @@ class DelayCompensation:
         self._input = whole_periods(input_delay, "input_delay")
 
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> DelayedEstimate:
-        """First estimate, of the instant ``t`` plus the input delay, from the first measurement."""
+        """First estimate, at time ``t`` plus the input delay, from the first measurement."""
         resting = (self.model.u0,) * self._input
         first = self.estimator.start(y, t, **_given(w))
         return self._ahead(first, resting, self._sensor)
@@ -82,16 +82,16 @@ class DelayCompensation:
     def update(
         self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
     ) -> DelayedEstimate:
-        """Estimate one period later, from what arrives and the input decided since."""
+        """Estimate one period later, from the arrived measurement and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
             raise InputError(
-                "DelayCompensation goes on from its own estimates only; begin with start() [HM-ESTIMATE-005]"
+                "DelayCompensation: the estimate must be its own. Begin with start(). [HM-ESTIMATE-005]"
             )
         base, y = estimate.filtered, sampled(y, (None,), "y")
         inputs = (*estimate.inputs, sampled(u_prev, (None,), "u_prev"))
         if estimate.missing:
             missing = estimate.missing - 1
-            if not missing:  # this one was taken at the start itself
+            if not missing:  # this measurement was taken at the start
                 base = self.estimator.correct(base, y)
             return self._ahead(base, inputs, missing)
         return self._ahead(self.estimator.update(base, y, inputs[0], **_given(w)), inputs[1:], 0)
@@ -120,20 +120,20 @@ def _given(w: ArrayLike | None) -> dict[str, Array]:
 
 
 MOST_PERIODS = 10**6
-"""Most periods of a delay: each is remembered."""
+"""Most periods of a delay: each is stored."""
 
 
 def whole_periods(delay: float, name: str) -> int:
-    """A delay in periods, whole and not negative."""
+    """A delay in periods, a nonnegative integer."""
     return whole(delay, f"{name} [periods]", 0, MOST_PERIODS)
 
 
 def filtered(estimate: Estimate) -> Estimate:
-    """The estimate of the instant of the last measurement: what a delayed one was predicted from."""
+    """The estimate at the time of the last measurement, from which a delayed estimate was predicted."""
     return estimate.filtered if isinstance(estimate, DelayedEstimate) else estimate
 
 
 def sees_truth(estimator: Estimator) -> bool:
-    """Whether an estimator is an oracle's, which gets the true state."""
+    """Whether an estimator is an oracle's, which receives the true state."""
     inner = estimator.estimator if isinstance(estimator, DelayCompensation) else estimator
     return isinstance(inner, TrueState)

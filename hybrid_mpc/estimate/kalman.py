@@ -1,4 +1,4 @@
-"""Extended Kalman filter over state, hidden state and unmeasured disturbances; the estimator that gets the truth."""
+"""Extended Kalman filter over state, hidden state and unmeasured disturbances; and the oracle's estimator."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 
 Array = NDArray[np.float64]
 START_LIMIT = 25
-"""Most periods at rest that the first estimate runs the hidden state through: as many as training warms it up on.
-Longer makes a loop's first step late. Closed loops with a network depend on it (docs/results/README.md)."""
+"""Most periods at rest over which the first estimate settles the hidden state: as many as in training.
+More would delay a loop's first step. Closed loops with a network depend on this number (docs/results/README.md)."""
 FITS = 1e-6
-"""Squared error of the first outputs, in the sensors' deviations, below which a state fits them."""
+"""Largest squared error of the first outputs, in the sensors' standard deviations, of a state that fits them."""
 LOST = 1e12
-"""Growth of a variance that leaves few digits of a covariance: nothing is known any more."""
+"""Growth of a variance after which its covariance has few correct digits: the estimate is lost."""
 EXACT = 1e-9
-"""Error of the first outputs, in the sensors' deviations, that is rounding."""
+"""Largest error of the first outputs, in the sensors' standard deviations, that is rounding."""
 DEPENDENT = 1e-9
-"""Share of the largest singular value below which sensors count as showing the same."""
+"""Singular values below this share of the largest belong to redundant sensors."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of a machine's state at one instant.
+    """Estimate of a machine's state at one time.
 
     Args:
         t: Time [s].
         x: State ``(n_x,)`` [SI].
         h: Hidden state ``(n_h,)`` before ``(x, u)`` at ``t``.
         d: Unmeasured disturbances ``(n_d,)`` in the order of the model's ``disturbance_model``, by default at the
-            inputs [input units]: the machine acts as if its input were ``u + d``.
+            inputs [input units]: the machine behaves as if its input were ``u + d``.
         P: Covariance of ``(x, h, d)``, ``(n_x + n_h + n_d,) * 2``.
         innovation: Measured minus predicted outputs ``(n_y,)``; NaN where nothing was measured.
         nis: Normalised innovation squared [-], chi-square with n_y degrees of freedom if the filter's assumptions hold;
             NaN without a measurement.
-        w: Measured disturbances ``(n_w,)`` from ``t`` on; the last ones where there was no sample. Default: none.
+        w: Measured disturbances ``(n_w,)`` from ``t`` on; without a sample the last ones. Default: none.
     """
 
     t: float
@@ -61,10 +61,9 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """What a closed loop needs of an estimator. Both methods are pure.
+    """The methods that a closed loop needs of an estimator; both are pure.
 
-    ``w`` ``(n_w,)`` are the measured disturbances from the sample's instant on. A loop gives them where the model has
-    some, and only there.
+    ``w`` ``(n_w,)`` are the measured disturbances from the sample on, given if and only if the model has any.
     """
 
     @property
@@ -83,15 +82,15 @@ class Estimator(Protocol):
 class ExtendedKalmanFilter:
     """Extended Kalman filter over ``(x, h, d)`` with the model's exact Jacobian.
 
-    Unmeasured disturbances ``d`` are random walks; where they act says the model's ``disturbance_model``. Measured ones
-    ``w`` come with each sample and are held over the period. A network's hidden state has no noise of its own, it
-    follows the state; hidden states that are parameters have
-    (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). On a linear model this is the Kalman filter. No
-    method changes what the object gives; not for several threads at once (it reuses its buffers).
+    Unmeasured disturbances ``d`` are random walks that act as the model's ``disturbance_model`` says. Measured ones
+    ``w`` come with each sample and are held over the period. A network's hidden state follows the state and has no
+    noise of its own; hidden states that are parameters have noise
+    (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). For a linear model this is the Kalman filter. The
+    object has no state, but reuses its buffers: it is not thread-safe.
 
-    A prediction is lost if it is not finite, or a deviation is a million times what is given here for it: the larger of
-    its first one and its step per period, and of a state that a sensor shows what that shows of it (an unstable
-    model long without measurements, an absurd measurement). The next measurement then starts anew.
+    A prediction is lost if it is not finite, or a standard deviation is a million times its reference: the larger of
+    its first value and its step per period, and for a directly measured state the sensor's deviation (after a long time
+    without measurements of an unstable model, or an absurd measurement). The next measurement then restarts the filter.
 
     Args:
         model: The deployed model.
@@ -99,13 +98,13 @@ class ExtendedKalmanFilter:
         sigma_x: Standard deviations of the process noise per period ``(n_x,)`` [state units].
         sigma_x0: Standard deviations of the first state ``(n_x,)``.
         sigma_d: Standard deviations of the step of ``d`` per period ``(n_d,)`` [their units]. Default: zero.
-        sigma_d0: Standard deviations of the first disturbances ``(n_d,)``. Default: zero. Without both ``d`` stays
+        sigma_d0: Standard deviations of the first disturbances ``(n_d,)``. Default: zero. Without both, ``d`` stays
             exactly zero.
         sigma_h: Standard deviations of the step of the hidden states per period ``(n_h,)``. Default: zero.
         sigma_h0: Standard deviations of the first hidden states ``(n_h,)``. Default: zero.
 
     Raises:
-        InputError: If a shape does not fit, a deviation is negative or not finite, or ``sigma_y`` is 0.
+        InputError: If a shape does not fit, a standard deviation is negative or not finite, or ``sigma_y`` is 0.
 
     Source: Simon, *Optimal State Estimation*, 2006, section 13.2; Joseph form of the correction.
 
@@ -139,7 +138,7 @@ class ExtendedKalmanFilter:
         hidden0 = _variance(np.zeros(n_h) if sigma_h0 is None else sigma_h0, n_h, "sigma_h0")
         variance_y = _variance(sigma_y, n_y, "sigma_y")
         if not np.all(variance_y > 0):
-            raise InputError(f"sigma_y must be positive, got {np.asarray(sigma_y)} [HM-ESTIMATE-006]")
+            raise InputError(f"sigma_y: must be positive, got {np.asarray(sigma_y)} [HM-ESTIMATE-006]")
         self.model, self._sizes = model, (n_x, n_h, n_d, n_y)
         self._on_u, self._on_x, self._on_y = model.disturbed
         self._noise_y = variance_y
@@ -156,7 +155,7 @@ class ExtendedKalmanFilter:
 
     @property
     def noise(self) -> tuple[Array, Array]:
-        """Variances of the process noise of ``(x, h, d)`` a period ``(n,)``, and of the measurement ``(n_y,)``."""
+        """Variances of the process noise of ``(x, h, d)`` per period ``(n,)``, and of the measurement ``(n_y,)``."""
         return self._noise.copy(), self._noise_y.copy()
 
     @property
@@ -166,13 +165,13 @@ class ExtendedKalmanFilter:
 
     @property
     def most(self) -> Array:
-        """Variances of ``(x, h, d)`` ``(n,)`` beyond which nothing is known any more; the largest number where none is
-        given.
+        """Largest variances of ``(x, h, d)`` ``(n,)`` of an estimate that is not lost; the largest number without a
+        limit.
         """
         return self._lost.copy()
 
     def _most_known(self) -> Array:
-        """:attr:`most`: each in its own unit."""
+        """:attr:`most`, each in its own unit."""
         own = np.maximum(self._noise, self._first)
         by_x = self._measured(self.model.x0, self.model.u0, self.model.w)[1]
         for row, variance in zip(by_x, self._noise_y, strict=True):
@@ -182,17 +181,17 @@ class ExtendedKalmanFilter:
         return np.where(own > 0, LOST * own, np.finfo(np.float64).max)
 
     def lost(self, estimate: Estimate) -> bool:
-        """Whether an estimate is not finite, or so uncertain that nothing is known any more."""
+        """Whether an estimate is not finite, or too uncertain to be useful."""
         return not (estimate.finite and np.all(np.diag(estimate.P) <= self._lost))
 
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> Estimate:
-        """Estimate at rest: the state nearest to the operating point's with the output ``y`` ``(n_y,)``, ``d`` zero.
-        Distances count in ``sigma_x0``, so a state that is known exactly stays; in units where all are.
+        """Estimate at rest: the state closest to the operating point with the output ``y`` ``(n_y,)``; ``d`` is zero.
+        Distances are scaled by ``sigma_x0``, so an exactly known state is kept; if all of it is zero, by 1.
 
-        Elements of ``y`` that are not finite tell nothing. Where several states have the output (``l sin q``, a
-        speed's size) or the output does not move at the operating point, Newton's method begins one deviation
-        ``sigma_x0`` beside it too, and the nearest state of those that fit is taken. On which side it lies the
-        operating point says alone: the filter does not find out.
+        Elements of ``y`` that are not finite are ignored. If several states have the output (``l sin q``, the absolute
+        value of a speed), or the output has no slope at the operating point, Newton's method also starts one
+        ``sigma_x0`` away from it, and the closest fitting state is taken. The operating point alone determines the
+        side; the filter cannot correct it.
         """
         model, u = self.model, self.model.u0
         w = self.known_w(None, w)
@@ -204,12 +203,12 @@ class ExtendedKalmanFilter:
 
     @property
     def nearness(self) -> Array:
-        """What 1 means of a distance between first states ``(n_x,)``: ``sigma_x0``; ones where all of it is zero."""
+        """Scale of distances between first states ``(n_x,)``: ``sigma_x0``; ones if all of it is zero."""
         size = np.sqrt(self._first[: self._sizes[0]])
         return size if np.any(size > 0) else np.ones(size.size)
 
     def _fitting(self, x0: Array, y: Array, u: Array, w: Array) -> Array:
-        """The state ``(n_x,)`` nearest to ``x0`` whose output is ``y`` where that is finite."""
+        """The state ``(n_x,)`` closest to ``x0`` whose output is ``y`` where ``y`` is finite."""
         x, unlike, whole = self._newton(x0, y, u, w)
         if whole and unlike < FITS:
             return x
@@ -220,10 +219,10 @@ class ExtendedKalmanFilter:
         size = self.nearness
         return min(fitting, key=lambda x: float(np.sum(((x - x0) / np.where(size > 0, size, 1.0)) ** 2)))
 
-    @np.errstate(over="ignore", invalid="ignore")  # no value of a sensor warns
+    @np.errstate(over="ignore", invalid="ignore")  # no sensor value may cause a warning
     def _newton(self, x: Array, y: Array, u: Array, w: Array) -> tuple[Array, float, bool]:
-        """A state whose output is ``y`` by Newton's method, the squared error in deviations of the sensors, and whether
-        no step had to be shortened. One step if the outputs are linear in the state.
+        """A state whose output is ``y`` by Newton's method, its squared error in the sensors' standard deviations, and
+        whether all steps were full. For outputs linear in the state this is one step.
         """
         seen, whole, size_x, sigma = np.isfinite(y), True, self.nearness, np.sqrt(self._noise_y)
 
@@ -243,7 +242,7 @@ class ExtendedKalmanFilter:
                 after = lacks(moved)
                 if after[2] < size:
                     break
-                if size < FITS:  # what is left is rounding
+                if size < FITS:  # only rounding is left
                     return x, size, whole
                 whole = False
             else:
@@ -252,7 +251,7 @@ class ExtendedKalmanFilter:
         return x, size if np.isfinite(size) else np.inf, whole
 
     def known_w(self, estimate: Estimate | None, w: ArrayLike | None) -> Array:
-        """Measured disturbances ``(n_w,)``: what was measured, else the last ones, else the operating point's."""
+        """Measured disturbances ``(n_w,)``: the measured values, else the last ones, else the operating point's."""
         n_w = self.model.n_w
         last = estimate.w if estimate is not None and estimate.w.size == n_w else self.model.w
         if w is None or not n_w:

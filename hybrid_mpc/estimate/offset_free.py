@@ -1,4 +1,4 @@
-"""Whether outputs could be held without offset: the rank test of a disturbance model, and that of the targets."""
+"""Rank tests for offset-free control: of a disturbance model, and of the targets."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
-from hybrid_mpc.model.riccati import coming_back, unmoved
+from hybrid_mpc.model.riccati import remedy_for_unmoved, unmoved_states
 
 Array = NDArray[np.float64]
 AROUND = 5
-"""Points around the operating point that are asked where the model cannot tell the disturbances there."""
+"""Points around the operating point that are tested if the disturbances cannot be distinguished at it."""
 RANK = 1e-9
-"""Singular values below this share of the largest count as zero, rows and columns brought to one size."""
+"""Singular values below this share of the largest count as zero, after scaling of rows and columns."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class OffsetFree:
     Args:
         n_d: Number of unmeasured disturbances.
         n_y: Number of outputs.
-        rank: Of ``[[A - I, B_d], [C, C_d]]``.
-        needed: ``n_z + n_d``: with less the outputs cannot tell the disturbances from the states.
-        target_rank: Of ``[[A - I, B], [C_c, D_c]]``, ``c`` the controlled outputs.
-        target_needed: ``n_z + n_c``: with less not every set-point has a steady state.
-        unmoved: Where the targets' rank lacks: states that no input moves and that never come to rest
-            (:func:`~hybrid_mpc.model.riccati.unmoved`).
+        rank: Rank of ``[[A - I, B_d], [C, C_d]]``.
+        needed: ``n_z + n_d``: with less, the outputs cannot distinguish disturbances and states.
+        target_rank: Rank of ``[[A - I, B], [C_c, D_c]]``, ``c`` the controlled outputs.
+        target_needed: ``n_z + n_c``: with less, not every set-point has a steady state.
+        unmoved: If the targets' rank is too low: states that no input affects and that do not return to rest
+            (:func:`~hybrid_mpc.model.riccati.unmoved_states`).
     """
 
     n_d: int
@@ -46,13 +46,13 @@ class OffsetFree:
 
     @property
     def detectable(self) -> bool:
-        """Whether a filter can find the disturbances."""
+        """Whether the disturbances are detectable by a filter."""
         return self.rank == self.needed
 
     @property
     def promised(self) -> bool:
-        """Whether the rank conditions hold under which constant disturbances can leave no offset in the controlled
-        outputs, where no limit is active. Whether a kit's loop leaves none is tried by its run
+        """Whether the rank conditions hold for offset-free control of the controlled outputs under constant
+        disturbances, as long as no limit is active. The run of a kit tests its loop for offsets
         (:attr:`~hybrid_mpc.kit.artifact.Kit.promises`).
         """
         return not self.why
@@ -64,25 +64,25 @@ class OffsetFree:
 
     @property
     def why(self) -> str:
-        """Which condition is missing; empty: none."""
-        few = f"{self.n_d} disturbances for {self.n_y} outputs; as many are needed"
+        """The violated conditions; empty if all hold."""
+        few = f"{self.n_d} disturbances for {self.n_y} outputs, but as many are needed"
         parts = (self.why_undetectable, few * (self.n_d != self.n_y), self.why_unreachable)
         return "; ".join(part for part in parts if part)
 
     @property
     def why_undetectable(self) -> str:
-        """Why a filter cannot find the disturbances; empty: it can."""
+        """Why a filter cannot detect the disturbances; empty if it can."""
         ranks = f"(rank {self.rank}, needed {self.needed})"
-        return f"the outputs cannot tell the disturbances from the states {ranks}" * (not self.detectable)
+        return f"the outputs cannot distinguish disturbances and states {ranks}" * (not self.detectable)
 
     @property
     def why_unreachable(self) -> str:
-        """Why the inputs cannot hold the outputs where they are asked to be; empty: they can."""
+        """Why the inputs cannot hold the outputs at their set-points; empty if they can."""
         if self.reachable:
             return ""
         ranks = f"(rank of the targets {self.target_rank}, needed {self.target_needed})"
-        why = coming_back(self.unmoved) or "weigh other outputs in q_y"
-        return f"the inputs cannot hold the controlled outputs anywhere they are asked to be {ranks}; {why}"
+        why = remedy_for_unmoved(self.unmoved) or "Weigh other outputs in q_y"
+        return f"the inputs cannot hold the controlled outputs at arbitrary set-points {ranks}. {why}"
 
 
 def offset_free(
@@ -97,7 +97,7 @@ def offset_free(
 
     Args:
         model: The model, with its ``disturbance_model``.
-        controlled: Places of the outputs that are to be held. Default: all.
+        controlled: Indices of the controlled outputs. Default: all.
         x: State ``(n_x,)``. Default: the operating point's.
         u: Input ``(n_u,)``. Default: likewise.
         w: Measured disturbances ``(n_w,)``. Default: likewise.
@@ -115,8 +115,8 @@ def offset_free(
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x,
         ...     disturbance_model=(Disturbance("output", "x", 1.0),))
-        >>> offset_free(model).why  # an offset of the sensor and the level are one
-        'the outputs cannot tell the disturbances from the states (rank 1, needed 2)'
+        >>> offset_free(model).why  # a sensor's offset and the level cannot be distinguished
+        'the outputs cannot distinguish disturbances and states (rank 1, needed 2)'
     """
     x = model.x0 if x is None else vector(x, model.n_x, "x")
     u = model.u0 if u is None else vector(u, model.n_u, "u")
@@ -133,25 +133,25 @@ def offset_free(
     chosen = list(range(model.n_y)) if controlled is None else list(controlled)
     if not all(0 <= i < model.n_y for i in chosen):
         raise InputError(
-            f"controlled: {chosen} given; needed: places of the {model.n_y} outputs [HM-ESTIMATE-010]"
+            f"controlled: must be indices of the {model.n_y} outputs, got {chosen} [HM-ESTIMATE-010]"
         )
     target_rank, target_needed = _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen)
     return OffsetFree(
         model.n_d, model.n_y,
         _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d, target_rank, target_needed,
-        unmoved(model, a, b) if target_rank < target_needed else (),
+        unmoved_states(model, a, b) if target_rank < target_needed else (),
     )  # fmt: skip
 
 
 def distinguishable(model: HybridModel, sizes: ArrayLike | None = None) -> OffsetFree:
-    """The rank test at the operating point, or in motion around it where that alone tells the disturbances.
+    """The rank test at the operating point, or at points around it if the disturbances are only detectable in motion.
 
-    At rest a bristle of friction takes up a load, so there the two are one; in motion they are not.
+    At rest the bristle of a friction model compensates a load, so the two cannot be distinguished; in motion they can.
 
     Args:
         model: The model.
-        sizes: Sizes of the states ``(n_x,)``, which are moved by a tenth of them. Default: by the spread in recordings
-            or half the signals' ranges; a state without either stays.
+        sizes: Sizes of the states ``(n_x,)``, which are moved by a tenth of them. Default: the spread in recordings, or
+            half the signals' ranges; a state without either stays.
     """
     around = _sizes(model) if sizes is None else 0.1 * vector(sizes, model.n_x, "sizes")
     found = offset_free(model)
@@ -165,7 +165,7 @@ def distinguishable(model: HybridModel, sizes: ArrayLike | None = None) -> Offse
 
 
 def _sizes(model: HybridModel) -> Array:
-    """How far around the operating point: a tenth of a state's spread, or of half its range."""
+    """Distances around the operating point: a tenth of a state's spread, or of half its range."""
     half = np.array([0.5 * (s.upper - s.lower) for s in model.states])
     half = np.where(np.isfinite(half), half, 0.0)
     return 0.1 * (
@@ -174,9 +174,9 @@ def _sizes(model: HybridModel) -> Array:
 
 
 def _rank(matrix: Array) -> int:
-    """Rank of a matrix whose rows and columns have units of their own.
+    """Rank of a matrix whose rows and columns have their own units.
 
-    A model that gives no finite number there is not refused for it: the monitor says so, and the loop falls back.
+    A model with non-finite values has full rank here: the monitor reports it, and the loop falls back.
     """
     if not np.all(np.isfinite(matrix)):
         return min(matrix.shape)

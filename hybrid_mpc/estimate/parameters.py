@@ -1,4 +1,4 @@
-"""Parameters of the prior as constant states: a filter estimates them, a controller plans with them."""
+"""Parameters of the prior as constant states: estimated by a filter, used by a controller."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from hybrid_mpc.model.model import (
 
 Array = NDArray[np.float64]
 LEAST = 1.0 - 1e-9
-"""Share of its bound at which a factor's state ends: at the bound itself it would be infinite."""
+"""Largest state of a factor, as a share of its bound: at the bound itself it would be infinite."""
 FIRST = 0.02
-"""Deviation of the first parameter states: a fitted model's parameters are known to a few per cent."""
+"""Standard deviation of the first parameter states: a fitted model's parameters are known to a few per cent."""
 
 
 def with_parameter_states(
@@ -40,28 +40,27 @@ def with_parameter_states(
 ) -> HybridModel:
     """The same model with one further hidden state for each group of the prior's parameters.
 
-    The states ``theta`` ``(n_g,)`` are constant and stand after the model's own ``h``. The parameters of group i are
+    The states ``theta`` ``(n_g,)`` are constant and follow the model's own ``h``. The parameters of group i are
     multiplied by ``exp(L tanh(theta_i / L))`` with ``L = log(most)``: a small ``theta`` is the relative change, and no
     estimate leaves the bounds. A step adds the change of the prior's acceleration, ``a(x, u, p(theta)) - a(x, u, p)``
-    in the middle of the model's own step, held over the period and damped as the changed prior damps it (linearly
-    implicit, so that steep friction stays stable). What the network adds stays as it is. At zero the model is the one
-    given, to the last bit.
+    in the middle of the model's own step, held over the period and damped like the changed prior (linearly implicit,
+    so steep friction stays stable). The network's correction does not change. At zero the model equals the given one,
+    to the last bit.
 
     A filter estimates ``theta`` with ``sigma_h`` and ``sigma_h0`` (:class:`ExtendedKalmanFilter`); a controller on this
-    model plans with the estimate. No input controls these states, so there is no LQR with them: give the problem the
-    terminal weight of the given model, ``OCP.terminal_weight(model)``.
+    model uses the estimate. No input affects these states, so there is no LQR for them: give the problem the terminal
+    weight of the given model, ``OCP.terminal_weight(model)``.
 
     Args:
-        model: A model that knows its parameters.
-        groups: Names, and the parameters of each, which change in proportion; an input's gain is
+        model: A model with parameters.
+        groups: Names, and the parameters of each, which change in proportion; the gain of an input is
             ``"gain of <input>"``.
-        prior: Model of the prior alone, whose parameters change. Default: the model itself, where it has no network.
-        most: Largest factor; the smallest is one over it. Default 4.
+        prior: Model of the prior alone, whose parameters change. Default: the model itself, if it has no network.
+        most: Largest factor; the smallest is its inverse. Default 4.
 
     Raises:
-        InputError: If the model does not know its parameters, has a network and no prior is given, has further states
-            than positions and velocities, or inputs that act later; if a parameter is unknown, or ``most`` is not
-            above 1.
+        InputError: If the model has no parameters, has a network and no prior is given, has states other than positions
+            and velocities, or a delayed input; if a parameter is unknown, or ``most`` is not above 1.
 
     Source: Simon, *Optimal State Estimation*, 2006, section 13.4 (parameter estimation).
 
@@ -82,11 +81,11 @@ def with_parameter_states(
     _check_model(model, prior or model)
     if not (math.isfinite(most) and most > 1):
         raise InputError(
-            f"parameter states: most = {most} given, the largest factor; it must be above 1, e.g. 4 [HM-ESTIMATE-011]"
+            f"parameter states: most, the largest factor, must be above 1, e.g. 4, got {most} [HM-ESTIMATE-011]"
         )
     if not groups:
         raise InputError(
-            'parameter states: at least one group needed, e.g. {"mass": ("m", "J")} [HM-ESTIMATE-012]'
+            'parameter states: at least one group is needed, e.g. {"mass": ("m", "J")} [HM-ESTIMATE-012]'
         )
     acceleration = _acceleration(model, given, groups, most)
     change, n_g = _change(model, acceleration), len(groups)
@@ -122,31 +121,31 @@ def parameter_filter(
     drift: float = 1e-3,
     step: float = 0.1,
 ) -> SwitchingFilter:
-    """The filter of a model with parameter states: quiet while nothing happens, quick when something breaks.
+    """The filter of a model with parameter states: quiet normally, quick after a fault.
 
-    It switches between three filters: quiet, slip (ten times the process noise), and break, in which parameters step.
-    Keep ``sigma_d`` small: a load and heavier friction are the same until the motion turns round, and no parameter
-    learns what a quick disturbance has explained.
+    It switches between three filters: quiet, slip (ten times the process noise), and fault, in which parameters step.
+    Keep ``sigma_d`` small: a load and heavier friction are indistinguishable until the motion reverses, and a change
+    that a quick disturbance has explained is not attributed to a parameter.
 
     Args:
-        model: What :func:`with_parameter_states` made.
+        model: The result of :func:`with_parameter_states`.
         groups: Number of its parameter states.
         sigma_y: See :class:`ExtendedKalmanFilter`.
         sigma_x: Likewise.
         sigma_x0: Likewise.
         sigma_d: Likewise. Default: no disturbance.
         sigma_d0: Likewise.
-        drift: Step of the parameter states per period while nothing happens, a relative change [-]. Default 0.001.
-        step: Their step per period of a break [-]; a break lasts two periods on average. Default 0.1.
+        drift: Step of the parameter states per period without a fault, a relative change [-]. Default 0.001.
+        step: Their step per period during a fault [-]; a fault lasts two periods on average. Default 0.1.
 
     Raises:
-        InputError: If there are fewer hidden states, or a deviation does not fit.
+        InputError: If there are fewer hidden states, or a standard deviation does not fit.
 
     Example: ``parameter_filter(adaptive, 2, sigma_y=[5e-4], sigma_x=[2e-5, 2e-3], sigma_x0=[5e-4, 0.1])``
     """
     if not 1 <= groups <= model.n_h:
         raise InputError(
-            f"parameter filter: {groups} groups given, model {model.name} has {model.n_h} hidden states"
+            f"parameter filter: {groups} groups given, but model {model.name} has {model.n_h} hidden states"
             " [HM-ESTIMATE-013]"
         )
     own = np.zeros(model.n_h - groups)
@@ -173,7 +172,7 @@ def parameter_factors(theta: ArrayLike, most: float = 4.0) -> Array:
 
 
 def parameter_states(factors: ArrayLike, most: float = 4.0) -> Array:
-    """States ``theta`` ``(..., n_g)`` of factors on the parameters, cut to the bounds.
+    """States ``theta`` ``(..., n_g)`` for factors on the parameters, clipped to the bounds.
 
     Raises:
         InputError: If a factor is not positive.
@@ -194,20 +193,20 @@ def _check_model(model: HybridModel, prior: HybridModel) -> None:
     found = ca.Function("kinematics", point, [slope])(0, 0, 0, prior.w, prior.p).full()
     if model.n_x % 2 or not np.array_equal(found, np.eye(n_q, model.n_x + model.n_u, n_q)):
         raise InputError(
-            f"parameter states: the states {[s.name for s in model.states]} of model {model.name} are not positions "
-            "and then their velocities; nothing else is dealt with, no lags [HM-ESTIMATE-015]"
+            f"parameter states: the states {[s.name for s in model.states]} of model {model.name} must be positions "
+            "followed by their velocities; others, e.g. lags, are not supported [HM-ESTIMATE-015]"
         )
     if model.delay_states:
         raise InputError(
-            f"parameter states: the inputs of model {model.name} act later; parameters as states are for "
-            "models without a delay [HM-ESTIMATE-016]"
+            f"parameter states: model {model.name} has delayed inputs; parameter states need a model "
+            "without a delay [HM-ESTIMATE-016]"
         )
 
 
 def _acceleration(
     model: HybridModel, given: ca.Function, groups: Mapping[str, Sequence[str]], most: float
 ) -> ca.Function:
-    """``(x, u, theta, w, p) -> a`` of the prior; one function, so that it is exactly itself at equal arguments."""
+    """``(x, u, theta, w, p) -> a`` of the prior; a single function, so that equal arguments give equal bits."""
     if empty := [group for group, names in groups.items() if not names]:
         raise InputError(f"parameter states: group {empty[0]!r} is empty [HM-ESTIMATE-017]")
     changed = ca.DM(incidence(model, groups, "parameter states"))
@@ -219,7 +218,10 @@ def _acceleration(
 
 
 def _change(model: HybridModel, acceleration: ca.Function) -> ca.Function:
-    """``(x, theta, u, w, p) -> dx`` and its Jacobian by ``x, theta, u``: what theta changes in the period around x."""
+    """``(x, theta, u, w, p) -> dx``, the change over a period due to theta, and its Jacobian by ``x, theta, u``.
+
+    Linearly implicit midpoint rule: ``(I - dt/2 da/dv) dv = dt (a(theta) - a(0))``, ``dq = dt/2 dv``.
+    """
     n_g, n_q, dt = acceleration.size1_in(2), acceleration.size1_out(0), model.dt
     (x, _, u, w, p), theta = step_symbols(model), ca.MX.sym("theta", n_g)
     changed = acceleration(x, u, theta, w, p)
@@ -232,10 +234,10 @@ def _change(model: HybridModel, acceleration: ca.Function) -> ca.Function:
 
 
 def _expanded(f: ca.Function) -> ca.Function:
-    """In scalar operations where they allow it: quicker for a few numbers."""
+    """The function in scalar operations if possible: faster for a few numbers."""
     try:
         return f.expand()
-    except RuntimeError:  # an operation that has none
+    except RuntimeError:  # an operation without a scalar form
         return f
 
 
@@ -248,7 +250,7 @@ def _with_jacobian(model: HybridModel, change: ca.Function, n_g: int) -> ca.Func
     x_next, h_next, a, b = inlined(f, [x, own, u, w, p])
     dx, slopes = change(0.5 * (x + x_next), theta, u, w, p)
     by_x, by_theta, by_u = ca.horzsplit(slopes, [0, n_x, n_x + n_g, slopes.size2()])
-    onto = ca.DM.eye(n_x) + 0.5 * by_x  # what the model's own step passes on, moved to the middle
+    onto = ca.DM.eye(n_x) + 0.5 * by_x  # derivative of the state plus its change in the middle of the step
     rows_x = ca.horzcat(onto @ a[:n_x, :] + 0.5 * ca.horzcat(by_x, ca.MX.zeros(n_x, n_h)), by_theta)
     rows_h = ca.horzcat(a[n_x:, :], ca.MX.zeros(n_h, n_g))
     rows_theta = ca.horzcat(ca.MX.zeros(n_g, n_x + n_h), ca.MX.eye(n_g))
@@ -258,7 +260,7 @@ def _with_jacobian(model: HybridModel, change: ca.Function, n_g: int) -> ca.Func
 
 
 def _side_by_side(model: HybridModel, base: SideBySide, change: ca.Function, n_g: int) -> SideBySide:
-    """The same at many points: the given model's own way, and the change beside it."""
+    """The same at many points: the given model's own function, plus the change."""
     n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
     sizes = {"x": n_x, "h": n_h, "u": n_u}
 

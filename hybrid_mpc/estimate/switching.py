@@ -1,4 +1,4 @@
-"""Several Kalman filters side by side, and how probable each is: quick for a jump, quiet otherwise."""
+"""Several Kalman filters in parallel with probabilities: quick after a jump, quiet otherwise."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from hybrid_mpc.model.model import output_with_jacobian
 
 Array = NDArray[np.float64]
 NEGLIGIBLE = 0.01
-"""Share of a mode's past below which another mode is not mixed in: the wide covariance of an improbable jump would keep
-the quiet filter from becoming quiet."""
+"""Share of a mode's past below which another mode is not mixed in: the large covariance of an improbable jump would
+keep the quiet filter from becoming quiet."""
 SLIP = 10.0
-"""Process noise over the quiet one while a machine slips: sticking friction that breaks, backlash, an impact."""
+"""Process noise, over the quiet one, while a machine slips: breakaway of friction, backlash, an impact."""
 SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
-"""Probability per period to go from one of three modes (quiet, slip, jump) to another. At 50 Hz: a slip every second, a
-load that comes or goes or a part that breaks every 40 s; each lasts a period or two."""
+"""Transition probabilities per period between three modes (quiet, slip, jump). At 50 Hz: a slip every second, a load
+change or a fault every 40 s; each lasts one or two periods."""
 
 
 @dataclass(frozen=True)
 class SwitchingEstimate(Estimate):
-    """Estimates of several filters; its own fields are their weighted means.
+    """Estimates of several filters; the inherited fields are their weighted means.
 
     Args:
         z: ``(x, h, d)`` of each filter ``(m, n)``.
-        covariances: Of each ``(m, n, n)``.
-        innovations: Of each ``(m, n_y)``.
+        covariances: Covariance of each ``(m, n, n)``.
+        innovations: Innovation of each ``(m, n_y)``.
         nis_each: Normalised innovation squared of each ``(m,)``.
-        probability: Of each ``(m,)``.
+        probability: Probability of each ``(m,)``.
     """
 
     z: Array
@@ -55,16 +55,16 @@ class SwitchingEstimate(Estimate):
 
 
 class SwitchingFilter:
-    """Interacting multiple models: filters on one model that differ in the noise that they assume.
+    """Interacting multiple models: filters on one model that assume different noise.
 
-    One Kalman filter is either quiet or quick: the step that it allows a disturbance makes it follow a sudden load, and
-    lets the sensor's noise through at all times. Here each filter assumes one mode of the noise, a Markov chain says
-    how often modes change, and the measurements say which one is likely now. No method changes what the object gives;
-    not for several threads at once (it reuses its buffers).
+    A single Kalman filter is either quiet or quick: the step that it allows a disturbance lets it follow a sudden load,
+    but also passes the sensor's noise at all times. Here each filter assumes one mode of the noise, a Markov chain
+    describes the changes of modes, and the measurements determine the probability of each mode. The object has no
+    state, but reuses its buffers: it is not thread-safe.
 
     Args:
-        filters: The modes; same model.
-        transition: Probability per period ``(m, m)`` to go from mode i (row) to mode j.
+        filters: One filter per mode, on the same model.
+        transition: Probability per period ``(m, m)`` of a change from mode i (row) to mode j.
 
     Raises:
         InputError: If there are no filters, their models differ, or the rows of ``transition`` are no probabilities.
@@ -91,11 +91,11 @@ class SwitchingFilter:
         m, p = len(filters), np.array(transition, dtype=float)
         if not m or any(f.model is not filters[0].model for f in filters):
             raise InputError(
-                "a switching filter needs at least one filter, all on the same model [HM-ESTIMATE-018]"
+                "switching filter: at least one filter is needed, all on the same model [HM-ESTIMATE-018]"
             )
         if p.shape != (m, m) or np.any(p < 0) or not np.allclose(p.sum(axis=1), 1.0, atol=1e-9):
             raise InputError(
-                f"transition: probabilities of shape {(m, m)} whose rows sum to 1 needed, got {p.tolist()}"
+                f"transition: must be probabilities of shape {(m, m)} with rows that sum to 1, got {p.tolist()}"
                 " [HM-ESTIMATE-019]"
             )
         model = filters[0].model
@@ -177,12 +177,14 @@ class SwitchingFilter:
     def _assessed(
         self, t: float, w: Array, z: Array, p: Array, probability: Array, y: Array, u: ArrayLike | None
     ) -> tuple[SwitchingEstimate, float]:
-        """Estimate after a measurement of which something is there, and its log-likelihood."""
+        """Estimate after a measurement with at least one finite output, and its log-likelihood."""
         y_hat, c = self._measured(z, u, w)
         seen = np.isfinite(y)
         innovations = np.where(seen, y - y_hat, np.nan)
         step, nis, size = np.zeros(z.shape), np.zeros(len(z)), np.zeros(len(z))
-        for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
+        for i in np.flatnonzero(
+            seen
+        ):  # sequential updates are exact, since the sensors' noises are independent
             row, noise = c[:, i], self._noise_y[:, i]
             pc = np.einsum("mij,mj->mi", p, row)
             s = np.sum(row * pc, axis=1) + noise
@@ -195,7 +197,7 @@ class SwitchingFilter:
         likelihood = np.where(np.isfinite(likelihood), likelihood, -np.inf)
         largest = float(np.max(likelihood))
         weight = probability * np.exp(likelihood - largest)
-        if not np.sum(weight) > 0:  # absurd to every filter: it says nothing of the modes
+        if not np.sum(weight) > 0:  # impossible for every filter: no information about the modes
             weight, largest = probability, -np.inf
         share = weight / weight.sum()
         after = self._together(
@@ -218,17 +220,17 @@ class SwitchingFilter:
         return y.reshape(m, n_y) + d @ on_y.T, c
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
-        """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation; that of the mixture."""
+        """Covariance ``(n_y, n_y)`` of a predicted estimate's innovation, for the mixture."""
         return self.filters[0].innovation_covariance(estimate, u)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what overflows is lost
     def update(
         self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
     ) -> SwitchingEstimate:
-        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``; ``w`` as
-        :meth:`ExtendedKalmanFilter.update` takes it.
+        """:meth:`predict` with the input ``u_prev`` held since, then :meth:`correct` with ``y``; ``w`` as for
+        :meth:`ExtendedKalmanFilter.update`.
 
-        A lost prediction is dropped: the estimate starts anew from ``y`` if any of it is finite.
+        A lost prediction is dropped: the estimate restarts from ``y`` if any element of it is finite.
         """
         before, y = self._own(estimate), sampled(y, (self.model.n_y,), "y")
         z, p, probability = self._predicted(before, u_prev)
@@ -241,7 +243,7 @@ class SwitchingFilter:
         return self._assessed(t, w, z, p, probability, y, u_prev)[0]
 
     def measuring(self, predicted: Estimate, w: ArrayLike | None) -> SwitchingEstimate:
-        """The prediction with the disturbances ``w`` ``(n_w,)`` that were measured at its instant."""
+        """The prediction with the disturbances ``w`` ``(n_w,)`` measured at its time."""
         before = self._own(predicted)
         return before if w is None else replace(before, w=self._w(before, w))
 
@@ -251,7 +253,7 @@ class SwitchingFilter:
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
         if not isinstance(estimate, SwitchingEstimate) or len(estimate.z) != len(self.filters):
             raise InputError(
-                "SwitchingFilter goes on from its own estimates only; begin with start() [HM-ESTIMATE-020]"
+                "SwitchingFilter: the estimate must be its own. Begin with start(). [HM-ESTIMATE-020]"
             )
         return estimate
 
@@ -259,7 +261,7 @@ class SwitchingFilter:
         self, t: float, w: Array, z: Array, p: Array, probability: Array, innovation: Array | None = None,
         nis: float = float("nan"), each: tuple[Array, Array] | None = None,
     ) -> SwitchingEstimate:  # fmt: skip
-        """The filters' estimates with one Gaussian that has the mean and the covariance of their mixture."""
+        """The filters' estimates, and one Gaussian with the mean and covariance of their mixture."""
         n_x, n_z = self._ends
         mean = probability @ z
         off = z - mean
@@ -275,11 +277,11 @@ class SwitchingFilter:
 
 
 Filter: TypeAlias = ExtendedKalmanFilter | SwitchingFilter
-"""A filter on one model: it predicts, corrects, and knows the likelihood of its measurements."""
+"""A filter on one model: it predicts, corrects, and computes the likelihood of measurements."""
 
 
 def _stationary(transition: Array) -> Array:
-    """Shares ``(m,)`` of its time that the chain spends in each mode."""
+    """Stationary distribution ``(m,)`` of the Markov chain."""
     m = len(transition)
     rows = np.vstack([transition.T - np.eye(m), np.ones(m)])
     shares = np.linalg.lstsq(rows, np.append(np.zeros(m), 1.0), rcond=None)[0]

@@ -1,4 +1,4 @@
-"""Process noise of a filter: a model's errors over one period, and their scale by maximum likelihood."""
+"""Process noise of a filter: a model's one-period errors, scaled by maximum likelihood."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 BESIDE = 0.1
-"""Share of its range by which each state lies beside the operating point where a load is looked for in motion."""
+"""Share of its range by which each state is moved from the operating point to look for a load in motion."""
 FOUND = math.exp(-1.0)
-"""Share of a constant disturbance that is left when a filter has found it: a filter of one time constant leaves so much
-after that time."""
+"""Remaining share of a constant disturbance that a filter has found: that of a first-order lag after one time
+constant."""
 ROUNDING = 1e-9
 """Share of a state's size below which a model's error is rounding: no filter assumes less noise."""
 
@@ -32,7 +32,7 @@ class Recording(Protocol):
 
     @property
     def u(self) -> Array:
-        """Inputs ``(n, n_u)``, each held over the period that it begins."""
+        """Inputs ``(n, n_u)``, each held over the period that begins with it."""
 
     @property
     def y(self) -> Array:
@@ -51,66 +51,65 @@ class Known(Recording, Protocol):
         """States ``(n, n_x)``."""
 
 
-def surroundings(model: HybridModel, recording: Recording) -> Array:
-    """Measured disturbances of a recording ``(n, n_w)``; none where the model has none.
+def measured_disturbances(model: HybridModel, recording: Recording) -> Array:
+    """Measured disturbances of a recording ``(n, n_w)``; empty if the model has none.
 
     Raises:
-        InputError: If it has others than the model.
+        InputError: If their number differs from the model's.
     """
     n = len(recording.u)
     if not model.n_w:
         return np.zeros((n, 0))
     w: Array = np.asarray(recording.w, dtype=np.float64)
     if w.shape != (n, model.n_w):
-        raise InputError(
-            f"recording: measured disturbances {w.shape} given, needed: {(n, model.n_w)} [HM-ESTIMATE-021]"
-        )
+        raise InputError(f"recording: w must have shape {(n, model.n_w)}, got {w.shape} [HM-ESTIMATE-021]")
     return w
 
 
 def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4000) -> Array:
     """Standard deviations ``(n_x,)`` of the model's one-period errors on recordings [SI].
 
-    The hidden state runs along the measured states, from zero.
+    The hidden state follows the measured states, starting at zero.
 
     Args:
         model: The model.
         recordings: Smoothed recordings on the model's grid (the training ones).
-        most: After so many periods no further recording is looked at. Default 4000.
+        most: Number of periods after which no further recording is used. Default 4000.
 
     Raises:
-        InputError: If there is no period to look at.
+        InputError: If there is no period.
 
     Example:
         ``ExtendedKalmanFilter(model, sigma_x=process_noise(model, train), sigma_y=[1e-3], sigma_x0=[1e-3, 0.1])``
     """
     errors: list[Array] = []
     for recording in recordings:
-        h, ws = np.zeros(model.n_h), surroundings(model, recording)
+        h, ws = np.zeros(model.n_h), measured_disturbances(model, recording)
         for k in range(len(recording.u) - 1):
             x_next, h = (
                 m.full().ravel() for m in model.step(recording.x[k], h, recording.u[k], ws[k], model.p)
             )
-            if k >= model.delay_states:  # before, the inputs under way are unknown
+            if k >= model.delay_states:  # earlier the delayed inputs are unknown
                 errors.append(x_next - recording.x[k + 1])
         if len(errors) >= most:
             break
     if not errors:
         raise InputError(
-            "process noise: no recording with at least two samples given; pass training recordings [HM-ESTIMATE-022]"
+            "process noise: a recording with at least two samples is needed. Pass training recordings."
+            " [HM-ESTIMATE-022]"
         )
     sizes = np.sqrt(np.mean(np.square(np.concatenate([r.x for r in recordings])), axis=0))
     return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), ROUNDING * sizes)
 
 
 def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> float:
-    """Log-likelihood of the measured outputs under a filter's own innovations and their variances.
+    """Log-likelihood of the measured outputs under a filter's innovations and their variances.
 
-    The sum over samples, the first ``skip`` left out, without the constant; minus infinity where the filter is lost.
+    The sum over samples after the first ``skip``, without the constant; minus infinity if the filter diverges.
 
     Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
     """
-    ws = surroundings(estimator.model, recording)
+    ws = measured_disturbances(estimator.model, recording)
     estimate, total = estimator.start(recording.y[0], w=ws[0]), 0.0
     for k in range(1, len(recording.y)):
         ahead = estimator.measuring(estimator.predict(estimate, recording.u[k - 1]), ws[k])
@@ -122,20 +121,20 @@ def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> f
     return total
 
 
-def most_likely(
+def choose_most_likely(
     make: Callable[[float], Filter], recordings: Sequence[Recording], scales: Sequence[float]
 ) -> float:
-    """The one of ``scales`` whose filter ``make(scale)`` makes the recordings, undisturbed ones, most likely."""
+    """The scale whose filter ``make(scale)`` gives undisturbed recordings the largest likelihood."""
     values = [sum(log_likelihood(make(s), r) for r in recordings) for s in scales]
     return float(scales[int(np.argmax(values))])
 
 
-def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
-    """Share of each constant disturbance that a filter has not found after ``periods``, ``(n_d,)``.
+def remaining_load(ekf: ExtendedKalmanFilter, periods: int) -> Array:
+    """Remaining share of each constant disturbance after ``periods`` of a filter, ``(n_d,)``.
 
-    With the gain of the settled covariance, at the model's operating point and beside it, every state moved by a tenth
-    of its range (one without a range by its first deviation). The smaller share counts: dry friction at rest hides a
-    load that shows in motion. NaN of a filter whose covariance settles at neither.
+    With the gain of the settled covariance, at the model's operating point and beside it, where every state is moved by
+    a tenth of its range (without a range, by its first standard deviation). The smaller share counts, since dry
+    friction at rest hides a load that motion reveals. NaN if the covariance settles at neither point.
 
     Example:
         >>> import casadi as ca
@@ -144,7 +143,7 @@ def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> slow, quick = (ExtendedKalmanFilter(model, sigma_y=[1.0], sigma_x=[1.0], sigma_x0=[1.0], sigma_d=[step])
         ...                for step in (0.01, 0.1))
-        >>> load_left(slow, 50).round(2), load_left(quick, 50).round(2)
+        >>> remaining_load(slow, 50).round(2), remaining_load(quick, 50).round(2)
         (array([0.61]), array([0.01]))
 
     Source: Anderson and Moore, *Optimal Filtering*, 1979, section 4.4.
@@ -153,8 +152,8 @@ def load_left(ekf: ExtendedKalmanFilter, periods: int) -> Array:
 
 
 def periods_to_find(ekf: ExtendedKalmanFilter, most: int) -> Array:
-    """Periods ``(n_d,)`` after which a filter has found two thirds of each constant disturbance; infinite where it has
-    not after ``most``, NaN where its covariance does not settle.
+    """Periods ``(n_d,)`` after which a filter has found two thirds of each constant disturbance; infinite if not within
+    ``most``, NaN if its covariance does not settle.
 
     Example:
         >>> import casadi as ca
@@ -178,15 +177,15 @@ def periods_to_find(ekf: ExtendedKalmanFilter, most: int) -> Array:
 
 
 def _left(errors: Sequence[Array], periods: int, n_d: int) -> Array:
-    """:func:`load_left` of the errors' matrices at the points looked at."""
+    """:func:`remaining_load` for the error matrices of several points."""
     powers = [np.linalg.matrix_power(one, periods) for one in errors]
     found = [np.abs(np.diag(power)[len(power) - n_d :]) for power in powers]
     return np.min(found, axis=0) if found else np.full(n_d, np.nan)
 
 
 def _errors(ekf: ExtendedKalmanFilter) -> list[Array]:
-    """Matrices ``(n, n)`` by which errors of a settled filter go on from one period to the next, at the operating point
-    and beside it; none where its covariance does not settle.
+    """Matrices ``(n, n)`` that propagate errors of a settled filter over one period, at the operating point and beside
+    it; empty if its covariance does not settle.
     """
     model = ekf.model
     rest = ekf.start(np.full(model.n_y, np.nan))
@@ -197,11 +196,13 @@ def _errors(ekf: ExtendedKalmanFilter) -> list[Array]:
 
 
 def _error(ekf: ExtendedKalmanFilter, at: Estimate) -> Array | None:
-    """The matrix at one point; None where the covariance does not settle."""
+    """The matrix at one point; None if the covariance does not settle."""
     f, c = ekf.tangent(at, ekf.model.u0)
     noise, noise_y = ekf.noise
     try:
-        p, _ = dare(f.T, c.T, np.diag(noise), np.diag(noise_y))  # of the predicted estimate
+        p, _ = dare(
+            f.T, c.T, np.diag(noise), np.diag(noise_y)
+        )  # of the prediction: the dual Riccati equation
     except InputError:
         return None
     gain = np.linalg.solve(c @ p @ c.T + np.diag(noise_y), c @ p).T

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from hybrid_mpc.data.scales import evenly, robust_spread
+from hybrid_mpc.data.scales import evenly, robust_spread, time_unit
 from hybrid_mpc.data.scales import periods as periods_of
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
@@ -72,6 +72,9 @@ HARM = 1.05
 GAIN = 0.7
 """Ratio of errors below which a gain counts no more in the upper bound: a bound that is larger for it, and that no
 single recording of a large gain widens."""
+POOR = 0.7
+"""Error [spreads] of a model that explains half of the outputs' variance: where a term leaves more, only a gain beyond
+``GAIN`` counts, since small ones of such free runs are chance."""
 DOUBT = 0.1
 """Probability of an error beyond an end of an interval, for all candidates of a step together that were fitted: a term
 is added where the upper end is below 1, so that it surely lowers the error."""
@@ -92,6 +95,11 @@ LEAST = 20
 """Periods of the parts of a single recording at least."""
 ALONG = 4
 """Steps of a period in which a term's state is followed along a recording."""
+LOWERED = 0.99
+"""Ratio of errors over all windows that a candidate has to reach before it is fitted in every fold."""
+MEMORY = 3.0
+"""Length of a block at least, in the machine's seconds: shorter ones are no separate evidence. ``FEWEST`` there are in
+any case: then a term must take off much in all of them."""
 SHORTEST = 4
 """Samples of a block at least."""
 DRAWN = 200
@@ -202,6 +210,7 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
             Evidence(len(present), len(present), groups, length, text),
             warm,
         )
+    lasting = MEMORY * time_unit(known, known[0].dt) / known[0].dt
     pieces, count, blocks_of = (
         np.zeros((len(of), samples), dtype=np.int64),
         0,
@@ -210,7 +219,8 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
     for recorded in present:  # a few recordings are pieces of evidence in blocks
         at = np.flatnonzero(recording == recorded)
         whole = len(at) * samples
-        blocks = max(1, min(math.ceil(BLOCKS / len(present)), whole // SHORTEST))
+        most = max(FEWEST / len(present), min(BLOCKS / len(present), whole / lasting))
+        blocks = max(1, min(math.ceil(most), whole // SHORTEST))
         pieces[at] = (count + np.arange(whole) * blocks // whole).reshape(len(at), samples)
         blocks_of[at] = np.arange(len(at))
         count += blocks
@@ -370,13 +380,21 @@ class _Search:
             squares[held] = _squares(self.judged(self.evidence, terms, fitted, held), fitted)
         return squares
 
+    def start(self, terms: Terms, theta: Array) -> Array:
+        """``theta`` of all terms from that of the first ones: the others begin at their nominal values."""
+        return np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
+
+    def by_short_windows(self, terms: Terms, start: Array) -> Array:
+        """A fit to the short windows."""
+        return self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
+
     def begun(self, terms: Terms, theta: Array) -> Fitted:
         """A fit to all windows from ``theta`` of the terms but the last ones: at once, and by way of short windows,
         which lead further where long free runs go astray; the better one.
         """
-        start = np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
+        start = self.start(terms, theta)
         problem = self.problem(terms, self.evidence.windows)
-        near = self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
+        near = self.by_short_windows(terms, start)
         starts = (
             [start, near] if problem.explained([near])[0] < FAR * problem.explained([start])[0] else [start]
         )
@@ -513,6 +531,7 @@ class _Fitted:
     squares: Array
     reason: str = ""
     sure: bool = False
+    worse: bool = False
 
 
 @dataclass(frozen=True)
@@ -716,7 +735,8 @@ class _Explain:
             for form in one.forms:
                 try:
                     terms = (*now.terms, form)
-                    score = 0.5 * math.log(search.error(terms, search.begun(terms, now.theta).theta) / ends)
+                    theta = search.by_short_windows(terms, search.start(terms, now.theta))
+                    score = 0.5 * math.log(search.error(terms, theta) / ends)
                 except (InputError, np.linalg.LinAlgError) as error:
                     diverged.append(Trial((_found(form),), "diverged", None, str(error)))
                     continue
@@ -735,6 +755,7 @@ class _Explain:
     def _fitted(self, some: Sequence[Terms], text: str) -> Iterator[_Fitted]:
         """Candidates, fitted in every fold and judged."""
         search, now = self.search, self.now
+        ends = search.error(now.terms, now.theta)
         for done, forms in enumerate(some):
             self.on_progress(
                 done, len(some), f"{text}: {' and '.join(form.name for form in forms)} is fitted"
@@ -742,6 +763,11 @@ class _Explain:
             terms = (*now.terms, *forms)
             try:
                 own = search.begun(terms, now.theta)
+                left = math.sqrt(search.error(terms, own.theta) / ends)
+                if left > LOWERED:
+                    said = f"fitted to all data, it leaves {left:.2f} of the error"
+                    yield _Fitted(forms, None, own.theta, np.zeros(0), said, worse=True)
+                    continue
                 untold = search.untold(terms, own, forms)
                 squares = search.held_out(terms, own.theta)
             except (InputError, np.linalg.LinAlgError) as error:
@@ -763,6 +789,8 @@ class _Explain:
             reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
             if more:
                 reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
+        elif found.error > POOR and found.ratio > GAIN:
+            reason = f"the error is {found.error:.2f} of the outputs' spread with it: so small a gain may be chance"
         elif untold:
             reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
         elif ends := self._at_bounds(forms, theta):
@@ -798,7 +826,7 @@ class _Explain:
         if one is chosen:
             outcome = "added"
         elif one.held_out is None:
-            outcome = "diverged"
+            outcome = "worse" if one.worse else "diverged"
         elif chosen is not None and one.held_out.ratio < WORTH:
             between = self.evidence.compared(one.squares, chosen.squares, 1)
             outcome = "alternative" if between.lower <= 1.0 else "worse"

@@ -104,7 +104,7 @@ class Trial:
         terms: The candidate's terms: one, or a pair.
         outcome: ``"added"``; ``"alternative"``: the data do not tell it from what was added; ``"unsure"``: it may
             lower the error, but not surely; ``"worse"``: it does not lower it; ``"diverged"``: its fit failed.
-        held_out: Its error over held-out data; None where the fit failed.
+        held_out: Its error over held-out data; None where the fit failed, or did not lower the error of all data.
         reason: Why it was not added; empty where it was.
     """
 
@@ -153,7 +153,7 @@ class ExplainStep:
         held_out: Error with the step's change, over that before the step.
         parameters: Fitted values of the terms' parameters: of the last fit, or of the step for removed terms.
         scored: Candidates that were scored in the step by one Gauss-Newton step.
-        trials: Candidates that were fitted in every fold, the best first; the alternatives are among them.
+        trials: Candidates that were fitted, the best first; the alternatives are among them.
         pictures: Of each term; empty for terms that were removed later.
     """
 

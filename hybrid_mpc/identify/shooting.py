@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.scales import robust_spread, within
+from hybrid_mpc.data.scales import robust_spread, trim_outliers
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.identifiable import Fitted, covariance
 from hybrid_mpc.identify.output_fit import OutputFit, Slopes
@@ -374,7 +374,7 @@ class Shooting:
         own = error.reshape(self.windows.y.shape)
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
-        whole = np.array([float(np.sqrt(np.mean(within(v) ** 2))) if len(v) else 0.0 for v in left])
+        whole = np.array([float(np.sqrt(np.mean(trim_outliers(v) ** 2))) if len(v) else 0.0 for v in left])
         robust = np.maximum(robust, COMMON * whole)  # errors that are common are the prior's, and no outliers
         return np.maximum(robust, 1e-9 * self.spread)
 

@@ -18,9 +18,14 @@ from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.machine.terms import Place, Term
-from hybrid_mpc.machine.units import parsed
+from hybrid_mpc.machine.units import parse_unit
 
 Array = NDArray[np.float64]
+WIDEST, NARROWEST = 0.05, 0.005
+"""Speeds over which dry friction turns round, over the speed's size. Between them it is half of what the speed changes
+in a period: the recordings show nothing finer, and it needs no shorter integration steps."""
+EXPONENTS = 0.25, 4.0
+"""Bounds of the exponent of a loss: below that of an outlet, 0.5, to that of radiation."""
 REACH = 3.0
 """Bound of a term's weight: what it does at most, over what the state's rate is in the recordings."""
 
@@ -67,6 +72,7 @@ class _Library:
         self.x, self.u, self.w = points
         rates = prior.equations.xdot(self.x.T, self.u.T, self.w.T, prior.p).full().T
         self.rates = np.sqrt(np.mean(np.square(rates), axis=0))
+        self.changes = dt * self.rates
         self.positions = {v: q for q, v in prior.kinematics}
         self.mechanical = isinstance(prior, MechanicalPrior)
         if isinstance(prior, MechanicalPrior):
@@ -108,7 +114,7 @@ class _Library:
             return
         place: Place = "force" if self.mechanical else "rate"
         unit = _force_unit(state.unit) if self.mechanical else f"{state.unit}/s"
-        width = 0.05 * speed
+        width = min(WIDEST * speed, max(0.5 * self.changes[i], NARROWEST * speed))
 
         def weight(
             key: str, size: float, per: Sequence[str] = (), positive: bool = False, words: str = ""
@@ -191,7 +197,7 @@ class _Library:
 
     def _process(self, i: int, state: Signal) -> Iterator[Candidate]:
         own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
-        temperature = (parsed(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
+        temperature = (parse_unit(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
 
         def weight(key: str, size: float, per: Sequence[str] = (), words: str = "") -> Parameter:
             return self._weight(f"{key}_{own}", i, size, over(unit, *per), words=words)
@@ -242,13 +248,13 @@ class _Library:
         references += [(s.name, c) for s, c in self._alike(i, state.unit)]
         for number, (reference, other) in enumerate(references, 1):
             far = float(np.sqrt(np.mean((values - other) ** 2))) or 1.0
-            for exponent, key in ((1.0, "a"), (1.25, "b"), (0.5, "c"), (2.0, "d")):
-                if (temperature and exponent == 0.5) or (exponent == 1.25 and not temperature):
+            for exponent, key in ((1.0, "a"), (0.5, "b"), (2.0, "c")):
+                if temperature and exponent == 0.5:
                     continue
-                whole = over(unit, *[state.unit] * int(exponent))
-                by = whole if exponent in (1.0, 2.0) else f"{unit}/{state.unit}^{exponent:g}"
-                k = weight(f"k_{number}{key}", far**exponent, by, "loss")
-                forms.append(laws.loss(own, k, exponent=exponent, reference=reference))
+                k = weight(f"k_{number}{key}", far, "1/s", "loss")
+                # free convection lies between; an outlet below
+                n = Parameter(f"n_{number}{key}_{own}", exponent, "-", *EXPONENTS, "exponent of the loss")
+                forms.append(laws.loss(own, k, n, scale=far, reference=reference))
         yield Candidate(f"loss of {own}", tuple(forms))
         if temperature:
             kelvin = 0.0 if state.unit == "K" else 273.15
@@ -271,7 +277,7 @@ class _Library:
                 laws.overflow(
                     own,
                     weight(f"s_{n}", high - edge, over(unit, state.unit), "overflow"),
-                    edge=edge,
+                    Parameter(f"edge_{n}_{own}", edge, state.unit, 0.5 * (low + high), high, "edge"),
                     width=width,
                 )
                 for n, edge in enumerate(edges, 1)

@@ -47,7 +47,8 @@ UNITS = 3
 HEAD = """# Terms
 
 The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search to some of them.
-`hm.terms.LAW(...)` makes one for a prior of your own ([machines](machines.md)).
+`hm.terms.LAW(...)` makes one for a prior of your own
+([mechanical machines and terms](mechanical-priors.md#friction-and-other-terms)).
 
 | symbol | meaning |
 | --- | --- |

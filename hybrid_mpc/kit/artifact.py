@@ -1,7 +1,7 @@
-"""The artifact: a folder of deployed models as data, and the kit of a loop's parts that is made of it.
+"""The artifact, a folder with deployed models as data, and the kit, which builds the parts of a loop from it.
 
-The folder is composed of files that :mod:`hybrid_mpc.kit.parts` describes. Loading needs no torch and executes nothing
-from the folder.
+:mod:`hybrid_mpc.kit.parts` describes the files of the folder. Loading needs no torch, and executes nothing from the
+folder.
 """
 
 from __future__ import annotations
@@ -75,15 +75,13 @@ INPUTS = {
     BALANCE: ("x", "xdot", "u", "w", "p"),
 }
 OWN = ("step", "xdot")
-"""Functions of a single network that are its own; the others are those of the prior that it stands on."""
+"""Functions that each single network has of its own; the others are those of the hybrid."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
 JACOBIANS = {"A": ("x", "h"), "B": ("u",)}
 WATCHES = ("own", "guard", "energy", "residuals")
 """Kinds of monitor, see :meth:`Kit.monitor`."""
 
-WITHOUT = (
-    'go without alarms: kind="own" records readings, monitor=None (export c: --no-monitor) watches nothing'
-)
+WITHOUT = 'use no alarms: kind="own" only records readings, monitor=None (export c: --no-monitor) removes the monitor'
 
 
 def save_artifact(
@@ -98,22 +96,22 @@ def save_artifact(
     members: Sequence[Mapping[str, nn_export.Program]] = (),
     predicting: Predicting | None = None,
 ) -> None:
-    """Write models to ``folder``, and what loops on them need.
+    """Write models, and the settings of loops with them, to ``folder``.
 
     Args:
-        folder: Made if missing.
+        folder: Folder to write; it is made if missing.
         programs: Program of each function of each model, e.g. ``programs["hybrid"]["step"]``, and of each of its
             balances, ``programs["hybrid"]["balance/energy"]``.
         info: Period and signals, the same for all models.
-        limits: By what monitors alarm, by model. Default: none are written.
-        provenance: What the models were made from.
-        loop: What loops need beside the models. Default: nothing is written.
-        recommended: Model that a loop is made of where none is named. Default: the hybrid.
+        limits: Limits of the monitors, by model. Default: none.
+        provenance: Origin of the models. Default: unknown.
+        loop: Settings of loops: control problems, noise. Default: none.
+        recommended: Name of the default model of a loop. Default: the hybrid.
         members: ``step`` and ``xdot`` of each network that the hybrid is the mean of, the best first. Default: none.
-        predicting: What predictions of recordings need beside the models. Default: there can be none.
+        predicting: Settings of predictions of recordings. Default: none, predictions are not possible.
 
     Raises:
-        InputError: If an expression of a control problem cannot be stated as a program.
+        InputError: If an expression of a control problem cannot be written as a program.
     """
     save_models(
         folder,
@@ -157,12 +155,12 @@ def save_models(
 
 
 def build_model(name: str, programs: Mapping[str, nn_export.Program], info: ModelInfo) -> HybridModel:
-    """The model of ``programs["<name>/step"]`` and its siblings, with the input's delay.
+    """Build a model from ``programs["<name>/step"]`` and its other functions, with the input's delay.
 
     Raises:
         KeyError: If a program is missing.
         nn_export.ExportError: If a program cannot be built.
-        InputError: If it does not fit the signals.
+        InputError: If the sizes of the programs do not match the signals.
     """
     step, xdot, output = (nn_export.build(programs[f"{name}/{f}"], f) for f in FUNCTIONS)
     balances = tuple(
@@ -201,7 +199,7 @@ def _at_use(
     names: Sequence[str], programs: Mapping[str, nn_export.Program], info: ModelInfo,
     chosen: tuple[Disturbance, ...] | None,
 ) -> ModelsAtUse:  # fmt: skip
-    """Models that are built at their first use, of programs that are all there; KeyError for one that is not."""
+    """Models that are built at their first use; KeyError if one of their programs is missing."""
     needed = (*FUNCTIONS, *(b.program for b in info.balances))
     own = {f"{name}/{key}": programs[f"{name}/{key}"] for name in names for key in needed}
     return ModelsAtUse(names, partial(_built, own, info, chosen))
@@ -218,36 +216,39 @@ def _built(
 
 
 def load(folder: str | Path) -> Kit:
-    """The kit of an artifact: models, and all that loops on them need.
+    """Load the kit of an artifact: models, and everything that loops with them need.
 
-    It is composed of the files in the folder (docs/kit.md). What is not there, or was made for other models or another
-    observer, is left out; :attr:`Kit.lacks` names it, and what needs it raises.
+    Files that are missing, or that belong to other models or another observer, are left out (docs/kit.md);
+    :attr:`Kit.lacks` names them, and methods that need them raise.
 
     Args:
-        folder: The run's folder, or its ``model``.
+        folder: The run's folder, or its folder ``model``.
 
     Raises:
-        InputError: If there is none, or a file is damaged or of another version, or the models are not there.
+        InputError: If there is no artifact, a file is damaged or of another version, or the models are missing.
 
     Example:
         ``kit = hm.load("runs/mine")``
     """
     if not isinstance(folder, str | Path):
-        raise InputError(f"load: the path of a folder is needed, got {type(folder).__name__} [HM-KIT-001]")
+        raise InputError(f"load: give the path of a folder, got {type(folder).__name__} [HM-KIT-001]")
     folder = artifact_folder(Path(folder))
     parts = read_parts(folder)
     found = parts.description
     if sha256(folder / PROGRAMS) != found.programs_sha256:
         raise InputError(
-            f"{folder}: {PROGRAMS} is not the one that {KIT} was saved with: the stage export ended in between, or a "
-            f"file was changed; {AGAIN}, or take the folder from its run [HM-KIT-002]"
+            f"{folder}: {PROGRAMS} does not belong to {KIT}. The stage export was interrupted, or a file was changed; "
+            f"{AGAIN}, or copy the folder from its run [HM-KIT-002]"
         )
     try:
         programs = nn_export.load_programs(folder / MODELS)
         models = _at_use(found.models, programs, found.model, parts.loop.disturbance_model)
         members = member_models(programs, found.model, found.members)
     except KeyError as error:
-        raise InputError(f"{folder}: {PROGRAMS} lacks {error}, which {KIT} names [HM-KIT-003]") from error
+        raise InputError(
+            f"{folder}: {PROGRAMS} lacks {error}, which {KIT} names; {AGAIN}, or copy the folder from its run "
+            "[HM-KIT-003]"
+        ) from error
     except nn_export.ExportError as error:
         raise InputError(f"{folder}: {error}") from error
     return Kit(
@@ -266,39 +267,38 @@ def load(folder: str | Path) -> Kit:
 
 
 def _named(name: object, what: str) -> str:
-    """A name as somebody gives it; InputError if it is no text."""
+    """The given name; InputError if it is not a text."""
     if not isinstance(name, str):
-        raise InputError(f"{what}: a name is needed, got {type(name).__name__} [HM-KIT-004]")
+        raise InputError(f"{what}: give a name, got {type(name).__name__} [HM-KIT-004]")
     return name
 
 
 def _disturbed(
     models: Mapping[str, HybridModel], chosen: tuple[Disturbance, ...] | None, name: str
 ) -> HybridModel:
-    """A model with a disturbance model; as it is where it has it."""
+    """A model with the chosen disturbance model; the same object if it already has it."""
     model = models[name]
     return model if model.disturbance_model == chosen else replace(model, disturbance_model=chosen)
 
 
 @dataclass(frozen=True)
 class Kit:
-    """A loaded artifact: models, and estimator, controller, monitor and guard that are made from them.
+    """A loaded artifact: its models, and methods that build estimator, controller, monitor and guard from them.
 
     Args:
         models: Deployed models by name (``"hybrid"``, ``"prior"``).
-        watch: By what monitors alarm, by model.
-        provenance: What the models were made from.
-        input_delay: Delay [s] that the models hold. Default: none.
-        loop: Control problems, noise and what else loops need. Default: nothing.
-        recommended: Model that observer, controller and monitor are made of where none is named. Default: the hybrid.
+        watch: Limits of the monitors, by model.
+        provenance: Origin of the models.
+        input_delay: Delay [s] of the inputs in the models. Default: 0.
+        loop: Settings of loops: control problems, noise. Default: none.
+        recommended: Default model of observer, controller and monitor. Default: the hybrid.
         members: The networks that the hybrid is the mean of, by name, the best first. Default: none.
-        predicting: What :func:`hybrid_mpc.predict` needs beside the models. Default: there can be no predictions.
-        programs_sha256: Hash of the models' programs. Default: not known.
-        promised: The table that the run left beside the models (:attr:`promises`). Default: there is none.
-        lacks: What the folder does not hold, and which stage of the run writes it, by file. Default: nothing is known
-            to be missing.
+        predicting: Settings of :func:`hybrid_mpc.predict`. Default: none, predictions are not possible.
+        programs_sha256: Hash of the models' programs. Default: unknown.
+        promised: The table of promises in the folder (:attr:`promises`). Default: none.
+        lacks: Missing content and the stage of the run that writes it, by file. Default: nothing is missing.
 
-    Example: the whole way from a folder to a loop::
+    Example: from a folder to a loop::
 
         kit = hm.load("runs/mine")
         loop = hm.Loop(kit.observer(), kit.controller(), monitor=kit.monitor(), reference=[0.5, 0.0])
@@ -318,27 +318,25 @@ class Kit:
 
     @property
     def promises(self) -> tuple[Promise, ...]:
-        """What this kit promises of its loops, and why or why not: the table that its run has made (docs/promises.md).
+        """The table "What this kit promises" of its run (docs/promises.md).
 
-        Where there is none, or models, noise or control problems are others since, one row says so.
+        If the table is missing, or models, noise or control problems have changed since, a single row says so.
 
         Example:
             ``[promise.name for promise in kit.promises if promise.verdict != "shown"]``
         """
         if self.promised is None:
             return none_made(
-                "this kit holds no table of promises: an older version made it, or its run did not come to the stage "
+                "this kit holds no table of promises: an older version made it, or its run did not finish the stage "
                 "promises"
             )
         if self.promised.of != self.identity:
-            return none_made(
-                "models, noise or control problems are others than those that the table was made of"
-            )
+            return none_made("models, noise or control problems have changed since the table was made")
         return self.promised.rows
 
     @property
     def identity(self) -> str:
-        """Digest of all that promises depend on: models, the recommended one, its observer, and control problems."""
+        """Digest of everything that promises depend on: models, recommended model, its observer, control problems."""
         own = f"{self.recommended}_observer"
         noise = {name: sigma for name, sigma in self.loop.process_noise.items() if name == own}
         loop = replace(self.loop, causes={}, tasks=(), safe_input=None, process_noise=noise)
@@ -361,22 +359,22 @@ class Kit:
 
     @property
     def first_sigma(self) -> tuple[float, ...] | None:
-        """Standard deviations of states that no sensor shows at an estimator's start; None: by sensors and ranges."""
+        """Initial standard deviations of the states that no output measures directly; None: from sensors and ranges."""
         return self.loop.first_sigma
 
     @property
     def causes(self) -> Mapping[str, tuple[str, ...]]:
-        """What may break, by name: the parameters that change together then."""
+        """Possible faults by name: the parameters that change together."""
         return self.loop.causes
 
     @property
     def control(self) -> OCP | None:
-        """The control problem of all tasks that have none of their own; None: there is none."""
+        """The common control problem, of all tasks without one of their own; None if missing."""
         return self.loop.control.get("")
 
     @property
     def safe_input(self) -> tuple[float, ...] | None:
-        """Input ``(n_u,)`` that the machine may be left with; None: none is declared."""
+        """Input ``(n_u,)`` with which the machine may be left alone; None if not declared."""
         return self.loop.safe_input
 
     @property
@@ -386,7 +384,7 @@ class Kit:
 
     @property
     def known_rest(self) -> tuple[float, ...] | None:
-        """The same; where none was learned, a share of the natural speeds of the recordings; None: unknown."""
+        """:attr:`rest_speed`; if none was learned, a share of the typical speeds of the recordings; None: unknown."""
         held, prior = self.predicting, self.models.get("prior")
         if self.rest_speed is not None or held is None or prior is None:
             return self.rest_speed
@@ -396,19 +394,21 @@ class Kit:
         return natural if of_pairs and min(natural) > 0 else None
 
     def with_noise(self, noise: Mapping[str, ArrayLike]) -> Kit:
-        """The kit with other process noise, by estimator (see :meth:`noise`)."""
+        """A kit with other process noise, by estimator (see :meth:`noise`)."""
         if not isinstance(noise, Mapping):
             raise InputError(
-                f"noise: numbers by the name of an estimator are needed, got {type(noise).__name__} [HM-KIT-005]"
+                f"noise: give a mapping from estimator to numbers, got {type(noise).__name__} [HM-KIT-005]"
             )
         return replace(self, loop=replace(self.loop, process_noise=tuples(noise)))
 
     def on(self, scenario: Scenario) -> Kit:
-        """The kit with the control problems, tasks, sensors, disturbances and causes that a scenario states now; where
-        it names no disturbances, the default ones (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`).
+        """A kit with the present control problems, tasks, sensors, disturbances and causes of a scenario.
+
+        Without declared disturbances, the default ones are used
+        (:func:`~hybrid_mpc.kit.disturbances.default_disturbances`).
         """
         if not isinstance(scenario, Scenario):
-            raise InputError(f"on: a Scenario is needed, got {type(scenario).__name__} [HM-KIT-006]")
+            raise InputError(f"on: give a Scenario, got {type(scenario).__name__} [HM-KIT-006]")
         chosen, problem = scenario.disturbance_model, scenario.control
         if chosen is None and problem is not None and problem.n_y:
             name = "prior" if "prior" in self.models else self.recommended
@@ -416,25 +416,24 @@ class Kit:
         return replace(self, loop=loop_settings(scenario, self.loop.process_noise)).with_disturbances(chosen)
 
     def with_disturbances(self, chosen: Sequence[Disturbance] | None) -> Kit:
-        """The kit with another disturbance model (see ``Scenario``); None: one at each input."""
+        """A kit with another disturbance model (see ``Scenario``); None: one disturbance at each input."""
         own = None if chosen is None else tuple(chosen)
         models = ModelsAtUse(tuple(self.models), partial(_disturbed, self.models, own))
         return replace(self, models=models, loop=replace(self.loop, disturbance_model=own))
 
     def problem(self, task: str = "") -> OCP:
-        """The control problem of a task; of one without a problem of its own, and where no task is named, the common
-        one.
+        """The control problem of a task; the common one if the task has none of its own, or no task is given.
 
         Raises:
-            InputError: If there is no such task, or no control problem.
+            InputError: If the task is unknown, or the control problem is missing.
         """
         if _named(task, "task") and (self.loop.control or TASKS not in self.lacks):
             known(task, sorted({*self.loop.tasks, *self.loop.control} - {""}), "task")
         found = self.loop.control.get(task, self.control)
         if found is None:
             raise InputError(
-                f"{self._whose} was saved without a control problem: define one in the scenario (control=OCP(...)) "
-                f"and run it again{self._lack(TASKS)} [HM-KIT-007]"
+                f"{self._whose}: no control problem. Define one in the scenario (control=OCP(...)) and run it again"
+                f"{self._lack(TASKS)} [HM-KIT-007]"
             )
         return found
 
@@ -442,32 +441,33 @@ class Kit:
         """Process noise ``(n_x,)`` per period [state units] of an estimator.
 
         Args:
-            estimator: Name of the model, with ``_observer`` behind it where an unknown load is followed.
+            estimator: Name of the model, followed by ``_observer`` if the estimator estimates an unknown load.
 
         Raises:
-            InputError: If the folder holds none for it, or it is of another size.
+            InputError: If the noise of this estimator is missing, or has another size.
         """
         if _named(estimator, "estimator") not in self.loop.process_noise:
             raise InputError(
-                f"{self._whose} was saved without process noise for {estimator}; run the scenario again (its stage "
-                f"noise estimates it){self._lack(OBSERVER)} [HM-KIT-008]"
+                f"{self._whose}: no process noise for {estimator}. Run the scenario again; its stage noise estimates it"
+                f"{self._lack(OBSERVER)} [HM-KIT-008]"
             )
         sigma, n_x = np.array(self.loop.process_noise[estimator]), next(iter(self.models.values())).n_x
         if sigma.shape != (n_x,):
             raise InputError(
-                f"the model's process noise of {estimator} must be {n_x} numbers; train it anew [HM-KIT-009]"
+                f"{self._whose}: the process noise of {estimator} must have {n_x} numbers, got {sigma.size}. Run the "
+                "scenario again [HM-KIT-009]"
             )
         return sigma
 
     def limits(self, model: str = "", kind: str = "") -> WatchLimits:
-        """By what a monitor alarms.
+        """Limits of a monitor.
 
         Args:
-            model: Name of the model that is compared with the machine. Default: the recommended one.
-            kind: Kind of readings, ``"energy"`` or ``"residuals"``. Default: the energy where it can be read.
+            model: Name of the model that is compared with the machine. Default: the recommended model.
+            kind: Kind of readings, ``"energy"`` or ``"residuals"``. Default: the energy if the model allows it.
 
         Raises:
-            InputError: If the folder holds none.
+            InputError: If the limits are missing.
         """
         watched, name = self._model(model), model or self.recommended
         kind = kind or (ENERGY if reads_energy(watched) else RESIDUALS)
@@ -475,21 +475,21 @@ class Kit:
         if own is None or kind not in own.limits:
             lack = self._lack(watch_file(name)) or self._lack(WATCH)
             raise InputError(
-                f"{self._whose} holds no limits of {kind} for the model {name}, which the run's stage watch learns: "
-                f"run the main job again with it, take learn_limits, or {WITHOUT}{lack} [HM-KIT-010]"
+                f"{self._whose}: no limits of {kind} for the model {name}. The stage watch of a run learns them: run "
+                f"the scenario again with this stage, use learn_limits, or {WITHOUT}{lack} [HM-KIT-010]"
             )
         return own.limits[kind]
 
     def observer(self, model: str = "", *, task: str = "", load: bool = True) -> Filter:
-        """The estimator of a model's state, hidden state and, with ``load``, an unknown load at its inputs.
+        """The estimator of a model's state, hidden state and, with ``load``, unknown disturbances.
 
         Args:
-            model: Name of the model. Default: the recommended one.
-            task: Whose control problem says how large a load may be. Default: the common one.
-            load: Whether it follows a load: without, a steady one leaves an offset. Default: yes.
+            model: Name of the model. Default: the recommended model.
+            task: Task whose control problem determines the size of a load. Default: the common control problem.
+            load: Whether it estimates a load; without this, a constant load causes an offset. Default: True.
 
         Raises:
-            InputError: If there is no such model or task, no control problem, or no noise for this estimator.
+            InputError: If model or task are unknown, or control problem or noise are missing.
         """
         check_flag(load, "load")
         model = _named(model, "model") or self.recommended
@@ -499,17 +499,18 @@ class Kit:
     def controller(
         self, model: str = "", *, task: str = "", solver: str = "rti", iterations: int | None = None
     ) -> SafeController:
-        """The MPC of a model; its safeguards use the prior.
+        """The MPC of a model with its safeguards, which use the prior.
 
         Args:
-            model: Name of the model that plans. Default: the recommended one.
-            task: Whose control problem it solves. Default: the common one.
-            solver: ``"rti"``, ``"native"`` (the same as compiled C), ``"sqp"`` or ``"ipopt"``.
-            iterations: Linearizations a period of ``rti``, most iterations a solve of ``sqp`` and ``ipopt``; ``native``
-                has one. Default: the solver's own, one of ``rti``.
+            model: Name of the model that plans. Default: the recommended model.
+            task: Task whose control problem is solved. Default: the common control problem.
+            solver: ``"rti"``, ``"native"`` (the same as compiled C), ``"sqp"`` or ``"ipopt"``. Default: rti.
+            iterations: Linearizations a period of ``rti``, or largest number of iterations a solve of ``sqp`` and
+                ``ipopt``; ``native`` always has one. Default: that of the solver, one for ``rti``.
 
         Raises:
-            InputError: If there is no such model, task or solver, none of so many iterations, or no control problem.
+            InputError: If model, task or solver are unknown, ``iterations`` is not possible, or the control problem is
+                missing.
         """
         return make_controller(
             self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations,
@@ -517,21 +518,21 @@ class Kit:
         )  # fmt: skip
 
     def monitor(self, model: str = "", *, kind: str = "", task: str = "") -> Monitor:
-        """What watches a loop or a recording, with what the run has learned.
+        """The monitor of a loop or a recording, with the limits learned by the run.
 
-        A mechanical model whose positions are measured is watched by its energy, any other by the residuals of its
+        A mechanical model with measured positions is monitored by its energy, any other model by the residuals of its
         outputs and balances.
 
         Args:
-            model: Name of the model that is compared with the machine. Default: the recommended one.
-            kind: ``"guard"``: the readings that fit the model, with their limits; ``"energy"`` or ``"residuals"``:
-                these readings, with theirs; ``"own"``: the readings that fit, without limits, so that only a monitor
-                without a valid reading alarms. Default: ``"guard"``.
-            task: Whose control problem gives the inputs' ranges. Default: the common one.
+            model: Name of the model that is compared with the machine. Default: the recommended model.
+            kind: ``"guard"``: the suitable readings with their limits; ``"energy"`` or ``"residuals"``: these readings
+                with their limits; ``"own"``: the suitable readings without limits, so that it only alarms without a
+                valid reading. Default: ``"guard"``.
+            task: Task whose control problem gives the inputs' ranges. Default: the common control problem.
 
         Raises:
-            InputError: If there is no such model, task or kind, nothing was learned by which the monitor could alarm
-                (all kinds but ``"own"``), or the energy of a model is asked for that has none.
+            InputError: If model, task or kind are unknown, limits are missing (all kinds but ``"own"``), or
+                ``"energy"`` is requested for a model without energy balance.
         """
         watched = self._model(model)
         kind = known(_named(kind, "kind of monitor") or "guard", WATCHES, "kind of monitor")
@@ -542,28 +543,29 @@ class Kit:
         return make_monitor(watched, limits, kind=of, rest_speed=rest, input_range=span)
 
     def diagnoser(self, model: str = "") -> Diagnoser:
-        """What explains the alarms of a monitor with a model: changes of the prior's parameters, actuators or sensors.
+        """The diagnoser of a monitor's alarms: changes of the prior's parameters, actuators or sensors.
 
         Args:
-            model: Name of the model. Default: the recommended one.
+            model: Name of the model. Default: the recommended model.
 
         Raises:
-            InputError: If there is no such model.
+            InputError: If the model is unknown.
         """
         watched, own = self._model(model), self.watch.get(model or self.recommended)
         limits = None if own is None else own.limits.get(RESIDUALS)
         return Diagnoser(watched, limits, self.causes or None, prior=self.models.get("prior"))
 
     def guard(self, *, adapt: bool = False, task: str = "") -> Guard:
-        """What a loop does on alarms: no input while the sensor is frozen; the rest is recorded, or adapted to.
+        """The guard of a loop, which reacts to alarms: with the safe input while a sensor is frozen; other alarms are
+        recorded, or cause a switch to an adaptive backup.
 
         Args:
-            adapt: Whether a backup that estimates the prior's changed parameters takes over once an alarm has lasted.
-                Default: no.
-            task: Whose control problem the backup solves. Default: the common one.
+            adapt: Whether to switch to a backup that estimates the prior's changed parameters after a persistent alarm.
+                Default: False.
+            task: Task whose control problem the backup solves. Default: the common control problem.
 
         Raises:
-            InputError: If a backup is asked for and its model, noise, causes or task are missing.
+            InputError: If a backup is requested and its model, noise, causes or task are missing.
 
         Example:
             ``simulate(..., monitor=kit.monitor(), guard=kit.guard())``
@@ -576,13 +578,13 @@ class Kit:
         return make_adaptive_guard(hybrid, self._model("prior"), self, noise, problem)
 
     def _lack(self, file: str) -> str:
-        """What is known of a missing file, to put behind a message."""
+        """Reason why a file is missing, as an addition to a message."""
         why = self.lacks.get(file)
         return f" ({why})" if why else ""
 
     @property
     def _whose(self) -> str:
-        return f"the model of scenario {self.name or '(unnamed)'}"
+        return f"model of scenario {self.name or '(unnamed)'}"
 
     def _model(self, name: str) -> HybridModel:
         return self.models[known(_named(name, "model") or self.recommended, self.models, "model")]

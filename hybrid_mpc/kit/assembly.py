@@ -1,4 +1,4 @@
-"""Assembly: estimator, controller, monitor and guard from models, noise and a control problem."""
+"""Build estimator, controller and guard from models, noise and a control problem."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
-from hybrid_mpc.estimate.tuning import FOUND, load_left, most_likely
+from hybrid_mpc.estimate.tuning import FOUND, choose_most_likely, remaining_load
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 from hybrid_mpc.records import known
@@ -35,41 +35,42 @@ Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump")
 """Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
 QUIET_SHARE = 0.0003
-"""Step of the estimated load per period while nothing happens (drift, temperature), as a share of its size. Where
-a filter finds a constant load too slowly it is doubled, see :func:`quiet_shares`."""
+"""Standard deviation of the load's random walk per period in the quiet filter, as a share of the load's size (drift,
+temperature). It is doubled if the filter is too slow, see :func:`quiet_shares`."""
 FOUND_HORIZONS, MOST_DOUBLED = 1.5, 7
-"""Horizons of the controller within which the quiet filter, and the slip filter, have found two thirds of a constant
-load, and how often their steps are doubled at most. A load that a jump does not show takes as long to be compensated.
-The quiet filter of the golf robot takes 1.3 horizons, the disk's less, so neither is doubled: quick steps make a loop
-hunt around sticking friction, and where a model's errors come and go they are taken for loads. Four horizons cost
-machines that only lag, as heaters and arms, 1.3 to 1.5 times as much under a load
-(docs/results/simulated_machines.md)."""
+"""Horizons of the controller within which quiet and slip filter must estimate two thirds of a constant load, and the
+largest number of doublings. Only loads that the jump filter does not detect take that long. The golf robot's quiet
+filter takes 1.3 horizons, the disk's less, so neither is doubled: with faster filters a loop limit-cycles around static
+friction, and intermittent model errors are taken for loads. With four horizons instead, the cost under a load is 1.3 to
+1.5 times as large for machines that only lag, as heaters and arms (docs/results/simulated_machines.md)."""
 SEARCHED = 100
-"""Horizons after which a load that no filter has found counts as never found: its offset would last for minutes where a
-plan lasts seconds."""
+"""Horizons after which a load that no filter has estimated counts as never estimated: its offset would last for minutes
+with a plan of seconds."""
 JUMP_SHARE = 0.05
-"""The same when a load comes or goes. A load of a twentieth of what the drive can do is ordinary; for a larger one
-the filter needs a few periods."""
+"""Standard deviation of the load's random walk per period in the jump filter. A load of 5 % of the drive's range is
+ordinary; a larger load takes a few periods."""
 FIRST_LOAD = 0.001
-"""Deviation of the first load, as a share of the input's range. Small: a machine that sticks at rest shows nothing of
-its load, and what an observer makes of it there is wrong when it moves."""
+"""Initial standard deviation of the load, as a share of the input's range. It is small, because the load of a machine
+that sticks at rest is not observable, and its estimate would be wrong when the machine moves."""
 SCALES = (1.0, 3.0)
-"""Candidate factors on the model's one-period errors; the likeliest gives the process noise."""
+"""Candidate factors on the model's one-period errors; the process noise is that of largest likelihood."""
 TUNED_PERIODS, TUNED_RECORDINGS = 500, 3
-"""So many periods of so many training recordings decide."""
+"""Number of periods and of training recordings in that likelihood."""
 DWELL_S, QUIET_S = 0.5, 1.0
-"""A guard's shortest time in a mode, and the time without alarm before it goes back [the machine's seconds]."""
+"""A guard's shortest time in a mode, and the time without alarm before it switches back, in time constants of the
+machine."""
 PATIENCE_S = 0.8
-"""[The machine's seconds.] A push of 0.2 s raised alarms for up to 0.7 s, through the monitor's windows and what the
-observer makes of it; a backup that takes it for a heavier machine costs more than it saves (docs/results/guard.md)."""
+"""Time that an alarm must last before the backup takes over [time constants of the machine]. A push of 0.2 s causes
+alarms for up to 0.7 s, because of the monitor's windows and the observer. A backup that interprets the push as a
+heavier machine costs more than it saves (docs/results/guard.md)."""
 GAIN = "gain of "
 
 
 def native(model: HybridModel, ocp: OCP) -> Controller:
-    """The real-time iteration as compiled C; without a compiler, with a ``RuntimeWarning``, that of Python.
+    """The real-time iteration as compiled C; without a compiler that of Python, with a ``RuntimeWarning``.
 
     Raises:
-        InputError: If something of model or problem has no C, by name.
+        InputError: If a part of model or problem cannot be exported to C; the message names it.
     """
     from hybrid_mpc.control.rti import CondensedController
     from hybrid_mpc.embedded.native import NativeController
@@ -78,7 +79,7 @@ def native(model: HybridModel, ocp: OCP) -> Controller:
         return NativeController(model, ocp)
     except CompileError as error:
         warnings.warn(
-            f"solver native: {error}; rti, which gives the same inputs, runs in Python instead",
+            f"solver native: {error}. Using rti in Python, which computes the same inputs but takes longer",
             RuntimeWarning,
             stacklevel=2,
         )
@@ -103,19 +104,19 @@ def _ipopt(model: HybridModel, ocp: OCP, **options: Any) -> Controller:
     return IpoptController(model, ocp, **options)
 
 
-# solvers are imported when one is made: a kit that only estimates or watches loads none
+# a solver is imported when it is built: a kit for an estimator or monitor alone imports none
 SOLVERS: Mapping[str, Callable[..., Controller]] = {
     "rti": _rti,
     "native": native,
     "sqp": _sqp,
     "ipopt": _ipopt,
 }
-"""By the name that commands and settings take: the condensed real-time iteration; the same as compiled C; sequential
-quadratic programs to convergence; the same by IPOPT."""
+"""Solvers by name: ``rti``, the condensed real-time iteration; ``native``, the same as compiled C; ``sqp``, sequential
+quadratic programming to convergence; ``ipopt``, the nonlinear program solved by IPOPT."""
 
 
 class LoopAssumptions(Protocol):
-    """What estimators and guards assume of a machine: a scenario states it, a kit has it from its folder."""
+    """Assumptions of estimators and guards about a machine, given by a scenario or a kit."""
 
     @property
     def name(self) -> str:
@@ -127,7 +128,7 @@ class LoopAssumptions(Protocol):
 
     @property
     def first_sigma(self) -> tuple[float, ...] | None:
-        """Standard deviations of states that no sensor shows at an estimator's start; None: by sensors and ranges."""
+        """Initial standard deviations of the states that no output measures directly; None: from sensors and ranges."""
 
     @property
     def control(self) -> OCP | None:
@@ -135,11 +136,11 @@ class LoopAssumptions(Protocol):
 
     @property
     def safe_input(self) -> tuple[float, ...] | None:
-        """Input ``(n_u,)`` that the machine may be left with; None: none is declared."""
+        """Input ``(n_u,)`` with which the machine may be left alone; None if not declared."""
 
     @property
     def causes(self) -> Mapping[str, tuple[str, ...]]:
-        """What may break, by name: the parameters that change together then."""
+        """Possible faults by name: the parameters that change together."""
 
 
 def tuned_noise(
@@ -151,11 +152,17 @@ def tuned_noise(
     observer: bool,
     known: Mapping[str, float] | None = None,
 ) -> Array:
-    """Process noise ``(n_x,)`` per period: ``base`` times the scale that makes undisturbed recordings most likely.
+    """Process noise ``(n_x,)`` per period by maximum likelihood on undisturbed recordings: ``base`` times a scale.
 
-    No state strays further in a period than its spread in the recordings. ``base`` are the model's one-period errors
-    ``(n_x,)``; an ``observer`` follows an unknown load. ``known`` is that of single states by name, which no scale
-    changes.
+    The noise of a state is at most its spread in the recordings.
+
+    Args:
+        model: The model.
+        scenario: Assumptions about the machine.
+        base: One-period errors of the model ``(n_x,)``.
+        recordings: Training recordings with smoothed states.
+        observer: Whether the estimator estimates an unknown load.
+        known: Fixed noise of single states by name. Default: none.
     """
     own = np.array([(known or {}).get(s.name, np.nan) for s in model.states])
     spread = np.array(model.state_spread) if model.state_spread else np.zeros(model.n_x)
@@ -169,7 +176,7 @@ def tuned_noise(
     def filter_of(scale: float) -> Filter:
         return make_estimator(model, scenario, scaled(scale), observer=observer)
 
-    return scaled(most_likely(filter_of, parts, SCALES))
+    return scaled(choose_most_likely(filter_of, parts, SCALES))
 
 
 def make_estimator(
@@ -180,23 +187,22 @@ def make_estimator(
     *,
     observer: bool = True,
 ) -> Filter:
-    """The estimator that all controllers share.
+    """Build the estimator of a model.
 
-    With observer it switches between three filters (:data:`MODES`): one filter that is quick enough for a push lets
-    the encoder's steps through at all times, and one that is quiet takes a push for noise. The unknown loads are those
-    of the model's ``disturbance_model``.
+    With ``observer`` it switches between three filters (:data:`MODES`). A single filter is either fast enough for a
+    push, but then passes the encoder's quantization on to the input, or quiet, but then takes a push for noise. The
+    unknown loads are those of the model's ``disturbance_model``.
 
     Args:
-        model: The model to estimate with.
-        scenario: The machine, a scenario or a kit: its sensors' noise.
+        model: The model.
+        scenario: A scenario or a kit, with the sensor noise.
         sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
-        control: The control problem; its ``input_range`` says what a large load is. Default: the scenario's.
-        observer: Whether it estimates the unmeasured disturbances. Default: yes.
+        control: The control problem, whose ``input_range`` determines the size of a load. Default: the scenario's.
+        observer: Whether it estimates the unmeasured disturbances. Default: True.
 
     Raises:
-        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, there is no control problem, the
-            outputs cannot tell the disturbances from the states, or the noise of the states hides them: an observer
-            that never finds a load is no observer of loads.
+        InputError: If the size of ``sensor_sigma`` or ``first_sigma`` is wrong, there is no control problem, the
+            disturbances are not observable, or the process noise hides them, so that a load is never estimated.
 
     Example:
         ``make_estimator(model, scenario, process_noise(model, train))``
@@ -204,13 +210,14 @@ def make_estimator(
     control = scenario.control if control is None else control
     if control is None:
         raise InputError(
-            f"scenario {scenario.name} has no control problem, so no input range; give control=OCP(...) [HM-KIT-011]"
+            f"scenario {scenario.name}: no control problem, so no input range; give control=OCP(...) [HM-KIT-011]"
         )
     first, span = first_deviations(model, scenario), disturbance_sizes(model, control)
     if observer and not (found := distinguishable(model, Sizes(model, control).states)).detectable:
         raise InputError(
-            f"an observer of model {model.name}: at its operating point {found.why_undetectable}; declare others: "
-            'Scenario(disturbance_model=(Disturbance("output", ...), ...)), no more than there are outputs [HM-KIT-012]'
+            f"observer of model {model.name}: at the operating point {found.why_undetectable}. Declare other "
+            'disturbances, at most as many as outputs: Scenario(disturbance_model=(Disturbance("output", ...), ...)) '
+            "[HM-KIT-012]"
         )
 
     def filter_of(scale: float, step: Array | None) -> ExtendedKalmanFilter:
@@ -223,7 +230,7 @@ def make_estimator(
         return filter_of(1.0, None)
     periods = round(FOUND_HORIZONS * control.horizon)
     quiet, slip = (quiet_shares(partial(filter_of, scale), periods, model.n_d) for scale in (1.0, SLIP))
-    # where a load lasts, the slip filter would explain it by slip after slip, and the load would never be found
+    # else the slip filter would explain a lasting load by repeated slips, and never estimate it
     modes = (
         filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, JUMP_SHARE)),
     )  # fmt: skip
@@ -232,13 +239,13 @@ def make_estimator(
 
 
 def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Array) -> None:
-    """Refuse filters none of which finds two thirds of a constant load within so many periods.
+    """Refuse an observer if none of its filters estimates two thirds of a constant load within ``periods``.
 
-    Where no covariance settles there is too little noise for a state that stays, which does no harm, or so much that
-    rounding is all: more than the states' ``sizes`` ``(n_x,)``.
+    A covariance that does not converge means too little noise for a constant state, which is harmless, or noise above
+    the states' ``sizes`` ``(n_x,)``, where rounding dominates.
     """
     model, sigma = modes[0].model, np.sqrt(modes[0].noise[0])
-    left = np.array([load_left(one, periods) for one in modes])
+    left = np.array([remaining_load(one, periods) for one in modes])
     drowned = bool(np.any(sigma[: model.n_x] > sizes))
     unsettled = np.all(np.isnan(left), axis=0)
     lost = np.flatnonzero(~np.any(left <= FOUND, axis=0) & (drowned | ~unsettled))
@@ -250,21 +257,21 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Arr
     )
     noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
     raise InputError(
-        f"an observer of model {model.name} never finds a load at {where}: with the process noise of the states "
-        f"({noise} a period) it takes every load for noise, and a constant one would leave an offset. Correct the "
-        "prior, give Scenario(state_noise={...}), or run the scenario again [HM-KIT-013]"
+        f"observer of model {model.name}: it never estimates a load at {where}, because its process noise ({noise} a "
+        "period) explains every load. A constant load would cause an offset. Correct the prior, set "
+        "Scenario(state_noise={...}), or run the scenario again [HM-KIT-013]"
     )
 
 
 def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: int, n_d: int) -> Array:
-    """Steps ``(n_d,)`` of the loads in a filter that no jump drives, a period, as shares of their sizes.
+    """Random walk ``(n_d,)`` of the loads per period in the quiet or slip filter, as shares of their sizes.
 
-    Each is :data:`QUIET_SHARE`, doubled until the filter has found two thirds of a constant load of that kind after
-    ``periods``, at rest or in motion; at most :data:`MOST_DOUBLED` times.
+    Each is :data:`QUIET_SHARE`, doubled at most :data:`MOST_DOUBLED` times, until the filter estimates two thirds of a
+    constant load within ``periods``, at rest or in motion.
     """
     shares = np.full(n_d, QUIET_SHARE)
     for _ in range(MOST_DOUBLED):
-        slow = load_left(filter_of(shares), periods) > FOUND
+        slow = remaining_load(filter_of(shares), periods) > FOUND
         if not slow.any():
             break
         shares = np.where(slow, 2.0 * shares, shares)
@@ -272,14 +279,15 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: in
 
 
 def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
-    """Standard deviations ``(n_x,)`` of the state at the estimator's start.
+    """Initial standard deviations ``(n_x,)`` of the estimator's state.
 
-    A state that an output shows alone has that of the sensor. The others have ``first_sigma``, in their order, or
-    without it: the speed of such a state what two samples tell of it, ``sqrt(2) sigma / dt``; any other that of an even
-    spread over its signal's range.
+    A state that an output measures directly has the deviation of its sensor. The others have ``first_sigma``, in their
+    order. Without ``first_sigma``, the speed of a measured position has ``sqrt(2) sigma / dt`` (difference of two
+    samples), any other state that of a uniform distribution over its range, ``(upper - lower) / sqrt(12)``.
 
     Raises:
-        InputError: If ``sensor_sigma`` or ``first_sigma`` does not fit the model, or is needed and missing.
+        InputError: If the size of ``sensor_sigma`` or ``first_sigma`` is wrong, or ``first_sigma`` is needed and
+            missing.
 
     Example:
         >>> import casadi as ca
@@ -294,7 +302,7 @@ def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
     sigma, others = scenario.sensor_sigma, scenario.first_sigma
     if len(sigma) != model.n_y:
         raise InputError(
-            f"sensor_sigma needs {model.n_y} standard deviations of the outputs, got {sigma} [HM-KIT-014]"
+            f"sensor_sigma: give {model.n_y} standard deviations of the outputs, got {sigma} [HM-KIT-014]"
         )
     found = np.full(model.n_x, np.nan)
     for row, deviation in zip(
@@ -308,7 +316,7 @@ def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
         if len(others) != len(unseen):
             names = ", ".join(model.states[i].name for i in unseen) or "none"
             raise InputError(
-                f"first_sigma needs {len(unseen)} standard deviations, of the states that no output shows alone "
+                f"first_sigma: give {len(unseen)} standard deviations, of the states that no output measures directly "
                 f"({names}), got {others} [HM-KIT-015]"
             )
         found[unseen] = others
@@ -323,8 +331,8 @@ def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:
     if np.any(np.isnan(found)):
         names = ", ".join(model.states[i].name for i in np.flatnonzero(np.isnan(found)))
         raise InputError(
-            f"first_sigma: how uncertain {names} may be at the start nobody can tell; give it, {len(unseen)} standard "
-            "deviations of the states that no output shows alone, or give the states' signals a range [HM-KIT-016]"
+            f"first_sigma: the initial uncertainty of {names} is unknown. Give first_sigma with {len(unseen)} standard "
+            "deviations of the states that no output measures directly, or give these states a range [HM-KIT-016]"
         )
     return found
 
@@ -338,22 +346,23 @@ def make_controller(
     iterations: int | None = None,
     safe_input: ArrayLike | None = None,
 ) -> SafeController:
-    """A model's controller with its safeguards, which use the prior.
+    """Build a model's controller with its safeguards, which use the prior.
 
-    The first plan of ``rti`` is made before the loop starts: it is converged, from every start of the control problem.
+    The first plan of ``rti`` is computed by SQP to convergence before the loop starts, from every start of the control
+    problem.
 
     Args:
-        model: The model to plan with.
+        model: The model that plans.
         prior: The fitted prior, for terminal weight and fallback.
         control: The control problem.
-        solver: Name in :data:`SOLVERS`.
-        iterations: Linearizations a period of ``rti``, most iterations a solve of ``sqp`` and ``ipopt``; ``native``
-            has one. Default: the solver's own, one of ``rti``.
-        safe_input: Input ``(n_u,)`` that the machine may be left with. Default: none is declared.
+        solver: Name in :data:`SOLVERS`. Default: rti.
+        iterations: Linearizations a period of ``rti``, or largest number of iterations a solve of ``sqp`` and
+            ``ipopt``; ``native`` always has one. Default: that of the solver, one for ``rti``.
+        safe_input: Input ``(n_u,)`` with which the machine may be left alone. Default: not declared.
 
     Raises:
-        InputError: If there is no such solver, or none of so many iterations, or the inputs cannot hold the outputs
-            that the problem weighs.
+        InputError: If the solver is unknown, ``iterations`` is not possible, or the inputs cannot control the weighted
+            outputs.
 
     Example:
         ``make_controller(models["hybrid"], models["prior"], scenario.control)``
@@ -365,7 +374,8 @@ def make_controller(
             raise InputError(f"control problem: at the operating point {found.why_unreachable} [HM-KIT-017]")
     if iterations is not None and solver == "native":
         raise InputError(
-            "solver native linearizes once a period: leave iterations out, or take rti, sqp or ipopt [HM-KIT-018]"
+            "iterations: solver native always linearizes once a period. Omit iterations, or use rti, sqp or ipopt "
+            "[HM-KIT-018]"
         )
     options = {} if iterations is None else {"iterations": iterations}
     controller = SOLVERS[known(solver, SOLVERS, "solver")](model, ocp, **options)
@@ -376,8 +386,9 @@ def make_controller(
 def first_controller(
     model: HybridModel, ocp: OCP, controller: Controller | None = None
 ) -> SQPController | BestOf:
-    """What makes the first plan: SQP, from each of the problem's starts if there are any. It shares the functions of
-    the ``controller`` that goes on from there, if that is a real-time iteration in Python.
+    """The controller of the first plan: SQP, from each start of the problem if there are any.
+
+    It shares the functions of ``controller`` if that is a real-time iteration in Python.
     """
     from hybrid_mpc.control.best_of import BestOf
     from hybrid_mpc.control.rti import CondensedController
@@ -388,9 +399,9 @@ def first_controller(
 
 
 def make_ocp(prior: HybridModel, control: OCP) -> OCP:
-    """The problem with a working point, at which terminal weight and fallback are linearized: in motion if it has none.
+    """The problem with a working point, at which terminal weight and fallback are linearized; by default in motion.
 
-    At rest the slope of dry friction would pass for strong damping.
+    At rest, the slope of smoothed dry friction would act like strong damping.
 
     Args:
         prior: The fitted prior.
@@ -403,11 +414,9 @@ def make_ocp(prior: HybridModel, control: OCP) -> OCP:
 
 
 def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
-    """Working point of the problem, ``(x, u)``, else the operating point, with positions in motion: at speeds ``1 /
-    sqrt(q)``.
+    """Working point ``(x, u)`` of the problem; without one, the operating point with speeds ``1 / sqrt(q)``.
 
-    A speed without weight is the one that crosses the position's acceptable deviation ``1 / sqrt(q)`` within the
-    horizon.
+    A speed without weight is ``1 / sqrt(q) / T``, with the weight ``q`` of its position and the horizon ``T`` [s].
     """
     x, u = control.point(model)
     if control.working_point is not None:
@@ -420,9 +429,9 @@ def working_point(model: HybridModel, control: OCP) -> tuple[Array, Array]:
 
 
 def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
-    """Largest steps ``(n_y,)`` of the sensors: an error spread evenly over such a step has the deviation given.
+    """Resolution ``(n_y,)`` of the sensors, from the deviation of a uniform quantization error: ``sqrt(12) sigma``.
 
-    A real step may be finer; then a frozen sensor is found a little later.
+    If the real resolution is finer, a frozen sensor is detected a little later.
 
     Example:
         >>> [round(step, 6) for step in sensor_steps((0.001,))]
@@ -432,10 +441,10 @@ def sensor_steps(sensor_sigma: Sequence[float]) -> tuple[float, ...]:
 
 
 def make_resting_guard(model: HybridModel) -> Guard:
-    """A guard that records where the model does not describe the machine, and rests where the sensor is frozen.
+    """Build a guard that only records alarms of the model, and switches to the safe input when a sensor freezes.
 
     Args:
-        model: The model; the guard's times count in its ``time_unit``.
+        model: The model, whose ``time_unit`` scales the guard's times.
 
     Example:
         ``simulate(..., monitor=monitor, guard=make_resting_guard(hybrid))``
@@ -445,7 +454,7 @@ def make_resting_guard(model: HybridModel) -> Guard:
 
 
 def make_backup_guard(controller: SafeController, estimator: Estimator) -> Guard:
-    """A guard that hands over to another controller and its estimator where the model does not describe the machine."""
+    """Build a guard that switches to another controller and its estimator after an alarm of the model."""
     unit = controller.controller.model.time_unit
     return Guard(
         Mode.BACKUP, Mode.REST, backup=controller, backup_estimator=estimator, dwell=DWELL_S * unit,
@@ -462,23 +471,23 @@ def make_adaptive_guard(
     *,
     patience: float | None = None,
 ) -> Guard:
-    """A guard whose backup estimates how the prior's parameters have changed, and plans with that.
+    """Build a guard with a backup that estimates changes of the prior's parameters, and plans with them.
 
-    The backup's filter runs all the time, so it has found the change when the guard switches. On a frozen sensor the
-    input is the safe one.
+    The backup's filter always runs, so its estimate has converged when the guard switches. With a frozen sensor the
+    safe input is applied.
 
     Args:
-        model: The model that the normal controller plans with; it must know its parameters.
-        prior: The fitted prior, whose parameters change; terminal weight and fallback are made of it.
-        scenario: The machine: its sensors' noise, and as ``causes`` the parameters that change together, by name. Gains
-            of inputs are left out where there are other causes: but for friction, a weaker motor is a heavier machine.
+        model: The model of the normal controller; it must have parameters.
+        prior: The fitted prior, whose parameters change, for terminal weight and fallback.
+        scenario: Sensor noise, and ``causes``: groups of parameters that change together, by name. Gains of inputs are
+            left out if there are other causes, because a weaker motor acts like a heavier machine, friction apart.
         sigma_x: Process noise ``(n_x,)`` per period of the model's estimator.
         control: The control problem. Default: the scenario's.
-        patience: Time [s] that an alarm must have lasted. Default: 0.8 of the machine's seconds.
+        patience: Time [s] that an alarm must last. Default: 0.8 time constants of the machine.
 
     Raises:
-        InputError: If there are no causes or no control problem, the model does not know its parameters, or one of
-            them is unknown.
+        InputError: If causes or control problem are missing, the model has no parameters, or a parameter of a cause is
+            unknown.
 
     Example:
         ``make_adaptive_guard(hybrid, prior, scenario, sigma_x)``
@@ -488,7 +497,7 @@ def make_adaptive_guard(
     control = scenario.control if control is None else control
     if control is None:
         raise InputError(
-            f"a guard that adapts needs a control problem; scenario {scenario.name} has none [HM-KIT-019]"
+            f"adaptive guard: scenario {scenario.name} has no control problem; give control=OCP(...) [HM-KIT-019]"
         )
     span = disturbance_sizes(model, control)
     plain = make_ocp(prior, control)
@@ -509,25 +518,25 @@ def make_adaptive_guard(
 
 
 def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
-    """Those of the causes that a backup adapts to: gains of inputs only where there is nothing else.
+    """Causes that a backup adapts to; gains of inputs only if there are no other causes.
 
     Raises:
-        InputError: If there are no causes, the model does not know its parameters, or its inputs act later.
+        InputError: If there are no causes, or the model has no parameters, or its inputs are delayed.
     """
     groups = {name: tuple(names) for name, names in causes.items()}
     if not groups:
         raise InputError(
-            'a guard that adapts needs causes: groups of parameters that may change, e.g. {"mass": ("m", "J")}; '
-            "a scenario names them in its field causes [HM-KIT-020]"
+            "adaptive guard: no causes. Give groups of parameters that may change together in the scenario, e.g. "
+            'causes={"mass": ("m", "J")} [HM-KIT-020]'
         )
     if not model.n_p:
         raise InputError(
-            f"a guard that adapts needs a model that knows its parameters; model {model.name} has none: give its prior "
-            "a parameters and train it anew [HM-KIT-021]"
+            f"adaptive guard: model {model.name} has no parameters. Give its prior parameters, and run the scenario "
+            "again [HM-KIT-021]"
         )
     if model.delay_states:
         raise InputError(
-            f"a guard that adapts needs a model whose inputs act at once; those of model {model.name} act later"
+            f"adaptive guard: model {model.name} has delayed inputs, which it does not support. Use guard rest or prior"
             " [HM-KIT-022]"
         )
     others = {name: names for name, names in groups.items() if not _is_gain(names)}

@@ -1,4 +1,4 @@
-"""Models of a kit that are built when they are asked for."""
+"""Models of a kit that are built at their first use."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from hybrid_mpc.model.model import HybridModel
 
 
 class ModelsAtUse(Mapping[str, HybridModel]):
-    """Models by name, each built at its first use and kept: a loop needs one or two of them.
+    """Models by name; each is built at its first use and kept, since a loop needs only one or two of them.
 
     Args:
-        names: Their names, in order.
-        build: Makes one of its name; an InputError where it cannot be made.
+        names: Names of the models, in order.
+        build: Builds a model by name, or raises an InputError.
 
     Example:
         >>> models = ModelsAtUse(["prior"], lambda name: print("built", name))

@@ -1,4 +1,4 @@
-"""The disturbance model of a machine whose scenario names none: as many disturbances as there are outputs."""
+"""The default disturbance model of a scenario that declares none."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 
 Array = NDArray[np.float64]
 OFF = 0.2
-"""Share by which each parameter may be off: that of the wrong models on which a kit's promises are tried."""
+"""Relative error of each parameter: that of the wrong models with which a kit's promises are examined."""
 CARRIES = 1.0
-"""Largest disturbance, over its size, that errors of the parameters may ask for. Inputs that need more have so little
-effect at rest that a load at them explains no error: its estimate wanders off."""
+"""Largest disturbance, over its size, that errors of the parameters may require. An input that needs more has so little
+effect at steady state that a load there explains no error: its estimate would drift away."""
 EXPLAINED = 0.01
-"""Largest deviation of an output, over its size, that is no offset."""
+"""Largest deviation of an output, over its size, that does not count as an offset."""
 QUARTER, RUN, STILL = 0.25, 5000, 1e-6
-"""Share of its range by which an input is moved; longest run to rest [periods]; change a period, over a state's size,
-at which it rests."""
+"""Step of an input as a share of its range; longest run to steady state [periods]; change a period, over a state's
+size, that counts as steady."""
 REACH = 0.5
-"""Share of the horizon within which a rate's disturbance of its size moves the state by the size of that."""
+"""Share of the horizon within which a disturbance of a rate moves the state by the state's size."""
 
 
 def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance, ...] | None:
-    """What unmeasured disturbances are added to where nobody says it; None: one at each input.
+    """Default disturbance model; None: one disturbance at each input.
 
-    Disturbances of held outputs act at the inputs. Where errors of the parameters ask for larger ones than the inputs'
-    ranges, they act on the rates of the states that held outputs show. An output that no weight holds has a disturbance
-    of its own where errors of the parameters move it in a way that no load at an input explains: without, they leave an
-    offset in the held ones. There are never more disturbances than outputs, which could not be told apart. A problem
-    with references of states has one at each input.
+    Disturbances of controlled outputs act at the inputs. If errors of the parameters require disturbances larger than
+    the inputs' ranges, they act on the rates of the states that the controlled outputs measure. An output
+    without weight has a disturbance of its own if errors of the parameters move it in a way that no load at an input
+    explains; otherwise the controlled outputs would have an offset. There are never more disturbances than outputs, since more are not observable. A
+    problem with references of states has one disturbance at each input.
 
     Args:
         model: The fitted prior.
@@ -82,7 +82,7 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
 
 
 def _plain(model: HybridModel) -> tuple[Disturbance, ...] | None:
-    """The disturbance model; None where it is one at each input."""
+    """The disturbance model of a model; None if it is one at each input."""
     each = tuple(Disturbance("input", s.name) for s in model.inputs)
     return None if model.disturbance_model == each else model.disturbance_model
 
@@ -93,8 +93,8 @@ def _with_inputs(model: HybridModel, places: tuple[int, ...], own: list[Disturba
 
 
 def _with_rates(model: HybridModel, control: OCP, held: list[int], sizes: Sizes) -> HybridModel | None:
-    """Rates of the states that held outputs show, of their speeds where they are positions, and outputs that are not
-    held; None where an output shows no state alone.
+    """The model with disturbances of the rates of the states that controlled outputs measure (for positions: of their
+    speeds), and of the other outputs; None if an output does not depend on exactly one state.
     """
     rows = output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full()
     speeds, reach = kinematics(model), REACH * control.horizon * model.dt
@@ -114,10 +114,10 @@ def _with_rates(model: HybridModel, control: OCP, held: list[int], sizes: Sizes)
 
 
 def needed(model: HybridModel, control: OCP) -> float:
-    """Largest disturbance at an input, over its size, that keeps the outputs where they are when each parameter is off
-    by a share of :data:`OFF`; the largest over the operating point and what the model rests at under other inputs.
+    """Largest disturbance at an input, over its size, that compensates parameter errors of :data:`OFF` at the outputs.
 
-    Zero of a model without free parameters or without disturbances at inputs.
+    The maximum is taken over the operating point and steady states at other inputs. Zero for a model without free
+    parameters or without disturbances at inputs.
     """
     at_inputs = np.any(model.disturbed[0] != 0, axis=0)
     sizes, found = disturbance_sizes(model, control), [0.0]
@@ -128,12 +128,12 @@ def needed(model: HybridModel, control: OCP) -> float:
 
 
 def unexplained(model: HybridModel, control: OCP) -> float:
-    """Largest deviation of an output, over its size, that remains when each parameter is off by a share of :data:`OFF`
-    and the disturbances explain what they can; over the same points.
+    """Largest deviation of an output, over its size, that remains after the disturbances have compensated parameter
+    errors of :data:`OFF` as far as possible; over the same points.
     """
     sizes, n_z, found = Sizes(model, control).outputs, model.n_x + model.n_h, [0.0]
     for matrix, off in _errors(model, control):
-        # what outputs do where state and disturbance are at rest: the rest of the equations holds exactly
+        # eliminate the steady-state equations (first n_z rows) exactly, then fit the outputs
         _, values, rows = np.linalg.svd(matrix[:n_z])
         rank = int(np.sum(values > RANK * values[0]))
         rest = np.linalg.lstsq(matrix[:n_z], off[:n_z], rcond=RANK)[0]
@@ -177,8 +177,8 @@ def _at_rest(model: HybridModel, x: Array, h: Array, u: Array) -> Array:
 
 
 def _rests(model: HybridModel, control: OCP) -> list[tuple[Array, Array, Array]]:
-    """The operating point, and where the model comes to rest from there with one input a quarter of its range away;
-    none where it does not within the range of its states.
+    """The operating point, and the steady states after a step of each input by a quarter of its range, if they are
+    reached within the ranges of the states.
     """
     u0 = np.clip(model.u0, control.u_min, control.u_max)
     found = [(model.x0, hidden_fixed_point(model, model.x0, u0), u0)]

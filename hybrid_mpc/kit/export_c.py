@@ -1,4 +1,4 @@
-"""The controller of a kit as a folder of C."""
+"""Export of a kit's controller as a folder of C code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.records import known
 
 REACTIONS = ("", "rest", "adapt")
-"""What an alarm does in the C: nothing, :meth:`Kit.guard`, or the same with a backup that adapts."""
+"""Reactions to an alarm in the C code: none, :meth:`Kit.guard`, or the same with an adaptive backup."""
 
 
 def generate_controller(
@@ -23,41 +23,43 @@ def generate_controller(
 ) -> Path:  # fmt: skip
     """Write estimator, real-time iteration, safeguards, monitor and guard as C11, with a test program and a README.
 
-    One period of the C is one of :class:`~hybrid_mpc.loop.loop.Loop`.
+    One period of the C code equals one period of :class:`~hybrid_mpc.loop.loop.Loop`.
 
     Args:
         kit: The loaded artifact.
-        folder: Folder, made if missing; it must be empty, or hold an earlier controller.
-        model: Name of the model that plans and estimates. Default: the recommended one.
-        task: Whose control problem it solves. Default: the common one.
-        load: Whether the estimator follows an unknown load, as :meth:`Kit.observer`. Default: yes.
-        single: Whether numbers are ``float``. Default: ``double``.
-        monitor: Whether :meth:`Kit.monitor` watches the loop. Default: it does.
-        guard: What its alarms do, which are those of ``kit.monitor(kind="guard")`` then: ``"rest"``, no input while a
-            sensor is frozen; ``"adapt"``, a second controller too that estimates the prior's changed parameters
-            (:meth:`Kit.guard`). Default: nothing, they are told.
-        check: Whether the C is compiled and its test is run, and its README has its sizes: code that was made of the
-            folder's content runs. Default: no, nothing of it is compiled or run.
+        folder: Folder to write; it must be new or empty, or hold an earlier controller.
+        model: Name of the model of controller and estimator. Default: the recommended model.
+        task: Task whose control problem is solved. Default: the common control problem.
+        load: Whether the estimator estimates an unknown load, as :meth:`Kit.observer`. Default: True.
+        single: Whether numbers are ``float``. Default: False, ``double``.
+        monitor: Whether :meth:`Kit.monitor` watches the loop. Default: True.
+        guard: Reaction to alarms of ``kit.monitor(kind="guard")``: ``"rest"``, the safe input while a sensor is frozen;
+            ``"adapt"``, also a second controller that estimates the prior's changed parameters (:meth:`Kit.guard`).
+            Default: none, alarms are only reported.
+        check: Whether to compile the C code, run its test, and write its sizes into the README. This executes code that
+            was generated from the folder's content. Default: False.
 
     Returns:
         The folder.
 
     Raises:
-        InputError: If something of the controller has no C, all of it by name; if the folder holds something else; if
-            the kit lacks something that a loop, its monitor or its guard needs; if the check fails.
-        StorageError: If it cannot be written; the folder is then as it was.
+        InputError: If parts of the controller cannot be exported (the message names all of them), the folder holds
+            something else, the kit lacks a part of the loop, its monitor or its guard, or the check fails.
+        StorageError: If the folder cannot be written; it is then unchanged.
 
     Example:
         ``hm.generate_controller(hm.load("runs/mine"), "controller")``
     """
     place = Path(folder)
     if place.exists() and not place.is_dir():
-        raise InputError(f"{place} is a file; give a folder [HM-KIT-023]")
+        raise InputError(f"{place}: is a file; give a folder [HM-KIT-023]")
     if place.is_dir() and any(place.iterdir()) and not (place / "hmpc.h").is_file():
-        raise InputError(f"{place} is not empty; give a new folder [HM-KIT-024]")
+        raise InputError(f"{place}: folder is not empty; give a new folder [HM-KIT-024]")
     known(guard or "none", ("none", *REACTIONS[1:]), "guard")
     if guard and not monitor:
-        raise InputError(f"guard {guard!r} acts on alarms; leave monitor=True [HM-KIT-025]")
+        raise InputError(
+            f"guard: {guard!r} reacts to alarms, so it needs the monitor; set monitor=True [HM-KIT-025]"
+        )
     name = model or kit.recommended
     estimator = kit.observer(name, task=task, load=load)
     prior = kit.models["prior"]

@@ -1,4 +1,4 @@
-"""A kit of a former format, written in the present one."""
+"""Migration of a kit from an older format to the present one."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class OldDetector:
-    """The energy's detector until version 5."""
+    """Detector of the energy in version 5 and older."""
 
     dt: float
     force: tuple[tuple[float, ...], ...]
@@ -71,7 +71,7 @@ class OldDetector:
     time_unit: float = 1.0
 
     def limits(self, info: ModelInfo, sensor_sigma: tuple[float, ...]) -> WatchLimits:
-        """The same as limits of channels."""
+        """The detector's thresholds as limits of channels."""
         n_q = len(info.states) // 2
         (rate,) = (b.rate_unit for b in info.balances if b.name == ENERGY)
         low = [self.interval[i : i + 2] for i in (0, 2)]
@@ -107,7 +107,7 @@ class OldDetector:
 
 @dataclass(frozen=True)
 class OldCalibration:
-    """Thresholds of the energy's levels until version 5, which nothing reads any more, the detector, rest speeds."""
+    """Calibration in version 5 and older: unused thresholds of the energy's levels, detector, rest speeds."""
 
     threshold_w: float | None
     release_w: float | None
@@ -124,7 +124,7 @@ class OldCalibration:
 
 @dataclass(frozen=True)
 class OldResidualLimits:
-    """Limits of residuals until version 5."""
+    """Limits of residuals in version 5 and older."""
 
     channels: tuple[str, ...]
     dt: float
@@ -138,7 +138,7 @@ class OldResidualLimits:
     rated: bool = True
 
     def limits(self, info: ModelInfo) -> WatchLimits:
-        """The same as limits of channels."""
+        """The limits as limits of channels."""
         units = {s.name: s.unit for s in (*info.outputs, *info.disturbances)}
         units |= {b.name: b.rate_unit for b in info.balances}
         units |= {free_run_of(s.name): s.unit for s in info.outputs}
@@ -165,7 +165,7 @@ class OldResidualLimits:
 
 @dataclass(frozen=True)
 class OldEnergy:
-    """What ``watch/energy.json`` held in version 5."""
+    """Content of ``watch/energy.json`` in version 5."""
 
     calibration: OldCalibration
     of: Line = ""
@@ -173,7 +173,7 @@ class OldEnergy:
 
 @dataclass(frozen=True)
 class OldChannels:
-    """What ``watch/residuals.json`` held in version 5."""
+    """Content of ``watch/residuals.json`` in version 5."""
 
     limits: Mapping[Name, OldResidualLimits]
     of: Mapping[Name, Line] = field(default_factory=dict)
@@ -181,7 +181,7 @@ class OldChannels:
 
 @dataclass(frozen=True)
 class OldGuard:
-    """What ``guard.json`` held in version 5."""
+    """Content of ``guard.json`` in version 5."""
 
     detector: OldDetector | None
     reason: Text = ""
@@ -190,7 +190,7 @@ class OldGuard:
 
 @dataclass(frozen=True)
 class OldDescription:
-    """What ``model.json`` held in version 4; the fields are those of the present files."""
+    """Content of ``model.json`` in version 4; its fields are those of the present files."""
 
     models: tuple[Name, ...]
     programs_sha256: Line
@@ -205,22 +205,21 @@ class OldDescription:
 
 
 def migrate_kit(old: str | Path, new: str | Path) -> Path:
-    """Write a kit of version 4 (``model.json``) or 5 of the format in the present one, into a new folder.
+    """Write a kit of format version 4 (``model.json``) or 5 in the present format, into a new folder.
 
-    Nothing is computed: numbers, programs and promises are the old ones. Thresholds of the energy's levels, beside
-    which there was a detector, are left out.
+    Numbers, programs and promises are copied; nothing is computed. Unused thresholds of the energy's levels are left
+    out.
 
     Args:
-        old: The old kit's folder, or the folder of the run that holds it as ``model``; it stays as it is.
-        new: Folder to make; new or empty.
+        old: The old kit's folder, or the folder of its run; it is not changed.
+        new: Folder to write; it must be new or empty.
 
     Returns:
         The new folder.
 
     Raises:
-        InputError: If ``old`` holds no kit of a former format, or one that is still older or damaged; or if ``new``
-            holds something.
-        StorageError: If it cannot be written; nothing half-written is left.
+        InputError: If ``old`` holds no kit of version 4 or 5, or a damaged one, or if ``new`` is not empty.
+        StorageError: If the new folder cannot be written; no partial folder is left.
 
     Example:
         ``migrate_kit("runs/old", "kit")``
@@ -235,8 +234,8 @@ def migrate_kit(old: str | Path, new: str | Path) -> Path:
             shutil.copyfile(folder / name if single else folder / MODELS / name, place / MODELS / name)
         if sha256(place / PROGRAMS) != held.programs_sha256:
             raise InputError(
-                f"{folder}: {OLD_FILES[1]} is not the one that the kit was saved with; take the folder from its run "
-                "again [HM-KIT-026]"
+                f"{folder}: {OLD_FILES[1]} was changed after the kit was saved. Copy the folder from its run again "
+                "[HM-KIT-026]"
             )
         write_description(
             place,
@@ -283,7 +282,10 @@ def _old_folder(folder: Path) -> Path:
             return place
         if is_file(place / KIT) and read_object(place / KIT).get("schema_version") == SPLIT_SCHEMA:
             return place
-    raise InputError(f"{folder} holds no kit of a former format; there is nothing to migrate [HM-KIT-027]")
+    raise InputError(
+        f"{folder}: no kit of an older format, so there is nothing to migrate. Give the folder of such a kit "
+        "[HM-KIT-027]"
+    )
 
 
 def _single(folder: Path) -> OldDescription:
@@ -291,8 +293,8 @@ def _single(folder: Path) -> OldDescription:
     path = folder / OLD_FILE
     if (version := read_object(path).get("schema_version")) != OLD_SCHEMA:
         raise InputError(
-            f"{path} is of version {version!r} of the format (field schema_version); versions {OLD_SCHEMA} and "
-            f"{SPLIT_SCHEMA} alone can be migrated: train the models anew [HM-KIT-028]"
+            f"{path}: format version {version!r} (field schema_version); only versions {OLD_SCHEMA} and {SPLIT_SCHEMA} "
+            "can be migrated. Run the scenario again [HM-KIT-028]"
         )
     found = _read(folder, OLD_FILE, OldDescription)
     assert found is not None
@@ -300,7 +302,7 @@ def _single(folder: Path) -> OldDescription:
 
 
 def _split(folder: Path) -> OldDescription:
-    """A kit of version 5; what was learned with other models or another observer is left out."""
+    """A kit of version 5, without limits of other models or another observer."""
     known = _read(folder, KIT, Description)
     assert known is not None
     observer, tasks = (

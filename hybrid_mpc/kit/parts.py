@@ -1,18 +1,18 @@
-"""The files of an artifact: one folder, each file written whole by one stage of a run and never edited by another.
+"""The files of an artifact: one folder, in which each file is written by exactly one stage of a run.
 
 =============================  ============================================================  ==============
-file                           what                                                          written by
+file                           content                                                       written by
 =============================  ============================================================  ==============
 ``kit.json``                   machine, signals, provenance, default model                   ``export``
 ``models/``                    programs and weights of the models                            ``export``
 ``observer.json``              noise of sensors and states, disturbance model                ``noise``
 ``tasks.json``, ``tasks/``     common control problem, safe input; problems of single tasks  ``tasks``
-``watch/NAME.json``            limits of all channels that watch with a model                ``watch``
-``promises.json``              what the kit promises (:mod:`hybrid_mpc.kit.promises`)        ``promises``
+``watch/NAME.json``            limits of all channels of the monitor with a model            ``watch``
+``promises.json``              promises of the kit (:mod:`hybrid_mpc.kit.promises`)          ``promises``
 =============================  ============================================================  ==============
 
-What belongs to something carries the digest of it (``of``): the noise that of the models, limits that of the observer
-whose estimates they were learned on. :func:`read_parts` composes what fits and says of the rest what is missing.
+A file that depends on others holds their digest (``of``): the noise that of the models, limits that of the observer
+that they were learned with. :func:`read_parts` combines the files that match, and lists those that are missing.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.watch.detector import WatchLimits
 
 SCHEMA_VERSION = 6
-"""Version of the format of the whole folder; docs/kit.md describes it."""
+"""Format version of the whole folder, described in docs/kit.md."""
 KIT, MODELS, OBSERVER, TASKS = "kit.json", "models", "observer.json", "tasks.json"
 WATCH = "watch/*.json"
 PROGRAMS, WEIGHTS = f"{MODELS}/programs.json", f"{MODELS}/weights.safetensors"
@@ -59,29 +59,29 @@ OWNERS: Mapping[str, str] = {
     KIT: "export", PROGRAMS: "export", WEIGHTS: "export", OBSERVER: "noise", TASKS: "tasks", "tasks/*.json": "tasks",
     WATCH: "watch", "promises.json": "promises",
 }  # fmt: skip
-"""The stage of a run that writes a file; no other does."""
+"""The only stage of a run that writes a file, by file."""
 OLD_FILE, OLD_SCHEMA = "model.json", 4
-"""The description of a kit in a former format, of one file; see :mod:`hybrid_mpc.kit.migrate`."""
+"""Description of a kit in format version 4, a single file; see :mod:`hybrid_mpc.kit.migrate`."""
 SPLIT_SCHEMA = 5
-"""The former format of several files, which can be migrated, too."""
+"""Previous format version with several files; it can be migrated, too."""
 OLD_FILES = (OLD_FILE, "programs.json", "weights.safetensors")
 SPLIT_FILES = ("watch/energy.json", "watch/residuals.json", "guard.json")
 BENCHMARK_NOTE = "benchmark_model.json"
-"""File of a benchmark's model, which is no artifact."""
+"""File of a benchmark's model, which is not an artifact."""
 MOST_MODELS = 16
-"""Models that an artifact may hold: prior, hybrid, and a few to compare them with."""
+"""Largest number of models in an artifact: prior, hybrid, and a few for comparison."""
 HYBRID = "hybrid"
 MOST_MEMBERS = 32
-"""Other networks of the hybrid's training that an artifact may hold."""
+"""Largest number of single networks of the hybrid in an artifact."""
 BALANCE = "balance"
-"""Function of a balance: its program is ``<model>/balance/<name of the balance>``."""
-AGAIN = "give the run's command again with --resume"
+"""Begin of a balance's program name: ``<model>/balance/<name of the balance>``."""
+AGAIN = "repeat the command of the run with --resume"
 R = TypeVar("R")
 
 
 @dataclass(frozen=True)
 class BalanceInfo:
-    """Name and units of a :class:`~hybrid_mpc.model.model.Balance`: of the storage, of its rate and of the residual."""
+    """Name and units of a :class:`~hybrid_mpc.model.model.Balance`: of the storage, and of its rate and residual."""
 
     name: Name
     unit: Unit
@@ -98,7 +98,7 @@ class BalanceInfo:
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """What the models' programs do not say themselves; the same for all models of an artifact.
+    """Description of the models besides their programs; the same for all models of an artifact.
 
     Args:
         dt: Model period [s].
@@ -106,20 +106,20 @@ class ModelInfo:
         inputs: Signals of u.
         outputs: Signals of y.
         parameters: The prior's parameters with their fitted values, in the order of p. Default: none.
-        input_delay: Time [s] from a command to the input that the programs take. Default: none.
-        time_unit: The machine's second [s], see :class:`~hybrid_mpc.model.model.HybridModel`. Default 1.
+        input_delay: Delay [s] from a command to the input of the programs. Default: 0.
+        time_unit: Time constant of the machine [s], see :class:`~hybrid_mpc.model.model.HybridModel`. Default: 1.
         disturbances: Signals of w. Default: none.
-        nominal_w: What is taken for w where none is given. Default: zeros.
+        nominal_w: Default of w. Default: zeros.
         covariance: Rows of the covariance of the fitted values. Default: unknown.
-        balances: Balances that have programs. Default: none.
+        balances: Balances with programs. Default: none.
         nominal_x: State of the operating point. Default: zeros.
         nominal_u: Input of the operating point. Default: zeros.
-        state_spread: Spread of the states in the training recordings; 0 where one does not move. Default: not known.
-        output_spread: Likewise of the outputs.
+        state_spread: Spread of the states in the training recordings; 0 for a constant state. Default: unknown.
+        output_spread: Spread of the outputs. Default: unknown.
 
     Raises:
-        InputError: If a field is of another kind, the period or the machine's second is not positive, the delay
-            negative, or two signals of one kind, parameters or balances have one name; all of it together.
+        InputError: If a field is of the wrong kind, period or time constant are not positive, the delay is negative, or
+            names of signals, parameters or balances are not unique. The message lists all errors together.
     """
 
     dt: Seconds
@@ -151,7 +151,7 @@ def _names(info: ModelInfo, role: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What an artifact was made from. None of it is a path, and nothing of it is ever executed.
+    """Origin of an artifact. It contains no path, and is never executed.
 
     Args:
         scenario: Name of the scenario.
@@ -172,23 +172,24 @@ class Provenance:
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What loops need beside the models.
+    """Settings of loops besides the models.
 
     Args:
-        control: Control problems by task; under ``""`` the one of all tasks that have none of their own. Default: none.
-        sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units], as estimators assume them.
-        first_sigma: Those of the states that no output shows alone, at an estimator's start. Default: by the sensors'
-            and the states' ranges.
-        process_noise: Standard deviations per period ``(n_x,)`` [state units] by model, and by model with ``_observer``
-            behind it where the estimator follows an unknown load.
-        causes: What may break, by name: the parameters that change together then.
-        safe_input: Input ``(n_u,)`` that the machine may be left with. Default: none is declared.
+        control: Control problems by task; ``""`` is the common one, of all tasks without one of their own. Default:
+            none.
+        sensor_sigma: Standard deviations of the sensors ``(n_y,)`` [output units] in the estimators.
+        first_sigma: Initial standard deviations of the states that no output measures directly. Default: from sensors
+            and ranges.
+        process_noise: Standard deviations per period ``(n_x,)`` [state units] by estimator: the name of the model,
+            followed by ``_observer`` if an unknown load is estimated. Default: none.
+        causes: Possible faults by name: the parameters that change together. Default: none.
+        safe_input: Input ``(n_u,)`` with which the machine may be left alone. Default: not declared.
         tasks: Names of the tasks, with or without a control problem of their own. Default: those of ``control``.
-        disturbance_model: What unmeasured disturbances are added to. Default: one at each input.
+        disturbance_model: Unmeasured disturbances. Default: one at each input.
 
     Raises:
-        InputError: If a field is of another kind, a deviation is negative or not finite, a task has two problems of one
-            name, or the safe input is outside a problem's limits; all of it together.
+        InputError: If a field is of the wrong kind, a deviation is negative or not finite, a name of a task is not
+            unique, or the safe input is outside a problem's limits. The message lists all errors together.
     """
 
     control: Mapping[NameOrNone, OCP] = field(default_factory=dict)
@@ -208,13 +209,13 @@ class LoopSettings:
             lambda: (
                 self.safe_input is None or all(_within(self.safe_input, p) for p in self.control.values())
             ),
-            f"safe_input {self.safe_input} is outside the limits of a control problem [HM-KIT-029]",
+            f"safe_input: {self.safe_input} is outside the limits of a control problem; choose it within [HM-KIT-029]",
         )
         own.refuse()
 
 
 def _within(u: tuple[float, ...], problem: OCP) -> bool:
-    """Whether an input fits a problem's number of inputs and their limits."""
+    """Whether an input has the size of a problem's inputs and lies within their limits."""
     return len(u) == problem.n_u and all(
         low <= value <= high for value, low, high in zip(u, problem.u_min, problem.u_max, strict=True)
     )
@@ -223,7 +224,7 @@ def _within(u: tuple[float, ...], problem: OCP) -> bool:
 def loop_settings(
     scenario: Scenario, process_noise: Mapping[str, tuple[float, ...]] | None = None
 ) -> LoopSettings:
-    """What a scenario's loops need beside the models; process noise by estimator, unless it is estimated later."""
+    """Settings of a scenario's loops; ``process_noise`` by estimator, empty if it is estimated later."""
     problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
     safe = scenario.safe_input
     return LoopSettings(
@@ -240,20 +241,20 @@ def loop_settings(
 
 @dataclass(frozen=True)
 class Description:
-    """What ``kit.json`` holds beside the format's version and its hash.
+    """Content of ``kit.json`` besides format version and hash.
 
     Args:
         models: Names of the models.
         programs_sha256: Hash of ``models/programs.json``.
         model: Period, signals and parameters of all models.
-        provenance: What the models were made from.
-        recommended: Default model of a loop. Empty: the hybrid.
-        members: How many networks the hybrid is the mean of, each held alone beside it, the best first. Default: it is
-            a single one.
-        predicting: What predictions of recordings need beside the models. Default: there can be none.
+        provenance: Origin of the models.
+        recommended: Name of the default model of a loop; empty means the hybrid.
+        members: Number of networks that the hybrid is the mean of; the artifact also holds each alone, the best first.
+            Default: 0, the hybrid is a single network.
+        predicting: Settings of predictions of recordings. Default: none, predictions are not possible.
 
     Raises:
-        InputError: If there are no models, too many, or two of one name.
+        InputError: If there are no models, too many models, or two models with the same name.
     """
 
     models: tuple[Name, ...]
@@ -268,30 +269,30 @@ class Description:
         Fields(self, "artifact").refuse()
         if not 0 <= self.members <= (MOST_MEMBERS if HYBRID in self.models else 0):
             raise InputError(
-                f"members: 0 to {MOST_MEMBERS} networks beside a model {HYBRID!r} are needed, got {self.members}"
+                f"members: give 0 to {MOST_MEMBERS}, and a model {HYBRID!r} with any member; got {self.members}"
                 " [HM-KIT-030]"
             )
         if self.recommended and self.recommended not in self.models:
             raise InputError(
-                f"recommended: no model {self.recommended!r}; there are: {', '.join(self.models)} [HM-KIT-031]"
+                f"recommended: no model {self.recommended!r}; choose one of: {', '.join(self.models)} [HM-KIT-031]"
             )
         if not 0 < len(set(self.models)) == len(self.models) <= MOST_MODELS:
             raise InputError(
-                f"models: 1 to {MOST_MODELS} different names are needed, got {len(self.models)} [HM-KIT-032]"
+                f"models: give 1 to {MOST_MODELS} different names, got {len(self.models)} [HM-KIT-032]"
             )
 
 
 @dataclass(frozen=True)
 class ObserverSettings:
-    """What ``observer.json`` holds.
+    """Content of ``observer.json``.
 
     Args:
-        sensor_sigma: See :class:`LoopSettings`, as the other fields of these names.
-        first_sigma: Likewise.
-        process_noise: Likewise.
-        disturbance_model: Likewise.
-        of: Digest of the models that the noise was estimated with (:func:`models_digest`). Empty: of any, it was given
-            by hand.
+        sensor_sigma: As in :class:`LoopSettings`.
+        first_sigma: As in :class:`LoopSettings`.
+        process_noise: As in :class:`LoopSettings`.
+        disturbance_model: As in :class:`LoopSettings`.
+        of: Digest of the models that the noise was estimated with (:attr:`Parts.models`). Empty: given by hand, valid
+            for any models.
     """
 
     sensor_sigma: tuple[NotNegative, ...] = ()
@@ -303,14 +304,14 @@ class ObserverSettings:
 
 @dataclass(frozen=True)
 class TaskList:
-    """What ``tasks.json`` holds; it is written after the files in ``tasks/``.
+    """Content of ``tasks.json``, which is written after the files in ``tasks/``.
 
     Args:
-        control: The control problem of all tasks that have none of their own; None: there is none.
-        safe_input: See :class:`LoopSettings`, as the other fields of these names.
-        causes: Likewise.
-        tasks: Likewise.
-        own: Digest of the control problem of each task that has its own, in ``tasks/NAME.json``.
+        control: The common control problem, of all tasks without one of their own; None if missing.
+        safe_input: As in :class:`LoopSettings`.
+        causes: As in :class:`LoopSettings`.
+        tasks: As in :class:`LoopSettings`.
+        own: Digests of the control problems of single tasks, in ``tasks/NAME.json``.
     """
 
     control: OCP | None = None
@@ -322,20 +323,21 @@ class TaskList:
 
 @dataclass(frozen=True)
 class TaskProblem:
-    """What ``tasks/NAME.json`` holds: the control problem of a task."""
+    """Content of ``tasks/NAME.json``: the control problem of a task."""
 
     control: OCP
 
 
 @dataclass(frozen=True)
 class WatchFile:
-    """What ``watch/NAME.json`` holds: by what a monitor with the model of that name alarms.
+    """Content of ``watch/NAME.json``: limits of a monitor with the model of that name.
 
     Args:
-        limits: WatchLimits by kind of readings (:mod:`hybrid_mpc.watch.readings`).
-        reason: Why some are missing. Default: none is.
+        limits: Limits by kind of readings (:mod:`hybrid_mpc.watch.readings`).
+        reason: Why limits are missing. Default: empty, none are missing.
         rest_speed: Speeds ``(n_q,)`` below which friction may stick. Default: unknown.
-        of: Digest of the observer that they were learned with (:meth:`Parts.observer`). Empty: by hand, of any.
+        of: Digest of the observer that the limits were learned with (:meth:`Parts.observer`). Empty: given by hand,
+            valid for any observer.
     """
 
     limits: Mapping[Name, WatchLimits]
@@ -346,13 +348,13 @@ class WatchFile:
 
 @dataclass(frozen=True)
 class Parts:
-    """What the files of an artifact say together.
+    """Combined content of the files of an artifact.
 
     Args:
-        description: ``kit.json``.
-        loop: Control problems, noise and what else loops need.
-        watch: By what monitors alarm, by model.
-        lacks: What is missing, and the stage that gives it, by file.
+        description: Content of ``kit.json``.
+        loop: Settings of loops: control problems, noise.
+        watch: Limits of the monitors, by model.
+        lacks: Missing content and the stage that writes it, by file.
     """
 
     description: Description
@@ -362,15 +364,13 @@ class Parts:
 
     @property
     def models(self) -> str:
-        """Digest of the models, to which noise belongs."""
+        """Digest of the models; process noise depends on it."""
         return digest([self.description.programs_sha256, self.description.model.input_delay])
 
     def observer(self, model: str) -> str:
-        """Digest of all that makes the observer of a model, to which limits belong: the models, its noise, and how
-        large its loads may be.
-        """
+        """Digest of a model's observer: models, noise, and sizes of the loads; limits depend on it."""
         loop, problem, sizes = self.loop, self.loop.control.get(""), None
-        if problem is not None:  # loads elsewhere than at the inputs have sizes that weights decide too
+        if problem is not None:  # sizes of loads that do not act at inputs also depend on weights
             spans: object = (problem.u_min, problem.u_max, problem.input_range, problem.horizon)
             sizes = spans if loop.disturbance_model is None else problem
         noise = loop.process_noise.get(f"{model}_observer")
@@ -380,19 +380,19 @@ class Parts:
 
 
 def write_description(folder: Path, description: Description) -> None:
-    """Write ``kit.json``; what a kit of a former format has left in the folder goes."""
+    """Write ``kit.json``, and delete files of older formats in the folder."""
     _write(folder, KIT, description)
     for name in (*OLD_FILES, *SPLIT_FILES):
         (folder / name).unlink(missing_ok=True)
 
 
 def write_observer(folder: Path, observer: ObserverSettings) -> None:
-    """Write ``observer.json``, unless it is there."""
+    """Write ``observer.json`` unless it already has this content."""
     _write_once(folder, OBSERVER, observer)
 
 
 def write_tasks(folder: Path, loop: LoopSettings) -> None:
-    """Write the control problems, safe input and causes of loops, ``tasks.json`` last; unless they are there."""
+    """Write control problems, safe input and causes of loops, ``tasks.json`` last; skip files with this content."""
     problems = {name: TaskProblem(problem) for name, problem in loop.control.items() if name}
     for name, problem in problems.items():
         _write_once(folder, _task_file(name), problem)
@@ -405,7 +405,7 @@ def write_tasks(folder: Path, loop: LoopSettings) -> None:
 
 
 def write_watch(folder: Path, watch: Mapping[str, WatchFile]) -> None:
-    """Write ``watch/NAME.json`` of each model, unless it is there; files of other models go."""
+    """Write ``watch/NAME.json`` of each model unless it has this content; delete files of other models."""
     for name, limits in watch.items():
         _write_once(folder, watch_file(name), limits)
     for path in (folder / "watch").glob("*.json"):
@@ -414,12 +414,12 @@ def write_watch(folder: Path, watch: Mapping[str, WatchFile]) -> None:
 
 
 def watch_file(model: str) -> str:
-    """Place of what a monitor with a model alarms by."""
+    """File of the limits of a monitor with a model, relative to the artifact's folder."""
     return f"watch/{model}.json"
 
 
 def save_loop(folder: Path, loop: LoopSettings) -> None:
-    """Write what loops need beside the models, as a script states it: ``tasks.json``, ``tasks/``, ``observer.json``."""
+    """Write settings of loops from a script: ``tasks.json``, ``tasks/``, ``observer.json``."""
     write_tasks(folder, loop)
     write_observer(
         folder,
@@ -432,7 +432,7 @@ def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
 
     Raises:
         InputError: If the folder holds no artifact.
-        StorageError: If it cannot be written.
+        StorageError: If the file cannot be written.
     """
     read_description(folder)
     held = _read(folder, OBSERVER, ObserverSettings) or ObserverSettings()
@@ -440,11 +440,11 @@ def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
 
 
 def set_limits(folder: Path, limits: Mapping[str, Sequence[WatchLimits]]) -> None:
-    """Write by hand what monitors alarm by: limits of one or more kinds of readings, by model.
+    """Write limits of monitors by hand: limits of one or more kinds of readings, by model.
 
     Raises:
-        InputError: If the folder holds no artifact, or no such model.
-        StorageError: If it cannot be written.
+        InputError: If the folder holds no artifact, or a model is unknown.
+        StorageError: If a file cannot be written.
     """
     _check_models(limits, read_description(folder))
     write_watch(
@@ -465,18 +465,18 @@ def tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:
 
 
 def read_description(folder: Path) -> Description:
-    """What ``kit.json`` says; InputError if it is missing, damaged, changed by hand, or of another version."""
+    """Read ``kit.json``; InputError if it is missing, damaged, changed by hand, or of another version."""
     found = _read(folder, KIT, Description)
     if found is None:
-        raise InputError(f"{folder / KIT} is missing [HM-KIT-033]")
+        raise InputError(f"{folder / KIT}: file is missing; {AGAIN} [HM-KIT-033]")
     return found
 
 
 def read_parts(folder: Path) -> Parts:
-    """What all files of an artifact say together, and what is missing; the models' programs are not read.
+    """Read all files of an artifact except the models' programs, and list what is missing.
 
     Raises:
-        InputError: If there is no ``kit.json``, or a file is damaged, was changed by hand, or is of another version.
+        InputError: If ``kit.json`` is missing, or a file is damaged, was changed by hand, or is of another version.
     """
     found = read_description(folder)
     lacks: dict[str, str] = {}
@@ -520,8 +520,8 @@ def _read_tasks(folder: Path, lacks: dict[str, str]) -> tuple[TaskList, dict[str
         problem = _read(folder, _task_file(name), TaskProblem)
         if problem is None or read_object(folder / _task_file(name)).get("sha256") != of:
             lacks[TASKS] = (
-                f"{_task_file(name)} is not the one that {TASKS} was written with, a run ended in between; the stage "
-                f"tasks writes both: {AGAIN}"
+                f"{_task_file(name)} does not belong to {TASKS}, because a run was interrupted; stage tasks writes "
+                f"both: {AGAIN}"
             )
             return TaskList(), {}
         control[name] = problem.control
@@ -533,17 +533,21 @@ def _task_file(name: str) -> str:
 
 
 def _absent(file: str) -> str:
-    return f"there is no {file}; the run's stage {OWNERS[file]} writes it, if it can (its report says why not): {AGAIN}"
+    return (
+        f"{file} is missing; stage {OWNERS[file]} of the run writes it, or the report says why not: {AGAIN}"
+    )
 
 
 def _stale(file: str, other: str) -> str:
-    whose = "are of other models" if other == "models" else "were learned with another observer"
-    return f"the numbers in {file} {whose} than this kit's; the run's stage {OWNERS[file]} writes new ones: {AGAIN}"
+    whose = "belong to other models" if other == "models" else "were learned with another observer"
+    return f"the numbers in {file} {whose} than this kit's; stage {OWNERS[file]} of the run updates them: {AGAIN}"
 
 
 def _check_models(names: Collection[str], found: Description) -> None:
     if strange := [name for name in names if name not in found.models]:
-        raise InputError(f"watch: no model {strange[0]!r}; there are: {', '.join(found.models)} [HM-KIT-034]")
+        raise InputError(
+            f"watch: no model {strange[0]!r}; choose from: {', '.join(found.models)} [HM-KIT-034]"
+        )
 
 
 def _write(folder: Path, file: str, content: object) -> None:
@@ -553,7 +557,7 @@ def _write(folder: Path, file: str, content: object) -> None:
 
 
 def _write_once(folder: Path, file: str, content: object) -> None:
-    """Write a file whose content is not there yet; one that is damaged or of another version is written anew."""
+    """Write a file unless it already has this content; replace a file that is damaged or of another version."""
     with contextlib.suppress(InputError):
         held = _read(folder, file, type(content))
         if held is not None and digest(held) == digest(content):
@@ -562,7 +566,7 @@ def _write_once(folder: Path, file: str, content: object) -> None:
 
 
 def _read(folder: Path, file: str, kind: type[R]) -> R | None:
-    """What a file of an artifact holds; None where there is none.
+    """Read a file of an artifact; None if it is missing.
 
     Raises:
         InputError: If it is damaged, was changed by hand, or is of another version.
@@ -571,23 +575,23 @@ def _read(folder: Path, file: str, kind: type[R]) -> R | None:
     if not is_file(path):
         return None
     if (version := read_object(path).get("schema_version")) != SCHEMA_VERSION:
-        remedy = _anew(folder) if version == SPLIT_SCHEMA else "train the models anew"
+        remedy = _anew(folder) if version == SPLIT_SCHEMA else "Run the scenario again"
         raise InputError(
-            f"{path} is of version {version!r} of the format (field schema_version); this version of hybrid-mpc reads "
-            f"{SCHEMA_VERSION}: {remedy} [HM-KIT-035]"
+            f"{path}: format version {version!r} (field schema_version), but this version of hybrid-mpc reads "
+            f"{SCHEMA_VERSION}. {remedy} [HM-KIT-035]"
         )
     again = "" if file == KIT else f"; or delete it, and {AGAIN}"
-    document = read_document(path, f"take the folder from its run again{again}")
+    document = read_document(path, f"copy the folder from its run again{again}")
     del document["schema_version"]
     return record(kind, document, str(path))
 
 
 def _anew(folder: Path) -> str:
-    return f"Write it in the present one with: hybrid-mpc export kit {folder} --out NEW"
+    return f"Convert it with: hybrid-mpc export kit {folder} --out NEW"
 
 
 def artifact_files(folder: Path) -> tuple[str, ...]:
-    """All files of an artifact but its promises, of which no loop depends; others in its folder do not belong to it."""
+    """Files of an artifact that loops depend on: all except the promises and unknown files in the folder."""
     known = [name for name in OWNERS if "*" not in name and name != "promises.json"]
     own = [
         path.relative_to(folder).as_posix()
@@ -598,7 +602,7 @@ def artifact_files(folder: Path) -> tuple[str, ...]:
 
 
 def artifact_digest(folder: Path) -> str:
-    """Digest of all files of an artifact: ``kit.json`` names the models' programs by their hash.
+    """Digest of all files of an artifact; ``kit.json`` contains the hash of the models' programs.
 
     Raises:
         InputError: If a file is damaged or cannot be read.
@@ -608,28 +612,25 @@ def artifact_digest(folder: Path) -> str:
 
 
 def artifact_folder(folder: Path) -> Path:
-    """The artifact's folder, given it or the folder of a run that holds it as ``model``; InputError if neither holds
-    one.
-    """
+    """The artifact's folder: ``folder`` itself, or its subfolder ``model``; InputError if neither holds an artifact."""
     for place in (folder, folder / "model"):
         if is_file(place / KIT):
             return place
     for place in (folder, folder / "model"):
         if is_file(place / OLD_FILE):
             raise InputError(
-                f"{place / OLD_FILE}: this kit has a former format, of one file. {_anew(place)} [HM-KIT-036]"
+                f"{place / OLD_FILE}: this kit has an older format with a single file. {_anew(place)} [HM-KIT-036]"
             )
         if is_file(place / BENCHMARK_NOTE):
             raise InputError(
-                f"{folder} is the folder of a benchmark: its model ({place / BENCHMARK_NOTE}) predicts and has no "
-                f"controller. Evaluate it with: hybrid-mpc benchmark SCENARIO --model {folder} --test FILE. For loops "
-                "make an artifact of the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER [HM-KIT-037]"
+                f"{folder}: folder of a benchmark, whose model ({place / BENCHMARK_NOTE}) has no controller. "
+                f"Evaluate it with: hybrid-mpc benchmark SCENARIO --model {folder} --test FILE. For loops, run the "
+                "scenario on the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER [HM-KIT-037]"
             )
     try:
-        state = f"holds no {KIT}" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
+        state = f"no {KIT} in it" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
     except OSError as error:
-        state = f"cannot be looked into ({reason(error)})"
+        state = f"cannot be read ({reason(error)})"
     raise InputError(
-        f"{folder} {state}; needed is an artifact folder, such as model/ of a finished run, or the run's own folder"
-        " [HM-KIT-038]"
+        f"{folder}: {state}. Give the folder of a finished run, or its folder model/ [HM-KIT-038]"
     )

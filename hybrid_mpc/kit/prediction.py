@@ -1,4 +1,4 @@
-"""What predictions of recordings need beside the models, as plain data: columns, smoother of the first state, bands."""
+"""Settings that predictions of recordings need besides the models: columns, smoother of the initial state, bands."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from hybrid_mpc.machine.specification import DataSpec
 
 Array = NDArray[np.float64]
 SHARE = 0.9
-"""Share of the measurements that a band is to hold."""
+"""Nominal coverage of a band: share of the measurements within it."""
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Half widths of a band as a function of the parts of the variance.
+    """Half widths of a band as a function of the parts of the variance: ``scale sqrt(sum_m weights_m parts_m)``.
 
     Args:
         weights: Weight of each part, by output ``(n_y, m)``.
         scale: Half width over the standard deviation, by output.
-        constant: The same for a band of constant width, over the noise of the sensor. Default: not known.
-        share: Share of the measurements that it is to hold. Default: 90 %.
+        constant: Half width of a band of constant width, over the noise of the sensor. Default: unknown.
+        share: Nominal coverage. Default: 0.9.
     """
 
     weights: tuple[tuple[float, ...], ...]
@@ -33,9 +33,7 @@ class Bands:
     share: float = SHARE
 
     def of_constant_width(self) -> Bands:
-        """A band of one width for all times, as it is calibrated to hold the same share; see
-        :func:`~hybrid_mpc.identify.bands.fit_bands`.
-        """
+        """A band of constant width with the same nominal coverage; see :func:`~hybrid_mpc.identify.bands.fit_bands`."""
         return Bands(
             tuple((1.0, *(0.0 for _ in own[1:])) for own in self.weights),
             self.constant,
@@ -51,18 +49,18 @@ class Bands:
 
 @dataclass(frozen=True)
 class Predicting:
-    """What predictions of a recording need beside the models.
+    """Settings that predictions of a recording need besides the models.
 
     Args:
         data: How recordings are read.
         corrects: States whose rates a network may correct.
-        sigma: Noise of each sensor that the smoother of the warm-up assumes [output units].
-        walk: Change per period of the unexplained rates that it assumes, by corrected state.
-        sizes: Natural sizes of the signals that it assumes.
-        fading: What is left of an unexplained rate after a period [-].
-        substeps: Runge-Kutta sub-steps a period of the fitted prior.
-        bands: Bands around free runs, by model. Default: none were calibrated.
-        longest: Length [s] of the longest free run that they were calibrated on. Default: not known.
+        sigma: Sensor noise of the warm-up's smoother [output units].
+        walk: Standard deviation of the change per period of each unexplained rate in the smoother.
+        sizes: Natural sizes of the signals in the smoother.
+        fading: Factor of an unexplained rate after a period [-]. Default: 1.
+        substeps: Runge-Kutta sub-steps a period of the fitted prior. Default: 0.
+        bands: Bands around free runs, by model. Default: none.
+        longest: Length [s] of the longest free run of their calibration. Default: 0, unknown.
     """
 
     data: DataSpec

@@ -1,4 +1,4 @@
-"""What a kit promises of its loops: a table that its run leaves beside the models, each row shown or doubted."""
+"""The table "What this kit promises": properties of its loops, which a run examines and writes beside the models."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hybrid_mpc.records import Fields, plain, record
 from hybrid_mpc.rules import Line, Text
 
 PROMISES = "promises.json"
-"""File of the promises in a model's folder; the run's stage ``promises`` alone writes it."""
+"""File of the promises in a model's folder; only stage ``promises`` of a run writes it."""
 SCHEMA_VERSION = 1
 Verdict: TypeAlias = Literal["shown", "doubted", "not promised"]
 NONE_MADE = "promises"
-"""Name of the only row where a kit holds no table that fits it."""
-REMEDY = "Run the main job on this folder again: hybrid-mpc run SCENARIO --out FOLDER --resume."
+"""Name of the only row of a kit without a valid table."""
+REMEDY = "Run the scenario on this folder again: hybrid-mpc run SCENARIO --out FOLDER --resume."
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Promise:
     """One row of the table "What this kit promises".
 
     Args:
-        name: What it is about, e.g. ``"no offset"``.
-        verdict: ``"shown"``: the run has shown that it holds; ``"doubted"``: the run has found a reason why it may not
-            hold; ``"not promised"``: it does not hold, or the run could not examine it.
+        name: Name of the property, e.g. ``"no offset"``.
+        verdict: ``"shown"``: the run has shown the property; ``"doubted"``: the run has found a reason why it may fail;
+            ``"not promised"``: it does not hold, or the run could not examine it.
         evidence: Numbers with their units, or the reason.
-        remedy: What to do. Default: nothing needs to be done.
+        remedy: What to do. Default: empty, nothing.
 
     Raises:
         InputError: If a field is of another kind.
@@ -54,11 +54,11 @@ class Promise:
 
 @dataclass(frozen=True)
 class PromiseTable:
-    """What ``promises.json`` holds.
+    """Content of ``promises.json``.
 
     Args:
-        of: Digest of the models and of what loops are made of, for which the table was made.
-        rows: The promises, in the order in which they are shown.
+        of: Digest of the models and loop settings that the table belongs to.
+        rows: The promises, in the order of the table.
     """
 
     of: Line
@@ -75,10 +75,10 @@ def write_promises(folder: Path, table: PromiseTable) -> None:
 
 
 def read_promises(folder: Path) -> PromiseTable | None:
-    """The table of a model's folder; None where there is none.
+    """Read the table of a model's folder; None without a table.
 
     Raises:
-        InputError: If the file is damaged, was changed by hand, or is of another schema.
+        InputError: If the file is damaged, was changed by hand, or has another schema version.
     """
     path = folder / PROMISES
     if not is_file(path):
@@ -86,14 +86,14 @@ def read_promises(folder: Path) -> PromiseTable | None:
     document = read_document(path, f"delete it; {REMEDY[0].lower()}{REMEDY[1:]}")
     if document.pop("schema_version", None) != SCHEMA_VERSION:
         raise InputError(
-            f"{path} is no table of schema version {SCHEMA_VERSION} (field schema_version): this version of hybrid-mpc "
-            f"reads no other. {REMEDY} [HM-KIT-039]"
+            f"{path}: field schema_version is not {SCHEMA_VERSION}, the only version that this hybrid-mpc reads. "
+            f"{REMEDY} [HM-KIT-039]"
         )
     return record(PromiseTable, document, str(path))
 
 
 def promise_lines(rows: Sequence[Promise]) -> list[str]:
-    r"""The table for a terminal: a line each, what is not shown first.
+    r"""The table for a terminal: one line for each row, those with verdict shown last.
 
     Example:
         >>> late = Promise("step time", "doubted", "99 % of the steps take 9 ms, the period is 10 ms", "Solver native.")
@@ -111,5 +111,5 @@ def promise_lines(rows: Sequence[Promise]) -> list[str]:
 
 
 def none_made(why: str) -> tuple[Promise, ...]:
-    """The only row of a kit without a table that fits it: nothing is promised, and why."""
+    """The only row of a kit without a valid table: nothing is promised, and the reason."""
     return (Promise(NONE_MADE, "not promised", why, REMEDY),)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.problem import Controller, Status
-from hybrid_mpc.control.safeguard import Decision, SafeController, checked_safe_input
+from hybrid_mpc.control.safeguard import Decision, SafeController, check_safe_input
 from hybrid_mpc.errors import InputError, SafeInputError
 from hybrid_mpc.estimate.delay import sees_truth
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
@@ -168,7 +168,7 @@ class Runner:
                 "Runner: no safe input is declared; give safe_input=[...], or Scenario(safe_input=...): the input that "
                 "the machine may be left with. Zero is not safe for every machine, so it is never guessed [HM-LOOP-036]"
             )
-        self._safe_input = checked_safe_input(declared, loop.ocp)
+        self._safe_input = check_safe_input(declared, loop.ocp)
 
     @property
     def safe_input(self) -> Array:

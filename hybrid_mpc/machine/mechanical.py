@@ -1,4 +1,4 @@
-"""Priors of mechanical machines: an equation of motion by its mass matrix, potential, friction and forces."""
+"""Priors of mechanical machines: an equation of motion from mass matrix, potential, friction and forces."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from hybrid_mpc.machine.prior import POINT, Balance, Prior, column, components
 class MechanicalPrior(Prior):
     """``M(q) q_ddot + C(q, q_dot) q_dot + dV/dq + friction = force``; the states are ``x = [q, v]``, ``q_dot = v``.
 
-    A subclass writes :meth:`mass_matrix` and what else it has of :meth:`potential`, :meth:`friction` and :meth:`force`.
+    A subclass defines :meth:`mass_matrix` and, as needed, :meth:`potential`, :meth:`friction` and :meth:`force`.
     Coriolis and centrifugal forces follow from the mass matrix. The kinematics ``q_dot = v`` are exact, so networks
-    correct the accelerations alone (``corrects`` is the speeds). The energy balance is made of the same parts: ``T +
-    V`` is stored, the force's power is supplied, the friction's is lost. Its residual is the paper's ΔE. What
-    :meth:`balances` gives stands beside it.
+    correct only the accelerations (``corrects`` is the speeds). The energy balance follows from the same parts: ``T +
+    V`` is stored, the power of the force is supplied, that of the friction is lost. Its residual is the paper's ΔE.
+    Balances of :meth:`balances` are added.
 
-    Methods take named tuples of scalars, ``q`` the first half of the states and ``v`` the second; in a subclass of
-    :class:`~hybrid_mpc.machine.torch_prior.TorchPrior` too they are written in torch.
+    Methods take named tuples of scalars, ``q`` (first half of the states) and ``v`` (second half). They are
+    written in torch if the class derives from :class:`~hybrid_mpc.machine.torch_prior.TorchPrior`.
 
     Raises:
         InputError: If the states are not ``[q, v]`` in pairs.
@@ -53,13 +53,13 @@ class MechanicalPrior(Prior):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        states = getattr(cls, "states", ())  # its own, a base's or a mixin's
+        states = getattr(cls, "states", ())  # from the class, a base or a mixin
         if len(states) % 2:
             raise InputError(
                 f"{cls.__name__}: states must be [q, v] in pairs, got {len(states)}: "
                 f"{', '.join(s.name for s in states)} [HM-MACHINE-001]"
             )
-        if cls.corrects is cls._speeds:  # nobody has chosen others
+        if cls.corrects is cls._speeds:  # the user has chosen no others
             cls.corrects = cls._speeds = tuple(s.name for s in states[len(states) // 2 :]) or None
 
     @property
@@ -70,7 +70,7 @@ class MechanicalPrior(Prior):
     def mass_matrix(self, q: Any, p: Any) -> Any:
         """Inertia [SI]: rows of the symmetric, positive definite matrix ``((m11, m12), (m21, m22))``.
 
-        A tuple of scalars is a diagonal, a scalar that of one degree of freedom.
+        A tuple of scalars is a diagonal; a scalar is the inertia of one degree of freedom.
         """
         raise NotImplementedError(f"{type(self).__name__} must define mass_matrix(q, p)")
 
@@ -79,18 +79,18 @@ class MechanicalPrior(Prior):
         return 0.0
 
     def friction(self, q: Any, v: Any, p: Any) -> Any:
-        """Generalised forces against the motion, one a degree of freedom [N or N m]. Default: none.
+        """Generalised forces against the motion, one per degree of freedom [N or N m]. Default: none.
 
-        Their power is what is lost, so it must not be negative.
+        Their power is the loss, so it must not be negative.
         """
         return (0.0,) * self.n_q
 
     def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
-        """Generalised forces that drive the machine, one a degree of freedom [N or N m]. Default: the inputs."""
+        """Generalised driving forces, one per degree of freedom [N or N m]. Default: the inputs."""
         if len(self.inputs) != self.n_q:
             raise InputError(
-                f"{type(self).__name__}: {len(self.inputs)} inputs drive {self.n_q} degrees of freedom; define "
-                "force(q, v, u, w, p) [HM-MACHINE-002]"
+                f"{type(self).__name__}: {len(self.inputs)} inputs for {self.n_q} degrees of freedom. Define "
+                "force(q, v, u, w, p). [HM-MACHINE-002]"
             )
         return tuple(u)
 
@@ -124,7 +124,7 @@ class MechanicalPrior(Prior):
         n, found = self.n_q, components(value)
         if any(one is None for one in found):
             raise InputError(
-                f"{type(self).__name__}.mass_matrix(q, p) gives None; is a 'return' missing? [HM-MACHINE-003]"
+                f"{type(self).__name__}.mass_matrix(q, p) gives None. Check for a missing 'return'. [HM-MACHINE-003]"
             )
         entries = [ca.SX(c) for c in found]
         if len(entries) == n:
@@ -137,9 +137,11 @@ class MechanicalPrior(Prior):
         return ca.reshape(ca.vertcat(*entries), n, n).T
 
     def expressions(self, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[Any, Any, tuple[Balance, ...]]:
-        """Rates of the states, outputs and balances, made of the parts of the equation of motion."""
+        """Rates of the states, outputs and balances from the equation of motion."""
         given = tuple(zip(POINT, (x, u, w, p), strict=True))
         q, v, mass, potential, friction, force = self._parts(u, w, p)
+        # Lagrange: d/dt(M v) - dT/dq + dV/dq = force - friction with T = v' M v / 2,
+        # so M v_dot = force - friction - dV/dq - (d(M v)/dq v - dT/dq)
         momentum = mass @ v
         kinetic = 0.5 * ca.dot(v, momentum)
         gyroscopic = ca.jacobian(momentum, q) @ v - ca.gradient(kinetic, q)

@@ -1,9 +1,8 @@
-"""The prior of a machine: an ODE with outputs and balances, written in CasADi. No torch in here.
+"""The prior of a machine: an ODE with outputs and balances, written in CasADi. Does not import torch.
 
-:class:`Prior` is the base of all. :class:`~hybrid_mpc.machine.torch_prior.TorchPrior` takes the same methods written in
-torch, :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior` the parts of an equation of motion. Whatever it is
-written in, a prior becomes :class:`Equations`: CasADi functions, of which fit, training, estimator and controller are
-made.
+:class:`Prior` is the base class. :class:`~hybrid_mpc.machine.torch_prior.TorchPrior` takes the same methods written in
+torch, :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior` the parts of an equation of motion. Every prior becomes
+:class:`Equations`: CasADi functions, used by fit, training, estimator and controller.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from hybrid_mpc.rules import Name, Number, Unit
 
 Array = NDArray[np.float64]
 POINT = ("x", "u", "w", "p")
-"""What a prior's equations are functions of: states, inputs, measured disturbances, parameters."""
+"""Arguments of a prior's equations: states, inputs, measured disturbances, parameters."""
 
 
 _KINDS: dict[str, type] = {
@@ -35,18 +34,18 @@ _KINDS: dict[str, type] = {
 
 @dataclass(frozen=True)
 class Balance:
-    """What a machine stores of one kind, and what comes and goes: ``dS/dt = supply - loss``.
+    """A conserved quantity that the machine stores: ``dS/dt = supply - loss``.
 
     Args:
         name: e.g. ``"energy"``, ``"mass"``, ``"heat"``.
-        storage: What is stored, S(x) [unit].
-        supply: What is put in or taken out per time [rate_unit], of either sign.
-        loss: What is lost per time [rate_unit], not negative. Default: nothing.
+        storage: Stored amount S(x) [unit].
+        supply: Supplied amount per time [rate_unit], of either sign.
+        loss: Lost amount per time [rate_unit], not negative. Default: zero.
         unit: Unit of the storage. Default: J.
         rate_unit: Unit of supply and loss. Default: W.
 
     Raises:
-        InputError: If the name is no name, or a unit none.
+        InputError: If the name or a unit is invalid.
 
     Example:
         >>> Balance("mass", storage=2.0, supply=0.1, unit="kg", rate_unit="kg/s").loss
@@ -66,11 +65,11 @@ class Balance:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """An equilibrium around which a machine works.
+    """An equilibrium at which a machine works.
 
     Args:
         x: States ``(n_x,)`` [their units].
-        u: Inputs ``(n_u,)`` that hold them there.
+        u: Inputs ``(n_u,)`` that hold the states.
         w: Measured disturbances ``(n_w,)`` there. Default: none.
 
     Example:
@@ -89,27 +88,27 @@ class OperatingPoint:
 class Prior:
     """Any ODE ``xdot = f(x, u, w; p)`` with outputs ``y = g(x, u, w; p)``, written in CasADi.
 
-    A subclass names its signals and parameters as class attributes and writes :meth:`xdot`; :meth:`output` and
-    :meth:`balances` where it has others than the defaults. Each method takes four named tuples of scalar expressions,
-    in the order of the signals: ``x.level`` or ``level, flow = x``. It gives a tuple of scalars, one a state or output.
+    A subclass names its signals and parameters as class attributes and defines :meth:`xdot`, and :meth:`output` and
+    :meth:`balances` unless the defaults apply. Each method takes four named tuples of scalar expressions, in the order
+    of the signals: ``x.level`` or ``level, flow = x``. It returns a tuple of scalars, one per state or output.
 
     Attributes:
         states: Signals of ``x``. They need not be measured.
-        inputs: Signals of ``u``: what a controller commands.
-        outputs: Signals of ``y``: what sensors measure.
+        inputs: Signals of ``u``, the commands of a controller.
+        outputs: Signals of ``y``, measured by sensors.
         disturbances: Signals of ``w``: measured, but not commanded. Default: none.
         parameters: The parameters ``p`` with values, bounds and units. Default: none.
-        corrects: Names of the states whose rates a network may correct. Default: all. A rate that is exact, such as
-            that of a position, is not named.
-        operating_point: An equilibrium around which the machine works. Default: none is known.
-        methods: What is written of its equations, and the arguments of each.
+        corrects: Names of the states whose rates a network may correct. Default: all. Leave out states with exact
+            rates, such as positions.
+        operating_point: An equilibrium at which the machine works. Default: unknown.
+        methods: Methods with the prior's equations, and the arguments of each.
 
     Args:
-        values: Parameter values [their units] by name that replace the nominal ones, e.g. fitted ones.
+        values: Parameter values [their units] by name that replace nominal ones, e.g. fitted values.
 
     Raises:
-        InputError: If a name in ``values`` is no parameter, a kind of signals is missing, or, when the class is made, a
-            signal or parameter is none.
+        InputError: If a name in ``values`` is no parameter or a role has no signals; and, when the class is defined, if
+            a signal or parameter is of another type.
 
     Example:
         >>> class Tank(Prior):
@@ -153,7 +152,7 @@ class Prior:
         kind = type(self).__name__
         if not isinstance(values, Mapping | None):
             raise InputError(
-                f"{kind}: values are a mapping (name: number), got {values!r:.80} [HM-MACHINE-006]"
+                f"{kind}: values must be a mapping (name: number), got {values!r:.80} [HM-MACHINE-006]"
             )
         given = dict(values or {})
         if wrong := {k: v for k, v in given.items() if v is None or isinstance(v, bool | str)}:
@@ -161,13 +160,13 @@ class Prior:
         missing = [role for role in ("states", "inputs", "outputs") if not hasattr(self, role)]
         if missing:
             raise InputError(
-                f"{kind} has no {' and no '.join(missing)}; write {missing[0]} = (Signal(name, unit), ...) in the class"
-                " [HM-MACHINE-008]"
+                f"{kind} has no {' and no '.join(missing)}. Write {missing[0]} = (Signal(name, unit), ...) in the "
+                "class. [HM-MACHINE-008]"
             )
         self._values = {p.name: float(given.pop(p.name, p.value)) for p in self.parameters}
         if given:
             raise InputError(
-                f"{kind} has no parameter {', '.join(given)}; it has: {', '.join(self._values) or 'none'}"
+                f"{kind} has no parameter {', '.join(given)}; it has {', '.join(self._values) or 'none'}"
                 " [HM-MACHINE-009]"
             )
 
@@ -182,44 +181,44 @@ class Prior:
         return np.array(list(self._values.values()), dtype=np.float64)
 
     def xdot(self, x: Any, u: Any, w: Any, p: Any) -> Any:
-        """Rates of the states: a tuple of one scalar a state."""
+        """Rates of the states: a tuple with one scalar per state."""
         raise NotImplementedError(f"{type(self).__name__} must define xdot(x, u, w, p)")
 
     def output(self, x: Any, u: Any, w: Any, p: Any) -> Any:
-        """Measured outputs: a tuple of one scalar an output. Default: the states of the outputs' names."""
+        """Measured outputs: a tuple with one scalar per output. Default: the states of the same names."""
         at = {state.name: component for state, component in zip(self.states, x, strict=True)}
         unknown = [output.name for output in self.outputs if output.name not in at]
         if unknown:
             raise InputError(
-                f"{type(self).__name__}: no state is called {', '.join(unknown)}, as the output is; its states are: "
-                f"{', '.join(at)}. Define output(x, u, w, p), or give the output the name of the state it measures"
+                f"{type(self).__name__}: no state is called {', '.join(unknown)} like the output; the states are "
+                f"{', '.join(at)}. Define output(x, u, w, p), or give the output the name of the state it measures."
                 " [HM-MACHINE-010]"
             )
         return tuple(at[output.name] for output in self.outputs)
 
     def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[Balance, ...]:
-        """Balances of what the machine stores. Default: none; then there is no MOPGRNN."""
+        """Balances of the stored quantities. Default: none, which excludes the MOPGRNN."""
         return ()
 
     @property
     def corrected(self) -> tuple[int, ...]:
-        """Places in ``x`` of the states whose rates a network may correct; InputError if one is no state."""
+        """Indices in ``x`` of the states whose rates a network may correct; InputError if a name is no state."""
         names, kind = [s.name for s in self.states], type(self).__name__
         if isinstance(self.corrects, str):
             raise InputError(
-                f"{kind}: corrects must be a tuple of names, as ({self.corrects!r},) [HM-MACHINE-011]"
+                f"{kind}: corrects must be a tuple of names, e.g. ({self.corrects!r},) [HM-MACHINE-011]"
             )
         chosen = names if self.corrects is None else self.corrects
         unknown = [name for name in chosen if name not in names]
         if unknown:
             raise InputError(
-                f"{kind}: corrects names {', '.join(unknown)}; its states are: {', '.join(names)} [HM-MACHINE-012]"
+                f"{kind}: corrects names {', '.join(unknown)}, but the states are {', '.join(names)} [HM-MACHINE-012]"
             )
         return tuple(i for i, name in enumerate(names) if name in chosen)
 
     @property
     def kinematics(self) -> tuple[tuple[int, int], ...]:
-        """Places in ``x`` of each state whose rate is another state, and of that one: a position and its speed.
+        """Pairs of indices in ``x``: a state whose rate is another state, and that state (position and speed).
 
         Example:
             >>> from scenarios.pendulum.prior import PendulumPrior
@@ -239,11 +238,11 @@ class Prior:
 
     @property
     def equations(self) -> Equations:
-        """The prior as CasADi functions of ``(x, u, w, p)``; made once for equal priors."""
+        """The prior as CasADi functions of ``(x, u, w, p)``; cached for equal priors."""
         return _equations(_Alike(self))
 
     def expressions(self, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[Any, Any, tuple[Balance, ...]]:
-        """Rates of the states, outputs and balances at columns of expressions."""
+        """Rates of the states, outputs and balances for columns of expressions."""
         given = tuple(zip(POINT, (x, u, w, p), strict=True))
         return self.evaluated("xdot", *given), self.evaluated("output", *given), self._balances(*given)
 
@@ -257,15 +256,15 @@ class Prior:
         return tuple(found)
 
     def evaluated(self, method: str, *arguments: tuple[str, ca.SX]) -> Any:
-        """What a method gives at expressions: nested tuples of scalars, and balances.
+        """The result of a method for expressions: nested tuples of scalars, and balances.
 
         Args:
             method: Its name.
-            arguments: Name and expression ``(n,)`` of each argument; the name says whose components it has
+            arguments: Name and expression ``(n,)`` of each argument; the name determines its components
                 (:meth:`names_of`).
 
         Raises:
-            InputError: If the method does with them what only torch's tensors can.
+            InputError: If the method uses operations that only torch's tensors support.
         """
         given = (named(self.names_of(key), ca.vertsplit(v)) for key, v in arguments)
         try:
@@ -275,8 +274,8 @@ class Prior:
             if "Tensor" not in str(error) and "'SX' object" not in str(error):
                 raise
             raise InputError(
-                f"{type(self).__name__}.{method} gets CasADi expressions: {error}. Is it written in torch? Then it "
-                "must be a TorchPrior [HM-MACHINE-014]"
+                f"{type(self).__name__}.{method} gets CasADi expressions: {error}. A method written in torch needs a "
+                "TorchPrior. [HM-MACHINE-014]"
             ) from error
 
     def names_of(self, argument: str) -> tuple[str, ...]:
@@ -289,10 +288,10 @@ class Prior:
 
 @dataclass(frozen=True)
 class BalanceEquations:
-    """A balance as functions of scalar operations.
+    """A balance as CasADi functions of scalar operations.
 
     ``storage`` ``(x, p)`` [unit]; ``supply`` and ``loss`` ``(x, u, w, p)`` [rate_unit]; ``residual`` ``(x, xdot, u, w,
-    p)`` [rate_unit] is ``dS/dx xdot - supply + loss``. There a rate that networks do not correct is the prior's own.
+    p)`` [rate_unit] is ``dS/dx xdot - supply + loss``, in which rates that networks do not correct are the prior's own.
     """
 
     name: str
@@ -306,7 +305,7 @@ class BalanceEquations:
 
 @dataclass(frozen=True)
 class Equations:
-    """A prior as CasADi functions of scalar operations, of columns ``x, u, w, p``.
+    """A prior as CasADi functions of scalar operations, with columns ``x, u, w, p`` as arguments.
 
     Args:
         xdot: ``(x, u, w, p) -> xdot (n_x,)``.
@@ -320,7 +319,7 @@ class Equations:
 
 
 def components(value: Any) -> list[Any]:
-    """The scalars of what a prior's method gives: of nested tuples, of a column, of a number."""
+    """The scalars in a result of a prior's method: in nested tuples, a column, or a number."""
     if isinstance(value, tuple | list):
         return [scalar for part in value for scalar in components(part)]
     if isinstance(value, ca.SX | ca.DM) and value.numel() > 1:
@@ -329,13 +328,13 @@ def components(value: Any) -> list[Any]:
 
 
 def column(value: Any, n: int, what: str, names: Sequence[str] = ()) -> ca.SX:
-    """What a prior's method gives, as a column of ``n``, one for each of the ``names`` if they are given."""
+    """A result of a prior's method as a column of ``n``; ``names`` of its components are used in messages."""
     try:
         found = ca.vertcat(*(ca.SX(v) for v in components(value)))
     except (NotImplementedError, TypeError) as error:
         raise InputError(
-            f"{what} gives {type(value).__name__}, which is no tuple of scalars: is a 'return' missing, or is it "
-            "written in torch? Then it must be a TorchPrior [HM-MACHINE-015]"
+            f"{what} gives {type(value).__name__}, not a tuple of scalars. Check for a missing 'return'; a method "
+            "written in torch needs a TorchPrior. [HM-MACHINE-015]"
         ) from error
     if found.shape[0] != n:
         each = f": one for each of {', '.join(names)} is needed" if names else ""
@@ -347,22 +346,22 @@ def column(value: Any, n: int, what: str, names: Sequence[str] = ()) -> ca.SX:
 def _tuple_of(names: tuple[str, ...]) -> Any:
     def missing(_: Any, name: str) -> Any:
         raise AttributeError(
-            f"nothing is called {name!r} here; there is: {', '.join(names) or 'nothing'} [HM-MACHINE-044]"
+            f"no component {name!r}; known names: {', '.join(names) or 'none'} [HM-MACHINE-044]"
         )
 
-    # what is no identifier has its place alone
+    # names that are no identifiers are only reachable by index
     bases = (namedtuple("named", names, rename=True),)
     return type("named", bases, {"__slots__": (), "__getattr__": missing})
 
 
 def named(names: tuple[str, ...], parts: Sequence[Any]) -> Any:
-    """Components with their names: ``x.level`` or ``level, flow = x``."""
+    """Components with names: ``x.level`` or ``level, flow = x``."""
     return _tuple_of(names)(*parts[: len(names)])
 
 
 class _Alike:
-    """A prior without the values of its parameters: equal for two of one class whose own attributes are equal numbers
-    or texts. Any other attribute makes it equal to nothing but itself.
+    """A prior as a cache key, without the values of its parameters. Two priors of one class are equal if their own
+    attributes are equal numbers or texts; any other attribute makes a prior equal only to itself.
     """
 
     def __init__(self, prior: Prior) -> None:
@@ -389,7 +388,7 @@ def _equations(alike: _Alike) -> Equations:
     y = column(outputs, len(y_names), f"{kind}.output(x, u, w, p)", y_names)
     names = [b.name for b in balances]
     if len(set(names)) < len(names):
-        raise InputError(f"{kind}.balances(x, u, w, p): two have the same name: {names} [HM-MACHINE-017]")
+        raise InputError(f"{kind}.balances(x, u, w, p): names must differ, got {names} [HM-MACHINE-017]")
     return Equations(
         ca.Function("xdot", point, [ca.cse(xdot)], [*POINT], ["xdot"]),
         ca.Function("output", point, [ca.cse(y)], [*POINT], ["y"]),
@@ -405,7 +404,7 @@ def _balance(prior: Prior, balance: Balance, point: list[ca.SX], xdot: ca.SX) ->
     x, u, w, p = point
     if ca.depends_on(storage, ca.vertcat(u, w)):
         raise InputError(
-            f"{what}: the storage must be a function of x and p alone, it depends on u or w [HM-MACHINE-018]"
+            f"{what}: the storage must be a function of x and p only, but depends on u or w [HM-MACHINE-018]"
         )
     rate = ca.SX.sym("xdot", len(prior.states))
     corrected = set(prior.corrected)

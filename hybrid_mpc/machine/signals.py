@@ -17,18 +17,18 @@ class Signal:
         name: Short name, e.g. ``"phi"``: letters and digits of any alphabet, ``_ . [ ] -`` and blanks
             (:func:`~hybrid_mpc.rules.name_problem`).
         unit: SI unit, e.g. ``"rad"``; ``"-"`` for none (:func:`~hybrid_mpc.rules.unit_problem`).
-        lower: Smallest plausible value [unit]; data below it are refused, speeds
-            differentiated from them raise a warning. Default: no bound.
+        lower: Smallest plausible value [unit]; smaller data are refused, smaller speeds differentiated from data raise
+            a warning. Default: no bound.
         upper: Largest plausible value [unit], likewise. Default: no bound.
-        periodic: True for an angle that may turn through: networks see its sine and cosine, and recordings that jump by
-            full turns are made to count on.
-        saturation: Smallest and largest value [unit] that the sensor can show, ``(-inf, upper)`` or ``(lower, inf)``
-            if it has one end. A sample at or beyond an end is censored: it says only that the truth is at least, or at
-            most, this. Default: the sensor shows every value.
+        periodic: True for an angle that may turn by full turns: networks see its sine and cosine, and wrapped
+            recordings are unwrapped.
+        saturation: Smallest and largest value [unit] that the sensor can show, ``(-inf, upper)`` or ``(lower, inf)`` if
+            it has one end. A sample at or beyond an end is censored: it only bounds the true value from one side.
+            Default: the sensor shows every value.
 
     Raises:
-        InputError: If a field is of another kind, the range is empty, the sensor's range is, or it is that of a
-            periodic signal; all of it together.
+        InputError: With all problems: a field of a wrong kind, an empty range, an empty sensor range, or a sensor range
+            of a periodic signal.
 
     Example:
         >>> Signal("phi", "rad").label
@@ -49,7 +49,7 @@ class Signal:
         own.need(
             "lower upper",
             lambda: self.lower < self.upper,
-            f"its range [{self.lower}, {self.upper}] is empty [HM-MACHINE-019]",
+            f"range [{self.lower}, {self.upper}] is empty: lower must be below upper [HM-MACHINE-019]",
         )
         own.need(
             "saturation", lambda: self.saturation is None or self.saturation[0] < self.saturation[1],
@@ -57,8 +57,8 @@ class Signal:
         )  # fmt: skip
         own.need(
             "saturation periodic", lambda: self.saturation is None or not self.periodic,
-            "a periodic signal has no saturation; its sensor begins again at a full turn. Leave one of them out."
-            " [HM-MACHINE-021]",
+            "a periodic signal cannot have a saturation, since its sensor restarts at a full turn. Leave one of them "
+            "out. [HM-MACHINE-021]",
         )  # fmt: skip
         own.refuse()
 
@@ -70,7 +70,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A physical parameter of a prior with its published value and the bounds its fit must keep.
+    """A physical parameter of a prior with its published value and the bounds of its fit.
 
     Args:
         name: Attribute name on the prior, e.g. ``"J"``.
@@ -81,7 +81,7 @@ class Parameter:
         description: A few words, printed in tables.
 
     Raises:
-        InputError: If a field is of another kind, or the value lies outside its bounds; all of it together.
+        InputError: With all problems: a field of a wrong kind, or a value outside its bounds.
 
     Example:
         >>> Parameter("m", 0.5, "kg", 0.1, 2.0).fixed
@@ -99,13 +99,13 @@ class Parameter:
         own = Fields(self, f"parameter {self.label}")
         own.need(
             "value lower upper", lambda: self.lower <= self.value <= self.upper,
-            f"value {self.value} is not within its bounds [{self.lower}, {self.upper}] [HM-MACHINE-022]",
+            f"value {self.value} is outside its bounds [{self.lower}, {self.upper}] [HM-MACHINE-022]",
         )  # fmt: skip
         own.refuse()
 
     @property
     def fixed(self) -> bool:
-        """True if the fit leaves this parameter alone."""
+        """True if the fit does not change this parameter."""
         return self.lower == self.upper
 
     @property

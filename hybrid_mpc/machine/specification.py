@@ -24,23 +24,23 @@ from hybrid_mpc.rules import (
 )
 
 Role = Literal["train", "valid", "test", "nominal"]
-"""What a part of a recording is used for, see :class:`Window`."""
+"""Use of a part of a recording, see :class:`Window`."""
 Count = Annotated[int, Within(1, 10**9, "a whole number from 1 to 1e9")]
 CountOrNone = Annotated[int, Within(0, 10**9, "a whole number from 0 to 1e9")]
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of a recording and what it is used for.
+    """A part of a recording and its use.
 
     Args:
         start: First time [s] in the recording's own time.
         end: Last time [s].
-        role: ``"train"``, ``"valid"``, ``"test"``, or ``"nominal"``: known to be free of disturbances but used
-            for no free run (standing at an unstable point, say); the monitor must stay quiet there.
+        role: ``"train"``, ``"valid"``, ``"test"``, or ``"nominal"``: free of disturbances but unsuitable for free runs
+            (e.g. standing at an unstable point); the monitor must stay quiet there.
 
     Raises:
-        InputError: If a field is of another kind, or the end does not come after the start.
+        InputError: If a field is of a wrong kind, or the end is not after the start.
     """
 
     start: Bound
@@ -49,9 +49,7 @@ class Window:
 
     def __post_init__(self) -> None:
         own = Fields(self, f"window {self.start!r} to {self.end!r}")
-        own.need(
-            "start end", lambda: self.start < self.end, "its end must come after its start [HM-MACHINE-023]"
-        )
+        own.need("start end", lambda: self.start < self.end, "end must be after start [HM-MACHINE-023]")
         own.refuse()
 
 
@@ -60,20 +58,20 @@ class DataSpec:
     """How a machine's recordings are read.
 
     Args:
-        time: Column of the time stamps [s], or a number: the sampling time [s] of files without such a column.
+        time: Column of the time stamps [s], or a number: the sampling period [s] of files without such a column.
         inputs: Columns of the inputs, in the order of the prior's inputs (zero-order hold).
         outputs: Columns of the measured outputs, in the order of the prior's outputs. A blank cell is a missing sample.
-        dt: Model period [s]; declaring it is the request to resample to it.
-        max_gap: Longest distance [s] between two samples; a run is cut where it is exceeded.
-        smoothing: Length [s] of the local polynomial that first smooths and differentiates outputs that are the
-            positions of the states ``[q, v]``; the prior is fitted to that, then smooths them once more by its own
-            equations. Parts by ``fractions`` are this far apart.
-        warm_up: Measured past [s] that starts every free run: x(0) is smoothed from it, h warmed up on
-            it, and none of it is scored.
-        windows: Known windows by file stem. A recording that is not named here is split by ``fractions``.
+        dt: Model period [s]; recordings are resampled to it.
+        max_gap: Longest time [s] between two samples; a recording is cut at longer gaps.
+        smoothing: Length [s] of the local polynomial that smooths and differentiates outputs that are the positions of
+            states ``[q, v]``. The prior is fitted to the result, and then smooths them once more by its own equations.
+            Parts by ``fractions`` are this far apart.
+        warm_up: Measured past [s] before every free run: x(0) is smoothed from it, h is warmed up on it, and errors in
+            it are not counted.
+        windows: Windows by file stem. Other recordings are split by ``fractions``.
         fractions: Shares of training, validation and test samples, in this order of time.
-        free_run: Length [s] of the free runs that evaluate a model, started every fifth of it. Default: each test
-            trajectory as a whole. Where an unstable point multiplies every error, many short runs say more.
+        free_run: Length [s] of the free runs that evaluate a model; one starts every fifth of it. Default: each test
+            trajectory as a whole. At an unstable point, which multiplies every error, many short runs are better.
         inputs_of: Input columns of single recordings, by file stem, where they differ from ``inputs``.
         units: Units of columns that are not in seconds or in their signal's unit, by column: ``"ms"``, ``"deg"``, or
             the factor as a number (:mod:`hybrid_mpc.data.recording`).
@@ -81,14 +79,14 @@ class DataSpec:
             acts at once.
         disturbances: Columns of the disturbances, which are measured and not commanded (wind, supply voltage), in the
             order of the prior's disturbances. Default: none.
-        delays: Known delays [s] by column. An input acts so much later than it is recorded; an output or a disturbance
-            shows what was so much earlier. A negative one is the other way round. Reading shifts the columns against
-            each other. Default: none.
-        delays_of: Known delays of single recordings, by file stem and column, in place of those of ``delays``.
+        delays: Known delays [s] by column. An input acts this much later than recorded; an output or a disturbance was
+            measured this much earlier than recorded. A negative delay means the opposite. Reading shifts the columns
+            accordingly. Default: none.
+        delays_of: Known delays of single recordings, by file stem and column, instead of those in ``delays``.
 
     Raises:
-        InputError: If a field is of another kind, a length is not positive, a delay is not finite, a column is named
-            twice, or the fractions do not sum to one; all of it together.
+        InputError: With all problems: a field of a wrong kind, a length that is not positive, a delay that is not
+            finite, a column named twice, fractions that do not sum to one.
 
     Example:
         >>> spec = DataSpec(0.1, ("u",), ("y",), 0.1, 0.3, 1.0, 1.0, delays={"y": 0.2}, delays_of={"b": {"u": 0.1}})
@@ -115,7 +113,7 @@ class DataSpec:
 
     @property
     def columns(self) -> frozenset[str]:
-        """All columns that are read, of any file."""
+        """All columns that are read from any file."""
         time = (self.time,) if isinstance(self.time, str) else ()
         return frozenset(chain(time, self.inputs, self.disturbances, self.outputs, *self.inputs_of.values()))
 
@@ -124,7 +122,7 @@ class DataSpec:
         return tuple(self.inputs_of.get(stem, self.inputs))
 
     def delays_in(self, stem: str) -> dict[str, float]:
-        """Known delays [s] by column in the recording of this file stem; columns that are not named have none."""
+        """Known delays [s] by column in the recording of this file stem."""
         return {**self.delays, **self.delays_of.get(stem, {})}
 
     def __post_init__(self) -> None:
@@ -133,11 +131,11 @@ class DataSpec:
             own.distinct(name, lambda name=name: getattr(self, name), f"{name}: column")  # type: ignore[misc]
         own.need(
             "inputs_of", lambda: all(len(set(c)) == len(c) for c in self.inputs_of.values()),
-            "inputs_of: a column stands twice in one recording [HM-MACHINE-024]",
+            "inputs_of: a column appears twice in one recording. Name it once. [HM-MACHINE-024]",
         )  # fmt: skip
         own.need(
             "fractions", lambda: abs(sum(self.fractions) - 1.0) <= 1e-9,
-            f"fractions must sum to 1, got {self.fractions} [HM-MACHINE-025]",
+            f"fractions: must sum to 1, got {self.fractions} [HM-MACHINE-025]",
         )  # fmt: skip
         own.refuse()
 
@@ -148,13 +146,13 @@ class BenchmarkBudget:
 
     Args:
         hidden: Hidden units z.
-        networks: Networks of each kind.
+        networks: Number of networks of each kind.
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
-        horizon: Most scored periods of a free run in training.
-        batch: Windows a step. Default: 32.
-        decay: Weight decay times the number of training samples. Default: that of the training.
-        prior_replay: Weight of fading corrections where nothing was measured: see ``TrainingSettings``. Default: zero.
+        horizon: Most counted periods of a free run in training.
+        batch: Windows per step. Default: 32.
+        decay: Weight decay times the number of training samples. Default: as in training.
+        prior_replay: Weight that fades corrections where nothing was measured (``TrainingSettings``). Default: zero.
 
     Example:
         >>> BenchmarkBudget(hidden=16, networks=2, teacher_steps=100, free_run_steps=200, horizon=40).batch
@@ -176,30 +174,29 @@ class BenchmarkBudget:
 
 @dataclass(frozen=True)
 class BenchmarkSpec:
-    """How a machine's models are evaluated by free runs over recordings that they have not seen.
+    """How a machine's models are evaluated by free runs over held-out recordings.
 
-    A run starts from the scenario's ``warm_up``; it is the whole recording after that, or ``length`` seconds.
+    A run starts after the scenario's ``warm_up`` and covers the rest of the recording, or ``length`` seconds.
 
     Args:
         budgets: Effort by name, ``"quick"`` and ``"full"``.
-        units: By the name of an output the unit of its figures, and how many of these are one of its own: ``{"x":
-            ("mm", 1e3)}`` for an output in metres. Default: every output's own.
-        length: Length [s] of a run after what is given. Default: the whole recording.
-        repeated: Whether a recording is evaluated by as many runs of that length as fit into it one behind the other.
-            Default: by one, from its beginning.
-        piece: Length [s] of the pieces that long training recordings are cut into. Default: 25 s.
-        cycle: Roles of these pieces, again and again in order of time, where a recording's parts are not alike and
-            its last ones would not be a fair sample. Default: none, the data specification splits.
-        valid_every: Of several training files every so many-th, in the order of their names, validates as a whole, and
-            the others train as wholes. For short runs, whose last second is no fair sample. The files must not have
-            windows in the data specification. Fewer files than that are split by it. Default: zero, never.
-        fractions: Shares of training, validation and held-back samples, where they are not those of the data
-            specification: a benchmark's test files are of its own, the main job needs a part to evaluate on. Default:
-            those of the data specification.
+        units: By output name, the unit of its results and the factor to that unit: ``{"x": ("mm", 1e3)}`` for an output
+            in metres. Default: the output's own unit.
+        length: Length [s] of a run after its warm-up. Default: the whole recording.
+        repeated: Whether a recording is evaluated by as many consecutive runs of that length as it holds. Default: by
+            one run from its beginning.
+        piece: Length [s] of the pieces into which long training recordings are cut. Default: 25 s.
+        cycle: Roles of these pieces, repeated in order of time, for recordings whose last parts are not representative.
+            Default: none, the data specification splits.
+        valid_every: Every so many-th of several training files, in order of their names, is used as a whole for
+            validation, the others for training. For short runs whose last second is not representative. The files must
+            not have windows in the data specification, which also splits fewer files. Default: zero, never.
+        fractions: Shares of training, validation and held-back samples. A benchmark has test files of its own, while
+            the main job needs a part for evaluation. Default: those of the data specification.
 
     Raises:
-        InputError: If a length or a factor is out of its range, a cycle lacks a role that is needed, or
-            both ``cycle`` and ``valid_every`` are given, or runs without a length are to be repeated.
+        InputError: If a length or a factor is out of range, a cycle lacks a required role, both ``cycle`` and
+            ``valid_every`` are given, or repeated runs have no length.
 
     Example:
         >>> BenchmarkSpec({}, units={"q": ("mm", 1e3)}).length is None
@@ -218,20 +215,20 @@ class BenchmarkSpec:
     def __post_init__(self) -> None:
         own = Fields(self, "benchmark specification")
         own.need(
-            "repeated length", lambda: not self.repeated or self.length is not None, "repeated runs need a length"
+            "repeated length", lambda: not self.repeated or self.length is not None, "repeated: runs need a length"
             " [HM-MACHINE-026]"
         )  # fmt: skip
         own.need(
             "cycle", lambda: not self.cycle or {"train", "valid"} <= set(self.cycle),
-            f"cycle needs 'train' and 'valid', and may have 'test'; got {self.cycle} [HM-MACHINE-027]",
+            f"cycle: must contain 'train' and 'valid', and may contain 'test', got {self.cycle} [HM-MACHINE-027]",
         )  # fmt: skip
         own.need(
             "valid_every cycle", lambda: not self.valid_every or (self.valid_every >= 2 and not self.cycle),
-            "valid_every must be 2 or more (or 0 for never), and there must be no cycle beside it; got "
+            "valid_every: must be 2 or more (0: never), without a cycle, got "
             f"{self.valid_every} and cycle {self.cycle} [HM-MACHINE-028]",
         )  # fmt: skip
         own.need(
             "fractions", lambda: self.fractions is None or abs(sum(self.fractions) - 1.0) <= 1e-9,
-            f"fractions must sum to 1, got {self.fractions} [HM-MACHINE-029]",
+            f"fractions: must sum to 1, got {self.fractions} [HM-MACHINE-029]",
         )  # fmt: skip
         own.refuse()

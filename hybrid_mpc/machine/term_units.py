@@ -1,6 +1,6 @@
-"""Whether a law's unit can be that of what it adds: units are followed through its operations.
+"""Check whether a law's unit can be that of the quantity it adds to: units are propagated through its operations.
 
-A number in a law may have any unit, so only a law that certainly does not fit is refused.
+Numbers in a law may have any unit, so only a law that certainly does not fit is refused.
 """
 
 from __future__ import annotations
@@ -10,29 +10,29 @@ from typing import Any
 
 import casadi as ca
 
-from hybrid_mpc.machine.units import BASES, parsed
+from hybrid_mpc.machine.units import BASES, parse_unit
 
 Unit = tuple[float, ...] | None
-"""Exponents of the bases; None: any."""
+"""Exponents of the base units; None: any unit."""
 NONE: tuple[float, ...] = (0.0,) * len(BASES)
 _SECOND: tuple[float, ...] = tuple(1.0 if base == "s" else 0.0 for base in BASES)
 _PURE = {
     ca.OP_SIN, ca.OP_COS, ca.OP_TAN, ca.OP_ASIN, ca.OP_ACOS, ca.OP_ATAN, ca.OP_SINH, ca.OP_COSH, ca.OP_TANH,
     ca.OP_EXP, ca.OP_LOG, ca.OP_ERF, ca.OP_SIGN,
 }  # fmt: skip
-"""Functions that give pure numbers; a width of 1 leaves no trace in their argument, so that is not judged."""
+"""Functions with dimensionless results. The unit of their argument is not checked: a width of 1 leaves no trace."""
 _SAME = {ca.OP_NEG, ca.OP_FABS, ca.OP_FLOOR, ca.OP_CEIL}
 _ALIKE = {ca.OP_ADD, ca.OP_SUB, ca.OP_FMIN, ca.OP_FMAX}
 
 
 def of(unit: str) -> Unit:
-    """Exponents of a unit's bases; None if it is not known.
+    """Exponents of a unit's base units; None if the unit is unknown.
 
     Example:
         >>> of("N m")
         (2.0, 1.0, -2.0, 0.0, 0.0, 0.0, 0.0)
     """
-    found = parsed(unit)
+    found = parse_unit(unit)
     return None if found is None else tuple(float(e) for e in (*found[1], *NONE[len(found[1]) :]))
 
 
@@ -42,17 +42,17 @@ def per_second(unit: Unit) -> Unit:
 
 
 def clash(value: Any, inputs: Sequence[tuple[Any, str]], wanted: Unit) -> str:
-    """Why an expression cannot have the unit that is wanted, as the end of a sentence; empty where it can.
+    """Why an expression cannot have the unit ``wanted``, as the end of a sentence; empty if it can.
 
     Args:
-        value: The expression, a scalar of CasADi's SX.
-        inputs: The symbols that it may contain, with their units; others have any.
-        wanted: The unit that it should have.
+        value: The expression, a CasADi SX scalar.
+        inputs: Symbols in it, with units; other symbols may have any unit.
+        wanted: The required unit.
 
     Example:
         >>> v, d = ca.SX.sym("v"), ca.SX.sym("d")
         >>> clash(d * v, [(v, "m/s"), (d, "kg/s")], of("N")), clash(d * v, [(v, "m/s"), (d, "kg")], of("N"))
-        ('', 'it is kg m/s where kg m/s^2 is needed')
+        ('', 'its unit is kg m/s where kg m/s^2 is needed')
     """
     f = ca.Function(
         "law", [ca.vertcat(*(symbol for symbol, _ in inputs))], [ca.SX(value)], {"allow_free": True}
@@ -74,12 +74,12 @@ def clash(value: Any, inputs: Sequence[tuple[Any, str]], wanted: Unit) -> str:
                 return result
             work[made[0]] = result
     if found is not None and wanted is not None and not _equal(found, wanted):
-        return f"it is {_text(found)} where {_text(wanted)} is needed"
+        return f"its unit is {_text(found)} where {_text(wanted)} is needed"
     return ""
 
 
 def _through(operation: int, given: list[Unit]) -> Unit | str:
-    """The unit of a result; a text where the operands' do not go together."""
+    """The unit of a result; a text if the operands' units contradict each other."""
     first = given[0]
     if operation in _SAME:
         return first
@@ -101,7 +101,7 @@ def _through(operation: int, given: list[Unit]) -> Unit | str:
         if first is None or second is None:
             return None
         return _sum(first, second, 1.0 if operation == ca.OP_MUL else -1.0)
-    return None  # a power, a comparison: not followed
+    return None  # powers and comparisons are not propagated
 
 
 def _sum(one: tuple[float, ...], other: tuple[float, ...], sign: float = 1.0) -> tuple[float, ...]:
@@ -113,7 +113,7 @@ def _equal(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
 
 
 def _text(unit: tuple[float, ...]) -> str:
-    """A unit by its bases."""
+    """A unit in base units."""
     order = sorted(zip(BASES, unit, strict=True))
     up, down = ([(b, s * e) for b, e in order if s * e > 0] for s in (1.0, -1.0))
     words = [[b if e == 1 else f"{b}^{e:g}" for b, e in part] for part in (up, down)]

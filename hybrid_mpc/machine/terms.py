@@ -28,6 +28,8 @@ Place: TypeAlias = Literal["force", "potential", "rate", "input", "disturbance",
 PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "disturbance", "output")
 REPLACED: tuple[Place, ...] = ("input", "disturbance", "output")
 """Places whose signal a term replaces."""
+LEAST_SHARE = 1e-4
+"""Square of the distance from a reference, over its scale, that keeps a loss' slope finite where both are equal."""
 Option: TypeAlias = Signal | tuple[float, ...] | bool | float | str
 
 
@@ -751,27 +753,31 @@ def _power(x: str, exponent: float) -> str:
     return f"{x} |{x.removeprefix('(').removesuffix(')')}|{more}"
 
 
-def loss(of: str, k: Parameter, *, exponent: float, reference: str | float = 0.0) -> Term:
-    """A loss to what surrounds it: ``-k sign(x - r) |x - r|^exponent``.
+def loss(of: str, k: Parameter, n: Parameter, *, scale: float, reference: str | float = 0.0) -> Term:
+    """A loss to what surrounds it: ``-k (x - r) |(x - r) / scale|^(n - 1)``.
 
-    ``exponent`` is 1 for conduction, 1.25 for free convection, 0.5 for an outlet. ``reference`` is the state or
-    measured disturbance of the same unit on the other side, or a number.
+    Args:
+        of: State.
+        k: Loss rate [1/s] where the state is ``scale`` away from the reference.
+        n: Exponent: 1 for conduction, 1.25 to 1.33 for free convection, 0.5 for an outlet.
+        scale: Distance from the reference [unit of the state], that of the recordings.
+        reference: The state or measured disturbance of the same unit on the other side, or a number.
 
-    Source: Incropera, DeWitt, *Fundamentals of Heat and Mass Transfer*, 6th edition (2007), section 9.3, for 1.25.
+    Source: Incropera, DeWitt, *Fundamentals of Heat and Mass Transfer*, 6th edition (2007), section 9.3, for free
+    convection.
     """
 
     def law(at: At, p: Any) -> Any:
-        other = reference if not isinstance(reference, str) else _signal(at, reference)
-        far = at.own - other
-        if exponent == 1.0:
-            return -p[0] * far
-        # finite slope where both are equal
-        return -p[0] * far * (far * far + 1e-4) ** (0.5 * (exponent - 1.0))
+        far = at.own - (_signal(at, reference) if isinstance(reference, str) else reference)
+        share = far / scale
+        return -p[0] * far * (share * share + LEAST_SHARE) ** (0.5 * (p[1] - 1.0))
 
     to = reference if isinstance(reference, str) else f"{reference:.3g}"
+    far_off = _from(of, to)
     return _added(
-        "loss", f"loss to {to} by {exponent:g}", "rate", of, (k,), law, f"-{k.name} {_power(_from(of, to), exponent)}",
-        exponent=exponent, reference=reference,
+        "loss", f"loss to {to}", "rate", of, (k, n), law,
+        f"-{k.name} {far_off} |{far_off} / {scale:.3g}|^({n.name} - 1)",
+        scale=scale, reference=reference,
     )  # fmt: skip
 
 
@@ -793,12 +799,12 @@ def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:
     )  # fmt: skip
 
 
-def overflow(of: str, k: Parameter, *, edge: float, width: float) -> Term:
+def overflow(of: str, k: Parameter, edge: Parameter, *, width: float) -> Term:
     """What runs over an edge: ``-k max(x - edge, 0)``, smooth over ``width``."""
     return _added(
-        "overflow", f"overflow at {edge:.3g}", "rate", of, (k,),
-        lambda at, p: -0.5 * p[0] * (at.own - edge + ca.sqrt((at.own - edge) ** 2 + width**2)),
-        f"-{k.name} max({of} - {edge:.3g}, 0)", loss=True, edge=edge, width=width,
+        "overflow", "overflow", "rate", of, (k, edge),
+        lambda at, p: -0.5 * p[0] * (at.own - p[1] + ca.sqrt((at.own - p[1]) ** 2 + width**2)),
+        f"-{k.name} max({of} - {edge.name}, 0)", loss=True, width=width,
     )  # fmt: skip
 
 

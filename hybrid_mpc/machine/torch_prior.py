@@ -17,13 +17,13 @@ from hybrid_mpc.machine.prior import Balance, Prior, named
 class TorchPrior(Prior):
     """A prior whose methods are written in torch.
 
-    The methods take named tuples of tensors without axes, ``x.level``, and give tuples of such tensors or of numbers;
-    nobody thinks of batches. They are traced once, so what they do may not depend on values: ``torch.where`` instead
-    of ``if``. Everything else is as in :class:`~hybrid_mpc.machine.prior.Prior`; with
-    :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior` as a second base its parts are written in torch.
+    Methods take named tuples of scalar tensors, ``x.level``, and return tuples of such tensors or of numbers, without
+    a batch axis. They are traced once, so they must not branch on values: ``torch.where`` instead of ``if``. All else
+    is as in :class:`~hybrid_mpc.machine.prior.Prior`. With :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior` as a
+    second base, its parts are written in torch.
 
     Raises:
-        nn_export.ExportError: When it is traced, if a method does what cannot be exported.
+        nn_export.ExportError: During tracing, if a method uses an operation that cannot be exported.
 
     Example:
         >>> from hybrid_mpc import Parameter, Signal
@@ -43,17 +43,17 @@ class TorchPrior(Prior):
     def evaluated(self, method: str, *arguments: tuple[str, ca.SX]) -> Any:
         """See :class:`~hybrid_mpc.machine.prior.Prior`."""
         what = f"{type(self).__name__}.{method}"
-        kind = type(what, (_Traced,), {})  # what cannot be exported is told by this name
+        kind = type(what, (_Traced,), {})  # the name appears in messages about the export
         module = kind(self, method, tuple(self.names_of(key) for key, _ in arguments))
         examples = tuple(torch.ones(v.numel(), dtype=torch.float64) for _, v in arguments)
         try:
-            shape = module.result(*examples)  # what it gives: tuples of tuples, balances
+            shape = module.result(*examples)  # structure of the result: nested tuples, balances
         except (NotImplementedError, TypeError) as error:
             if "Tensor" not in str(error):
                 raise
             raise InputError(
-                f"{what} gets torch's tensors: {str(error).splitlines()[0]} Is it written in "
-                "CasADi? Then it must be a Prior [HM-MACHINE-040]"
+                f"{what} gets torch tensors: {str(error).splitlines()[0]} A method written in CasADi needs a Prior, "
+                "not a TorchPrior. [HM-MACHINE-040]"
             ) from error
         scalars = _scalars(shape, what)
         if not any(isinstance(s, Tensor) for s in scalars):
@@ -70,7 +70,7 @@ class TorchPrior(Prior):
 
 
 class _Traced(nn.Module):
-    """One method of a prior, of vectors and to one vector."""
+    """One method of a prior, from vectors to one vector."""
 
     def __init__(self, prior: Prior, method: str, names: tuple[tuple[str, ...], ...]) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class _Traced(nn.Module):
 
     def forward(self, *vectors: Tensor) -> Tensor:
         found = [s for s in _scalars(self.result(*vectors), type(self).__name__) if isinstance(s, Tensor)]
-        # operators that need no decomposing are traced twice as fast
+        # operators that need no decomposition are traced twice as fast
         return torch.stack(
             [s if s.ndim == 0 and s.dtype is torch.float64 else s.reshape(()).double() for s in found]
         )
@@ -105,14 +105,14 @@ def _scalars(value: Any, what: str) -> list[Any]:
         return [scalar for part in parts for scalar in _scalars(part, what)]
     if not isinstance(value, Tensor | float | int):
         raise InputError(
-            f"{what} of a TorchPrior must give tensors or numbers in tuples, it gives {type(value).__name__}; is a "
-            "'return' missing, or is it written in CasADi? Then it must be a Prior [HM-MACHINE-041]"
+            f"{what} of a TorchPrior must give tensors or numbers in tuples, got {type(value).__name__}. Check for a "
+            "missing 'return'; a method written in CasADi needs a Prior. [HM-MACHINE-041]"
         )
     return [value]
 
 
 def _like(value: Any, scalars: Any) -> Any:
-    """The same structure with each tensor replaced by the next of the scalars."""
+    """The same structure, with each tensor replaced by the next scalar."""
     if isinstance(value, Balance):
         storage, supply, loss = (_like(v, scalars) for v in (value.storage, value.supply, value.loss))
         return replace(value, storage=storage, supply=supply, loss=loss)

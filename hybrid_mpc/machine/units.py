@@ -1,7 +1,7 @@
-"""What two units have to do with each other: ``m`` and ``mm``, ``J`` and ``W``. One that is not known says nothing.
+"""Relations between units, e.g. ``m`` and ``mm``, ``J`` and ``W``. Unknown units never cause an error.
 
-One table for the columns of recordings, ``hybrid-mpc new`` and the checks of a prior. It is this project's own, since
-units libraries take radians for pure numbers: they turn 1 Hz into 1 rad/s, which is off by 6.28.
+One table serves columns of recordings, ``hybrid-mpc new`` and checks of a prior. The project has its own table because
+units libraries treat radians as pure numbers and convert 1 Hz to 1 rad/s, which is wrong by a factor of 6.28.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _KNOWN: dict[str, tuple[float, tuple[int, ...]]] = {
     "C": (1.0, (0, 0, 1, 1)), "V": (1.0, (2, 1, -3, -1)), "ohm": (1.0, (2, 1, -3, -2)),
     "F": (1.0, (-2, -1, 4, 2)), "H": (1.0, (2, 1, -2, -2)), "Wb": (1.0, (2, 1, -2, -1)), "T": (1.0, (0, 1, -2, -1)),
 }  # fmt: skip
-"""Factor to SI and exponents of the bases, in their order; those that are left out are zero."""
+"""Factor to SI and exponents of the base units, in their order; missing ones are zero."""
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1, "h": 1e2, "k": 1e3, "M": 1e6}
 _PREFIXED = ("m", "g", "l", "L", "s", "A", "Ah", "K", "mol", "N", "J", "W", "Wh", "Pa", "bar", "C", "V", "VA", "ohm",
              "F", "H", "S", "T", "rad", "Hz", "cal")  # fmt: skip
@@ -51,28 +51,28 @@ _ALIASES = {
 }  # fmt: skip
 """Other spellings of the same units."""
 _ZEROS = {"K": 0.0, "degC": 273.15, "degF": 459.67 * 5 / 9, "degR": 0.0}
-"""Zeros of the scales of temperature [K]."""
+"""Zero of each temperature scale [K]."""
 _TURNING = frozenset({"rad", "deg", "rev", "turn", "rpm", "rps", "arcmin", "arcsec", "mrad", "urad"})
-"""Units of an angle that turns, or of its rate."""
+"""Units of a rotation angle or its rate."""
 _TERM = re.compile(r"([A-Za-z%]+|1|-)(?:\^?(-?\d+))?")
 _TIMES = {
     1.0: "s sec secs second seconds", 1e-3: "ms msec msecs millis millisecond milliseconds",
     1e-6: "us usec usecs micros microsecond microseconds", 1e-9: "ns nsec nsecs nanos nanosecond nanoseconds",
     60.0: "min mins minute minutes", 3600.0: "h hr hrs hour hours", 86400.0: "d day days",
 }  # fmt: skip
-"""Spellings of the units of time, by their seconds."""
+"""Spellings of the units of time, by their length [s]."""
 NEAR = 1e-9
-"""Share by which factors that are equal may differ: rounding."""
+"""Relative deviation of equal factors: rounding."""
 
 
 @cache
-def parsed(unit: str) -> tuple[float, tuple[int, ...]] | None:
-    """Factor to SI and exponents of metre, kilogram, second, ampere, kelvin, mole, candela; None if it is not known.
+def parse_unit(unit: str) -> tuple[float, tuple[int, ...]] | None:
+    """Factor to SI and exponents of metre, kilogram, second, ampere, kelvin, mole, candela; None if unknown.
 
-    Factors stand side by side, or with ``*`` or ``·`` between them; what follows a ``/`` divides.
+    Factors are separated by blanks, ``*`` or ``·``; everything after a ``/`` divides.
 
     Example:
-        >>> parsed("N m"), parsed("mm/s"), parsed("furlong")
+        >>> parse_unit("N m"), parse_unit("mm/s"), parse_unit("furlong")
         ((1.0, (2, 1, -2, 0, 0, 0, 0)), (0.001, (1, 0, -1, 0, 0, 0, 0)), None)
     """
     text = unit.replace("µ", "u").replace("μ", "u").replace("°", "deg").replace("²", "^2").replace("³", "^3")
@@ -108,13 +108,13 @@ def _named(word: str) -> tuple[float, tuple[int, ...]] | None:
 
 
 def differ(one: str, other: str) -> bool:
-    """Whether two units are certainly not the same: both are known, and another quantity or of another size.
+    """Whether two units certainly differ: both are known, and have different quantities or sizes.
 
     Example:
         >>> differ("N m", "J"), differ("rad", "deg"), differ("m", "kg"), differ("m", "furlong")
         (False, True, True, False)
     """
-    first, second = parsed(one), parsed(other)
+    first, second = parse_unit(one), parse_unit(other)
     if first is None or second is None:
         return False
     return first[1] != second[1] or abs(first[0] - second[0]) > NEAR * abs(first[0])
@@ -122,27 +122,27 @@ def differ(one: str, other: str) -> bool:
 
 @dataclass(frozen=True)
 class Conversion:
-    """From one unit to another: ``factor * value + offset``."""
+    """A conversion of units: ``factor * value + offset``."""
 
     factor: float
     offset: float = 0.0
 
 
 def conversion(one: str, other: str) -> Conversion | str:
-    """How numbers in the first unit become numbers in the second; else why they do not, as the end of a sentence.
+    """The conversion of numbers from the first unit to the second; or why there is none, as the end of a sentence.
 
-    Temperatures have zeros of their own. Rotation and frequency are converted by turns: 1 Hz is 6.28 rad/s, 60 1/min
-    are 1 Hz. Of ``1/s`` nobody knows whether it is ``rad/s`` or a turn a second.
+    Temperature scales have their own zeros. Rotation and frequency are converted by turns: 1 Hz is 6.28 rad/s, 60 1/min
+    are 1 Hz. ``1/s`` is ambiguous: it may be ``rad/s`` or turns per second.
 
     Example:
         >>> conversion("mm", "m"), conversion("degC", "K"), conversion("Hz", "rad/s").factor
         (Conversion(factor=0.001, offset=0.0), Conversion(factor=1.0, offset=273.15), 6.283185307179586)
         >>> conversion("1/s", "rad/s"), conversion("m", "kg"), conversion("furlong", "m")
-        ('of which nobody knows how many turns it is', 'which is another quantity', 'which is not known')
+        ('which is ambiguous: radians or turns', 'which is another quantity', 'which is not known')
     """
     if plain(one) == plain(other):
         return Conversion(1.0)
-    first, second = parsed(one), parsed(other)
+    first, second = parse_unit(one), parse_unit(other)
     if first is None or second is None:
         return "which is not known"
     if first[1] != second[1]:
@@ -155,13 +155,13 @@ def conversion(one: str, other: str) -> Conversion | str:
     if turning[0] != turning[1] and first[1][:3] in ((0, 0, -1), (0, 0, -2)) and not any(first[1][3:]):
         cycles = _words(one if turning[1] else other)
         if not {"Hz", "kHz", "MHz", "min", "h"} & set(cycles):
-            return "of which nobody knows how many turns it is"
+            return "which is ambiguous: radians or turns"
         size *= 2 * math.pi if turning[1] else 1 / (2 * math.pi)
     return Conversion(size)
 
 
 def plain(unit: str) -> str:
-    """A unit without what writers differ in.
+    """A unit in one spelling.
 
     Example:
         >>> plain("N·m"), plain("°C"), plain("µs") == plain("μs")
@@ -173,18 +173,18 @@ def plain(unit: str) -> str:
 
 
 def _words(unit: str) -> list[str]:
-    """Names of units in a unit, by their first spelling."""
+    """Names of units in a unit, in one spelling."""
     return [_ALIASES.get(word, word) for word in re.findall(r"[A-Za-z%]+", unit.replace("°", "deg"))]
 
 
 def is_product(one: str, other: str, whole: str) -> bool:
-    """Whether the product of two units may be a third; it certainly is not if all are known and it is another.
+    """Whether the product of two units may be a third: False only if all are known and the product differs.
 
     Example:
         >>> is_product("N m", "rad/s", "W"), is_product("V", "rad/s", "W"), is_product("furlong", "1/s", "W")
         (True, False, True)
     """
-    first, second, third = parsed(one), parsed(other), parsed(whole)
+    first, second, third = parse_unit(one), parse_unit(other), parse_unit(whole)
     if first is None or second is None or third is None:
         return True
     exponents = tuple(i + j for i, j in zip(first[1], second[1], strict=True))
@@ -192,18 +192,18 @@ def is_product(one: str, other: str, whole: str) -> bool:
 
 
 def alike(one: str, other: str) -> bool:
-    """Whether two units may be of one quantity, whatever their size: the other way round, certainly of two.
+    """Whether two units may measure the same quantity, whatever their size.
 
     Example:
         >>> alike("mm", "m"), alike("mm", "kg"), alike("mm", "furlong")
         (True, False, True)
     """
-    first, second = parsed(one), parsed(other)
+    first, second = parse_unit(one), parse_unit(other)
     return first is None or second is None or first[1] == second[1]
 
 
 def per_second(unit: str) -> str:
-    """The unit of a rate of change, as it is written here.
+    """The unit of a rate of change.
 
     Example:
         >>> per_second("m"), per_second("J"), per_second("m/s"), per_second("-")
@@ -219,7 +219,7 @@ def per_second(unit: str) -> str:
 
 
 def time_factor(unit: str) -> float | None:
-    """Seconds per unit; None where it is no unit of time.
+    """Seconds per unit; None if it is no unit of time.
 
     Example:
         >>> time_factor("msec"), time_factor("hr"), time_factor("V")

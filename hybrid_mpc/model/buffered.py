@@ -1,4 +1,4 @@
-"""CasADi functions on fixed numpy buffers: no matrices are made or copied per call."""
+"""CasADi functions on fixed numpy buffers, without allocations or copies per call."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ Array = NDArray[np.float64]
 
 
 class BufferedFunction:
-    """A CasADi function whose arguments and results are numpy arrays that stay the same.
+    """A CasADi function whose arguments and results are fixed numpy arrays.
 
-    Fill :attr:`inputs`, call, read :attr:`outputs`; the next call overwrites them. Not for several threads
-    at once.
+    Fill :attr:`inputs`, call, read :attr:`outputs`; the next call overwrites them. Not thread-safe.
 
     Args:
         function: The function; sparse arguments and results become dense.
@@ -45,7 +44,7 @@ class BufferedFunction:
             buffer.set_arg(i, memoryview(array.data))
         for i, array in enumerate(self.outputs):
             buffer.set_res(i, memoryview(array.data))
-        self._buffer = buffer, function  # both must live as long as this object
+        self._buffer = buffer, function  # must live as long as this object
 
     def __call__(self) -> None:
         """Evaluate :attr:`inputs` into :attr:`outputs`."""

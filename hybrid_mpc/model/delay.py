@@ -1,4 +1,4 @@
-"""A model whose input acts later: the inputs on their way are delay states, the first entries of ``h``."""
+"""A model with a delayed input: the delayed inputs are delay states, the first entries of ``h``."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from hybrid_mpc.model.model import (
 
 Array = NDArray[np.float64]
 TINY = 1e-9
-"""Share of a period below which a delay's rest counts as none."""
+"""Fraction of a period below which the remainder of a delay is zero."""
 MOST_DELAY_STATES = 1000
-"""Most inputs on their way: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at
-100 Hz; a longer delay is a slip in its unit, or a damaged file."""
+"""Most delay states: an estimator can still work with matrices of a thousand rows. It is 10 s of one input at 100 Hz; a
+longer delay has a wrong unit, or comes from a damaged file."""
 
 
 def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
-    """The model with an input that acts ``delay`` later, any delay: ``h = [delayed inputs, the oldest first; h]``.
+    """The model with an input that acts ``delay`` later: ``h = [delayed inputs, the oldest first; h]``.
 
-    A delay of ``m`` periods and a share ``f`` makes ``(1 - f) u_{k-m} + f u_{k-m-1}`` act in period ``k``, the mean
-    over the period: what :func:`hybrid_mpc.identify.delay.delayed` gives the training. Estimator, controller and
-    monitor take such a model as any other; the first estimate takes the inputs before it for zero. ``xdot`` and the
-    balances are those of the model: they take the input that acts.
+    For a delay of ``m`` periods and a fraction ``f``, the mean input ``(1 - f) u_{k-m} + f u_{k-m-1}`` acts in period
+    ``k``, as in training (:func:`hybrid_mpc.identify.delay.delayed`). Estimator, controller and monitor need no change;
+    the first estimate assumes that earlier inputs were zero. ``xdot`` and the balances are those of the model and take
+    the input that acts.
 
     Args:
         model: The model without delay.
-        delay: Of the input [s], positive; at most :data:`MOST_DELAY_STATES` delay states (periods times inputs).
+        delay: Delay of the input [s], positive; at most :data:`MOST_DELAY_STATES` delay states (periods times inputs).
 
     Raises:
         InputError: If the delay is not positive or too long, or the model has delay states already.
@@ -49,7 +49,7 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "-"),)
         >>> model = HybridModel.of("sum", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
         >>> late = with_input_delay(model, 0.75)
-        >>> x_next, h_next = late.step(0.0, 4.0, 8.0, late.w, late.p)  # three quarters of the old, one of the new
+        >>> x_next, h_next = late.step(0.0, 4.0, 8.0, late.w, late.p)  # 0.75 of the old input, 0.25 of the new one
         >>> float(x_next), float(h_next)
         (5.0, 8.0)
     """
@@ -60,13 +60,13 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     periods = delay / model.dt
     if not periods * model.n_u <= MOST_DELAY_STATES:
         raise InputError(
-            f"model {model.name}: an input's delay of {delay:g} s is {periods:.4g} periods of {model.dt:g} s, so that "
-            f"{periods * model.n_u:.4g} delay states would be needed, at most {MOST_DELAY_STATES} can be; give it in "
-            "seconds, or take a model of a longer period [HM-MODEL-002]"
+            f"model {model.name}: an input delay of {delay:g} s is {periods:.4g} periods of {model.dt:g} s and needs "
+            f"{periods * model.n_u:.4g} delay states; at most {MOST_DELAY_STATES} are possible. Give the delay in "
+            "seconds, or use a model with a longer period. [HM-MODEL-002]"
         )
     if model.delay_states:
         raise InputError(
-            f"model {model.name} has delay states already; give the one without delay [HM-MODEL-003]"
+            f"model {model.name} has delay states already. Give the model without a delay. [HM-MODEL-003]"
         )
     queue = _Queue(periods, model.n_u)
     x, _, u, w, p = step_symbols(model)
@@ -90,7 +90,7 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
 
 
 class _Queue:
-    """Delay states: how many, and the share of each (and of the new input) that acts."""
+    """The number of delay states, and the share of each (and of the new input) that acts."""
 
     def __init__(self, periods: float, n_u: int) -> None:
         whole = math.floor(periods + TINY)
@@ -104,7 +104,7 @@ class _Queue:
         self.share = share
 
     def slopes(self, n_x: int, a: ca.MX, b: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """``A`` and ``B`` of the delayed model from those of the model."""
+        """``A`` and ``B`` of the delayed model, from those of the model."""
         n, n_u = self.size, self.n_u
         old, new = b @ ca.DM(self.share[:, :n]), b @ ca.DM(self.share[:, n:])
         moved = ca.DM(np.eye(n, n + n_u, n_u))
@@ -117,7 +117,7 @@ class _Queue:
 
 
 def _side_by_side(inner: SideBySide, n_x: int, queue: _Queue) -> SideBySide:
-    """The delayed model at many points in one call, of the model's own way."""
+    """The delayed model at many points in one call, from the model's own function."""
 
     def make(n: int, blocks: Mapping[str, Sequence[str]]) -> ManyPoints:
         many = inner(n, {name: (name,) for name in ("x", "h", "u")})
@@ -147,5 +147,5 @@ def _side_by_side(inner: SideBySide, n_x: int, queue: _Queue) -> SideBySide:
 
 
 def _inserted(rows: Array, n_x: int, queue: Array) -> Array:
-    """Rows of a Jacobian ``(n, n_x + n_h, columns)`` with those of the delay states after the states'."""
+    """Rows of a Jacobian ``(n, n_x + n_h, columns)`` with those of the delay states inserted after the states'."""
     return np.concatenate([rows[:, :n_x], queue, rows[:, n_x:]], axis=1)

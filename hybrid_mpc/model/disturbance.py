@@ -1,4 +1,4 @@
-"""Unmeasured disturbances of a machine as plain data: constant values at inputs, rates of states or outputs."""
+"""Unmeasured disturbances of a machine as plain data: constants at inputs, rates of states or outputs."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One unmeasured disturbance, constant but for slow steps: a load, a leak, a sensor's offset.
+    """One unmeasured disturbance, constant or slowly changing: a load, a leak, a sensor's offset.
 
     Args:
         at: Where it is added: to an ``"input"``, to the ``"rate"`` of a state, to an ``"output"``.
         signal: Name of that input, state or output.
-        size: A large value of it [the signal's unit; of a rate that per second]. Default 0: the range of the input;
-            rates and outputs have none and need it.
+        size: A large value of it [the signal's unit; for a rate, per second]. Default 0: the range of the input; for
+            rates and outputs it is required.
 
     Raises:
         InputError: If the size is negative or not finite, or missing for a rate or an output.
@@ -43,8 +43,8 @@ class Disturbance:
         own = Fields(self, f"disturbance at the {self.at} {self.signal}")
         own.need(
             "at size", lambda: self.at == "input" or self.size > 0,
-            f"size {self.size} given; needed: how large it may be, a positive number (an input's may be left out: its "
-            "range) [HM-MODEL-004]",
+            f"size: must be positive, got {self.size}. Give a large value of the disturbance (not needed at an input, "
+            "whose range is the default). [HM-MODEL-004]",
         )  # fmt: skip
         own.refuse()
 
@@ -56,24 +56,24 @@ def disturbance_matrices(
     outputs: Sequence[Signal],
     dt: float,
 ) -> tuple[Array, Array, Array]:
-    """How disturbances ``d`` ``(n_d,)`` act: on inputs ``(n_u, n_d)``, on states over a period ``(n_x, n_d)``, on
-    outputs ``(n_y, n_d)``. None: one at each input.
+    """Effect of disturbances ``d`` ``(n_d,)``: matrices on inputs ``(n_u, n_d)``, on states over a period
+    ``(n_x, n_d)``, on outputs ``(n_y, n_d)``. ``chosen`` None: one at each input.
 
     Raises:
-        InputError: If there is none, a signal is unknown, or two are the same.
+        InputError: If there is no disturbance, a signal is unknown, or two disturbances are equal.
     """
     if chosen is None:
         chosen = [Disturbance("input", s.name) for s in inputs]
     if not chosen:
         raise InputError(
-            "disturbance model: none is given; leave disturbance_model out for one at each input, or name at least one "
-            "(as many as there are outputs leave no offset): an estimator without would take every load for a motion"
+            "disturbance model: it is empty. Leave out disturbance_model for one at each input, or name at least one "
+            "(as many as outputs give offset-free control): without any, an estimator takes every load for a motion."
             " [HM-MODEL-005]"
         )
     places = {"input": (inputs, 1.0), "rate": (states, dt), "output": (outputs, 1.0)}
     if len({(d.at, d.signal) for d in chosen}) < len(chosen):
         raise InputError(
-            f"disturbance model: two are the same: {[(d.at, d.signal) for d in chosen]} [HM-MODEL-006]"
+            f"disturbance model: disturbances must differ, got {[(d.at, d.signal) for d in chosen]} [HM-MODEL-006]"
         )
     found = {at: np.zeros((len(signals), len(chosen))) for at, (signals, _) in places.items()}
     for j, d in enumerate(chosen):
@@ -82,7 +82,7 @@ def disturbance_matrices(
         if d.signal not in names:
             what = "state" if d.at == "rate" else d.at
             raise InputError(
-                f"disturbance model: no {what} {d.signal!r}; there are: {', '.join(names)} [HM-MODEL-007]"
+                f"disturbance model: no {what} {d.signal!r}; known names: {', '.join(names)} [HM-MODEL-007]"
             )
         found[d.at][names.index(d.signal), j] = factor
     return found["input"], found["rate"], found["output"]

@@ -1,7 +1,7 @@
-"""Steady states of a model: the one search for them, and what else of a machine at rest is computed.
+"""Steady states of a model: one search for all uses, and functions of a machine at rest.
 
-A steady state solves ``0 = F(z, u, w, d) - z``, or ``0 = xdot``, with bounds and, where there is one, a set-point of
-outputs. Observers, the target calculator, the safeguard, analysis, pre-flight and default tasks all search here.
+A steady state solves ``0 = F(z, u, w, d) - z``, or ``0 = xdot``, within bounds and, if given, at a set-point of the
+outputs. Observers, target calculator, safeguard, analysis, pre-flight check and default tasks use this search.
 """
 
 from __future__ import annotations
@@ -22,45 +22,45 @@ from hybrid_mpc.model.model import Expression, HybridModel, output_with_jacobian
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 SETTLED = 1e-10
-"""Largest change in a step of a hidden state that counts as settled."""
+"""Largest change per step of a settled hidden state."""
 SETTLING = 6
-"""Steps of Newton's method at most by which a hidden state is brought to rest."""
+"""Most Newton steps that settle a hidden state."""
 ITERATIONS = 60
 STEADY = 1e-9
-"""Largest step, in scales of the unknowns, at which Newton's method has converged."""
+"""Largest step, in scales of the unknowns, of a converged Newton iteration."""
 REACHED = 1e-6
 """Largest deviation of an output that counts as reached, in tolerated deviations ``1 / sqrt(q_y)``."""
 RANK = 1e-9
 """Singular values below this share of the largest count as zero."""
 FREE = 1e-6
-"""Weight of the distance from the operating point along directions that the outputs do not see."""
+"""Weight of the distance from the operating point along directions that do not affect the outputs."""
 STALLED, WITHIN = 0.9, 5
-"""A descent is given up whose lack of a steady state has not fallen to this share within so many steps, which those
-that arrive do many times over."""
+"""A descent is stopped if its residual has not fallen to the share ``STALLED`` within ``WITHIN`` steps; successful
+descents fall far more."""
 AWAY = 1e6
-"""Distance from its start, in scales of the unknowns, at which a descent has run away."""
+"""Distance from its start, in scales of the unknowns, at which a descent has diverged."""
 STILL = 1e-6
-"""Largest lack of a steady state, in the states' scales, that is rounding."""
+"""Largest residual of a steady state, in the states' scales, that is rounding."""
 NEAR = 1e-5
-"""Largest step, in scales of the unknowns, that rounding may keep from helping."""
+"""Largest step, in scales of the unknowns, that rounding may prevent from reducing the residual."""
 CONTRACTS = 0.7
-"""Largest share of the step before that a step has along a descent whose end no rounding changes."""
+"""Largest ratio of a step to the previous one in a descent whose end does not depend on rounding."""
 LEAST_SHARE = 1e-3
 """Smallest share of a step that is tried."""
 FOLLOWED, LEAST_PART, MOST_PARTS = 0.125, 1 / 1024, 100
-"""First part of the way that a continuation goes at once, the least one, and descents at most."""
+"""First and smallest part of the way of a continuation, and the most descents."""
 RUN = 5000
-"""Periods of the model's own run at most."""
+"""Most periods of the model's own run."""
 NEARER = 1e-3
-"""Largest lack of a steady state, in the states' scales, at which a run has nearly come to rest."""
+"""Largest residual, in the states' scales, at which a run has nearly settled."""
 EQUAL = 1e-3
-"""Share by which the deviations of steady states that do equally well may differ."""
+"""Largest relative difference between deviations of equally good steady states."""
 EXACT = 1e-12
-"""Largest step, in scales of the unknowns, at which an analysis has converged, and ..."""
+"""Largest step, in scales of the unknowns, at which an analysis has converged."""
 RESIDUAL = 1e-10
-"""... the largest residual at its steady states, in the units of the states."""
+"""Largest residual of an analysis's steady states, in the units of the states."""
 REACHES = 0.01 * 2.0 ** np.arange(12)
-"""Distances from a guess at which the search for a holding input begins anew."""
+"""Distances from a guess at which the search for a holding input restarts."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class Steady:
         x: States ``(n_x,)``.
         h: Hidden states ``(n_h,)``.
         u: Inputs ``(n_u,)`` that hold it.
-        y: Outputs ``(n_y,)`` there, with what unmeasured disturbances add.
-        reached: Whether the outputs that the problem weighs are the set-point's.
-        steady: Whether it is a steady state of the model; False: none was found, this is the last iterate.
+        y: Outputs ``(n_y,)``, with the effect of unmeasured disturbances.
+        reached: Whether the outputs with weights are at the set-point.
+        steady: Whether it is a steady state of the model; False: none was found, and this is the last iterate.
     """
 
     x: Array
@@ -90,19 +90,19 @@ class Steady:
 
 
 class Equations(Protocol):
-    """What is zero at a steady state, and what set-points are of, as functions of the unknowns ``v`` ``(n_v,)``."""
+    """The equations of a steady state and the outputs of set-points, as functions of the unknowns ``v`` ``(n_v,)``."""
 
     def rest(self, v: Array) -> tuple[Array, Array]:
-        """What changes ``(n_e,)``, and its Jacobian ``(n_e, n_v)``."""
+        """Residual ``(n_e,)`` of the steady state, and its Jacobian ``(n_e, n_v)``."""
         ...
 
     def shown(self, v: Array) -> tuple[Array, Array]:
-        """What set-points are of ``(n_y,)``, and its Jacobian ``(n_y, n_v)``."""
+        """Outputs of set-points ``(n_y,)``, and their Jacobian ``(n_y, n_v)``."""
         ...
 
 
 class StepEquations:
-    """A model's step and outputs over ``v = (x, h, u)``, under disturbances ``d`` and ``w`` that may be set anew."""
+    """A model's step and outputs over ``v = (x, h, u)``; the disturbances ``d`` and ``w`` may be changed."""
 
     def __init__(self, model: HybridModel, w: ArrayLike | None = None) -> None:
         assert model.with_jacobian is not None
@@ -115,7 +115,7 @@ class StepEquations:
         self.d: Array = np.zeros(model.n_d)
         """Unmeasured disturbances ``(n_d,)``."""
         self.w: Array = model.w if w is None else vector(w, model.n_w, "w")
-        """Measured ones ``(n_w,)``."""
+        """Measured disturbances ``(n_w,)``."""
 
     def rest(self, v: Array) -> tuple[Array, Array]:
         """``F(z, u) - z`` and its Jacobian ``(n_z, n_z + n_u)``."""
@@ -148,8 +148,8 @@ class StepEquations:
 
 
 class RateEquations:
-    """Rates ``xdot(x, u, w, p)`` over ``v = (x, u)`` at held ``w`` and ``p``; set-points are of ``shown(x, u, w, p)``,
-    of the states where there is none.
+    """Rates ``xdot(x, u, w, p)`` over ``v = (x, u)`` at constant ``w`` and ``p``; set-points are of ``shown(x, u, w,
+    p)``, by default of the states.
     """
 
     def __init__(self, xdot: ca.Function, w: Array, p: Array, shown: ca.Function | None = None) -> None:
@@ -165,7 +165,7 @@ class RateEquations:
         return rates.ravel(), slopes
 
     def shown(self, v: Array) -> tuple[Array, Array]:
-        """What set-points are of, and its Jacobian."""
+        """Outputs of set-points, and their Jacobian."""
         values, slopes = (m.full() for m in self._shown(v))
         return values.ravel(), slopes
 
@@ -173,7 +173,7 @@ class RateEquations:
 @dataclass(frozen=True)
 class Range:
     """Bounds of a search: ``lower``, ``upper`` ``(n_v,)`` of the unknowns and ``y_lower``, ``y_upper`` ``(n_y,)`` of
-    what set-points are of. Those of the unknowns ``kept`` hold in every search, the others in bounded ones alone.
+    the outputs. Bounds of the unknowns ``kept`` hold in every search, the others only in bounded ones.
     """
 
     lower: Array
@@ -190,16 +190,16 @@ class Range:
 
 
 class Descent(NamedTuple):
-    """Where a descent ended.
+    """The end of a descent.
 
     Attributes:
         v: The unknowns.
-        y: What set-points are of, there.
-        off: Its largest deviation from the set-point, in tolerated ones.
-        slopes: How it answers to the unknowns that lean, along steady states.
+        y: The outputs.
+        off: Largest deviation of an output from the set-point, in tolerated deviations.
+        slopes: Derivatives of the outputs by the leaning unknowns, along steady states.
         steady: Whether it is a steady state.
-        sure: Whether all steps were whole ones, each of them shorter than the one before: then another rounding, and a
-            start nearby, end there too.
+        sure: Whether all steps were full and shorter than the one before: then the end does not depend on rounding, or
+            on small changes of the start.
     """
 
     v: Array
@@ -216,8 +216,8 @@ class Descent(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """What a descent needs to know of ``v``: ``rest`` and ``y`` with their Jacobians; ``lacks``, the size of ``rest``
-    in scales; and ``merit``, which a descent lowers: ``lacks``, and the weighted deviation of ``y``, less.
+    """A point of a descent: ``rest`` and ``y`` with Jacobians; ``lacks``, the scaled norm of ``rest``; and ``merit``,
+    which a descent reduces: ``lacks`` plus, with less weight, the weighted deviation of ``y``.
     """
 
     v: Array
@@ -230,24 +230,23 @@ class _Point(NamedTuple):
 
 
 class SteadySearch:
-    """Steady states as near to a set-point as bounds allow: ``min |y - goal|^2`` in weights over ``rest(v) = 0``.
+    """Steady states closest to a set-point within bounds: ``min |y - goal|^2``, weighted, subject to ``rest(v) = 0``.
 
-    Gauss-Newton's method, the steady states eliminated by their null space; bounds are an active set. Of several
-    answers that do equally well the one nearest to the operating point is taken, in the scales of the unknowns that
-    lean towards it. All counts in scales, so that no answer depends on units.
+    A Gauss-Newton method that eliminates the steady-state equations by their null space; bounds are treated by an
+    active set. Of several equally good solutions the one closest to the operating point is taken, measured in the
+    scales of the leaning unknowns. All quantities are scaled, so solutions do not depend on units.
 
     Args:
-        equations: What is zero at a steady state, and what set-points are of.
-        scale: What 1 means of the unknowns ``(n_v,)``.
-        size: What 1 means of the equations ``(n_e,)``.
-        root: Roots of the set-point's weights ``(n_y,)``; 0: does not matter.
+        equations: Steady-state equations and outputs.
+        scale: Scale of the unknowns ``(n_v,)``.
+        size: Scale of the equations ``(n_e,)``.
+        root: Square roots of the set-point's weights ``(n_y,)``; 0: no weight.
         near: The operating point ``(n_v,)``.
-        leans: Places of the unknowns that stay near it.
+        leans: Indices of the unknowns that stay close to it.
         bounds: Bounds. Default: none.
-        heed: Shares ``(n_e,)`` of ``size`` that count as much. Default: 1.
-        hidden: Places of hidden states, which are brought to rest on the way; the last equations are theirs. Default:
-            there are none.
-        free: Places of the unknowns that are sought; the others are held. Default: all.
+        heed: Factors ``(n_e,)`` on ``size`` in the linearization. Default: 1.
+        hidden: Indices of hidden states, which are settled in between; the last equations are theirs. Default: none.
+        free: Indices of the free unknowns; the others are constant. Default: all.
         steady: Largest step, in scales, at which a descent has converged. Default: 1e-9.
 
     Source: Rawlings, Mayne, Diehl, *Model Predictive Control*, 2017, section 1.5; Nocedal, Wright, *Numerical
@@ -283,7 +282,7 @@ class SteadySearch:
         bounds = Range.none(n_v, root.size) if bounds is None else bounds
         self.bounds = bounds
         finite = (np.isfinite(bounds.lower) | np.isfinite(bounds.upper)) & (place >= 0)
-        # which unknowns are bounded, their places among the free ones, and their bounds, in scales
+        # indices of bounded unknowns, their indices among the free ones, and their scaled bounds
         self._always, self._all = (
             (k, place[k], bounds.lower[k] / scale[k], bounds.upper[k] / scale[k])
             for k in (
@@ -293,9 +292,9 @@ class SteadySearch:
         )
         self._seen = np.flatnonzero(np.isfinite(bounds.y_lower) | np.isfinite(bounds.y_upper))
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is looked at and refused
+    @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def descend(self, v: Array, goal: Array, bounded: bool = True) -> Descent:
-        """Gauss-Newton from ``v`` to the set-point ``goal`` ``(n_y,)``; not ``bounded``: within kept bounds alone."""
+        """Gauss-Newton from ``v`` to the set-point ``goal`` ``(n_y,)``; not ``bounded``: only kept bounds hold."""
         at, done, sure = self._point(v, goal), False, True
         lacks, before = [at.lacks], np.inf
         slopes = np.full((self._tracked.size, self._leans.size), np.nan)
@@ -311,7 +310,7 @@ class SteadySearch:
             before, share = size, 1.0
             after = self._settled(at.v + step, goal)
             if not after.merit < at.merit and size >= NEAR:
-                # watchdog: along a curved branch a step leaves it by its square, and the next one comes back to it
+                # watchdog: on a curved branch a step leaves it to second order, and the next step returns to it
                 second = self._newton(after, goal, bounded)[0]
                 again = np.inf if second is None else float(np.max(np.abs(second / self.scale), initial=0.0))
                 if second is not None and np.isfinite(again):
@@ -323,7 +322,7 @@ class SteadySearch:
                 share, sure = 0.5 * share, sure and size < NEAR
                 after = self._settled(at.v + share * step, goal)
             if not after.merit < at.merit:
-                done = size < NEAR and at.lacks <= STILL  # rounding is all that is left
+                done = size < NEAR and at.lacks <= STILL  # only rounding is left
                 break
             at = after
             lacks.append(at.lacks)
@@ -343,11 +342,12 @@ class SteadySearch:
         sure: bool = True,
         before: Callable[[float], None] | None = None,
     ) -> Descent | None:
-        """The steady state to which set-points from ``begun``, that of ``v``, to ``goal`` lead; None: the branch ends.
+        """The steady state reached by moving the set-point from ``begun``, that of ``v``, to ``goal``; None if the
+        branch ends.
 
-        Parts of the way shorten where Newton's method does not contract, and grow where it does, so that the branch is
-        not left, whatever the rounding. Without ``sure`` any steady state is gone on from. ``before`` is called with
-        the share of the way before each descent, for what else changes on it.
+        Steps along the way shrink if Newton's method does not contract and grow if it does, so the continuation stays
+        on its branch whatever the rounding. Not ``sure``: any steady state is accepted. ``before`` is called with the
+        share of the way before each descent, to change other quantities along it.
         """
         done, part, found = 0.0, FOLLOWED, None
         for _ in range(MOST_PARTS):
@@ -366,9 +366,9 @@ class SteadySearch:
         return None
 
     def best(self, found: list[Descent]) -> Descent | None:
-        """Of steady states that nearest to the set-point, and of those that are equally near, to the operating point.
+        """The steady state closest to the set-point; of equally close ones, the one closest to the operating point.
 
-        Only if none is sure, the others count. None where there is no steady state.
+        Uncertain ones count only if none is sure. None if there is no steady state.
         """
         steady = [f for f in found if f.sure] or [f for f in found if f.steady]
         if not steady:
@@ -377,7 +377,7 @@ class SteadySearch:
         return min((f for f in steady if f.off <= least), key=self.distance)
 
     def distance(self, found: Descent) -> float:
-        """Distance from the operating point in scales, of all that is sought but hidden states."""
+        """Scaled distance of the free unknowns, without hidden states, from the operating point."""
         apart = ((found.v - self.near) / self.scale)[self._sought]
         if self._hidden is not None:
             apart = np.delete(
@@ -386,18 +386,18 @@ class SteadySearch:
         return float(np.linalg.norm(apart))
 
     def slopes(self, v: Array) -> Array:
-        """How outputs with weights answer to the unknowns that lean, along steady states ``(n, len(leans))``."""
+        """Derivatives of the weighted outputs by the leaning unknowns, along steady states ``(n, len(leans))``."""
         at = self._point(v, np.zeros(self.bounds.y_lower.size))
         return self._newton(at, at.y, False)[1]
 
     def lacks(self, v: Array) -> float:
-        """How much of a steady state ``v`` lacks, in scales."""
+        """Scaled residual of the steady state at ``v``."""
         return float(np.sum(np.abs(self.equations.rest(v)[0] / self.size)))
 
     def _newton(self, at: _Point, goal: Array, bounded: bool) -> tuple[Array | None, Array]:
-        """The step that the linearization asks for, None where its QP has no answer; and :meth:`slopes` there."""
+        """The step of the linearized problem (None if its QP has no solution), and :meth:`slopes` there."""
         scale, v, y = self.scale, at.v, at.y
-        # rows have units, too: which rank they have must not depend on these
+        # scaled rows, so that their rank does not depend on units
         rest, e, j = at.rest / self._own, at.rest_by_v * scale / self._own[:, None], at.y_by_v * scale
         if self._free is not None:
             e, j = e[:, self._free], j[:, self._free]
@@ -405,8 +405,8 @@ class SteadySearch:
             return None, np.full((self._tracked.size, self._leans.size), np.nan)
         left, sizes, right = np.linalg.svd(e)
         rank = int(np.sum(sizes > RANK * sizes[0])) if sizes.size else 0
-        onto = right[:rank].T @ ((left[:, :rank].T @ -rest) / sizes[:rank])  # to the steady states
-        along = right[rank:].T  # and along them
+        onto = right[:rank].T @ ((left[:, :rank].T @ -rest) / sizes[:rank])  # step to the steady states
+        along = right[rank:].T  # directions along the steady states
         sees = self._root[:, None] * j[self._tracked] @ along
         error = self._root * (goal - y - j @ onto)[self._tracked]
         lean = self._leans
@@ -439,8 +439,8 @@ class SteadySearch:
         return moved * scale, sees @ move.T
 
     def _settled(self, v: Array, goal: Array) -> _Point:
-        """The point with the hidden state at rest under its state and input, by Newton's method; as it is where that
-        does not end there. What a network does between two rests says nothing of how far the machine is from one.
+        """The point with its hidden state settled by Newton's method, or unchanged if that fails. The hidden state on
+        the way between two steady states does not measure the distance from either.
         """
         plain = at = self._point(v, goal)
         if self._hidden is None:
@@ -463,7 +463,7 @@ class SteadySearch:
         return at if at.merit < plain.merit else plain
 
     def _point(self, v: Array, goal: Array) -> _Point:
-        """What descents need to know of ``v``; the merit is infinite where something is not finite."""
+        """The data of a point; the merit is infinite if a value is not finite."""
         rest, rest_by_v = self.equations.rest(v)
         y, y_by_v = self.equations.shown(v)
         lacks = float(np.sum(np.abs(rest / self.size)))
@@ -473,7 +473,7 @@ class SteadySearch:
 
 def natural_sizes(model: HybridModel) -> Array:
     """Sizes ``(n_x + n_h,)`` of a model's states for an analysis: spread, else half the range, else the operating
-    point's value, else 1; 1 of a hidden state, of a delayed input that of the input.
+    point's value, else 1; for delayed inputs the size of the input, for other hidden states 1.
     """
     half = np.array([0.5 * (s.upper - s.lower) for s in model.states])
     spread = np.array(model.state_spread) if model.state_spread else np.zeros(model.n_x)
@@ -496,7 +496,7 @@ def rest_search(
 ) -> SteadySearch:
     """A search for steady states ``v = (x, h, u)`` without a set-point; ``scale`` ``(n_z,)`` are sizes of ``(x, h)``.
 
-    ``free`` are the places that are sought. Default: states and hidden states, under a held input.
+    ``free`` are the indices of the free unknowns. Default: states and hidden states, at a constant input.
     """
     n_x, n_z = model.n_x, model.n_x + model.n_h
     scale = natural_sizes(model) if scale is None else scale
@@ -511,9 +511,9 @@ def rate_search(
     equations: RateEquations, scale: Array, near: Array, root: Array, *, bounds: Range | None = None,
     free: Places | None = None,
 ) -> SteadySearch:  # fmt: skip
-    """A search for steady states ``v = (x, u)`` of rates, which count by what a state or input of its size changes.
+    """A search for steady states ``v = (x, u)`` of rates, scaled by the effect of states and inputs of their sizes.
 
-    ``near`` is the operating point, which the inputs stay near; the rest is as in :class:`SteadySearch`.
+    ``near`` is the operating point, to which the inputs stay close; the rest is as in :class:`SteadySearch`.
     """
     slopes = equations.rest(near)[1]
     size = np.linalg.norm(np.where(np.isfinite(slopes), slopes * scale, 0.0), axis=1)
@@ -523,9 +523,9 @@ def rate_search(
     )
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what overflows is no rest
+@np.errstate(over="ignore", invalid="ignore")  # a run that overflows does not settle
 def run_to_rest(search: SteadySearch, v: Array) -> Array | None:
-    """Where a model's own run from ``v = (x, h, u)`` comes nearly to rest under its input; None where it does not."""
+    """The nearly steady end of the model's own run from ``v = (x, h, u)``; None if it does not settle."""
     equations, v = search.equations, v.copy()
     assert isinstance(equations, StepEquations)
     n_z = search.size.size
@@ -538,13 +538,12 @@ def run_to_rest(search: SteadySearch, v: Array) -> Array | None:
 
 
 def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[Array, Array]:
-    """The equilibrium ``x`` ``(n_x,)``, ``h`` ``(n_h,)`` under a held input, by Newton's method from a guess of ``x``.
+    """The equilibrium ``x`` ``(n_x,)``, ``h`` ``(n_h,)`` at a constant input, by Newton's method from a guess of ``x``.
 
-    Where it does not end there, it begins anew from where the model's own run has come to, which finds a rest that is
-    stable.
+    If Newton's method fails, it restarts from the end of the model's own run, which finds a stable equilibrium.
 
     Raises:
-        InputError: If a size is wrong or none is found (largest residual above 1e-10 in the units of the state).
+        InputError: If a size is wrong or no equilibrium is found (largest residual above 1e-10 in the states' units).
     """
     x0, u0 = vector(x_guess, model.n_x, "x_guess"), vector(u, model.n_u, "u")
     search, none = rest_search(model), np.zeros(model.n_y)
@@ -556,8 +555,8 @@ def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[A
     if not found.steady or (size := residual_of(search, found.v)) > RESIDUAL:
         size = residual_of(search, found.v)
         raise InputError(
-            f"model {model.name}: no fixed point found from x = {x0.tolist()} under u = {u0.tolist()} "
-            f"(residual {size:.2g}, needed {RESIDUAL:g}); give a nearer x_guess or an input it can rest under"
+            f"model {model.name}: no equilibrium found from x = {x0.tolist()} under u = {u0.tolist()} "
+            f"(residual {size:.2g}, must be below {RESIDUAL:g}). Give a closer x_guess or an input with an equilibrium."
             " [HM-MODEL-008]"
         )
     return found.v[: model.n_x], found.v[model.n_x : model.n_x + model.n_h]
@@ -574,8 +573,8 @@ def hidden_fixed_point(
 ) -> Array:
     """Hidden state ``(n_h,)`` that the step reaches with ``x`` ``(n_x,)``, ``u`` ``(n_u,)`` and ``w`` ``(n_w,)`` held.
 
-    The iteration starts at zero, delayed inputs at ``u``. It ends when no element moves by more than 1e-10, or after
-    ``limit`` steps with the last value.
+    The iteration starts at zero (delayed inputs at ``u``) and ends when no element changes by more than 1e-10, or after
+    ``limit`` steps.
     """
     h = np.zeros(model.n_h)
     h[: model.delay_states] = np.resize(u, model.delay_states)
@@ -589,10 +588,10 @@ def hidden_fixed_point(
 
 
 def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
-    """Hidden state ``(n_h,)`` at rest while ``x`` ``(n_x,)`` and ``u`` ``(n_u,)`` are held, by Newton's method.
+    """Steady hidden state ``(n_h,)`` at constant ``x`` ``(n_x,)`` and ``u`` ``(n_u,)``, by Newton's method.
 
     Raises:
-        InputError: If there is none.
+        InputError: If none is found.
     """
     x0, u0 = vector(x, model.n_x, "x"), vector(u, model.n_u, "u")
     if model.n_h == 0:
@@ -605,14 +604,14 @@ def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
     size = residual_of(search, found.v)
     if not found.steady or size > RESIDUAL:
         raise InputError(
-            f"model {model.name}: the hidden state finds no rest at x = {x0.tolist()} (residual {size:.2g}); give h"
+            f"model {model.name}: the hidden state does not settle at x = {x0.tolist()} (residual {size:.2g}). Give h."
             " [HM-MODEL-009]"
         )
     return found.v[n_x:n_z]
 
 
 class _Rows:
-    """Some rows of a step's equations: the others need not hold."""
+    """Some rows of a step's equations; the others need not hold."""
 
     def __init__(self, model: HybridModel, rows: Places) -> None:
         self._all, self._rows = StepEquations(model), rows
@@ -639,8 +638,8 @@ def _of_rows(model: HybridModel, rows: Places, free: Places, hidden: slice = sli
 def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None = None) -> Array:
     """Input ``(n_u,)`` that holds a machine at rest at positions ``q`` ``(n_x / 2,)``, with its hidden state settled.
 
-    Where Newton's method from the guess finds none (a network that has learned how a machine sticks feels no input
-    there), it begins further and further away from it to both sides, and the nearest input counts.
+    If Newton's method fails from the guess (e.g. a network that has learned sticking friction has a zero slope there),
+    it restarts at growing distances on both sides, and the closest input is returned.
 
     Args:
         model: The model, state ``[q, v]``, with as many inputs as positions.
@@ -656,7 +655,8 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     n_q = positions_of(model)
     if model.n_u != n_q:
         raise InputError(
-            f"model {model.name}: {model.n_u} inputs cannot be found from {n_q} positions; give them [HM-MODEL-010]"
+            f"model {model.name}: an input for {n_q} positions needs as many inputs, got {model.n_u}. Give the input."
+            " [HM-MODEL-010]"
         )
     x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
     guess = np.zeros(model.n_u) if u_guess is None else vector(u_guess, model.n_u, "u_guess")
@@ -676,7 +676,7 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
         held = [u for u, left in aside if left <= RESIDUAL]
         if not held:
             raise InputError(
-                f"model {model.name}: no input found that holds q = {x[:n_q].tolist()} (residual {size:.2g})"
+                f"model {model.name}: no input holds q = {x[:n_q].tolist()} (residual {size:.2g})"
                 " [HM-MODEL-011]"
             )
         found = min(held, key=lambda u: float(np.linalg.norm((u - guess) / input_sizes(model))))
@@ -684,11 +684,11 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
 
 
 def holding(rates: Expression, u: Expression, u0: Array, sizes: Array, scale: Array) -> Expression:
-    """The input that holds a state best, of ``rates`` ``(n_x,)`` of the state with the symbol ``u``: one Newton step of
-    least squares from the operating point's input ``u0``. Rates count in ``sizes``, inputs in ``scale``.
+    """The input that holds a state best: one Newton step of least squares on ``rates`` ``(n_x,)`` over the symbol ``u``
+    from the operating point's input ``u0``. Rates are scaled by ``sizes``, inputs by ``scale``.
 
-    A fallback holds states that are no steady states in a period's time: a search has no answer for it. Of a machine
-    whose rates are linear in its inputs one step is exact, and in C it is a row of scalar code.
+    A fallback holds states that are no steady states, within one period, where a search has no solution. For rates
+    linear in the inputs one step is exact, and in C it is scalar code.
     """
     size, rates = ca.DM(scale), rates / ca.DM(sizes)
     slope = ca.jacobian(rates, u) @ ca.diag(size)
@@ -706,9 +706,11 @@ def equilibrium_input(model: HybridModel, sizes: Array, scale: Array) -> ca.Func
 
 
 def bounded_least_squares(h: Array, g: Array, rows: Array, lower: Array, upper: Array) -> Array | None:
-    """``min 1/2 s'hs + g's`` with ``lower <= rows s <= upper``, for a few unknowns; None where there is none.
+    """``min 1/2 s'hs + g's`` with ``lower <= rows s <= upper``, for a few unknowns; None if infeasible.
 
-    The bounds' squared violation is the dual's non-negative least squares: exact, whatever the number of rows.
+    Solved as least distance programming by non-negative least squares of the dual: exact for any number of rows.
+
+    Source: C. L. Lawson, R. J. Hanson, *Solving Least Squares Problems*, 1974, chapter 23.
     """
     from scipy.linalg import LinAlgError, cho_factor, cho_solve
     from scipy.optimize import nnls

@@ -1,4 +1,4 @@
-"""HybridModel: the deployed model of a machine as CasADi functions, and what is made of one model alone."""
+"""HybridModel: the deployed model of a machine as CasADi functions, and functions of a single model."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Expression: TypeAlias = Any
 ManyPoints: TypeAlias = Callable[..., tuple[Array, ...]]
 """``(x, h, u, w, p)``, each ``(n, size)``, to ``(x_next, h_next)`` and Jacobians ``(n, n_z, columns)``."""
 SideBySide: TypeAlias = Callable[[int, Mapping[str, Sequence[str]]], ManyPoints]
-"""Makes such a function for ``n`` points; the mapping names each Jacobian's variables, ``{"A": ("x", "h")}``."""
+"""Makes such a function for ``n`` points; the mapping gives the variables of each Jacobian, ``{"A": ("x", "h")}``."""
 STEP_INPUTS = ("x", "h", "u", "w", "p")
 STEP_OUTPUTS = ("x_next", "h_next")
 
 
 @dataclass(frozen=True)
 class Balance:
-    """A balance of what a machine stores, e.g. of its energy, as the prior has it.
+    """A balance of a quantity that a machine stores, e.g. of its energy, as defined by the prior.
 
     ``residual`` ``(x, xdot, u, w, p)`` [rate_unit] is the violation of the balance if the state changes at ``xdot``;
     zero along the prior's own flow. ``unit`` is that of the storage, e.g. ``"J"``.
@@ -45,11 +45,10 @@ class Balance:
 class HybridModel:
     """A discrete-time model over the state ``x`` and the hidden state ``h``, all in SI units.
 
-    ``h`` is the hidden state before ``(x_k, u_k)``; a prior's is empty (``n_h = 0``, 0 x 1). ``w`` are disturbances,
-    measured but not commanded; ``p`` are the prior's parameters. Both may be empty; :attr:`w` and :attr:`p` are their
-    usual values. ``d`` are disturbances that nobody measures; they are no argument of the functions:
-    :attr:`disturbance_model` says what they are added to. The fitted prior, the hybrid and an oracle share this
-    interface. :meth:`of` makes a model of expressions.
+    ``h`` is the hidden state before ``(x_k, u_k)``; a prior's is empty (``n_h = 0``, 0 x 1). ``w`` are measured
+    disturbances, ``p`` are the prior's parameters. Both may be empty; :attr:`w` and :attr:`p` are their nominal values.
+    Unmeasured disturbances ``d`` are no argument of the functions: :attr:`disturbance_model` says where they are added.
+    The fitted prior, the hybrid and an oracle share this interface. :meth:`of` makes a model from expressions.
 
     Args:
         name: e.g. ``"mopgrnn"``.
@@ -58,28 +57,28 @@ class HybridModel:
         inputs: Signals of ``u``.
         outputs: Signals of ``y``.
         step: ``(x, h, u, w, p) -> (x_next, h_next)``, columns n_x, n_h, n_u, n_w, n_p.
-        xdot: ``(x, h, u, w, p) -> xdot`` at the instant, with the network's correction.
+        xdot: ``(x, h, u, w, p) -> xdot``, with the network's correction.
         output: ``(x, u, w, p) -> y``.
         with_jacobian: ``(x, h, u, w, p) -> (x_next, h_next, A, B)`` with ``A`` of ``(x_next, h_next)`` by
             ``(x, h)`` and ``B`` by ``u``. Default: made from ``step`` by CasADi's own derivatives.
-        side_by_side: The same at many points in one call, where that is faster than one call a point, e.g.
+        side_by_side: The same at many points in one call, if that is faster than one call per point, e.g.
             :class:`nn_export.SideBySide` of a program. Default: none.
         disturbances: Signals of ``w``. Default: none.
-        nominal_w: What is taken for ``w`` where none is given ``(n_w,)`` [their units]. Default: zeros.
-        parameters: The prior's parameters with their fitted values and bounds: ``p`` in this order. What a network adds
-            does not depend on them. Default: none; then no diagnosis can name what has changed.
+        nominal_w: Values of ``w`` if none are given ``(n_w,)`` [their units]. Default: zeros.
+        parameters: The prior's parameters with fitted values and bounds, in the order of ``p``. A network's correction
+            does not depend on them. Default: none; then no diagnosis can name a changed parameter.
         covariance: Rows ``(n_p, n_p)`` of the covariance of the fitted values. Default: unknown.
         balances: Balances of energy, mass, heat, ... Default: none.
-        delay_states: Leading entries of ``h`` that are inputs on their way to the machine, the oldest first; ``xdot``
-            and the balances then take the input that acts. Default 0.
-        time_unit: The machine's second [s] (:func:`~hybrid_mpc.data.scales.time_unit`): the unit of the lengths of
-            monitor and guard. Default 1.
-        nominal_x: State ``(n_x,)`` of the operating point: an equilibrium with ``nominal_u`` and ``nominal_w``. Where
-            nothing else is known, loops start there. Default: zeros.
-        nominal_u: Input ``(n_u,)`` that holds it there. Default: zeros.
-        disturbance_model: What unmeasured disturbances are added to. Default: one at each input.
-        state_spread: Spread of the states ``(n_x,)`` in the recordings, the sizes that controllers count in
-            (:class:`~hybrid_mpc.control.sizes.Sizes`); 0 where it is not known. Default: not known.
+        delay_states: Number of leading entries of ``h`` that are delayed inputs, the oldest first; ``xdot`` and the
+            balances then take the input that acts. Default 0.
+        time_unit: The machine's unit of time [s] (:func:`~hybrid_mpc.data.scales.time_unit`), in which lengths of
+            monitor and guard are counted. Default 1.
+        nominal_x: State ``(n_x,)`` of the operating point: an equilibrium with ``nominal_u`` and ``nominal_w``, and the
+            default start of loops. Default: zeros.
+        nominal_u: Input ``(n_u,)`` that holds it. Default: zeros.
+        disturbance_model: Where unmeasured disturbances are added. Default: one at each input.
+        state_spread: Spread of the states ``(n_x,)`` in the recordings, by which controllers scale
+            (:class:`~hybrid_mpc.control.sizes.Sizes`); 0 for an unknown one. Default: unknown.
         output_spread: Likewise of the outputs ``(n_y,)``.
 
     Raises:
@@ -146,7 +145,7 @@ class HybridModel:
         for name, size in (("nominal_x", self.n_x), ("nominal_u", self.n_u), ("nominal_w", self.n_w)):
             object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * size)
         _check_numbers(self)
-        _ = self.disturbed  # an unknown signal is refused here
+        _ = self.disturbed  # raises for an unknown signal
 
     @classmethod
     def of(
@@ -176,7 +175,7 @@ class HybridModel:
         nominal_u: Sequence[float] = (),
         disturbance_model: tuple[Disturbance, ...] | None = None,
     ) -> HybridModel:
-        """A model of CasADi expressions, of MX or of SX.
+        """A model from CasADi expressions, MX or SX.
 
         Args:
             name: Its name.
@@ -187,10 +186,10 @@ class HybridModel:
             x: Symbol of the state ``(n_x,)``.
             u: Symbol of the input ``(n_u,)``.
             x_next: The state one period later.
-            xdot: Its rate at the instant.
+            xdot: Its rate.
             y: The outputs.
             h: Symbol of the hidden state ``(n_h,)``. Default: none.
-            h_next: The hidden state one period later. Default: as it is.
+            h_next: The hidden state one period later. Default: unchanged.
             w: Symbol of the disturbances ``(n_w,)``. Default: none.
             p: Symbol of the parameters ``(n_p,)``. Default: none.
             rate: Symbol ``(n_x,)`` of any rate of the state, for ``energy``.
@@ -204,7 +203,7 @@ class HybridModel:
             disturbance_model: See :class:`HybridModel`.
 
         Raises:
-            InputError: If an expression holds another symbol, or shapes do not fit.
+            InputError: If an expression contains another symbol, or shapes do not fit.
 
         Example:
             >>> x, u = ca.MX.sym("x"), ca.MX.sym("u")
@@ -223,8 +222,8 @@ class HybridModel:
                 return ca.Function(key, given, [ca.densify(v) for v in values])
             except RuntimeError as error:
                 raise InputError(
-                    f"model {name}: {key} must be an expression of the symbols given (x, u; h, w, p, rate where there "
-                    f"are any): {str(error).strip().splitlines()[-1]} [HM-MODEL-027]"
+                    f"model {name}: {key} must be an expression of the given symbols (x, u; h, w, p, rate if given): "
+                    f"{str(error).strip().splitlines()[-1]} [HM-MODEL-027]"
                 ) from error
 
         return cls(
@@ -276,14 +275,14 @@ class HybridModel:
 
     @cached_property
     def disturbed(self) -> tuple[Array, Array, Array]:
-        """How unmeasured disturbances act: what ``d`` adds to ``u`` ``(n_u, n_d)``, to ``x_next`` ``(n_x, n_d)`` and to
-        ``y`` ``(n_y, n_d)``.
+        """Effect of unmeasured disturbances: matrices of ``d`` on ``u`` ``(n_u, n_d)``, on ``x_next`` ``(n_x, n_d)``
+        and on ``y`` ``(n_y, n_d)``.
         """
         return disturbance_matrices(self.disturbance_model, self.inputs, self.states, self.outputs, self.dt)
 
     def acting(self, u: Array, d: Array, w: Array) -> Array:
-        """All that acts on the machine ``(N, n_v)``: inputs ``(N, n_u)`` with what ``d`` ``(n_d,)`` adds to them, then
-        ``w`` ``(N, n_w)`` if there are any, then what ``d`` adds to the next states if it does.
+        """All inputs of a period ``(N, n_v)``: ``u`` ``(N, n_u)`` with the effect of ``d`` ``(n_d,)``, then ``w``
+        ``(N, n_w)`` if any, then the effect of ``d`` on the next states if any.
         """
         on_u, on_x, _ = self.disturbed
         parts = [u + d if self.disturbance_model is None else u + on_u @ d]
@@ -310,7 +309,7 @@ class HybridModel:
 
     @property
     def w(self) -> Array:
-        """Measured disturbances ``(n_w,)`` that are taken where none are given: those of the operating point."""
+        """Measured disturbances ``(n_w,)`` of the operating point, used if none are given."""
         return np.array(self.nominal_w, dtype=np.float64)
 
     @property
@@ -330,16 +329,16 @@ def output_with_jacobian(model: HybridModel) -> ca.Function:
 
 
 def longer_period(model: HybridModel, periods: int) -> HybridModel:
-    """The same model with a period that is a multiple of its own; input and disturbance are held all the while.
+    """The same model with a period that is a multiple of its own; input and disturbance are held over it.
 
-    One step is ``periods`` steps of the model and its Jacobian their chain: nothing is discretised anew. Estimator,
-    controller and closed loop made of it run at the longer period: costs count its instants, ``du_max`` and ``r_delta``
-    its changes, bounds on states hold at its instants, not between them, and a filter's noise is that of a longer
-    period.
+    One step is ``periods`` steps of the model, and its Jacobian their chain: nothing is discretised again. Estimator,
+    controller and closed loop then run at the longer period: costs are summed over its instants, ``du_max`` and
+    ``r_delta`` apply to its changes, bounds on states hold at its instants and not between them, and a filter's noise
+    is that of a longer period.
 
     Args:
         model: The deployed model.
-        periods: Periods of the model that make one of the new ones, at least 1.
+        periods: Periods of the model per new period, at least 1.
 
     Raises:
         InputError: If ``periods`` is not a whole number of at least 1.
@@ -354,7 +353,7 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
     """
     if not isinstance(periods, int) or periods < 1:
         raise InputError(
-            f"model {model.name}: periods must be a whole number of at least 1, got {periods} [HM-MODEL-028]"
+            f"model {model.name}: periods must be an integer of at least 1, got {periods} [HM-MODEL-028]"
         )
     point = step_symbols(model)
     assert model.with_jacobian is not None
@@ -369,27 +368,27 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
         dt=periods * model.dt,
         step=step_function("step", point, by_value),
         with_jacobian=step_function("with_jacobian", point, [*by_jacobian, ca.densify(a), ca.densify(b)]),
-        side_by_side=None,  # that of the model knows one of its own periods only
+        side_by_side=None,  # the model's own only covers its own period
     )
 
 
 def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> ca.Function:
-    """Acceleration ``(x, u, w, p) -> a`` ``(n_q,)`` of the prior behind a model, without what a network adds.
+    """Acceleration ``(x, u, w, p) -> a`` ``(n_q,)`` of a model's prior, without the network.
 
-    ``prior`` is the model of its prior alone. Default: the model itself, where it has no network.
+    ``prior`` is the model of the prior alone. Default: the model itself, if it has no network.
     """
     if prior is None:
         if model.n_h > model.delay_states:
             raise InputError(
-                f"model {model.name} has a network, and its parameters are those of its prior: give prior=, the model "
-                'of the prior alone, e.g. kit.models["prior"] [HM-MODEL-029]'
+                f"model {model.name} has a network, but its parameters are those of its prior. Give prior=, the model "
+                'of the prior alone, e.g. kit.models["prior"]. [HM-MODEL-029]'
             )
         prior = model
     if prior.parameters != model.parameters or not model.n_p:
         own, other = ([p.name for p in m.parameters] for m in (model, prior))
         raise InputError(
-            f"model {model.name} has the parameters {own} and its prior {prior.name} {other}: parameters, the same of "
-            "both, are needed, as models have that are made of programs of one artifact (hybrid-mpc run) [HM-MODEL-030]"
+            f"model {model.name} has the parameters {own}, but its prior {prior.name} has {other}. Both need the same "
+            "parameters, as in models of one artifact (hybrid-mpc run). [HM-MODEL-030]"
         )
     n_q, point = prior.n_x // 2, step_symbols(prior)
     x, _, u, w, p = point
@@ -398,9 +397,9 @@ def prior_acceleration(model: HybridModel, prior: HybridModel | None = None) -> 
 
 
 def kinematics(model: HybridModel) -> dict[int, int]:
-    """Places of the states that are the rates of others, by the places of those: speeds by their positions.
+    """Indices of states that are the rates of others, by the indices of these: speeds by their positions.
 
-    A rate counts as a state's if it is that state exactly, at random points: ``{0: 1}`` for ``x = (q, q_dot)``.
+    A rate counts as a state if it equals that state exactly at random points: ``{0: 1}`` for ``x = (q, q_dot)``.
     """
     point = step_symbols(model)
     x, h, u, w, _ = point
@@ -429,7 +428,7 @@ def positions_of(model: HybridModel) -> int:
     """Number ``n_q`` of positions of a model whose state is ``[q, v]`` with ``q_dot = v``.
 
     Raises:
-        InputError: If its states are anything else: it has no speeds, and no friction of a motion.
+        InputError: If its states are anything else.
 
     Example:
         >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m"),)
@@ -438,31 +437,31 @@ def positions_of(model: HybridModel) -> int:
         >>> positions_of(tank)
         Traceback (most recent call last):
             ...
-        hybrid_mpc.errors.InputError: model tank: its states (x) are not positions and then their speeds...
+        hybrid_mpc.errors.InputError: model tank: its states (x) must be positions followed by their speeds...
     """
     n_q = model.n_x // 2
     if not n_q or kinematics(model) != {i: n_q + i for i in range(n_q)} or model.n_x != 2 * n_q:
         raise InputError(
-            f"model {model.name}: its states ({', '.join(s.name for s in model.states)}) are not positions and then "
-            "their speeds, so there is no friction of a motion and no working speed [HM-MODEL-031]"
+            f"model {model.name}: its states ({', '.join(s.name for s in model.states)}) must be positions followed by "
+            "their speeds; friction and working speeds are only defined for these [HM-MODEL-031]"
         )
     return n_q
 
 
 def changeable(model: HybridModel) -> tuple[str, ...]:
-    """What of a prior may change: its parameters, and the gain of each input."""
+    """Properties of a prior that may change: its parameters, and the gain of each input."""
     return (*(p.name for p in model.parameters), *(f"gain of {s.name}" for s in model.inputs))
 
 
 def incidence(model: HybridModel, groups: Mapping[str, Sequence[str]], what: str) -> Array:
-    """Which of the :func:`changeable` names each group changes ``(n_p + n_u, groups)``."""
+    """Which of the :func:`changeable` properties each group changes ``(n_p + n_u, groups)``: 1, else 0."""
     known = changeable(model)
     matrix = np.zeros((len(known), len(groups)))
     for j, names in enumerate(groups.values()):
         for name in names:
             if name not in known:
                 raise InputError(
-                    f"{what}: no parameter {name!r}; there are: {', '.join(known)} [HM-MODEL-032]"
+                    f"{what}: no parameter {name!r}; known names: {', '.join(known)} [HM-MODEL-032]"
                 )
             matrix[known.index(name), j] = 1.0
     return matrix
@@ -475,13 +474,13 @@ def step_symbols(model: HybridModel) -> list[ca.MX]:
 
 
 def step_function(name: str, point: Sequence[ca.MX], values: Sequence[ca.MX]) -> ca.Function:
-    """A function of ``x, h, u, w, p`` with the names of a step, or of one with its Jacobians."""
+    """A function of ``x, h, u, w, p`` with the names of a step, with or without its Jacobians."""
     outputs = [*STEP_OUTPUTS, "A", "B"][: len(values)]
     return ca.Function(name, list(point), list(values), [*STEP_INPUTS], outputs)
 
 
 def inlined(f: ca.Function, point: Sequence[Expression]) -> list[Expression]:
-    """Results of a function at symbols, written into the caller's graph if it is a graph of matrices: a call less."""
+    """Results of a function for symbols; a function of MX graphs is inlined, which saves a call."""
     return list(f.call(list(point), f.is_a("MXFunction"), False))
 
 
@@ -501,30 +500,30 @@ def _check_numbers(model: HybridModel) -> None:
         values = getattr(model, name)
         if len(values) != size or not all(map(math.isfinite, values)):
             raise InputError(
-                f"model {model.name}: {name} needs {size} finite values, got {values} [HM-MODEL-033]"
+                f"model {model.name}: {name} must have {size} finite values, got {values} [HM-MODEL-033]"
             )
     for name, size in (("state_spread", model.n_x), ("output_spread", model.n_y)):
         values = getattr(model, name)
         if values and (len(values) != size or not all(math.isfinite(v) and v >= 0 for v in values)):
             raise InputError(
-                f"model {model.name}: {name} needs {size} finite values that are not negative, or none, got {values}"
+                f"model {model.name}: {name} must have {size} finite values of at least 0, or none, got {values}"
                 " [HM-MODEL-034]"
             )
     if model.covariance and [len(row) for row in model.covariance] != [n_p] * n_p:
         raise InputError(
-            f"model {model.name}: covariance needs {n_p} rows of {n_p} values, one a parameter [HM-MODEL-035]"
+            f"model {model.name}: covariance must have {n_p} rows of {n_p} values, one per parameter [HM-MODEL-035]"
         )
     for what, names in (
         ("parameters", [p.name for p in model.parameters]), ("balances", [b.name for b in model.balances])
     ):  # fmt: skip
         if len(set(names)) < len(names):
             raise InputError(
-                f"model {model.name}: {what} need different names, got {', '.join(names)} [HM-MODEL-036]"
+                f"model {model.name}: {what} must have different names, got {', '.join(names)} [HM-MODEL-036]"
             )
     if not 0 <= model.delay_states <= model.n_h or model.delay_states % model.n_u:
         raise InputError(
-            f"model {model.name}: delay_states must be whole inputs within the {model.n_h} entries of h, "
-            f"got {model.delay_states} [HM-MODEL-037]"
+            f"model {model.name}: delay_states must be a multiple of the inputs and at most the "
+            f"{model.n_h} entries of h, got {model.delay_states} [HM-MODEL-037]"
         )
 
 
@@ -535,5 +534,5 @@ def _check(
     if given != (ins, outs):
         raise InputError(
             f"model {model}: {name} takes {given[0]} and returns {given[1]}, "
-            f"its signals need {ins} and {outs} [HM-MODEL-038]"
+            f"but its signals need {ins} and {outs} [HM-MODEL-038]"
         )

@@ -1,4 +1,4 @@
-"""Linearization of a model at a point: Riccati equation and LQR gain, the hidden state at its fixed point."""
+"""Linearization of a model with its hidden state settled; Riccati equation and LQR gain."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 DOUBLINGS, REFINED = 60, 3
-"""Doublings at most, which reach 2^60 periods ahead, and steps of Newton's method, whose error is squared by each."""
+"""Most doublings, which reach 2^60 periods ahead, and number of Newton steps, each of which squares the error."""
 ROUNDING = 1e-16
-"""Share of the sum below which a further term is rounding."""
+"""Relative size of a further term below which it is rounding."""
 UNDAMPED = 1e-9
-"""How near to the unit circle a mode counts as undamped, and how small a singular value, as a share of the largest, as
-one that no input reaches."""
+"""Largest distance from the unit circle of an undamped mode, and largest singular value, over the largest one, of a
+mode that no input reaches."""
 
 
 def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array, Array]:
@@ -33,11 +33,11 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
         ``P`` ``(n, n)`` and ``K`` ``(m, n)``; the optimal input is ``u = -K z``.
 
     Raises:
-        InputError: If (A, B) is not stabilisable, or a mode on the unit circle carries no weight.
+        InputError: If (A, B) is not stabilisable, or a mode on the unit circle has no weight.
 
-    The solution does not depend on units: ``P`` is the limit of a structured doubling algorithm, which adds positive
-    semi-definite matrices alone, refined by Newton's method. A general solver of generalised eigenvalues is off by
-    several times the gain at ``r = 1e14 q``, where the modes are next to the unit circle.
+    The solution does not depend on units: ``P`` is the limit of a structured doubling algorithm, which only adds
+    positive semi-definite matrices, refined by Newton's method. A general solver of generalised eigenvalue problems is
+    wrong by several times the gain at ``r = 1e14 q``, where the modes are close to the unit circle.
 
     Source: Anderson and Moore, *Optimal Control: Linear Quadratic Methods*, 1990, section 2.4; Chu, Fan, Lin, Wang,
     *Structure-preserving algorithms for periodic discrete-time algebraic Riccati equations*, 2004; Hewer, *An iterative
@@ -50,11 +50,11 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
     """
     given = {"A": a, "B": b, "Q": q, "R": r}
     a, b, q, r = (np.atleast_2d(floats(m, f"Riccati equation: {name}")) for name, m in given.items())
-    hint = "check the pair (A, B), give every undamped state a positive q and every input a positive r"
+    hint = "Check the pair (A, B), give every undamped state a positive q and every input a positive r."
     if not all(np.all(np.isfinite(m)) for m in (a, b, q, r)):
-        raise InputError("Riccati equation: A, B, Q or R holds a NaN or an infinite value [HM-MODEL-039]")
+        raise InputError("Riccati equation: A, B, Q or R contains NaN or infinity [HM-MODEL-039]")
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+        with np.errstate(over="ignore", invalid="ignore"):  # checked below
             p = _doubled(a, b, q, r)
             for _ in range(REFINED):
                 k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)  # K = (R + B'PB)^-1 B'PA
@@ -66,11 +66,11 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
             radius = float(np.max(np.abs(np.linalg.eigvals(a - b @ k))))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise InputError(
-            f"the Riccati equation has no stabilising solution ({error}); {hint} [HM-MODEL-040]"
+            f"Riccati equation: no stabilising solution ({error}). {hint} [HM-MODEL-040]"
         ) from error
     if not radius < 1.0:
         raise InputError(
-            f"not stabilisable: spectral radius {radius:.6f} in closed loop; {hint} [HM-MODEL-041]"
+            f"Riccati equation: not stabilisable, spectral radius {radius:.6f} in closed loop. {hint} [HM-MODEL-041]"
         )
     return p, np.asarray(k, dtype=np.float64)
 
@@ -95,7 +95,7 @@ def _doubled(a: Array, b: Array, q: Array, r: Array) -> Array:
 
 
 def _lyapunov(a: Array, q: Array) -> Array:
-    """``P = A'PA + Q``, the sum of ``A'^k Q A^k``, whose number of terms doubles with each step."""
+    """``P = A'PA + Q``: the sum of ``A'^k Q A^k``, with twice as many terms after each step."""
     p = q
     for _ in range(DOUBLINGS):
         more = a.T @ p @ a
@@ -106,18 +106,18 @@ def _lyapunov(a: Array, q: Array) -> Array:
 
 
 def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
-    """``A``, ``B`` of ``z = (x, h)`` by ``z`` and ``u`` at ``(x, u)``, and the fixed point ``h`` used."""
+    """``A``, ``B``: derivatives of the next ``z = (x, h)`` by ``z`` and ``u`` at ``(x, u)``; and the settled ``h``."""
     h = hidden_fixed_point(model, x, u)
     assert model.with_jacobian is not None
     _, _, a, b = model.with_jacobian(x, h, u, model.w, model.p)
     return a.full(), b.full(), h
 
 
-def unmoved(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
-    """Names of the states that no input moves and that never come to rest by themselves.
+def unmoved_states(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
+    """Names of states that no input affects and that do not return to rest by themselves.
 
-    They stand in modes of ``z+ = A z + B u`` on the unit circle or beyond that ``B`` does not reach (Hautus' test):
-    set-points have no steady state then, and the Riccati equation has no stabilising solution.
+    They belong to modes of ``z+ = A z + B u`` on or outside the unit circle that ``B`` does not reach (Hautus test):
+    then set-points have no steady state, and the Riccati equation has no stabilising solution.
 
     Args:
         model: The model.
@@ -131,7 +131,7 @@ def unmoved(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
         >>> room = HybridModel.of("room", 1.0, (Signal("oven", "degC"), Signal("room", "degC")), (Signal("u", "W"),),
         ...     (Signal("oven", "degC"),), x=v, u=u, y=v[0], x_next=ca.vertcat(0.9 * v[0] + 0.1 * v[1] + u, v[1]),
         ...     xdot=ca.vertcat(u, 0))
-        >>> unmoved(room, *linearization(room, [20.0, 20.0], [0.0])[:2])
+        >>> unmoved_states(room, *linearization(room, [20.0, 20.0], [0.0])[:2])
         ('room',)
     """
     if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
@@ -148,14 +148,14 @@ def unmoved(model: HybridModel, a: Array, b: Array) -> tuple[str, ...]:
     return tuple(s.name for s, part in zip(model.states, share, strict=False) if part > least)
 
 
-def coming_back(names: tuple[str, ...]) -> str:
-    """What to do about states that :func:`unmoved` names; empty for none."""
+def remedy_for_unmoved(names: tuple[str, ...]) -> str:
+    """A remedy for states from :func:`unmoved_states`; empty for none."""
     if not names:
         return ""
     name = names[0]
     return (
-        f"no input moves {', '.join(names)} and nothing brings it back: let it return slowly to its usual value in "
-        f"xdot, such as (usual - x.{name}) / 86400 for a day of seconds, or make it a measured disturbance"
+        f"no input moves {', '.join(names)} and nothing brings it back. Let it return slowly to its usual value in "
+        f"xdot, e.g. (usual - x.{name}) / 86400 for one day in seconds, or make it a measured disturbance"
     )
 
 
@@ -170,15 +170,15 @@ def lqr(
 ) -> Array:
     """Gain ``K`` ``(n_u, n_x + n_h)`` of ``u = u_target - K (z - z_target)`` with ``z = (x, h)``.
 
-    The model is linearized with its exact Jacobian, its hidden state at the fixed point. At rest the steep slope of a
-    smoothed friction law (tanh) dominates the linearization and passes for strong damping; ``working_point`` takes the
-    linearization from a moving point.
+    The model is linearized with its exact Jacobian and its hidden state settled. At rest the steep slope of a smoothed
+    friction law (tanh) dominates the linearization and looks like strong damping; ``working_point`` linearizes at a
+    moving point instead.
 
     Args:
         model: The model; ``n_h`` may be 0.
         x_target: ``(n_x,)`` [SI].
         u_target: ``(n_u,)`` [SI].
-        q: Weights of the states ``(n_x,)``; the hidden states carry none.
+        q: Weights of the states ``(n_x,)``; hidden states have none.
         r: Weights of the inputs ``(n_u,)``, positive.
         working_point: ``(x, u)`` to linearize at. Default: the target.
 

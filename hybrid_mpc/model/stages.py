@@ -1,4 +1,4 @@
-"""The model along a horizon with its Jacobians: all periods at once, or as one run."""
+"""The model along a horizon with its Jacobians: all periods in parallel, or as one run."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ Array = NDArray[np.float64]
 Derivatives = tuple[Array, Array, Array]
 """Successors ``(N, n_z)``, transposed ``A_k`` ``(N, n_z, n_z)`` and ``B_k`` ``(N, n_z, n_u)``."""
 Run = Callable[[Array, Array], Array]
-"""Trajectory ``(N + 1, n_z)`` of a model from ``z0`` ``(n_z,)`` on what acts ``(N, n_v)``
-(:meth:`~hybrid_mpc.model.model.HybridModel.acting`); without measured disturbances these are the inputs."""
+"""Trajectory ``(N + 1, n_z)`` of a model from ``z0`` ``(n_z,)`` with all inputs ``(N, n_v)``
+(:meth:`~hybrid_mpc.model.model.HybridModel.acting`); without disturbances these are the inputs ``u``."""
 Slopes = Callable[[Array, Array], Array]
-"""Jacobians of the successors ``(m, n_z, n_x + n_u)`` by ``(x, u)``, of ``z`` ``(m, n_z)`` and what acts; with
+"""Jacobians of the successors ``(m, n_z, n_x + n_u)`` by ``(x, u)`` at ``z`` ``(m, n_z)`` and all inputs; with
 ``hidden`` by ``(x, u, h)``."""
 
 
 class Linearization(Protocol):
-    """A model's periods over a horizon, values and Jacobians in one call."""
+    """The periods of a model over a horizon, values and Jacobians in one call."""
 
     def at(self, z: Array, v: Array) -> Derivatives:
-        """Every period from its own ``z`` ``(N, n_z)`` on what acts, ``v`` ``(N, n_v)``."""
+        """Every period from its own ``z`` ``(N, n_z)`` with all inputs ``v`` ``(N, n_v)``."""
 
     run: Run
-    """The model from one ``z`` on."""
+    """The trajectory from one ``z``."""
 
     def slopes(self, times: int, *, hidden: bool = False) -> Slopes:
-        """A function for ``m = times N`` periods; made once, it is called often."""
+        """A function for ``m = times N`` periods, made once and called often."""
 
 
 def stages(model: HybridModel, n: int, *, compiled: bool = False) -> Linearization:
-    """The fastest way that a model has: all periods at once with ``side_by_side``, else one after the other.
+    """The fastest linearization of a model: all periods in parallel with ``side_by_side``, else one after the other.
 
-    ``compiled``: what is evaluated period by period is compiled as C.
+    ``compiled``: functions that are evaluated period by period are compiled as C.
 
     Raises:
-        InputError: If it is to be compiled and there is no compiler, or it fails.
+        InputError: If compilation is requested and fails, or there is no compiler.
     """
     kind = Stages if model.side_by_side is None else VectorisedStages
     return kind(model, n, compiled=compiled)
@@ -90,7 +90,7 @@ class Stages:
 
 
 class VectorisedStages:
-    """All periods at once, of a model with ``side_by_side``; a run is one of ``step``."""
+    """All periods in parallel, for a model with ``side_by_side``; a run uses ``step``."""
 
     def __init__(self, model: HybridModel, n: int, *, compiled: bool = False) -> None:
         assert model.side_by_side is not None
@@ -115,14 +115,14 @@ class VectorisedStages:
         return lambda z, v: many(*self._point(z, v, held))[2]
 
     def _point(self, z: Array, v: Array, held: tuple[Array, Array]) -> tuple[Array, ...]:
-        """What the model's step takes at many points."""
+        """Arguments of the model's step at many points."""
         n_u, more = self._ends
         w = v[:, n_u:more] if more > n_u else held[0]
         u = v if v.shape[1] == n_u else np.ascontiguousarray(v[:, :n_u])
         return z[:, : self._n_x], z[:, self._n_x :], u, w, held[1]
 
     def _tiled(self, n: int) -> tuple[Array, Array]:
-        """No disturbances, and parameters, the same at all points."""
+        """Empty disturbances, and the parameters, for all points."""
         return np.zeros((n, 0)), np.tile(self._model.p, (n, 1))
 
 
@@ -140,7 +140,7 @@ def free_run(model: HybridModel, n: int, *, compiled: bool = False) -> Run:
 
 
 def stage_step(model: HybridModel) -> ca.Function:
-    """``(z, v) -> z_next``: a period of the model on all that acts."""
+    """``(z, v) -> z_next``: one period of the model with all inputs."""
     z, v = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("v", model.n_v)
     x_next, h_next = inlined(model.step, _point(model, z, v))
     return ca.Function("z_step", [z, v], [ca.vertcat(_moved(model, x_next, v), h_next)])
@@ -155,7 +155,7 @@ def _stage(model: HybridModel) -> ca.Function:
 
 
 def _point(model: HybridModel, z: ca.MX, v: ca.MX) -> list[ca.MX]:
-    """What the model's step takes."""
+    """Arguments of the model's step."""
     n_u, more = model.n_u, model.n_u + model.n_w
     u = v if v.numel() == n_u else v[:n_u]
     w = v[n_u:more] if model.n_w else ca.MX(ca.DM(model.w))
@@ -163,7 +163,7 @@ def _point(model: HybridModel, z: ca.MX, v: ca.MX) -> list[ca.MX]:
 
 
 def _moved(model: HybridModel, x_next: ca.MX, v: ca.MX) -> ca.MX:
-    """The next state with what unmeasured disturbances add to it."""
+    """The next state with the effect of unmeasured disturbances."""
     more = model.n_u + model.n_w
     return x_next + v[more:] if v.numel() > more else x_next
 
@@ -175,6 +175,6 @@ def _compiled(stage: ca.Function) -> ca.Function:
             return compile_function(stage)
     except (RuntimeWarning, CompileError) as error:
         raise InputError(
-            f"compiled=True given, but the model could not be compiled: {error}; needed: a C compiler (cc, gcc, "
-            "clang or the one that the variable CC names); leave compiled out to do without [HM-MODEL-043]"
+            f"compiled=True: the model could not be compiled: {error}. Install a C compiler (cc, gcc, clang or the "
+            "one named by the variable CC), or leave out compiled. [HM-MODEL-043]"
         ) from error

@@ -15,35 +15,35 @@ from hybrid_mpc.watch.readings import Channel
 
 Array = NDArray[np.float64]
 CAP = 1.5
-"""Sums saturate at this multiple of the threshold, so that an alarm ends soon after its cause."""
+"""Saturation of the sums as a multiple of the threshold, so that an alarm ends soon after its cause."""
 
 
 @dataclass(frozen=True)
 class ChannelLimit:
-    """What one channel is compared with.
+    """Limit of one channel.
 
     The value is divided by its nominal deviation, the root of ``scale`` times the sample's terms, or by 1 without
     ``scale``. The **level** is then, by ``length``:
 
-    - 0: a cumulative sum, ``g = max(0, g + z - drift)``, and the same for ``-z``, the larger one. It rises under a
-      lasting departure above ``drift`` and falls otherwise: the larger the departure, the sooner it passes.
+    - 0: a cumulative sum (CUSUM), ``g = max(0, g + z - drift)``, and the same for ``-z``; the larger of both. It rises
+      while ``|z|`` exceeds ``drift`` and falls otherwise, so large changes are detected sooner.
     - 1: the value itself.
-    - n: the mean of the latest n values; unknown where fewer than half are numbers.
+    - n: the mean of the latest n values; unknown if fewer than half of them are numbers.
 
     An alarm starts where the magnitude of the level exceeds ``threshold`` and ends below ``release``.
 
     Args:
         channel: Name of the channel.
-        unit: Its unit.
-        length: Samples, see above.
-        threshold: [deviations, or the unit]; infinite where a measured disturbance was constant.
-        release: Likewise; at most the threshold.
+        unit: Unit of the channel.
+        length: Number of samples, see above.
+        threshold: Alarm threshold [deviations, or the unit]; infinite if a measured disturbance was constant.
+        release: Level at which an alarm ends; at most the threshold.
         scale: Coefficients of the variance [unit squared, over that of the terms]. Default: none.
-        drift: Departure [deviations] that counts as nothing in a cumulative sum. Default 0.
-        interval: 5 % and 95 % of a block bootstrap of the threshold. Default: unknown.
+        drift: Dead band of a cumulative sum [deviations]. Default: 0.
+        interval: 5 % and 95 % quantiles of the threshold, by a block bootstrap. Default: unknown.
 
     Raises:
-        InputError: If a number is not as said.
+        InputError: If a number is out of its range.
 
     Source: Page, *Continuous inspection schemes*, Biometrika 41 (1954).
     """
@@ -60,12 +60,12 @@ class ChannelLimit:
     def __post_init__(self) -> None:
         if self.scale and not (all(math.isfinite(a) and a >= 0 for a in self.scale) and any(self.scale)):
             raise InputError(
-                f"limit of {self.channel}: scale needs numbers, not negative, not all 0; got {self.scale}"
+                f"limit of {self.channel}: scale must be numbers of at least 0, not all of them 0; got {self.scale}"
                 " [HM-WATCH-001]"
             )
         if not 0 < self.release <= self.threshold:
             raise InputError(
-                f"limit of {self.channel}: need 0 < release <= threshold, got {self.release} and {self.threshold}"
+                f"limit of {self.channel}: give 0 < release <= threshold, got {self.release} and {self.threshold}"
                 " [HM-WATCH-002]"
             )
         if not (self.length >= 0 and 0 <= self.drift < math.inf):
@@ -75,7 +75,7 @@ class ChannelLimit:
             )
 
     def words(self, dt: float) -> str:
-        """The threshold with its unit and what is compared with it.
+        """Text with the threshold, its unit and the compared level.
 
         Example:
             >>> ChannelLimit("level", "m", 15, 0.2, 0.1).words(0.02)
@@ -90,25 +90,25 @@ class ChannelLimit:
 
 @dataclass(frozen=True)
 class WatchLimits:
-    """Limits of all channels of one kind of readings, learned from recordings or loops in which nothing is wrong.
+    """Limits of all channels of one kind of readings, learned from fault-free recordings or loops.
 
     Args:
         kind: Kind of the readings, see :mod:`hybrid_mpc.watch.readings`.
-        dt: Period [s] they were learned at.
-        channels: A limit, or two, for each channel that alarms.
-        travel: How far each output may be predicted to move while its sensor repeats itself ``(n_y,)`` [its unit].
-        repeats: For so many samples each sensor may repeat itself while it should move ``(n_y,)``.
-        false_alarms_per_hour: Wanted rate [1/h] of all alarms together.
-        hours: Duration of the nominal data [h].
-        method: How thresholds were found.
-        rated: Whether the rate was told from the data; False where they were too short for any, and thresholds are a
-            margin above the highest nominal level.
-        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick. Default: none is known.
-        data_hash: Hash of the nominal data. Default: none.
-        time_unit: The machine's second [s] that lengths were counted in. Default 1.
+        dt: Period [s] of the nominal data.
+        channels: One or two limits for each channel that can alarm.
+        travel: Frozen sensor: largest predicted motion of each output while its readings repeat ``(n_y,)`` [its unit].
+        repeats: Frozen sensor: largest number of repeated readings while the output should move ``(n_y,)``.
+        false_alarms_per_hour: Wanted rate [1/h] of all false alarms together. Default: unknown.
+        hours: Duration of the nominal data [h]. Default: 0.
+        method: How the thresholds were computed. Default: unknown.
+        rated: Whether the thresholds correspond to the rate; False if the nominal data were too short, and thresholds
+            are a margin above the highest nominal level. Default: True.
+        rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick. Default: unknown.
+        data_hash: Hash of the nominal data. Default: unknown.
+        time_unit: Time constant of the machine [s], the unit of all lengths. Default: 1.
 
     Raises:
-        InputError: If a number is not as said.
+        InputError: If a number is out of its range.
     """
 
     kind: Line
@@ -131,7 +131,7 @@ class WatchLimits:
             )
         if len(self.travel) != len(self.repeats) or not all(far > 0 for far in self.travel):
             raise InputError(
-                f"limits: travels must be positive, one an output, got {self.travel} [HM-WATCH-005]"
+                f"limits: give one positive travel for each output, got {self.travel} [HM-WATCH-005]"
             )
 
     def of(self, channel: str) -> tuple[ChannelLimit, ...]:
@@ -141,33 +141,33 @@ class WatchLimits:
     def check(
         self, kind: str, channels: Sequence[Channel], n_terms: int, dt: float, time_unit: float
     ) -> None:
-        """Refuse readings of other channels, of another period or of another machine's second."""
+        """Refuse readings with other channels, another period or another time constant of the machine."""
         known = {(c.name, c.unit) for c in channels}
         strange = [one.channel for one in self.channels if (one.channel, one.unit) not in known]
         if kind != self.kind or strange:
             raise InputError(
-                f"limits: they are of {', '.join(strange) or self.kind}, the readings are of {kind}: "
-                f"{', '.join(c.name for c in channels)}; learn them anew with learn_limits [HM-WATCH-006]"
+                f"limits: they belong to {', '.join(strange) or self.kind}, but the readings are of {kind}: "
+                f"{', '.join(c.name for c in channels)}. Learn the limits again with learn_limits [HM-WATCH-006]"
             )
         if wrong := [one.channel for one in self.channels if len(one.scale) not in (0, n_terms)]:
             raise InputError(
-                f"limits: the scale of {wrong[0]} needs {n_terms} numbers; learn them anew [HM-WATCH-007]"
+                f"limits: the scale of {wrong[0]} must have {n_terms} numbers. Learn the limits again [HM-WATCH-007]"
             )
         for what, own, given in (
             ("a period", self.dt, dt),
-            ("a machine's second", self.time_unit, time_unit),
+            ("a time constant of the machine", self.time_unit, time_unit),
         ):
             if abs(own - given) > 1e-9 * own:
                 raise InputError(
-                    f"limits: learned at {what} of {own:g} s, the model's is {given:g} s; learn them anew"
+                    f"limits: learned with {what} of {own:g} s, but that of the model is {given:g} s. Learn them again"
                     " [HM-WATCH-008]"
                 )
 
 
 @dataclass(frozen=True)
 class DetectorState:
-    """What the detector remembers: sums of each cumulative limit, upwards and downwards; which limits are exceeded; the
-    latest values ``(longest, averaged channels)``, and for how many samples values have counted.
+    """State of the detector: sums of each cumulative limit, upwards and downwards; exceeded limits; the latest values
+    ``(longest, averaged channels)``; number of counted samples.
     """
 
     sums: tuple[float, ...]
@@ -177,7 +177,7 @@ class DetectorState:
 
 
 class Detector:
-    """Compares the values of channels with their limits, sample by sample; pure, the memory is the state it returns.
+    """Compares the values of channels with their limits, sample by sample; a pure function of its state.
 
     Example:
         >>> detector = Detector((ChannelLimit("force", "N", 0, 4.0, 2.0, (0.01,), 0.5),), ("force",))
@@ -193,7 +193,7 @@ class Detector:
         self.limits = tuple(limits)
         places = [list(channels).index(limit.channel) for limit in limits]
         self.channels = tuple(places)
-        """Which channel each limit is of."""
+        """Index of each limit's channel."""
         every = list(enumerate(zip(limits, places, strict=True)))
         self._sums = [
             (i, k, c, one.scale, one.drift, CAP * one.threshold)
@@ -211,7 +211,7 @@ class Detector:
         self.longest = max((one.length for _, _, one in means), default=0)
         if any(one.scale for _, _, one in means):
             raise InputError(
-                "detector: a mean of scaled values is not known; give a limit of length 0 or 1 [HM-WATCH-009]"
+                "detector: a limit with scale cannot be a mean. Give a length of 0 or 1 [HM-WATCH-009]"
             )
         self._bounds = [(one.threshold, one.release) for one in limits]
 
@@ -221,7 +221,7 @@ class Detector:
         return DetectorState((0.0,) * (2 * len(self._sums)), (False,) * len(self.limits), recent)
 
     def begun(self, state: DetectorState) -> DetectorState:
-        """The state with sums that begin anew."""
+        """The state with all sums reset to 0."""
         return DetectorState((0.0,) * len(state.sums), state.on, state.recent, state.counted)
 
     def update(
@@ -231,10 +231,10 @@ class Detector:
         terms: Sequence[Sequence[float]],
         settled: bool,
     ) -> tuple[DetectorState, list[float], float]:
-        """One sample of values and terms; a value that is no number changes no sum.
+        """Process one sample of values and terms; a NaN value does not change its sum.
 
         Returns:
-            The next state; the level of each limit; the largest as a share of its threshold.
+            The next state; the level of each limit; the largest ratio of a level to its threshold.
         """
         levels, sums = [0.0] * len(self.limits), list(state.sums)
         for i, k, c, scale, drift, most in self._sums:
@@ -274,7 +274,7 @@ def _deviation(scale: Sequence[float], terms: Sequence[Sequence[float]], channel
 
 
 def _mean(rows: Array) -> Array:
-    """Mean of each column without NaN; NaN where fewer than half are numbers."""
+    """Mean of each column without NaN; NaN if fewer than half of its values are numbers."""
     finite = np.isfinite(rows)
     count = finite.sum(axis=0)
     total = np.where(finite, rows, 0.0).sum(axis=0)

@@ -24,41 +24,39 @@ from hybrid_mpc.watch.residuals import free_run_of
 
 Array = NDArray[np.float64]
 BEFORE_S, AFTER_S = 2.0, 1.0
-"""How long before the alarm and after it is looked at [the machine's seconds]: the model needs the first to tell where
-the machine was, and a cause needs the second to show."""
+"""Window of the diagnosis before and after the alarm [time constants of the machine]: the first part determines the
+initial state, the second shows the effect of the cause."""
 FEWEST = 5
-"""Samples of each output that an explanation needs, for each number that it fits."""
+"""Smallest number of samples after the alarm."""
 LEFT = 0.5
-"""Share of what the model leaves that a known cause may leave; with more, something else broke."""
+"""Largest share of the squared errors that a known cause may leave; otherwise the cause is unknown."""
 ENOUGH, ORDINARY, SECOND = 0.15, 1 / 3, 0.5
-"""A second cause is looked for where the first one leaves more than the first share, or more than the second one of the
-threshold; it is taken where it leaves less than the third share of what the first one leaves."""
+"""A second cause is searched if the first leaves more than 15 % of the squared errors, or errors above a third of the
+threshold; it is accepted if it halves the remaining squared errors."""
 ONSETS = 14
-"""Instants that are tried, at most."""
+"""Largest number of tested onsets."""
 ALIKE = 4.0
-"""Causes whose misfits differ by less (2 deviations) cannot be told apart."""
+"""Difference of misfits (2 standard deviations, squared) below which two causes cannot be distinguished."""
 RIDGE = 1e-9
-"""Damping of the least squares, as a share of the columns' squared size: for directions that the window does not
-show."""
+"""Regularization of the least squares, relative to the squared norm of the columns, for unobservable directions."""
 REFINED, ITERATIONS = 4, 3
-"""So many of the best linear fits go on by so many steps of Gauss-Newton."""
+"""Number of the best linear fits that are refined, and their number of Gauss-Newton steps."""
 RANGE = (-0.98, 4.0)
-"""Changes of a parameter or gain that are looked at, as shares: it keeps its sign, and five times is another
-machine."""
+"""Range of the relative change of a parameter or gain: it keeps its sign and at most becomes five times as large."""
 
 
 BLIND = {
     Validity.WARM_UP: "no valid reading: the monitor's window is not full",
     Validity.MISSING: "no valid reading: samples are missing",
-    Validity.NOT_FINITE: "no valid reading: model or estimator gives no finite number",
+    Validity.NOT_FINITE: "no valid reading: model or estimator gives a non-finite value",
 }
-"""Diagnosis of an alarm that the monitor raises because it has no valid reading."""
+"""Diagnosis of an alarm without a valid reading."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change of one cause with its standard deviation: as a share of the nominal value (0.5: half as much more), or,
-    with a ``unit``, as a sum.
+    """A change of one cause with its standard deviation: relative to the nominal value (0.5: 50 % larger), or absolute
+    with a ``unit``.
     """
 
     name: str
@@ -74,13 +72,13 @@ class Change:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What explains an alarm.
+    """Diagnosis of an alarm.
 
     Args:
-        text: In words: ``"friction +95 ± 20 %, which leaves 2% unexplained"``, ``"none of the known causes ..."``.
-        samples: Samples of the window.
-        causes: One cause that explains the alarm, or two that together do. Default: none does.
-        alternatives: Other single causes that explain it as well.
+        text: As text: ``"friction +95 ± 20 %, which leaves 2% unexplained"``, ``"none of the known causes ..."``.
+        samples: Number of samples of the window.
+        causes: The cause of the alarm, or two causes that together explain it. Default: unknown.
+        alternatives: Other single causes that explain it equally well. Default: none.
     """
 
     text: str
@@ -91,7 +89,7 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Window:
-    """A stretch of a recording around an alarm.
+    """Part of a recording around an alarm.
 
     Args:
         y: Measurements ``(n, n_y)``; NaN where missing.
@@ -112,26 +110,24 @@ class Window:
 
 
 class Diagnoser:
-    """Says which change of the prior's parameters, of an actuator or of a sensor best explains an alarm; for any model.
+    """Finds the change of a parameter of the prior, of an actuator or of a sensor that best explains an alarm.
 
-    The model runs freely over a window around the alarm. Its first state, and the unmeasured disturbance that it took
-    for constant, are free; so is the instant within the averages before the alarm from which on something is different.
-    What is tried is a parameter of the prior (or a group that changes by one share), the gain and the offset of each
-    input, and the offset and gain of each output. The model's sensitivities to all of them come from one run; each is
-    fitted alone by weighted least squares, the best ones by Gauss-Newton, and two together where they explain much more
-    than one. Nothing is known of friction or of motion.
+    It simulates a free run of the model over a window around the alarm. The initial state, a constant unmeasured
+    disturbance and the onset of the change are free. Candidates are each parameter of the prior (or a group with the
+    same relative change), and gain and offset of each input and output. One run gives the sensitivities to all of them.
+    Each candidate is fitted alone by weighted least squares, the best ones by Gauss-Newton, and pairs of candidates if
+    they explain much more than one. It works for any model.
 
     Args:
         model: The model that the monitor compares with the machine.
-        limits: Limits of the model's residuals: outputs weigh by what is ordinary in their free runs. Default: by
-            their errors in the window.
-        causes: Names, and the parameters of each that change by the same share; gains and offsets of signals are
-            always tried. Default: each parameter by itself.
-        prior: Model of the prior alone, for a model with a network: its parameters are those of its prior. Default: the
-            model.
+        limits: Limits of the model's residuals, which weight the outputs by their ordinary free-run errors. Default:
+            weights by the errors in the window.
+        causes: Groups of parameters with the same relative change, by name; gains and offsets of signals are always
+            candidates. Default: each parameter alone.
+        prior: Model of the prior alone, if the model has a network. Default: the model.
 
     Raises:
-        InputError: If a cause's parameter is unknown, or the limits are of another model.
+        InputError: If a cause's parameter is unknown, or the limits belong to another model.
 
     Example: ``Diagnoser(model, limits).diagnose(window).text`` says ``"offset of level +0.1 ± 0.01 m"``
     """
@@ -149,7 +145,7 @@ class Diagnoser:
             of = [limits.of(free_run_of(s.name)) for s in model.outputs]
             if not all(of):
                 raise InputError(
-                    "diagnosis: the limits have no free runs of this model's outputs; give its residuals'"
+                    "diagnosis: limits without free runs of this model's outputs. Give limits of its residuals"
                     " [HM-WATCH-010]"
                 )
             self._scale = np.array([shortest[0].threshold for shortest in of])
@@ -165,7 +161,7 @@ class Diagnoser:
             *(f"gain of {s.name}" for s in model.inputs), *(f"offset of {s.name}" for s in model.inputs),
             *(f"gain of {s.name}" for s in model.outputs), *(f"offset of {s.name}" for s in model.outputs),
         )  # fmt: skip
-        """What is tried."""
+        """Names of all candidates."""
         n_u, n_y = model.n_u, model.n_y
         added = [[s.unit for s in signals] for signals in (model.inputs, model.outputs)]
         self._units = (*[""] * (len(groups) + n_u), *added[0], *[""] * n_y, *added[1])
@@ -177,24 +173,24 @@ class Diagnoser:
         )
 
     def of_alarm(self, alarm: int, trace: Trace, recording: TrajectoryLike, estimates: Sequence[Any]) -> str:
-        """What explains the alarm that begins at a sample of a replayed recording, in words.
+        """Diagnosis of an alarm in a replayed recording, as text.
 
         Args:
-            alarm: Number of the sample.
-            trace: Of the recording.
-            recording: With ``y``, ``u`` and, where the model has measured disturbances, ``w``.
-            estimates: The estimates along it.
+            alarm: Index of the sample at which the alarm begins.
+            trace: Trace of the recording.
+            recording: With ``y``, ``u`` and, if the model has measured disturbances, ``w``.
+            estimates: The estimates of all samples.
         """
         model = self.model
         frozen = np.atleast_1d(trace.frozen[alarm : alarm + self.after + 1].any(axis=0))
         stuck = [name for name, on in zip(trace.outputs, frozen, strict=True) if on]
         if stuck:
-            return f"the sensor of {', '.join(stuck)} repeats itself while motion is predicted"
+            return f"sensor of {', '.join(stuck)} frozen: its readings repeat although motion is predicted"
         on = [c.name for c, alarms in zip(trace.channels, trace.on[alarm], strict=True) if alarms]
         if not on:
             return BLIND.get(Validity(int(trace.validity[alarm])), "")
         if set(on) <= {s.name for s in model.disturbances}:
-            return f"{', '.join(on)} is where it never was when nothing was wrong"
+            return f"{', '.join(on)} is outside its range in the nominal data"
         first, end = max(alarm - self.before, 0), min(alarm + self.after + 1, len(recording.y))
         part, begin = slice(first, end), estimates[first]
         w: Array | None = getattr(recording, "w", None)
@@ -205,12 +201,12 @@ class Diagnoser:
         ).text
 
     def diagnose(self, window: Window) -> Diagnosis:
-        """What explains the alarm of a window."""
+        """Diagnosis of the alarm in a window."""
         nuisance = self.model.n_x + self.model.n_d
         known = np.asarray(np.isfinite(window.y).all(axis=1))
         samples = float(known.sum())
         if known[window.alarm :].sum() < FEWEST or samples < FEWEST + nuisance:
-            return Diagnosis(f"too few samples to tell: {samples:.0f}", samples)
+            return Diagnosis(f"too few samples for a diagnosis: {samples:.0f}", samples)
         if not (
             np.isfinite(window.u[:-1]).all() and np.isfinite(window.x).all() and np.isfinite(window.h).all()
         ):
@@ -265,7 +261,7 @@ class Diagnoser:
         return Diagnosis(f"{text}, which leaves {left:.0%} unexplained", samples, (first,), others)
 
     def _weighed(self, window: Window) -> Diagnoser:
-        """The same, with outputs that weigh by their errors in the window."""
+        """The same diagnoser with outputs weighted by their errors in the window."""
         found = copy.copy(self)
         found._scale = np.ones(self.model.n_y)
         errors, _ = found._linear(
@@ -276,13 +272,13 @@ class Diagnoser:
         return found
 
     def _within(self, fit: _Fit) -> _Fit:
-        """The fit, or one that explains nothing where a share is out of range."""
+        """The fit; with infinite misfit if a relative change is out of range."""
         shares = fit.change[self._is_share[list(fit.causes)]]
         inside = bool(np.all((shares >= RANGE[0]) & (shares <= RANGE[1])))
         return fit if inside else replace(fit, misfit=np.inf)
 
     def _onsets(self, window: Window) -> list[int]:
-        """Samples from which on something may be different: some of the averages' length before the alarm."""
+        """Candidate onsets [sample] before the alarm, within the length of the averages and the window."""
         back = [*range(self.short + 1), 2 * self.short, self.before // 3, self.before // 2]
         chosen = [back[i] for i in evenly(len(back), ONSETS)]
         return sorted({max(window.alarm - b, 1) for b in chosen})
@@ -297,7 +293,7 @@ class Diagnoser:
         slopes_0 = np.zeros((first.size, m.n_x + m.n_d + theta.size))
         slopes_0[: m.n_x, : m.n_x] = np.eye(m.n_x)
         state = np.concatenate([first, slopes_0.ravel(order="F"), np.zeros(m.n_u)])
-        # before the first period nothing acted: the output of the first sample takes the first input
+        # the input before the first sample is unknown: its output is computed with the first input
         state[-m.n_u :] = window.u[0]
         _, outs = self._run.mapaccum(n)(
             state, np.nan_to_num(given), np.tile(d[:, None], n), np.tile(theta[:, None], n)

@@ -1,4 +1,4 @@
-"""Readings of a mechanical machine whose positions are measured: residual forces, and the energy of free runs."""
+"""Readings of a mechanical machine with measured positions: residual forces, and the energy of free runs."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from hybrid_mpc.watch.readings import ENERGY, Channel, Sample, Test, Validity
 
 Array = NDArray[np.float64]
 RUNS = 2
-"""Free runs side by side, half a length apart: the older one always has half a length behind it."""
+"""Number of free runs, which begin half a length apart: the older one has always run for at least half a length."""
 RUN_SUMS = 3
 """Sums of a free run: energy departure, squared speed, squared input."""
 FORCES = {("W", "rad/s"): "N m", ("W", "m/s"): "N"}
 """Short names of a power over a speed."""
 HELD_SHARE = 0.25
-"""Change of an input, as a share of its range, that sticking friction does not hold."""
+"""Change of an input, as a share of its range, that static friction cannot compensate."""
 TERMS = 4
-"""Terms of a variance: constant, squared speed, squared input, and rest (force) or one over the time (power)."""
+"""Regressors of a variance: constant, squared speed, squared input, and rest (force) or inverse time (power)."""
 DRIFT = 2.0
 """Dead band of the cumulative sums [deviations]."""
 UNKNOWN = (math.nan,) * TERMS
 
 
 class Layout:
-    """Where values lie in the memory of the readings.
+    """Layout of the readings' memory vector.
 
-    ``window`` are samples, ``length`` the periods of a free run; 0 for none.
+    ``window`` is the number of samples, ``length`` the periods of a free run; 0 for none.
     """
 
     def __init__(self, model: HybridModel, window: int, length: int = 0) -> None:
@@ -57,19 +57,19 @@ class Layout:
         self.one_step = window * n_q + (window - 1) * self.row
         """Size of the window's part of the memory; travel and push follow it."""
         self.runs = self.one_step + 3 * n_q + model.n_u
-        """Where the free runs begin."""
+        """Index of the first free run."""
         self.run = model.n_x + model.n_h + window * n_q + RUN_SUMS
         """Size of a free run: state, hidden state, positions, sums."""
         self.size = self.runs + (RUNS * self.run if length else 0)
 
     def initial(self) -> tuple[Array, tuple[int, ...]]:
-        """Memory before the first sample, and the periods until each free run begins anew."""
+        """Memory before the first sample, and the periods until each free run restarts."""
         memory = np.full(self.size, np.nan)
         memory[self.one_step : self.runs] = 0.0
         return memory, (1, self.length // 2 + 1) if self.length else ()
 
     def begin_runs(self, memory: Array, left: tuple[int, ...], x: Array, h: Array) -> tuple[int, ...]:
-        """Begin those free runs anew, in place, that have come to their end; returns the periods left of each."""
+        """Restart the free runs that have ended, in place; returns the remaining periods of each."""
         following = []
         for i, periods in enumerate(left):
             if periods > 1:
@@ -87,12 +87,12 @@ class Layout:
 
 @dataclass(frozen=True)
 class EnergyState:
-    """What the readings remember, never changed in place; ``x`` and ``h`` are the latest estimate's.
+    """State of the readings, never changed in place; ``x`` and ``h`` are those of the latest estimate.
 
     Args:
-        memory: One vector, laid out as :class:`Layout` says; NaN until filled.
-        left: Periods left of each free run.
-        seen: Samples taken; ``whole``: since something was missing; both up to the window's.
+        memory: Vector with the layout of :class:`Layout`; NaN until filled.
+        left: Remaining periods of each free run.
+        seen: Number of processed samples, and ``whole`` since the last missing value; both at most the window's.
         w: Measured disturbances ``(n_w,)`` from that sample on.
     """
 
@@ -106,47 +106,48 @@ class EnergyState:
 
 
 class EnergyReadings:
-    """Compares the model's power balance with the measured one, causally.
+    """Compares the model's power balance with the measured one, using past samples only.
 
     **Violation** [W]: a least-squares cubic through the last ``window`` samples of ``y`` gives position, velocity and
     acceleration at the window's centre. This acceleration is a weighted mean of the true one,
     ``sum_i w_i y_i = int K(s) a(s) ds`` with the Peano kernel ``K(s) = sum_{t_i > s} w_i (t_i - s)``. The model's
     acceleration is averaged with the same ``K``: one step from every estimate ``(x_hat_i, h_i)`` gives
     ``dv = int a ds`` and ``dp = int (t_{i+1} - s) a ds``, hence exactly ``int K a ds = K_{i+1} dv - K' dp`` in every
-    period. So steps of the input raise no violation. The estimated disturbance ``d`` is left out, since it would hide
-    the fault. Both balances take the state ``[q, v]`` of the cubic and the input averaged with ``K``; with one degree
-    of freedom their difference is ``J |v| |a_model - a_measured|``. The violation has no limit: forces show the same.
+    period. So steps of the input cause no violation. The estimated disturbance ``d`` is left out, since it would hide
+    the fault. Both balances use the state ``[q, v]`` of the cubic and the input averaged with ``K``; with one degree
+    of freedom their difference is ``J |v| |a_model - a_measured|``. The violation has no limit, because the residual
+    forces contain the same information.
 
-    **Residual force**: at rest the violation is zero, whatever the forces do; ``M (a_measured - a_model)`` with the
-    inertia ``M`` of the energy balance is not. Near rest dry friction may be anything up to half the jump of the
-    model's force at zero speed. Only what exceeds this dead band counts there; it closes linearly up to twice
-    ``rest_speed``. So a hand that holds the machine still shows, and sticking friction does not.
+    **Residual force**: at rest the violation is zero for any force; ``M (a_measured - a_model)`` with the inertia ``M``
+    of the energy balance is not. Near rest, dry friction can have any value up to half the jump of the model's force at
+    zero speed. Only the residual above this dead band counts; the dead band closes linearly up to twice ``rest_speed``.
+    So a hand that holds the machine is detected, but static friction is not.
 
-    **Power of the free run** [W]: the one step starts from an estimate that has followed the measurements, and so has
-    half forgotten the fault. With ``free_run`` the model also runs on its own under the applied inputs; the energy by
-    which its balance departs from the measured one adds up, and the channel is its mean over the run's time: noise
-    averages out in it, a steady loss does not. Two runs, begun half a length apart, take turns; the older is read.
+    **Power of the free run** [W]: the one-step prediction starts at an estimate that partly follows the fault. With
+    ``free_run`` the model also runs freely with the applied inputs. The difference of its energy balance to the
+    measured one is integrated, and the channel is its mean over the time of the run: noise averages out, a constant
+    loss does not. Of two runs that begin half a length apart, the older one is read.
 
-    **Travel** of a sensor that repeats itself: the sum of the one-step predictions, those slower than ``rest_speed``
-    left out. Near rest the estimator takes a frozen sensor for a standing machine and the controller pulls harder: so
-    what the input's change since the sensor's last step would have moved counts as well, once it is more than a quarter
-    of the input's range. A blocked machine looks the same.
+    **Travel** of a sensor that repeats its reading: the sum of the one-step predictions that are faster than
+    ``rest_speed``. Near rest, the estimator takes a frozen sensor for a machine at rest, and the controller increases
+    its input. So the predicted motion due to the change of the input since the sensor's last change counts, too, if the
+    change is above a quarter of the input's range. A blocked machine cannot be distinguished from a frozen sensor.
 
-    A missing (NaN) measurement gives NaN readings until it has left the window. Positions must count on through full
-    turns. Not for several threads at once (buffers are reused).
+    A missing (NaN) measurement gives NaN readings until it has left the window. Positions must be continuous over full
+    turns. Not thread-safe (buffers are reused).
 
     Args:
         model: Model whose outputs are its positions ``q`` (state ``[q, v]``).
-        window: Samples in the local polynomial, odd, at least 5. Default: 0.2 of the machine's seconds.
-        free_run: Length [s] of the model's free runs; 0: none. Default: 0.6 of the machine's seconds.
+        window: Samples in the local polynomial, odd, at least 5. Default: 0.2 time constants of the machine.
+        free_run: Length [s] of the model's free runs; 0: none. Default: 0.6 time constants of the machine.
         rest_speed: Speeds ``(n_q,)`` [unit of v] below which friction may stick, or one for all; see
-            :func:`~hybrid_mpc.watch.lengths.rest_speeds`. Default: nothing is known to stick.
-        input_range: Range ``(n_u,)`` of each input, largest less smallest, for the travel near rest. Default: that of
-            the model's signals; without bounds inputs move no frozen sensor.
+            :func:`~hybrid_mpc.watch.lengths.rest_speeds`. Default: nothing sticks.
+        input_range: Range ``(n_u,)`` of each input, largest minus smallest, for the travel near rest. Default: that of
+            the model's signals; without bounds, inputs do not contribute to the travel.
 
     Raises:
-        InputError: If the window or a rest speed is unfit, a free run is no longer than two windows, the outputs are
-            not the positions, or the energy balance says nothing.
+        InputError: If the window or a rest speed is invalid, a free run is shorter than two windows, the outputs are
+            not the positions, or the energy balance does not depend on the acceleration.
 
     Source: energy balance and violation of the paper (energy objective, powers in W); Savitzky and Golay
     (1964) for the polynomial; Peano kernel theorem for the weighting.
@@ -185,7 +186,7 @@ class EnergyReadings:
         self.layout = Layout(model, window, round(free_run / model.dt))
         if free_run and self.layout.length < 2 * window:
             raise InputError(
-                f"energy: a free run of {free_run} s given; two windows, {2 * window * model.dt:g} s, needed"
+                f"energy: free_run of {free_run} s is too short; give at least two windows, {2 * window * model.dt:g} s"
                 " [HM-WATCH-012]"
             )
         self.model, self.window = model, window
@@ -197,16 +198,16 @@ class EnergyReadings:
         self.patience = window + samples(AVERAGE_S, model)
         self.n_terms = TERMS
         self.shortest = SHORTEST_S * model.time_unit
-        """Accumulated time [s] of a free run from which on it counts."""
+        """Shortest evaluated time [s] of a free run."""
         rate, n_q = _energy_of(model).rate_unit, self.layout.n_q
         forces = zip(model.states[:n_q], force_units(model), strict=True)
         self.channels = (
-            Channel("violation", rate, "balance of the model less that of the measurement"),
+            Channel("violation", rate, "balance of the model minus that of the measurement"),
             *(
                 Channel(f"force of {q.name}", unit, "force that the model does not explain")
                 for q, unit in forces
             ),
-            *[Channel("power of the free run", rate, "energy by which a free run departs, over its time")]
+            *[Channel("power of the free run", rate, "energy error of a free run over its time")]
             * bool(self.layout.length),
         )
         self.tests = tuple(
@@ -219,7 +220,7 @@ class EnergyReadings:
 
     @property
     def delay(self) -> float:
-        """Time [s] from the moment that violation and force speak of to the sample at which they are read."""
+        """Delay [s] of violation and force: from the window's centre to its last sample."""
         return 0.5 * (self.window - 1) * self.model.dt
 
     def initial(self) -> EnergyState:
@@ -231,17 +232,17 @@ class EnergyReadings:
     def update(
         self, state: EnergyState, y: Array, u_prev: Array, estimate: Any
     ) -> tuple[EnergyState, Sample]:
-        """Take one sample; see :class:`~hybrid_mpc.watch.readings.Readings`.
+        """Process one sample; see :class:`~hybrid_mpc.watch.readings.Readings`.
 
-        Of the estimate ``x`` ``(n_x,)`` and ``h`` ``(n_h,)`` are read, and of a model with measured disturbances ``w``
-        ``(n_w,)``; where it has none they are the operating point's.
+        The estimate's ``x`` ``(n_x,)``, ``h`` ``(n_h,)`` and, for a model with measured disturbances, ``w`` ``(n_w,)``
+        are used; a missing ``w`` is that of the operating point.
         """
         x, h = (np.array(values, dtype=np.float64).ravel() for values in (estimate.x, estimate.h))
         y, u_prev = (np.asarray(values, dtype=np.float64).ravel() for values in (y, u_prev))
         if (x.size, h.size, u_prev.size, y.size) != self._sizes:
             raise InputError(
                 f"monitor of model {self.model.name}: x, h, u_prev, y have {(x.size, h.size, u_prev.size, y.size)} "
-                f"entries, the model needs {self._sizes} [HM-WATCH-013]"
+                f"entries, but the model has {self._sizes}. Give values of this model [HM-WATCH-013]"
             )
         ins, outs = self._function.inputs, self._function.outputs
         ins[0][:], ins[1][:], ins[2][:], ins[3][:], ins[4][:] = state.memory, state.x, state.h, u_prev, y
@@ -277,7 +278,7 @@ class EnergyReadings:
         return following, Sample(values, terms, travel, self._repeats, self._inside, True, validity)
 
     def _free_runs(self, state: EnergyState) -> tuple[int, ...]:
-        """Periods left of each free run, after beginning those anew that have ended; whose windows are full."""
+        """Remaining periods of each free run after restarting those that have ended; sets which windows are full."""
         left = state.left
         if min(left) <= 1:
             left = self.layout.begin_runs(self._function.inputs[0], left, state.x, state.h)
@@ -304,7 +305,9 @@ def _spans(model: HybridModel, given: ArrayLike | None) -> Array:
         return np.array([s.upper - s.lower for s in model.inputs])
     spans = np.asarray(given, dtype=float).ravel()
     if spans.shape != (model.n_u,) or not np.all(spans > 0):
-        raise InputError(f"energy: input_range needs {model.n_u} positive ranges, got {spans} [HM-WATCH-014]")
+        raise InputError(
+            f"energy: input_range must be {model.n_u} positive ranges, got {spans} [HM-WATCH-014]"
+        )
     return spans
 
 
@@ -337,8 +340,8 @@ def _energy_of(model: HybridModel) -> Balance:
             return balance
     known = ", ".join(b.name for b in model.balances) or "none"
     raise InputError(
-        f"energy: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be "
-        "watched; give its prior one (a MechanicalPrior has it), and export it again, or take no monitor [HM-WATCH-015]"
+        f"energy: model {model.name} has no balance {ENERGY!r} (it has: {known}), so its energy cannot be monitored. "
+        "Add this balance to its prior (a MechanicalPrior has it) and run again, or use residuals [HM-WATCH-015]"
     )
 
 
@@ -349,7 +352,7 @@ def force_units(model: HybridModel) -> tuple[str, ...]:
 
 
 def force_unit(model: HybridModel) -> str:
-    """Unit of the level of all residual forces together; forces of several units are all named.
+    """Units of the residual forces, without duplicates.
 
     Example: ``force_unit(kit.models["prior"])`` is ``"N m"`` for a pendulum, ``"N, N m"`` for a cart with one.
     """
@@ -371,11 +374,11 @@ def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
 def _near_rest(
     model: HybridModel, position: ca.MX, h: ca.MX, g: ca.MX, rest: ca.DM
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """What a model says of slow motion: its mean acceleration there, and by how much dry friction and damping slow it.
+    """Accelerations of a model near rest: mean, deceleration ``D(s)``, and deceleration by dry friction alone.
 
-    Half the difference of the accelerations back and forth is ``D(s) = jump + damping s``: dry friction, which is fully
-    there at the rest speed, and what grows with the speed. So ``2 D(s) - D(2 s)`` is what dry friction can hold at
-    rest, and what damps is no part of it. Returned are the mean, ``D(s)`` and ``2 D(s) - D(2 s)``.
+    Half the difference of the accelerations at speeds ``-s`` and ``s`` is ``D(s) = jump + damping s``: dry friction,
+    which is fully developed at the rest speed ``s``, plus viscous damping. So ``2 D(s) - D(2 s) = jump`` is the part
+    that dry friction can hold at rest. Returns the mean, ``D(s)`` and ``2 D(s) - D(2 s)``.
     """
     n_q = model.n_x // 2
     (back, forth), (faster_back, faster_forth) = (
@@ -392,9 +395,9 @@ def _near_rest(
 def _residual(
     model: HybridModel, a_measured: ca.MX, a_model: ca.MX, x: ca.MX, h: ca.MX, g: ca.MX, rest: ca.DM
 ) -> ca.MX:
-    """Force ``(n_q,)`` that the model does not explain; near rest, what dry friction could not hold either.
+    """Residual force ``(n_q,)``; near rest only the part above the dry friction.
 
-    The model's accelerations near rest are half the monitor's work, so they are left out at speed.
+    The accelerations near rest take half of the monitor's computing time, so they are only evaluated at low speed.
     """
     n_q = model.n_x // 2
     sizes = {"e": n_q, "a": n_q, "x": model.n_x, "h": model.n_h, "g": model.n_u + model.n_w}
@@ -403,8 +406,10 @@ def _residual(
     inertia, speed = inertia_of(model, state, held_input), state[n_q:]
     mean, slowed, jump = _near_rest(model, state[:n_q], hidden, held_input, rest)
     friction = ca.fmax(0, inertia @ jump)
-    damping = (inertia @ slowed - friction) * speed / rest  # between joints it counts as each joint's own
-    held = inertia @ (measured - mean) + damping  # friction of either direction taken out
+    damping = (
+        (inertia @ slowed - friction) * speed / rest
+    )  # damping between joints counts as that of each joint
+    held = inertia @ (measured - mean) + damping  # without dry friction
     held = ca.sign(held) * ca.fmax(0, ca.fabs(held) - friction)
     near = ca.fmax(0, ca.fmin(1, 2 - ca.fabs(speed) / rest))
     slow = ca.Function("slow", sym, [ca.densify(near * held + (1 - near) * (inertia @ error))])
@@ -417,16 +422,16 @@ def _residual(
 def _free_run(
     layout: Layout, memory: ca.MX, g: ca.MX, measured_w: ca.MX, g_mean: ca.MX, v: ca.MX, full: ca.MX
 ) -> tuple[ca.MX, ca.MX]:
-    """A free run one period on: its memory, and its sums over the periods whose windows are full.
+    """One period of a free run: its memory, and its sums over the periods with a full window.
 
-    Its own positions go through the same polynomial as the measured ones.
+    Its positions are filtered by the same polynomial as the measured ones.
     """
     model, window, n_q = layout.model, layout.window, layout.n_q
     n_x, n_z = model.n_x, model.n_x + model.n_h
     x, h = model.step(memory[:n_x], memory[n_x:n_z], *_given(model, g), model.p)
     ring = ca.vertcat(memory[n_z + n_q : n_z + window * n_q], x[:n_q])
     position, velocity, acceleration, _, _ = weights(window, model.dt)
-    # No need to take the newest off: a run is short.
+    # positions need no offset here: a run is short
     q_m, v_m, a_m = (ca.reshape(ring, n_q, window) @ ca.DM(w) for w in (position, velocity, acceleration))
     power = energy_balance(model, ca.vertcat(q_m, v_m), ca.vertcat(v_m, a_m), g_mean)
     u_mean = g_mean[: model.n_u]
@@ -446,17 +451,18 @@ def _pushed(
     rest: ca.DM,
     spans: ca.DM,
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """Speed and travel ``(n_q,)`` that the input should have caused since the sensors' last step, and the input then.
+    """Predicted speed and travel ``(n_q,)`` due to the input since the sensors' last change, and the input then.
 
-    An estimator takes a frozen sensor for a standing machine, and an unknown load for what holds it; the controller
-    pulls, and nothing moves. What counts is what both the input's change since then and the input itself, beyond
-    friction, would do: a load that is there is no change, and a machine that has braked is left with no pull. The model
-    is asked only beyond ``HELD_SHARE`` of the input's range, for it costs six evaluations.
+    With a frozen sensor, the estimator takes the machine for standing still and explains it by an unknown load, while
+    the controller increases its input. The predicted acceleration is the smaller of those due to the change of the
+    input and due to the input itself beyond friction: a constant load is no change, and after braking the input
+    itself is small. The model is only evaluated for changes above ``HELD_SHARE`` of the input's range, because this
+    needs six evaluations.
     """
     model, n_q = layout.model, layout.n_q
     first = layout.one_step + n_q
     speed, travel, before = ca.vertsplit(memory[first : layout.runs], [0, n_q, 2 * n_q, 2 * n_q + model.n_u])
-    if model.delay_states:  # the oldest of the inputs on their way is the one that has begun to act
+    if model.delay_states:  # the oldest delayed input is the one that acts now
         u = h[: model.n_u]
     before = ca.if_else(ca.logic_and(still, ca.mmin(_known(before))), before, u)
     strong = ca.logic_and(still, ca.mmax(ca.fabs(u - before) - HELD_SHARE * spans) > 0)
@@ -477,17 +483,16 @@ def _pushed(
 
 
 def _known(values: ca.MX) -> ca.MX:
-    """Where values are numbers. ``values == values`` is true for CasADi, whatever they are."""
+    """Which values are finite; CasADi simplifies ``values == values`` to true, so it cannot detect NaN."""
     return ca.fabs(values) < np.inf
 
 
 def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) -> ca.Function:
     """``(memory, x_prev, h_prev, u_prev, y, full, w_prev) -> (memory_next, numbers)``.
 
-    The numbers: violation, residual ``(n_q)``, travel ``(n_q)``, speed ``(n_q)`` and input ``(n_u)`` at the centre;
-    with free runs the sums of each. ``full`` says of each run whether its window is
-    full. ``rest_speed`` ``(n_q,)`` are the speeds below which friction may stick, ``spans`` ``(n_u,)`` the ranges of
-    the inputs.
+    The numbers: violation, residual ``(n_q)``, travel ``(n_q)``, speed ``(n_q)`` and input ``(n_u)`` at the centre of
+    the window; with free runs the sums of each. ``full`` says for each run whether its window is full. ``rest_speed``
+    ``(n_q,)`` are the speeds below which friction may stick, ``spans`` ``(n_u,)`` the ranges of the inputs.
     """
     model, window, n_q, rest = layout.model, layout.window, layout.n_q, ca.DM(list(rest_speed))
     n_u, dt, row = model.n_u, model.dt, layout.row
@@ -502,7 +507,7 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     ys = ca.vertcat(memory[n_q : window * n_q], y)
     rows = ca.vertcat(memory[window * n_q + row : layout.one_step], dv, dp, given)
     y_grid, row_grid = ca.reshape(ys, n_q, window), ca.reshape(rows, row, window - 1)
-    # Positions relative to the newest: after many turns the small differences keep their digits.
+    # positions relative to the newest: after many turns this avoids cancellation
     relative = y_grid - ca.repmat(y, 1, window)
     q, v, a_measured = (relative @ ca.DM(w) for w in (position, velocity, acceleration))
     a_model = row_grid[:n_q, :] @ ca.DM(kernel[1:]) - row_grid[n_q : 2 * n_q, :] @ ca.DM(slope)
@@ -510,8 +515,8 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
     u_mean, state = g_mean[:n_u], ca.vertcat(q + y, v)
     balances = [energy_balance(model, state, ca.vertcat(v, a), g_mean) for a in (a_model, a_measured)]
     residual = _residual(model, a_measured, a_model, state, h, g_mean, rest)
-    # What is predicted while the sensor repeats itself; a missing sample or estimate begins anew. Where friction may
-    # stick nothing counts: there an estimate creeps that does not know of it.
+    # Travel: predicted motion while the sensor repeats its reading; a missing sample or estimate resets it. Motion
+    # below the rest speed does not count, because an estimate without friction creeps there.
     y_before = memory[(window - 1) * n_q : window * n_q]
     moved = x_next[:n_q] - x[:n_q]
     ahead = memory[layout.one_step : layout.one_step + n_q] + moved * (ca.fabs(moved) > rest * dt)
@@ -532,7 +537,7 @@ def reading_function(layout: Layout, rest_speed: Sequence[float], spans: Array) 
 
 
 def check_model(model: HybridModel) -> None:
-    """Refuse a model that the monitor cannot read: its outputs are not its positions, or it has no energy balance."""
+    """Refuse a model whose energy cannot be monitored: outputs that are not its positions, or no energy balance."""
     n_q = model.n_x // 2
     x, u = ca.MX.sym("x", model.n_x), ca.MX.sym("u", model.n_u)
     jacobian = ca.Function("C", [x, u], [ca.jacobian(model.output(x, u, model.w, model.p), ca.vertcat(x, u))])
@@ -540,12 +545,12 @@ def check_model(model: HybridModel) -> None:
     if given.shape[0] != n_q or not np.array_equal(given, np.eye(n_q, model.n_x + model.n_u)):
         raise InputError(
             f"energy: the outputs of model {model.name} must be its positions "
-            f"{[s.name for s in model.states[:n_q]]}; it measures {[s.name for s in model.outputs]}. "
-            "Give a model whose output is x[:n_q]. [HM-WATCH-016]"
+            f"{[s.name for s in model.states[:n_q]]}, but they are {[s.name for s in model.outputs]}. "
+            "Give a model whose output is x[:n_q], or use residuals [HM-WATCH-016]"
         )
     if not np.all(np.diag(ca.Function("M", [x, u], [inertia_of(model, x, u)])(0, 0).full()) > 0):
         raise InputError(
-            f"energy: the energy balance of model {model.name} does not grow with its acceleration, so it "
-            "says nothing of its motion; check the mass matrix of its prior, or the storage of its balance"
+            f"energy: the energy balance of model {model.name} does not grow with its acceleration. "
+            "Check the mass matrix of its prior, or the storage of its balance"
             " [HM-WATCH-017]"
         )

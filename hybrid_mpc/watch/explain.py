@@ -1,4 +1,4 @@
-"""Alarms of a recording or loop, each with what explains it; and the trace as a table."""
+"""Alarms of a recording or loop with their diagnoses, and the trace as a table."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm from its first to its last sample [s] in the recording's own time, the channels that alarmed in it, in
-    the order in which they did, and what explains it, if anything can.
+    """An alarm: first and last sample [s] in the recording's time, diagnosis (empty if unknown), and channels in the
+    order of their alarms.
     """
 
     start_s: float
@@ -42,11 +42,11 @@ def explained(
 
     Args:
         monitor: The monitor.
-        estimator: The one that the loop uses.
+        estimator: The estimator of the loop.
         recording: See :func:`~hybrid_mpc.watch.replay.replay`.
-        diagnoser: Makes what explains alarms; it is called once where there is one. Default: nothing is explained but
-            missing readings.
-        on_progress: Called with ``(done, total)`` samples every so often. Default: none.
+        diagnoser: Builds the diagnoser; called once, and only if there is an alarm. Default: only missing readings are
+            diagnosed.
+        on_progress: Called with ``(done, total)`` samples every 500 samples. Default: nothing.
     """
     estimates: list[Any] = []
     trace = replay(
@@ -65,9 +65,9 @@ def explained(
 
 
 def begun(alarms: Sequence[Alarm], start: float) -> tuple[list[Alarm], list[Alarm]]:
-    """Alarms that begin before ``start`` [s], and those from then on.
+    """Alarms that begin before ``start`` [s], and those that begin from then on.
 
-    One that is on already when something breaks says nothing of it.
+    An alarm that is already on when a fault begins is not a detection of the fault.
 
     Example:
         >>> before, seen = begun((Alarm(1.0, 9.0, ""), Alarm(5.0, 6.0, "pump")), 4.0)
@@ -79,8 +79,8 @@ def begun(alarms: Sequence[Alarm], start: float) -> tuple[list[Alarm], list[Alar
 
 
 def table(trace: Trace, y: Array, outputs: Sequence[Signal], monitor: Monitor) -> str:
-    """The trace as CSV, one row a sample: measurements ``y`` ``(n, n_y)``, values of the channels with units, levels of
-    their limits, alarms.
+    """The trace as CSV, one row for each sample: measurements ``y`` ``(n, n_y)``, values of the channels with units,
+    levels of their limits, alarms.
     """
     columns: dict[str, Any] = {"t_s": trace.t}
     columns |= {f"{s.name}_{s.unit}": y[:, i] for i, s in enumerate(outputs)}

@@ -21,23 +21,23 @@ from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, replay
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 MIN_BLOCKS = 30
-"""Blocks that the two parameters of a tail need."""
+"""Smallest number of blocks to fit the two parameters of a Gumbel distribution."""
 MAX_EXTRAPOLATION = 20.0
 """Longest mean time between false alarms, in multiples of the nominal data's length."""
 MARGIN = 1.5
-"""Where nominal data are too short for a rate: threshold over the highest nominal level."""
+"""Threshold over the highest nominal level if nominal data are too short for the rate."""
 ROUNDS = 5
-"""Fits of a variance, each weighted by the one before."""
+"""Number of reweighted least-squares fits of a variance."""
 FLOOR = 1e-3
-"""Smallest constant of a variance, as a share of its mean: a scale must not vanish where the data were quiet."""
+"""Smallest constant term of a variance over its mean, so that the scale is positive in quiet data."""
 BOOTSTRAPS = 200
-"""Resamplings of the thresholds."""
+"""Number of bootstrap samples of the thresholds."""
 NEIGHBOURS = 6
-"""Blocks that are drawn together: half a minute of blocks of 5 s, longer than what one motion does to the next."""
+"""Successive blocks that are resampled together (half a minute with blocks of 5 s), longer than their correlation."""
 ODD = 1e-4
-"""A largest block less probable than this under the rest of its own kind is no nominal one."""
+"""Probability of the largest block maximum below which a block does not count as nominal."""
 NEVER = 1e300
-"""A threshold that no level passes."""
+"""A threshold that is never exceeded."""
 
 
 def learn_limits(
@@ -51,22 +51,22 @@ def learn_limits(
     data_hash: str = "",
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> WatchLimits:
-    """Limits of a monitor's channels from recordings in which nothing is wrong.
+    """Learn the limits of a monitor's channels from fault-free recordings.
 
     Args:
-        readings: What the monitor reads (:func:`~hybrid_mpc.watch.monitor.make_readings`).
-        estimator: The one that the loop will use.
-        recordings: With ``t``, ``y``, ``u`` and, where the model has disturbances, ``w``, on the model's grid.
-        false_alarms_per_hour: Wanted rate [1/h] of all alarms together; of several, in rising order, the first that the
-            recordings are long enough for in every channel. Default 1.
-        nominal: Which samples of each recording count, ``(n,)`` each. Default: all.
-        resolution: Step of each sensor ``(n_y,)``, for frozen sensors. Default: found in the recordings for residuals,
-            unknown for the energy, where frozen sensors are not found then.
-        data_hash: Hash of the recordings, kept in the result.
-        on_progress: Called with ``(done, total)`` samples as the replays go on. Default: not at all.
+        readings: The monitor's readings (:func:`~hybrid_mpc.watch.monitor.make_readings`).
+        estimator: The estimator of the loop.
+        recordings: With ``t``, ``y``, ``u`` and, if the model has disturbances, ``w``, on the model's grid.
+        false_alarms_per_hour: Wanted rate [1/h] of all alarms together; or several rates in rising order, of which the
+            first is used that the recordings are long enough for. Default: 1.
+        nominal: Mask of the counted samples of each recording, ``(n,)`` each. Default: all.
+        resolution: Resolution of each sensor ``(n_y,)``, to detect frozen sensors. Default: estimated from the
+            recordings for residuals; unknown for the energy, which then detects no frozen sensors.
+        data_hash: Hash of the recordings, stored in the result. Default: none.
+        on_progress: Called with ``(done, total)`` samples. Default: nothing.
 
     Raises:
-        InputError: If the recordings leave nothing behind their beginning, hold an alarm, or a channel is zero in them.
+        InputError: If the recordings are too short, contain an alarm, or a channel is zero throughout.
 
     Example: ``learn_limits(make_readings(model), observer, dataset.whole, data_hash=dataset.hash)``
     """
@@ -101,13 +101,13 @@ def limits_of(
 ) -> WatchLimits:
     """The limits of :func:`learn_limits` from the ``traces`` of a monitor without limits, and the measurements ``ys``.
 
-    The first of the machine's seconds of each nominal stretch does not count: the estimator settles in it. The variance
-    of a channel with terms comes from weighted least squares of its squares, with coefficients that are not negative.
-    Each limit has its share of the wanted rate. Its threshold is the level that nominal ones pass so often (extreme
-    values of blocks); where the data are too short for that, half as much again as the highest of them, and ``method``
-    says so. A block bootstrap, six neighbours at a time, gives the thresholds' interval. Unless the data are
-    ``trusted``, as simulated ones are, a block of scaled levels that stands out is refused. A block lasts ``block_s``
-    [s], by default 5 of the machine's seconds and 50 periods at least.
+    The first time constant of the machine in each nominal interval does not count, because the estimator settles. The
+    variance of a channel with terms is fitted by weighted nonnegative least squares to its squared values. Each limit
+    gets an equal share of the wanted rate. Its threshold is the level that nominal levels exceed at that rate (extreme
+    values of blocks). If the data are too short, it is 1.5 times the highest nominal level, and ``method`` says so. A
+    block bootstrap of six neighbouring blocks gives the interval of a threshold. Unless the data are ``trusted``, such
+    as simulated data, a block of scaled levels that stands out is refused. The length of a block ``block_s`` [s] is 5
+    time constants of the machine by default, at least 50 periods.
 
     Source: Coles (2001), An Introduction to Statistical Modeling of Extreme Values, ch. 3; Lawson and Hanson (1974) for
     the least squares; Künsch, Annals of Statistics 17 (1989), for the bootstrap.
@@ -124,8 +124,8 @@ def limits_of(
     seconds = float(sum(mask.sum() for mask in masks)) * model.dt
     if not seconds:
         raise InputError(
-            f"limits: no nominal stretch is longer than the {settling_samples(model) * model.dt:g} s that the "
-            "estimator settles in [HM-WATCH-018]"
+            f"limits: every nominal interval is shorter than the estimator's settling time of "
+            f"{settling_samples(model) * model.dt:g} s. Give longer nominal data [HM-WATCH-018]"
         )
     tests = [
         ChannelLimit(
@@ -175,7 +175,7 @@ def limits_of(
 
 
 def settled(mask: ArrayLike, first: int) -> Mask:
-    """A mask ``(n,)`` without the first samples of each of its stretches.
+    """A mask ``(n,)`` without the first samples of each of its intervals.
 
     Example:
         >>> settled([True, True, True, False, True], 1).tolist()
@@ -188,9 +188,9 @@ def settled(mask: ArrayLike, first: int) -> Mask:
 
 
 def levels_of(detector: Detector, traces: Sequence[Trace], masks: Sequence[Mask]) -> list[list[Array]]:
-    """Magnitudes of each limit's levels along the traces, ``(n,)`` each; NaN where they do not count.
+    """Magnitudes of each limit's levels along the traces, ``(n,)`` each; NaN for samples that do not count.
 
-    Sums begin anew with each stretch that counts; no alarm limits them.
+    Sums are reset at the begin of each counted interval.
     """
     found: list[list[Array]] = [[] for _ in detector.limits]
     for trace, mask in zip(traces, masks, strict=True):
@@ -211,17 +211,17 @@ def levels_of(detector: Detector, traces: Sequence[Trace], masks: Sequence[Mask]
 def calibrate(
     levels: Sequence[Array], dt: float, *, false_alarms_per_hour: float = 1.0, block_s: float = BLOCK_S
 ) -> tuple[float, float]:
-    """Threshold that nominal levels, ``(n,)`` of each run, pass upwards at the wanted rate, and the level of release.
+    """Threshold that nominal levels, ``(n,)`` of each run, exceed at the wanted rate, and the level of release.
 
-    The largest level in a block follows a Gumbel distribution with location and scale from its first two L-moments. The
-    threshold ``location - scale * log(rate * block)`` is passed at the wanted rate. The alarm is released at half of
-    it, but not below the nominal 95 % quantile (or it would hang), nor above the threshold. A block of ``block_s``
-    seconds must be much longer than levels are correlated (:func:`~hybrid_mpc.watch.lengths.block_seconds`). NaN are
-    left out.
+    Block maxima follow a Gumbel distribution, whose location and scale are estimated by the first two L-moments. The
+    threshold is ``location - scale * log(rate * block)``. The release is half the threshold, but at least the nominal
+    95 % quantile (else an alarm might not end), and at most the threshold. The block length ``block_s`` [s] must be
+    much longer than the correlation time of the levels (:func:`~hybrid_mpc.watch.lengths.block_seconds`). NaN are
+    ignored.
 
     Raises:
-        InputError: If ``dt``, the block or the rate is not positive, more alarms are wanted than one in two blocks,
-            there is too little data (30 blocks, and one twentieth of the mean time between alarms), or it is zero.
+        InputError: If ``dt``, block or rate are not positive, the rate exceeds one alarm in two blocks, the data are
+            too short (30 blocks, and one twentieth of the mean time between alarms), or all levels are zero.
 
     Source: Hosking (1990) for the L-moments.
     """
@@ -233,22 +233,23 @@ def calibrate(
     rate = false_alarms_per_hour * block_s / 3600.0
     if rate > 0.5:
         raise InputError(
-            f"calibration: {false_alarms_per_hour}/h is too many; ask for at most {1800 / block_s:g}/h [HM-WATCH-020]"
+            f"calibration: a rate of {false_alarms_per_hour}/h is too high; give at most {1800 / block_s:g}/h "
+            "[HM-WATCH-020]"
         )
     maxima, finite = block_maxima(levels, max(round(block_s / dt), 1))
     needed = max(MIN_BLOCKS, int(np.ceil(1.0 / (rate * MAX_EXTRAPOLATION) - 1e-9)))
     if maxima.size < needed:
         raise InputError(
-            f"{maxima.size * block_s / 60:.1f} min of nominal data in whole blocks of {block_s:g} s; "
+            f"nominal data too short: {maxima.size * block_s / 60:.1f} min in whole blocks of {block_s:g} s; "
             f"{false_alarms_per_hour:.3g} false alarms an hour need {needed * block_s / 60:.1f} min. "
-            "Record more, or ask for a higher rate. [HM-WATCH-021]"
+            "Record more, or allow a higher rate [HM-WATCH-021]"
         )
     location, scale = gumbel(maxima)
     threshold = location - scale * float(np.log(rate))
     if not threshold > 0:
         raise InputError(
-            "calibration: the nominal levels are zero throughout, so nothing tells how large an ordinary one is; "
-            "record the machine in motion [HM-WATCH-022]"
+            "calibration: all nominal levels are zero, so no threshold can be estimated. Record the machine in motion "
+            "[HM-WATCH-022]"
         )
     return threshold, _release(threshold, finite)
 
@@ -276,9 +277,9 @@ def gumbel(maxima: Array) -> tuple[float, float]:
 
 
 def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
-    """Refuse largest levels of blocks, in their order, of which one stands out so far that it can be no nominal one.
+    """Refuse block maxima, in their order, if one of them is improbably large; the message names the times.
 
-    Location and scale come from the quartiles, which a few odd blocks hardly move. The message names the places.
+    Location and scale of the Gumbel distribution are estimated by the quartiles, which are robust to a few outliers.
     """
     if maxima.size < MIN_BLOCKS:
         return
@@ -290,8 +291,8 @@ def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
     if odd.size:
         places = ", ".join(f"{i * block_s:g}" for i in odd[:5])
         raise InputError(
-            f"nominal data of {what} hold an alarm: blocks of {block_s:g} s from {places} s stand out "
-            f"(up to {maxima.max():.3g}, nominal blocks stay below {limit:.3g}); cut them out, or find the cause"
+            f"nominal data of {what}: they contain an alarm. Blocks of {block_s:g} s from {places} s stand out "
+            f"(up to {maxima.max():.3g}, nominal blocks stay below {limit:.3g}). Cut them out, or find the cause"
             " [HM-WATCH-023]"
         )
 
@@ -300,7 +301,7 @@ def _thresholds(
     tests: Sequence[Test], limits: Sequence[ChannelLimit], levels: Sequence[Sequence[Array]], dt: float, rate: float,
     block_s: float,
 ) -> tuple[list[ChannelLimit], str]:  # fmt: skip
-    """Limits with thresholds for a rate each, and why extreme values do not tell them all."""
+    """Limits with thresholds for a rate of each, and why block maxima do not suffice for all of them."""
     found, short = [], ""
     for test, limit, runs in zip(tests, limits, levels, strict=True):
         every = np.concatenate(list(runs))
@@ -308,7 +309,7 @@ def _thresholds(
         if not (finite.size and finite.max() > 0):
             if not test.may_be_zero:
                 raise InputError(
-                    f"limits: {limit.channel} is zero or missing throughout the nominal data; record the machine in "
+                    f"limits: {limit.channel} is zero or missing throughout the nominal data. Record the machine in "
                     "motion [HM-WATCH-024]"
                 )
             threshold, release = math.inf, math.inf
@@ -330,14 +331,14 @@ def _release(threshold: float, finite: Array) -> float:
 def _scale_of(
     channel: int, traces: Sequence[Trace], masks: Sequence[Mask], names: Sequence[str]
 ) -> tuple[float, ...]:
-    """Coefficients of a channel's variance, by least squares with weights from the fit before."""
+    """Coefficients of a channel's variance, by iteratively reweighted least squares."""
     values = np.concatenate([t.values[m, channel] for t, m in zip(traces, masks, strict=True)])
     features = np.concatenate([t.terms[m, channel] for t, m in zip(traces, masks, strict=True)])
     known = np.isfinite(values) & np.isfinite(features).all(axis=1)
     features, squares = features[known], values[known] ** 2
     if not squares.size or not np.mean(squares) > 0:
         raise InputError(
-            f"limits: {names[channel]} is zero or missing throughout the nominal data; record the machine in motion"
+            f"limits: {names[channel]} is zero or missing throughout the nominal data. Record the machine in motion"
             " [HM-WATCH-025]"
         )
     from scipy.optimize import nnls  # slow to import, and a running monitor does without
@@ -375,11 +376,11 @@ def _freezing(
     readings: Readings, ys: Sequence[Array], traces: Sequence[Trace], masks: Sequence[Mask],
     resolution: ArrayLike | None,
 ) -> tuple[tuple[float, ...], tuple[int, ...]]:  # fmt: skip
-    """How far outputs may be predicted to move, and for how many samples, while their sensor repeats itself.
+    """Largest predicted motion of outputs, and largest number of samples, while a sensor repeats its reading.
 
-    Readings of the energy know friction: three of the sensor's steps. Residuals: beyond what nominal data have, and
-    three steps; the step is that of an even error as large as the sensor's noise, and no less than the smallest change
-    recorded. Repetitions of what is not predicted to move by a step are those of a machine at rest.
+    For the energy, which accounts for friction: three steps of the sensor. For residuals: above that in nominal data,
+    and at least three steps. The step is ``sqrt(12)`` times the sensor noise, at least the smallest recorded change.
+    Repetitions with a predicted motion below a step mean a machine at rest.
     """
     model = readings.model
     if readings.kind == ENERGY:
@@ -392,7 +393,9 @@ def _freezing(
         changes = np.concatenate([np.abs(np.diff(y[:, i])) for y in ys])
         changes = changes[changes > 0]
         if not changes.size:
-            raise InputError(f"limits: {signal.name} never changes in the nominal data [HM-WATCH-026]")
+            raise InputError(
+                f"limits: {signal.name} never changes in the nominal data. Record the machine in motion [HM-WATCH-026]"
+            )
         step, moved = max(math.sqrt(12.0) * noise[i], float(changes.min())), travel[:, i]
         if resolution is not None:
             step = max(step, float(np.ravel(resolution)[i]))

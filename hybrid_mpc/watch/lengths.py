@@ -1,4 +1,4 @@
-"""The lengths of monitor, detector and guard in the machine's own seconds, and the speed below which it is at rest."""
+"""Lengths of monitor, detector and guard in time constants of the machine, and the speed that counts as rest."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 WINDOW_S = 0.2
-"""Window of the guard's derivative: half of it is how late a reading is, and its noise grows with length^-2.5."""
+"""Window of the derivative: its delay is half the window, and its noise is proportional to length^-2.5."""
 AVERAGE_S = 0.1
-"""Beyond a window, so long may a monitor be without a valid reading: half a window."""
+"""Time without a valid reading, beyond a window, that is no alarm: half a window."""
 FREE_RUN_S = 0.6
 """Length of the model's free runs: three windows."""
 SHORT_S, LONG_S = 0.3, 3.0
-"""Lengths of the two averages of residuals: one is soon there, one shows what is small and lasts."""
+"""Lengths of the two averages of residuals: the short one reacts fast, the long one detects small lasting changes."""
 SETTLING_S = 1.0
-"""Beginning of a recording that nothing is learned from: the estimator does not know the speed yet."""
+"""Settling time of the estimator at the beginning of a recording; these samples are not used for learning."""
 BLOCK_S = 5.0
-"""Blocks whose largest levels tell the rate of false alarms: much longer than what one sample does to the next."""
+"""Length of the blocks whose maxima give the rate of false alarms: much longer than the correlation time."""
 SHORTEST_S = 0.08
-"""A free run counts from this accumulated time on."""
+"""Shortest evaluated time of a free run."""
 NOTHING_STICKS = 1e-12
-"""Rest speed, in any unit, where none was found in recordings and none is given: nothing is known to stick."""
+"""Rest speed, in any unit, if none is known: nothing sticks."""
 SHARE = 0.05
-"""Share of the speed at work below which friction may stick: on the recorded machines the smoothed step of the priors'
-dry friction (0.002 m/s to 0.1 rad/s) has risen to 99 % there."""
+"""Share of the working speed below which friction may stick: at this speed the smoothed dry friction of the priors of
+the recorded machines (0.002 m/s to 0.1 rad/s) has reached 99 %."""
 QUANTILE = 0.99
-"""Quantile of the speeds in motion that counts as speed at work: an outlier or a blow by hand moves it little."""
+"""Quantile of the speeds in motion that counts as working speed; it is robust to outliers and pushes by hand."""
 DEVIATIONS = 3.0
-"""Speeds within so many deviations of the sensor's noise count as no motion."""
+"""Speeds within this many standard deviations of the sensor noise count as rest."""
 
 
 def seconds(length: float, model: HybridModel) -> float:
-    """A length of this module [the machine's seconds] in seconds."""
+    """A length of this module [time constants of the machine] in seconds."""
     return length * model.time_unit
 
 
@@ -48,17 +48,17 @@ def samples(length: float, model: HybridModel, fewest: int = 1) -> int:
 
 
 def half_window(length: float, model: HybridModel) -> int:
-    """Samples to either side of the centre of a window of that length: two at least, for a cubic needs five."""
+    """Samples on each side of a window's centre: at least two, since a cubic needs five samples."""
     return samples(0.5 * length, model, 2)
 
 
 def settling_samples(model: HybridModel) -> int:
-    """Samples at the beginning of a recording that nothing is learned from."""
+    """Samples at the beginning of a recording that are not used for learning."""
     return periods(SETTLING_S * machine_second(model.dt, model.time_unit), model.dt)
 
 
 def machine_second(dt: float, time_unit: float) -> float:
-    """The machine's second [s] where it must hold samples: no shorter than ten periods.
+    """Time constant of the machine [s], at least ten periods.
 
     Example:
         >>> [machine_second(dt, 1.0) for dt in (0.02, 5.0)]
@@ -68,22 +68,22 @@ def machine_second(dt: float, time_unit: float) -> float:
 
 
 def block_seconds(dt: float, time_unit: float = 1.0) -> float:
-    """Length [s] of a block: of ``BLOCK_S`` of the machine's seconds (:func:`machine_second`)."""
+    """Length [s] of a block: ``BLOCK_S`` time constants of the machine (:func:`machine_second`)."""
     return BLOCK_S * machine_second(dt, time_unit)
 
 
 def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[float, ...]:
-    """Speeds, one for each degree of freedom, below which friction may stick [unit of v].
+    """Speeds below which friction may stick [unit of v], one for each degree of freedom.
 
-    A twentieth of the speed at work (the 99 % quantile of the speeds in motion), but no less than three deviations of
-    what the sensor's noise and steps make of a speed. Speeds are slopes of cubics over the guard's window.
+    They are 5 % of the working speed (the 99 % quantile of the speeds in motion), but at least three standard
+    deviations of a speed due to sensor noise and resolution. Speeds are slopes of cubics over the window.
 
     Args:
-        recordings: Positions ``y`` ``(n, n_q)`` on the model's grid, in which nothing is wrong: the training ones.
-        model: Whose period and unit of time make the window.
+        recordings: Positions ``y`` ``(n, n_q)`` of fault-free recordings on the model's grid.
+        model: The model; its period and time constant determine the window.
 
     Raises:
-        InputError: If there is no recording as long as the window, or nothing moves in them.
+        InputError: If every recording is shorter than the window, or a position never moves.
 
     Example:
         ``rest_speeds(dataset.by_role("train"), artifact.models["hybrid"])``
@@ -92,8 +92,8 @@ def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[floa
     long = [r for r in recordings if len(r.y) > 2 * half]
     if not long:
         raise InputError(
-            f"rest speeds: no recording has the {2 * half + 1} samples ({(2 * half + 1) * model.dt:g} s) of the "
-            "guard's window; give longer ones [HM-WATCH-027]"
+            f"rest speeds: every recording is shorter than the window of {2 * half + 1} samples "
+            f"({(2 * half + 1) * model.dt:g} s). Give longer recordings [HM-WATCH-027]"
         )
     speeds = np.abs(np.concatenate([speeds_of(r, model.dt, half) for r in long]))
     least = DEVIATIONS * noise_of(long) * speed_gain(model.dt, half)
@@ -104,17 +104,18 @@ def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[floa
     if not min(found) > 0:
         names = [s.name for s, rest in zip(model.outputs, found, strict=True) if not rest > 0]
         raise InputError(
-            f"rest speeds: {', '.join(names)} never moves in the recordings; give some in motion [HM-WATCH-028]"
+            f"rest speeds: {', '.join(names)} never moves in the recordings. Record the machine in motion "
+            "[HM-WATCH-028]"
         )
     return tuple(found)
 
 
 def checked_rest(rest_speed: ArrayLike, n_q: int, what: str) -> tuple[float, ...]:
-    """Rest speeds of ``n_q`` degrees of freedom, from as many or from one for all; positive."""
+    """Positive rest speeds of ``n_q`` degrees of freedom, from ``n_q`` values or from one for all."""
     values = np.asarray(rest_speed, dtype=float).ravel()
     if values.size not in (1, n_q) or not (np.all(np.isfinite(values)) and np.all(values > 0)):
         raise InputError(
-            f"{what}: rest_speed must be {n_q} positive speeds, one a degree of freedom (or one for all); got "
+            f"{what}: rest_speed must be {n_q} positive speeds, one for each degree of freedom, or one for all; got "
             f"{values.tolist()} [HM-WATCH-029]"
         )
     return tuple(np.broadcast_to(values, n_q).tolist())

@@ -1,4 +1,4 @@
-"""The monitor: reading, limits, alarm; the same for every kind of readings."""
+"""The monitor: compares readings with limits and raises alarms, for every kind of readings."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MonitorState:
-    """What a monitor remembers, never changed in place: of the readings, of the detector, and for how many samples in a
-    row there has been no valid reading.
+    """State of a monitor, never changed in place: of the readings, of the detector, and the number of successive
+    samples without a valid reading.
     """
 
     readings: Any
@@ -33,24 +33,24 @@ class MonitorState:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a monitor says of one period.
+    """Reading of a monitor in one period.
 
     Args:
-        values: Value of each channel [its unit]; NaN where unknown.
-        terms: What the variances of nominal values are linear in, for each channel.
-        levels: Level of each limit [deviations, or the unit of the channel]; none without limits.
+        values: Value of each channel [its unit]; NaN if unknown.
+        terms: Regressors of the variance of nominal values, for each channel.
+        levels: Level of each limit [deviations, or the unit of the channel]; empty without limits.
         share: The largest level over its threshold [-]; NaN without limits.
         on: Which limits are exceeded.
         channels: Names of the channels that alarm.
-        frozen_outputs: Names of the outputs whose sensor repeats itself while motion is predicted.
-        travel: How far each output was predicted to move since its sensor last moved ``(n_y,)`` [its unit].
-        repeats: Samples since then ``(n_y,)``.
+        frozen_outputs: Names of the outputs with a frozen sensor.
+        travel: Predicted motion of each output since its reading last changed ``(n_y,)`` [its unit].
+        repeats: Number of samples since that change ``(n_y,)``.
         inside: Which outputs lie inside their sensors' ranges ``(n_y,)``.
-        settled: Whether the values count.
+        settled: Whether the values count: the estimator has settled.
         alarm: True while a channel alarms, a sensor is frozen, or the monitor is blind.
         validity: Whether the values are valid, and if not, why.
-        blind: True while no reading has been valid for longer than the readings' ``patience``.
-        violation_w: Violation of the energy balance [W]; NaN where the energy is not read.
+        blind: True while there has been no valid reading for longer than the readings' ``patience``.
+        violation_w: Violation of the energy balance [W]; NaN if the energy is not read.
     """
 
     values: Sequence[float] | Array
@@ -76,21 +76,21 @@ class Reading:
 
 
 class Monitor:
-    """Watches a machine by the channels of its readings.
+    """Monitors a machine by the channels of its readings.
 
-    Each channel is compared with its own limits; a sensor that repeats itself while its output is predicted to move
-    beyond its limit is **frozen**; a monitor without a valid reading for longer than the readings' patience is
-    **blind**. Each of the three is an alarm.
+    Three conditions raise an alarm: a channel exceeds its limits; a sensor is **frozen** (its readings repeat although
+    the predicted motion of its output exceeds its limit); the monitor is **blind** (no valid reading for longer than
+    the readings' patience).
 
     Args:
-        readings: What is read, see :func:`make_monitor`.
-        limits: What the channels are compared with, of :func:`~hybrid_mpc.watch.learn.learn_limits`. Default: none,
-            then nothing alarms but a frozen sensor with ``resolution``, and blindness.
-        resolution: Step of each sensor ``(n_y,)`` [output units]: three of them are the least travel of a frozen
-            sensor. Default: the limits' travel alone.
+        readings: The readings, see :func:`make_monitor`.
+        limits: Limits of the channels, from :func:`~hybrid_mpc.watch.learn.learn_limits`. Default: none; then only a
+            frozen sensor (with ``resolution``) and blindness raise alarms.
+        resolution: Resolution of each sensor ``(n_y,)`` [output units]: three steps are the least travel of a frozen
+            sensor. Default: only the limits' travel counts.
 
     Raises:
-        InputError: If the limits are of other readings, or a step is not positive.
+        InputError: If the limits belong to other readings, or a resolution is not positive.
 
     Example: ``Monitor(EnergyReadings(model), limits)``
     """
@@ -103,14 +103,15 @@ class Monitor:
         self.channels = tuple(channel.name for channel in readings.channels)
         """Names of the channels."""
         self.detector = None
-        """What compares the channels with their limits; None without limits."""
+        """Detector of the limits; None without limits."""
         n_y = model.n_y
         travel, repeats = np.full(n_y, math.inf), np.zeros(n_y, dtype=int)
         if limits is not None:
             limits.check(readings.kind, readings.channels, readings.n_terms, model.dt, model.time_unit)
             if len(limits.travel) != n_y:
                 raise InputError(
-                    f"limits: {len(limits.travel)} travels, model {model.name} has {n_y} outputs [HM-WATCH-030]"
+                    f"limits: {len(limits.travel)} travels, but model {model.name} has {n_y} outputs. Learn the limits "
+                    "again [HM-WATCH-030]"
                 )
             self.detector = Detector(limits.channels, self.channels)
             travel, repeats = np.array(limits.travel), np.array(limits.repeats)
@@ -118,12 +119,12 @@ class Monitor:
             steps = np.asarray(resolution, dtype=float).ravel()
             if steps.shape != (n_y,) or not (np.all(np.isfinite(steps)) and np.all(steps > 0)):
                 raise InputError(
-                    f"monitor: resolution needs {n_y} positive steps of the sensors, got {steps} [HM-WATCH-031]"
+                    f"monitor: resolution must be {n_y} positive steps of the sensors, got {steps} [HM-WATCH-031]"
                 )
             least = FROZEN_STEPS * steps
             travel = least if readings.kind == ENERGY or limits is None else np.maximum(travel, least)
         self.frozen_travel, self.frozen_repeats = travel, repeats
-        """How far, and for how many samples, each sensor may repeat itself ``(n_y,)``."""
+        """Largest predicted motion, and largest number of samples, with repeated readings ``(n_y,)``."""
         self._outputs = [
             (s.name, far, often)
             for s, far, often in zip(model.outputs, travel.tolist(), repeats.tolist(), strict=True)
@@ -133,12 +134,12 @@ class Monitor:
 
     @property
     def cannot_alarm(self) -> str:
-        """Why no reading could raise an alarm, and what would give it limits; empty if one could."""
+        """Why no reading can raise an alarm, and the remedy; empty if one can."""
         if self.limits is not None or np.isfinite(self.frozen_travel).any():
             return ""
         return (
-            "it has no limits, so nothing alarms but missing readings; the run's stage watch learns them, and "
-            "kit.monitor() has them"
+            "it has no limits, so only missing readings raise an alarm. Use kit.monitor(), whose limits the stage "
+            "watch of a run learns"
         )
 
     def initial(self) -> MonitorState:
@@ -150,13 +151,13 @@ class Monitor:
     def update(
         self, state: MonitorState, y: Array, u_prev: Array, estimate: Any
     ) -> tuple[MonitorState, Reading]:
-        """Take one sample; pure: the same arguments give the same result.
+        """Process one sample; a pure function of its arguments.
 
         Args:
             state: State after the previous sample, or :meth:`initial`.
-            y: Measurement ``(n_y,)`` now; NaN where missing.
+            y: Present measurement ``(n_y,)``; NaN if missing.
             u_prev: Input ``(n_u,)`` applied over the period that just ended.
-            estimate: Estimate at this sample, of which ``x``, ``h``, ``w`` and ``d`` are read where it has them.
+            estimate: Estimate at this sample; its fields ``x``, ``h``, ``w`` and ``d`` are used if present.
 
         Returns:
             The next state and the reading.
@@ -182,7 +183,7 @@ class Monitor:
         )  # fmt: skip
 
     def frozen(self, travel: Any, repeats: Any, inside: Any) -> tuple[str, ...]:
-        """Names of the outputs whose sensor is frozen, from how far and for how long each has repeated itself."""
+        """Names of the outputs with a frozen sensor, from predicted motion and number of repeated readings."""
         return tuple(
             name
             for (name, far, often), moved, count, within in zip(
@@ -193,7 +194,7 @@ class Monitor:
 
 
 def reads_energy(model: HybridModel) -> bool:
-    """Whether a model's energy can be read: a mechanical one whose outputs are its positions."""
+    """Whether a model's energy can be monitored: it is mechanical, and its outputs are its positions."""
     try:
         positions_of(model)
         check_model(model)
@@ -209,22 +210,24 @@ def make_readings(
     rest_speed: ArrayLike | None = None,
     input_range: ArrayLike | None = None,
 ) -> EnergyReadings | ResidualReadings:
-    """Readings of a model's machine.
+    """Build the readings of a model's machine.
 
     Args:
         model: The model.
-        kind: ``"energy"`` or ``"residuals"``. Default: the energy where it can be read (:func:`reads_energy`).
-        rest_speed: See :class:`~hybrid_mpc.watch.energy.EnergyReadings`; residuals know of none.
-        input_range: Likewise.
+        kind: ``"energy"`` or ``"residuals"``. Default: the energy if :func:`reads_energy`.
+        rest_speed: See :class:`~hybrid_mpc.watch.energy.EnergyReadings`; residuals do not use it.
+        input_range: See :class:`~hybrid_mpc.watch.energy.EnergyReadings`; residuals do not use it.
 
     Raises:
-        InputError: If there is no such kind, or the energy of the model cannot be read.
+        InputError: If the kind is unknown, or the model's energy cannot be monitored.
     """
     kind = kind or (ENERGY if reads_energy(model) else RESIDUALS)
     if kind == RESIDUALS:
         return ResidualReadings(model)
     if kind != ENERGY:
-        raise InputError(f"readings: no kind {kind!r}; there are {ENERGY!r} and {RESIDUALS!r} [HM-WATCH-032]")
+        raise InputError(
+            f"readings: unknown kind {kind!r}; choose {ENERGY!r} or {RESIDUALS!r} [HM-WATCH-032]"
+        )
     return EnergyReadings(model, rest_speed=rest_speed, input_range=input_range)
 
 
@@ -237,18 +240,18 @@ def make_monitor(
     rest_speed: ArrayLike | None = None,
     input_range: ArrayLike | None = None,
 ) -> Monitor:
-    """A monitor of a model's machine.
+    """Build a monitor of a model's machine.
 
     Args:
         model: The model that is compared with the machine.
         limits: See :class:`Monitor`. Default: none.
-        kind: See :func:`make_readings`. Default: the limits' kind, else the energy where it can be read.
-        resolution: See :class:`Monitor`.
-        rest_speed: See :func:`make_readings`. Default: the limits' own.
-        input_range: See :func:`make_readings`.
+        kind: See :func:`make_readings`. Default: the limits' kind, else the energy if :func:`reads_energy`.
+        resolution: See :class:`Monitor`. Default: none.
+        rest_speed: See :func:`make_readings`. Default: that of the limits.
+        input_range: See :func:`make_readings`. Default: that of the model's signals.
 
     Raises:
-        InputError: As these.
+        InputError: As :class:`Monitor` and :func:`make_readings`.
 
     Example: ``make_monitor(kit.models["hybrid"], limits, resolution=[2 * np.pi / 4096])``
     """

@@ -1,4 +1,4 @@
-"""What is read of a machine each period: channels with a unit, the travel of sensors that repeat themselves."""
+"""Readings of a machine in each period: channels with a unit, and the predicted motion of sensors that repeat."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ ENERGY, RESIDUALS = "energy", "residuals"
 """The kinds of readings: :class:`~hybrid_mpc.watch.energy.EnergyReadings`, for mechanical machines, and
 :class:`~hybrid_mpc.watch.residuals.ResidualReadings`, for any."""
 FROZEN_STEPS = 3.0
-"""Steps of the sensor that must be predicted while it repeats itself."""
+"""Predicted motion, in steps of the sensor, from which on repeated readings mean a frozen sensor."""
 
 
 class Validity(IntEnum):
     """Whether a reading is valid, and if not, why."""
 
     VALID = 0
-    """All values that a valid reading needs are numbers."""
+    """All required values are numbers."""
     WARM_UP = 1
-    """The window was not full yet."""
+    """The window is not full yet."""
     MISSING = 2
-    """A measurement or input was missing."""
+    """A measurement or input is missing."""
     NOT_FINITE = 3
-    """Nothing was missing, but model or estimator gave no finite number."""
+    """Nothing is missing, but model or estimator gave a non-finite value."""
 
 
 SECONDS: Mapping[Validity, str] = MappingProxyType(
@@ -42,12 +42,12 @@ SECONDS: Mapping[Validity, str] = MappingProxyType(
         Validity.NOT_FINITE: "not_finite_s",
     }
 )
-"""Names under which results count the seconds of each."""
+"""Names of the seconds of each validity in results."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A named reading: a number per period, with its unit. ``kind`` is what it reads, in words."""
+    """A named reading: one number per period, with its unit; ``kind`` is a description."""
 
     name: str
     unit: str
@@ -56,8 +56,8 @@ class Channel:
 
 @dataclass(frozen=True)
 class Test:
-    """How a channel, by its number, is compared: over how many samples (0: a cumulative sum of what exceeds ``drift``
-    deviations). ``may_be_zero``: nominal data may not show how large the channel gets.
+    """Test of a channel, given by its index: ``length`` of the mean in samples (0: a cumulative sum with dead band
+    ``drift`` [deviations]). ``may_be_zero``: the channel may be constant zero in nominal data.
     """
 
     channel: int
@@ -68,13 +68,13 @@ class Test:
 
 @dataclass(frozen=True)
 class Sample:
-    """What was read in one period.
+    """Readings of one period.
 
     Args:
-        values: One number for each channel [its unit]; NaN where unknown.
-        terms: What the variances of nominal values are linear in, for each channel. Default: they are constant.
-        travel: How far each output was predicted to move since its sensor last moved ``(n_y,)`` [its unit].
-        repeats: Samples since then ``(n_y,)``.
+        values: One number for each channel [its unit]; NaN if unknown.
+        terms: Regressors of the variance of nominal values, for each channel; empty if it is constant.
+        travel: Predicted motion of each output since its reading last changed ``(n_y,)`` [its unit].
+        repeats: Number of samples since that change ``(n_y,)``.
         inside: Which outputs lie inside their sensors' ranges ``(n_y,)``.
         settled: Whether the values count: the estimator has settled.
         validity: Whether the values are valid, and if not, why.
@@ -90,22 +90,22 @@ class Sample:
 
 
 class Readings(Protocol):
-    """A kind of readings of a model's machine; pure, the memory is the state that it returns."""
+    """A kind of readings of a model's machine; a pure function of its state."""
 
     kind: str
     model: HybridModel
     channels: tuple[Channel, ...]
     patience: int
-    """Samples in a row without a valid reading that are no alarm."""
+    """Largest number of successive samples without a valid reading that is no alarm."""
     n_terms: int
-    """Terms of a variance; 0 where values are compared as they are."""
+    """Number of regressors of a variance; 0 if values are not scaled."""
     tests: tuple[Test, ...]
-    """What is learned a limit for."""
+    """Tests for which limits are learned."""
 
     def initial(self) -> Any:
         """State before the first sample."""
 
     def update(self, state: Any, y: Array, u_prev: Array, estimate: Any) -> tuple[Any, Sample]:
-        """Next state and sample, from measurement ``y`` ``(n_y,)``, the input ``(n_u,)`` that acted over the period
+        """Next state and sample, from the measurement ``y`` ``(n_y,)``, the input ``(n_u,)`` applied over the period
         that just ended, and the estimate at this sample.
         """

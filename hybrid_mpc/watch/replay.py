@@ -1,4 +1,4 @@
-"""A trace of readings: of a monitor that is run over a recording, as it would have run online."""
+"""Replay of a monitor over a recording as it would run online, and the trace of its readings."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from hybrid_mpc.watch.readings import SECONDS, Channel
 
 Array = NDArray[np.float64]
 REPORTED = 500
-"""Samples from one report of the progress to the next."""
+"""Samples between two progress reports."""
 
 
 class EstimatorLike(Protocol):
-    """The estimator as the replay uses it; estimates have ``x`` (n_x,) and ``h`` (n_h,)."""
+    """Interface of the estimator in a replay; estimates have ``x`` (n_x,) and ``h`` (n_h,)."""
 
     def start(self, y: Array, t: float) -> Any:
         """Estimate at the first sample; with measured disturbances ``start(y, t, w=w)``."""
@@ -58,18 +58,18 @@ class Trace:
         channels: The channels of the monitor.
         outputs: Names of the outputs.
         values: Values of the channels ``(n, channels)`` [their units]; NaN where unknown.
-        terms: What variances of nominal values are linear in ``(n, channels, terms)``.
+        terms: Regressors of the variances of nominal values ``(n, channels, terms)``.
         levels: Levels of the limits ``(n, limits)``.
         share: Largest level over its threshold ``(n,)`` [-]; NaN without limits.
         on: Which channels alarm ``(n, channels)``.
         frozen: Which outputs are frozen ``(n, n_y)``.
-        travel: How far outputs were predicted to move while their sensor repeated itself ``(n, n_y)``.
-        repeats: For how many samples it did ``(n, n_y)``.
+        travel: Predicted motion of the outputs while their readings repeat ``(n, n_y)``.
+        repeats: Number of repeated readings ``(n, n_y)``.
         inside: Which outputs lie inside their sensors' ranges ``(n, n_y)``.
         settled: Whether values count ``(n,)``.
         alarm: Any alarm ``(n,)``.
         validity: Values of :class:`~hybrid_mpc.watch.readings.Validity` ``(n,)``.
-        blind: ``(n,)``, True where there was no valid reading for too long.
+        blind: ``(n,)``, True while there has been no valid reading for too long.
     """
 
     t: Array
@@ -108,16 +108,14 @@ class Trace:
         return {name: self._times(on) for name, on in zip(self.names, every, strict=True) if on.any()}
 
     def named(self, start: float, end: float) -> tuple[str, ...]:
-        """Channels that alarm between two instants [s], in the order in which they do; frozen sensors as
-        ``"NAME frozen"``.
-        """
+        """Channels that alarm between two times [s], in the order of their alarms, or ``"NAME frozen"``."""
         within = (self.t >= start - 1e-9) & (self.t <= end + 1e-9)
         on = np.hstack([self.on, self.frozen])[within]
         first = [int(np.argmax(column)) if column.any() else len(on) for column in on.T]
         return tuple(self.names[i] for i in np.argsort(first, kind="stable") if first[i] < len(on))
 
     def coverage(self, dt: float) -> dict[str, float]:
-        """Seconds with a valid reading, and those without, by reason."""
+        """Seconds with a valid reading, and without one by reason."""
         return {name: float(np.sum(self.validity == why)) * dt for why, name in SECONDS.items()}
 
     def _times(self, on: NDArray[np.bool_]) -> list[tuple[float, float]]:
@@ -160,15 +158,15 @@ def replay(
     on_sample: Callable[[int, Any], None] = lambda k, estimate: None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Trace:
-    """Feed a recording to the estimator and the monitor, sample by sample.
+    """Run estimator and monitor over a recording, sample by sample.
 
     Args:
         monitor: The monitor.
-        estimator: The one that the loop uses.
-        recording: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) and, where the model has measured disturbances, ``w``
+        estimator: The estimator of the loop.
+        recording: With ``t`` (n,), ``y`` (n, n_y), ``u`` (n, n_u) and, if the model has measured disturbances, ``w``
             (n, n_w), on the model's grid.
-        on_sample: Called with each sample's number and estimate. Default: none.
-        on_progress: Called with ``(done, total)`` samples every so often. Default: none.
+        on_sample: Called with each sample's index and estimate. Default: nothing.
+        on_progress: Called with ``(done, total)`` samples every 500 samples. Default: nothing.
 
     Raises:
         InputError: If the recording is empty, its lengths differ, or its period is not the model's.
@@ -199,9 +197,9 @@ def replay(
 def along(
     recordings: Sequence[Recording], report: Callable[[str, int, int, str], None]
 ) -> Iterator[tuple[Recording, Callable[[int, int], None]]]:
-    """Recordings one after the other, each with the function that a replay reports its progress to.
+    """Recordings one after the other, each with a progress function for :func:`replay`.
 
-    ``report`` takes ``(key, done, total, text)`` with the samples of all of them.
+    ``report`` is called with ``(key, done, total, text)``, counted in samples of all recordings.
     """
     total, before = sum(len(r.t) for r in recordings), 0
     for r in recordings:
@@ -215,7 +213,7 @@ def along(
 
 
 def with_alarms(monitor: Monitor, trace: Trace) -> Trace:
-    """A trace with the levels and alarms of ``monitor``'s limits: values do not depend on them, nothing is replayed."""
+    """A trace with the levels and alarms of ``monitor``'s limits, without a replay: values do not depend on limits."""
     detector = monitor.detector
     assert detector is not None
     on, levels, shares, frozen = [], [], [], []
@@ -238,7 +236,7 @@ def with_alarms(monitor: Monitor, trace: Trace) -> Trace:
 
 
 def count_alarms(alarm: Array | NDArray[np.bool_], dt: float) -> tuple[int, float]:
-    """Number of alarms (rising edges; one that is on at the start counts) and their rate [1/h].
+    """Number of alarms (rising edges; an alarm at the start counts) and their rate [1/h].
 
     Example:
         >>> count_alarms(np.array([False, True, True, False]), 900.0)
@@ -255,7 +253,7 @@ def alarm_intervals(alarm: Array | NDArray[np.bool_], dt: float) -> list[tuple[f
 
 
 def stretches(on: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """First and last samples of the stretches in which ``on`` ``(n,)`` is true."""
+    """First and last indices of the intervals in which ``on`` ``(n,)`` is true."""
     edges = np.diff(np.concatenate([[0], np.asarray(on, dtype=bool), [0]]).astype(int))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
 
@@ -263,7 +261,7 @@ def stretches(on: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
 def _check(t: Array, y: Array, u: Array, dt: float) -> None:
     if not t.size or not t.size == len(y) == len(u):
         raise InputError(
-            f"replay: t, y, u have {t.size}, {len(y)}, {len(u)} samples; need equally many, not 0 [HM-WATCH-033]"
+            f"replay: t, y, u have {t.size}, {len(y)}, {len(u)} samples; give equally many, at least 1 [HM-WATCH-033]"
         )
     off = float(np.max(np.abs(np.diff(t) - dt))) if t.size > 1 else 0.0
     if off > 1e-3 * dt:

@@ -1,4 +1,4 @@
-"""Readings of any machine: what its model does not explain of every output and of every balance."""
+"""Readings of any machine: residuals of the model for every output and every balance."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from hybrid_mpc.watch.readings import RESIDUALS, Channel, Sample, Test, Validity
 
 Array = NDArray[np.float64]
 FREE_RUN_S = 1.0
-"""Length of the model's free runs [the machine's seconds]. A jump of a sensor, which the estimator follows within a few
-samples, shows in them until the next one begins."""
+"""Length of the model's free runs [time constants of the machine]. A jump of a sensor, which the estimator follows
+within a few samples, remains visible in a free run until the next run begins."""
 RUNS = 2
-"""Free runs that take turns, half a length apart: one has always half a length behind it."""
+"""Number of free runs, which begin half a length apart: the older one has always run for at least half a length."""
 
 
 def free_run_of(name: str) -> str:
@@ -30,16 +30,16 @@ def free_run_of(name: str) -> str:
 
 @dataclass(frozen=True)
 class ResidualState:
-    """What the readings remember, never changed in place.
+    """State of the readings, never changed in place.
 
     Args:
-        x: The latest estimate's state ``(n_x,)``; ``h`` its hidden state, ``w`` its disturbances; NaN before the first.
-        y: The latest measurement ``(n_y,)``.
-        travel: How far each output was predicted to move since its sensor last moved ``(n_y,)``.
-        repeats: Samples since then ``(n_y,)``.
+        x: State of the latest estimate ``(n_x,)``; ``h`` its hidden state, ``w`` its disturbances; NaN before the
+        first. y: The latest measurement ``(n_y,)``.
+        travel: Predicted motion of each output since its reading last changed ``(n_y,)``.
+        repeats: Number of samples since that change ``(n_y,)``.
         runs: States, hidden states and unmeasured disturbances of the free runs ``(2, n_x + n_h + n_d)``.
-        age: Periods since each of them began; negative: so long until it does.
-        seen: Samples taken, until all count.
+        age: Periods since the begin of each free run; negative before its begin.
+        seen: Number of processed samples, up to the settling time.
     """
 
     x: Array
@@ -58,24 +58,24 @@ class ResidualReadings:
 
     Its channels, in this order:
 
-    - Each **output**: what was measured less what one step of the model predicts from the estimate of a period ago,
-      under the input that acted and without the estimated disturbance [its unit].
-    - Each **balance**: the estimate's change over the period, less the model's, is a rate that the model does not
-      explain, ``r = (x_hat - x_predicted) / dt``. It holds the correction by the measurement, and what a disturbance
-      observer takes for a load: so a constant load shows as long as it is there. The residual is ``dS/dx r`` [unit of
-      rate], for a mechanical prior the power that the machine has and the model has not.
-    - Each **measured disturbance**: how far it is from the operating point's [its unit]. No model predicts it, but a
-      disturbance where it never was in nominal data is an alarm by itself, and models know nothing there.
-    - The **free run** of each output: what was measured less what the model, left alone since up to one of the
-      machine's seconds, makes of the inputs and of the disturbance that was estimated at its start [unit of the
-      output]. The one step begins at an estimate that has half followed the fault; the free run does not. Two take
-      turns, and the older one is read.
+    - Each **output**: measurement minus the model's one-step prediction from the last estimate, with the applied input
+      and without the estimated disturbance [its unit].
+    - Each **balance**: the change of the estimate over the period minus the model's is an unexplained rate,
+      ``r = (x_hat - x_predicted) / dt``. It contains the correction by the measurement and the estimated load, so a
+      constant load is always visible. The residual is ``dS/dx r`` [unit of the rate], for a mechanical prior the power
+      that the model lacks.
+    - Each **measured disturbance**: its distance from the operating point [its unit]. No model predicts it, but a value
+      outside the nominal data is an alarm, because models are unreliable there.
+    - The **free run** of each output: measurement minus a free run of the model over up to one time constant of the
+      machine, with the applied inputs and the disturbance that was estimated at its start [unit of the output]. The
+      one-step prediction starts at an estimate that partly follows the fault; the free run does not. Of two free runs
+      in turn, the older one is read.
 
-    The first of the machine's seconds does not count: estimates settle in it. **Travel**: an output repeats itself
-    exactly while the model's own predictions of it add up. A sensor at an end of its range is not frozen.
+    The first time constant of the machine does not count, because the estimates settle. **Travel**: the sum of the
+    one-step predictions while an output repeats its reading exactly. A sensor at the end of its range is not frozen.
 
-    For a mechanical model whose positions are measured :class:`~hybrid_mpc.watch.energy.EnergyReadings` show more: dry
-    friction is known there. Not for several threads at once (buffers are reused).
+    For a mechanical model with measured positions, :class:`~hybrid_mpc.watch.energy.EnergyReadings` detect more,
+    because they account for dry friction. Not thread-safe (buffers are reused).
 
     Args:
         model: The model that is compared with the machine.
@@ -100,17 +100,17 @@ class ResidualReadings:
     def __init__(self, model: HybridModel) -> None:
         self.model = model
         self.channels = (
-            *(Channel(s.name, s.unit, "measured less predicted a period ahead") for s in model.outputs),
+            *(Channel(s.name, s.unit, "measurement minus one-step prediction") for s in model.outputs),
             *(
-                Channel(b.name, b.rate_unit, "balance that the estimate's change leaves")
+                Channel(b.name, b.rate_unit, "residual of the balance for the change of the estimate")
                 for b in model.balances
             ),
             *(Channel(s.name, s.unit, "distance from the operating point") for s in model.disturbances),
-            *(Channel(free_run_of(s.name), s.unit, "measured less free run") for s in model.outputs),
+            *(Channel(free_run_of(s.name), s.unit, "measurement minus free run") for s in model.outputs),
         )
         unit = machine_second(model.dt, model.time_unit)
         self.settling = settling_samples(model)
-        """Samples at the beginning that do not count."""
+        """Number of samples at the beginning that do not count."""
         self.free_run = periods(FREE_RUN_S * unit, model.dt, RUNS)
         """Length of a free run [periods]."""
         self.short, self.long = (periods(length * unit, model.dt) for length in (SHORT_S, LONG_S))
@@ -139,9 +139,9 @@ class ResidualReadings:
     def update(
         self, state: ResidualState, y: Array, u_prev: Array, estimate: Any
     ) -> tuple[ResidualState, Sample]:
-        """Take one sample; see :class:`~hybrid_mpc.watch.readings.Readings`.
+        """Process one sample; see :class:`~hybrid_mpc.watch.readings.Readings`.
 
-        Of the estimate ``x``, ``h``, ``w`` and, where it has one, ``d`` are read.
+        The estimate's ``x``, ``h``, ``w`` and, if present, ``d`` are used.
         """
         m = self.model
         y = np.array(y, dtype=np.float64).ravel()
@@ -172,7 +172,7 @@ class ResidualReadings:
     def _turned(
         self, ahead: Array, free: Array, begun: Array, age: tuple[int, ...]
     ) -> tuple[Array, tuple[int, ...], Array]:
-        """Free runs and their ages after those that are at their end, or lost, have begun anew; error of the older."""
+        """Free runs and their ages after restarting those that have ended or diverged; error of the older run."""
         running = [k for k in range(RUNS) if age[k] >= 0]
         older = max(running, key=lambda k: age[k], default=None)
         error = np.full(self.model.n_y, np.nan) if older is None else free[older].copy()

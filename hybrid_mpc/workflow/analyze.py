@@ -1,4 +1,4 @@
-"""``hybrid-mpc analyze``: what is analyzed, read from an artifact, a scenario and recordings."""
+"""``hybrid-mpc analyze``: input of the linear analysis, read from an artifact, a scenario and recordings."""
 
 from __future__ import annotations
 
@@ -28,11 +28,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AnalysisSettings:
-    """What ``hybrid-mpc analyze`` is asked for.
+    """Settings of ``hybrid-mpc analyze``.
 
-    ``folder`` is that of the artifact, or of the run that holds it as ``model``. ``scenario`` is a name or file;
-    without one the artifact names it. The working ``speed`` [unit of v] is by default that of the scenario's weights,
-    else 1.
+    Args:
+        folder: Folder of the artifact, or of the run that holds it as ``model``.
+        scenario: Name or file of the scenario. Default: the artifact's.
+        data: Recordings. Default: none.
+        speed: Working speed [unit of v]. Default: from the scenario's weights, else 1.
+        seed: Seed of the random signals. Default: 0.
     """
 
     folder: Path
@@ -43,29 +46,33 @@ class AnalysisSettings:
 
 
 def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str, ...]]:
-    """Read what is analyzed, with notes on where it came from."""
+    """Read the input of the analysis; returns it with notes on its sources."""
     folder = artifact_folder(settings.folder)
     kit = load(folder)
     scenario = scenario_of(kit.provenance.scenario, folder / KIT, settings.scenario)
     if scenario is None and settings.data:
         raise InputError(
-            "--data needs --scenario, which names the columns of the recordings [HM-WORKFLOW-001]"
+            "--data: add --scenario, which names the columns of the recordings [HM-WORKFLOW-001]"
         )
     model = next(iter(kit.models.values()))
     if scenario is not None:
         kit = kit.on(scenario)
     control = kit.control
     speed = _speed(model, control, settings.speed)
-    notes = [f"scenario {scenario.name}" if scenario else "no scenario: no response of a machine"]
+    notes = [
+        f"scenario {scenario.name}" if scenario else "no scenario, so no response of a machine is estimated"
+    ]
     ocp: OCP | None = None
     filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}
     noise_known = scenario is not None or set(OBSERVERS) <= set(kit.loop.process_noise)
     if control is not None and not noise_known:
-        notes.append("no loops: the model holds no process noise for its filters; run the scenario again")
+        notes.append(
+            "no closed loops: the model has no process noise for its observers; run the scenario again"
+        )
     if control is not None and noise_known and {"prior", "hybrid"} <= set(kit.models):
         ocp = make_ocp(kit.models["prior"], control)
         filters, source = _filters(settings, scenario, kit)
-        notes.append(f"filters' noise: {source}")
+        notes.append(f"observers' noise: {source}")
     plant = scenario.plant() if scenario is not None and scenario.plant is not None else None
     return AnalysisInput(
         models=kit.models,
@@ -83,7 +90,7 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
 
 def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Array:
     if given is not None and not (np.isfinite(given) and given > 0):
-        raise InputError(f"--speed must be positive, got {given} [HM-WORKFLOW-002]")
+        raise InputError(f"--speed: give a positive number, got {given} [HM-WORKFLOW-002]")
     try:
         n_q = positions_of(model)
     except InputError as none:
@@ -101,7 +108,7 @@ def _speed(model: HybridModel, control: OCP | None, given: float | None) -> Arra
 def _filters(
     settings: AnalysisSettings, scenario: Scenario | None, kit: Kit
 ) -> tuple[dict[tuple[str, str], ExtendedKalmanFilter], str]:
-    """The observers of the closed loops: quiet, and in the periods after a load came or went."""
+    """Filters of the closed loops by model and mode: ``quiet``, and ``jump`` for the periods after a load step."""
     source = "the model's own"
     if scenario is not None:
         noise, source = find_noise(scenario, kit, OBSERVERS, settings.seed)

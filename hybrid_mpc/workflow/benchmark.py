@@ -1,6 +1,6 @@
-"""``hybrid-mpc benchmark``: fit, train and choose on some recordings, and evaluate free runs over others.
+"""``hybrid-mpc benchmark``: fit and train on training recordings, and evaluate free runs over test recordings.
 
-What is chosen (settings, networks, the recommended model) depends on training and validation parts alone.
+Every choice (settings, networks, recommended model) depends on training and validation data only.
 """
 
 from __future__ import annotations
@@ -54,25 +54,31 @@ from hybrid_mpc.workflow.stages.identify import PARTS, load_trained, save_traine
 Array = NDArray[np.float64]
 SCHEMA = 3
 SHOWN = 20.0
-"""Length of a run that is drawn sample by sample [the machine's seconds]."""
+"""Length of a run that is drawn in full [time constants of the machine]."""
 IN_MOTION = 0.1
-"""Least length [the machine's seconds] that is given of a validation piece: it begins in motion, while a recording that
-gives less (EMPS, 20 ms) begins at rest, and two samples tell no speed next to an unknown acceleration."""
+"""Shortest warm-up of a validation piece [time constants of the machine]. A piece begins in motion, and two samples do
+not determine speed and acceleration. Whole recordings with a shorter warm-up (EMPS, 20 ms) begin at rest."""
 REFIT_LENGTHS = (0.5, 1.0, 3.0)
-"""Free runs [the machine's seconds] of a refit, the short ones first: from parameters that are far off a long one leads
-nowhere. Short ones alone spend what little there is on their first states; 3 are what a refit mostly gets, whole."""
+"""Lengths of the free runs of a refit [time constants of the machine], the short ones first: from a bad start, the fit
+of long runs does not converge. Short runs alone spend most of the data on their initial states."""
 FEWEST_RUNS = 3
-"""Free runs of a refit at least: one alone would be fitted by any parameters."""
+"""Smallest number of free runs of a refit: a single run would be fitted by many parameters."""
 
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What one benchmark computes.
+    """Settings of a benchmark.
 
-    ``data`` and ``test`` are recordings to train and to evaluate on (default: what the training holds back); ``model``
-    is the folder of one made before, in place of training. ``refit`` is the length [s] of each test file's start that
-    the prior's parameters are fitted to anew, for a machine that has changed; the rest is evaluated with old and new
-    ones.
+    Args:
+        scenario: Name or file of the scenario.
+        data: Training recordings. Default: none, ``model`` is evaluated.
+        test: Test recordings. Default: parts of the training recordings that the training holds back.
+        model: Folder of an existing model, in place of training. Default: train one.
+        budget: Name of a benchmark budget. Default: quick.
+        seed: Seed of the training. Default: 0.
+        workers: Number of processes. Default: 1.
+        refit: For a machine that has changed: length [s] at the start of each test file to which the prior's parameters
+            are fitted again; the rest is evaluated with old and new parameters. Default: no refit.
     """
 
     scenario: str
@@ -87,7 +93,7 @@ class BenchmarkSettings:
 
 @dataclass(frozen=True)
 class _Description:
-    """What the JSON file next to the networks holds, see :class:`BenchmarkModel`."""
+    """Content of the JSON file next to the networks, see :class:`BenchmarkModel`."""
 
     scenario: str
     dt: float
@@ -106,8 +112,8 @@ class BenchmarkModel(_Description):
     """Everything that a free run over another recording needs: prior, recommended model (``hybrid``), networks by kind.
 
     ``validation`` and ``long`` are the errors of every model on validation pieces and on :attr:`Recordings.long`;
-    ``linear`` are the linear baselines by name, ``no_linear`` says why there is none of a name. ``choice`` says which
-    kinds surely beat the prior where they were not trained.
+    ``linear`` are the linear baselines by name, ``no_linear`` says why a baseline is missing. ``choice`` compares the
+    networks with the prior on held-out data.
     """
 
     networks: Mapping[str, Trained]
@@ -115,9 +121,7 @@ class BenchmarkModel(_Description):
 
 @dataclass(frozen=True)
 class Refit:
-    """A changed machine: errors over what follows the seconds that the prior was fitted to, with its old and new
-    parameters.
-    """
+    """Refit for a changed machine: errors with old and new parameters over the part after the refitted seconds."""
 
     seconds: float
     prior: Sequence[Mapping[str, Any]]
@@ -127,8 +131,8 @@ class Refit:
 
 @dataclass(frozen=True)
 class FileResult:
-    """A test file: its free runs, which count ``scored_s`` seconds, and the errors by model; ``"hybrid"`` is the
-    recommended.
+    """A test file: its free runs, the errors by model (``"hybrid"`` is the recommended model), and the length of the
+    evaluated data ``scored_s`` [s].
     """
 
     runs: Sequence[BenchmarkRun]
@@ -139,7 +143,7 @@ class FileResult:
 
 @dataclass(frozen=True)
 class BenchmarkResults:
-    """The model of a benchmark, and what its free runs over each test file came to."""
+    """The model of a benchmark, and the results of each test file."""
 
     model: BenchmarkModel
     test: Mapping[str, FileResult]
@@ -148,9 +152,9 @@ class BenchmarkResults:
 def benchmark(
     settings: BenchmarkSettings, out: Path, *, progress: Progress | None = None, cluster: Any = None
 ) -> BenchmarkResults:
-    """Fit, train and evaluate; or evaluate a model made before. The same command goes on where it was interrupted.
+    """Fit, train and evaluate, or evaluate an existing model. The same command continues an interrupted benchmark.
 
-    ``out`` gets ``results.json`` and, if something is trained, ``model/`` and ``checkpoints/``.
+    ``out`` gets ``results.json`` and, after a training, ``model/`` and ``checkpoints/``.
 
     Args:
         settings: Machine, files and effort.
@@ -160,11 +164,12 @@ def benchmark(
             reach the files and ``out`` under the same paths. Default: processes of this machine.
 
     Raises:
-        InputError: If a file, the model, the budget or the folder does not fit, or the scheduler cannot be reached.
+        InputError: If a file is bad, if model, budget or folder belong to something else, or if the scheduler cannot
+            be reached.
     """
     progress, scenario = progress or Progress(), load_scenario(settings.scenario)
     _check(settings, scenario)
-    check_scenario(replace(scenario, plant=None))  # no loop is closed here
+    check_scenario(replace(scenario, plant=None))  # a benchmark runs no closed loop
     data, tests, warnings = _read(settings, scenario)
     for warning in warnings:
         progress.warn(warning)
@@ -196,32 +201,34 @@ def _check(settings: BenchmarkSettings, scenario: Scenario) -> None:
     scored_signals(scenario.prior().outputs, benchmark_of(scenario))  # refuses units of what is no output
     if settings.budget not in budgets:
         raise InputError(
-            f"scenario {scenario.name} has no benchmark budget {settings.budget!r}; it has: {', '.join(budgets)}"
-            " [HM-WORKFLOW-004]"
+            f"budget: scenario {scenario.name} has no benchmark budget {settings.budget!r}; choose one of: "
+            f"{', '.join(budgets)} [HM-WORKFLOW-004]"
         )
     if settings.model is None and not settings.data:
         raise InputError(
-            "give recordings to train on with --data FILE, or a model made before with --model DIR [HM-WORKFLOW-005]"
+            "--data: no training recordings. Give them with --data FILE, or an existing model with --model DIR "
+            "[HM-WORKFLOW-005]"
         )
     if settings.model is not None and settings.data:
         raise InputError(
-            "--model is evaluated as it is: leave --data out, or leave --model out to train anew [HM-WORKFLOW-006]"
+            "--model and --data exclude each other: remove --data to evaluate the model, or --model to train a new one "
+            "[HM-WORKFLOW-006]"
         )
     if settings.model is not None and not settings.test:
         raise InputError(
-            "a model made before needs recordings to be evaluated on: --test FILE [HM-WORKFLOW-007]"
+            "--model: no test recordings to evaluate the model; give them with --test FILE [HM-WORKFLOW-007]"
         )
     names = [path.name for path in settings.test]
     if len(set(names)) < len(names):
         raise InputError(
-            f"two test files have the same name: {', '.join(sorted(names))}; rename one [HM-WORKFLOW-008]"
+            f"--test: two files have the same name: {', '.join(sorted(names))}. Rename one [HM-WORKFLOW-008]"
         )
 
 
 def _read(
     settings: BenchmarkSettings, scenario: Scenario
 ) -> tuple[Recordings | None, dict[str, tuple[Trajectory, ...]], list[str]]:
-    """Training files if there are to be some, test files by name, and warnings about them."""
+    """Training recordings unless a model is given, test recordings by name, and warnings about both."""
     data: Recordings | None = None
     tests: dict[str, tuple[Trajectory, ...]] = {}
     problems: list[str] = []
@@ -241,7 +248,7 @@ def _read(
     return data, tests, list(dict.fromkeys(warnings))
 
 
-# The model: fitted, trained and chosen, or what the folder holds of it.
+# The model: fit, training and choice; finished parts are read from the folder.
 
 
 def _make(
@@ -296,9 +303,9 @@ def _make(
 
 
 def _baselines(scenario: Scenario, data: Recordings) -> tuple[dict[str, LinearModel], dict[str, str]]:
-    """Linear models by name, chosen on the same validation pieces, and why there is none of a name."""
+    """Linear models by name, chosen on the same validation pieces, and why a model is missing."""
     dt, found, missing = scenario.data.dt, {}, {}
-    # the others start knowing this sample
+    # the initial state of the other models is estimated with this sample
     warm = warm_samples(max(scenario.data.warm_up, IN_MOTION), 0.0, dt) + 1
     for name, fitted in BASELINES.items():
         try:
@@ -309,7 +316,7 @@ def _baselines(scenario: Scenario, data: Recordings) -> tuple[dict[str, LinearMo
 
 
 def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
-    """Note in ``out`` what is trained there; another training in the same folder is refused."""
+    """Write a note of the training into ``out``; another training in the same folder is refused."""
     own = {
         "scenario": settings.scenario,
         "data": data.dataset.hash,
@@ -323,10 +330,10 @@ def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
 
 
 def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> PriorFit:
-    """The fitted prior; a fit that ``out`` holds is not made again."""
+    """The fitted prior, read from ``out`` if it is already there."""
     note, spec = out / "checkpoints" / "prior.json", benchmark_of(scenario)
     if note.is_file():
-        held = read_document(note, "delete it, and the same command fits the prior anew")
+        held = read_document(note, "delete this file; then the same command fits the prior again")
         return record(PriorFit, held, str(note))
     fit = fit_prior(
         scenario.prior, data.train, data.valid, dt=scenario.data.dt, length=spec.length or spec.piece,
@@ -337,7 +344,7 @@ def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Pro
 
 
 def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> TrainingSettings:
-    """Settings of one kind: free runs are trained on the error of the position, which the benchmark scores."""
+    """Training settings of one kind: free runs are trained on the output error, which the benchmark evaluates."""
     return TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
         seed=seed,
@@ -356,7 +363,7 @@ def candidate_errors(
     trajectories: Sequence[Trajectory],
     warm_up: float,
 ) -> dict[str, OutputErrors]:
-    """Errors of every model's free runs; ``warm_up`` [s] of each recording is given."""
+    """Errors of every model's free runs after a warm-up of ``warm_up`` [s]."""
     spec, prior = benchmark_of(scenario), scenario.prior(fit.values)
     runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length, linear=linear)
     return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
@@ -369,7 +376,7 @@ def _choice(
     training: Sequence[Trajectory],
     validation: Sequence[Trajectory],
 ) -> Choice:
-    """Which kinds of networks surely beat the prior where they were not trained; trajectories are smoothed."""
+    """Comparison of the networks with the prior on held-out data; trajectories are smoothed."""
     prior, dt = scenario.prior(fit.values), scenario.data.dt
     settings, smoother = networks["pgrnn"].settings, fit.smoother(prior, dt)
     runs = unseen_runs(settings, training, validation, smoother, benchmark_of(scenario).length)
@@ -399,11 +406,11 @@ def _choice(
 def recommended(
     validation: Mapping[str, float], long: Mapping[str, float], *, sure: Sequence[str] = ("pgrnn", "mopgrnn")
 ) -> str:
-    """The candidate whose larger error, over the prior's, is least: on validation pieces and on runs of full length.
+    """The candidate with the least worst-case ratio to the prior's error, over validation pieces and long runs.
 
-    Nothing was trained on validation pieces, but they may be shorter than the runs of the test, and then do not show
-    drift. Of the networks only those kinds count that are ``sure`` to beat the prior on what they were not trained on
-    (:func:`~hybrid_mpc.identify.choose.recommend`).
+    Validation pieces are held out, but they may be shorter than the test runs, and then do not show drift; long runs
+    do. Only the kinds of networks in ``sure`` are considered, which are significantly better than the prior on held-out
+    data (:func:`~hybrid_mpc.identify.choose.recommend`).
     """
 
     def larger(name: str) -> float:
@@ -417,7 +424,7 @@ def recommended(
 
 
 def save_model(folder: Path, model: BenchmarkModel) -> None:
-    """Write a model; the note comes last, so a folder that has it is whole."""
+    """Write a model, its note last: a folder with a note is complete."""
     for trained in model.networks.values():
         save_trained(folder, trained)
     description = {f.name: getattr(model, f.name) for f in fields(_Description)}
@@ -425,27 +432,30 @@ def save_model(folder: Path, model: BenchmarkModel) -> None:
 
 
 def load_model(folder: Path, scenario: str) -> BenchmarkModel:
-    """Read a model from its folder, or from that of the run which made it.
+    """Read a model from its folder, or from the folder of its benchmark.
 
     Raises:
-        InputError: If there is none, it is damaged, or of another machine.
+        InputError: If the model is missing, damaged, or of another machine.
     """
     folder = folder if (folder / BENCHMARK_NOTE).is_file() else folder / "model"
     path = folder / BENCHMARK_NOTE
     if not path.is_file():
         raise InputError(
-            f"{folder.parent} holds no model of a benchmark; give the folder that 'hybrid-mpc benchmark {scenario} "
-            "--data FILE --out DIR' has made [HM-WORKFLOW-009]"
+            f"{folder.parent}: no model of a benchmark. Give the folder of 'hybrid-mpc benchmark {scenario} "
+            "--data FILE --out DIR' [HM-WORKFLOW-009]"
         )
-    document = read_document(path, "make the benchmark anew")
+    document = read_document(path, "run the benchmark again")
     schema = document.pop("schema", None)
     if schema != SCHEMA:
         raise InputError(
-            f"{path}: schema {schema}, this version reads {SCHEMA}; train anew [HM-WORKFLOW-010]"
+            f"{path}: schema {schema}, but this version reads {SCHEMA}. Train the model again [HM-WORKFLOW-010]"
         )
     found = record(_Description, document, str(path))
     if found.scenario != scenario:
-        raise InputError(f"{folder} holds a model of {found.scenario}, not of {scenario} [HM-WORKFLOW-011]")
+        raise InputError(
+            f"{folder}: holds a model of {found.scenario}, not of {scenario}. Give a model of {scenario} "
+            "[HM-WORKFLOW-011]"
+        )
     return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in found.kinds})
 
 
@@ -472,7 +482,7 @@ def _runs(
     prior, spec = scenario.prior(fit.values), benchmark_of(scenario)
     warm_up, dt = scenario.data.warm_up, model.dt
     if spec.repeated and spec.length is not None:
-        # behind what is given and what is scored the last input, and the sample that it leads to
+        # two more samples than warm-up and evaluated length: the last input, and the sample that it leads to
         trajectories = in_runs(trajectories, round(warm_up / dt) + round(spec.length / dt) + 2)
     return run_freely(
         prior, fit, model.networks, trajectories, warm_up=warm_up, length=spec.length, linear=model.linear
@@ -494,17 +504,17 @@ def refitted(
 ) -> tuple[PriorFit, Trajectory]:
     """The prior fitted to the first seconds of a recording of a changed machine, and the rest of the recording.
 
-    The delay stays. First states are free, near those that the old prior smooths.
+    The delay is kept. Initial states are free, near those of the old prior's smoother.
 
     Raises:
-        InputError: If the recording is no longer than what is to be fitted, or that is too short.
+        InputError: If the recording is not longer than ``seconds``, or ``seconds`` is too short for a fit.
     """
     lengths = [time_unit([trajectory], dt) * own for own in REFIT_LENGTHS]
     n, least = round(seconds / dt), FEWEST_RUNS * lengths[0]
     if n >= len(trajectory.t) - 1 or seconds < least:
         raise InputError(
-            f"{trajectory.name}: {seconds:g} s are to be fitted; that takes at least {least:g} s and a recording that "
-            f"is longer than it ({len(trajectory.t) * dt:g} s) [HM-WORKFLOW-012]"
+            f"{trajectory.name}: a refit of {seconds:g} s is not possible. It needs at least {least:g} s and less than "
+            f"the recording's {len(trajectory.t) * dt:g} s; change --refit [HM-WORKFLOW-012]"
         )
     index = np.arange(len(trajectory.t))
     first = trajectory.part(index < n, trajectory.name, trajectory.role)
@@ -512,7 +522,7 @@ def refitted(
     return refit(make, fit, [first], dt=dt, lengths=lengths), rest
 
 
-# What is written and printed.
+# Output: results.json, figures, table.
 
 
 def _document(
@@ -522,7 +532,7 @@ def _document(
     results: BenchmarkResults,
     warnings: Sequence[str],
 ) -> dict[str, Any]:
-    """The content of ``results.json`` but for the time it took."""
+    """The content of ``results.json`` without the computing time."""
     trained = settings.model is None
     notes = {}
     if data is not None:
@@ -551,7 +561,7 @@ def _document(
 
 
 def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
-    """A model: parameters, delay, smoother, errors by candidate and network."""
+    """Plain description of a model: parameters, delay, smoother, errors by candidate and network."""
     fit = model.fit
     return {
         "prior": fit.rows(scenario.prior().parameters),

@@ -1,4 +1,4 @@
-"""A benchmark's recordings with their roles, free runs of all models over them, and the errors of these."""
+"""A benchmark's recordings with their roles, free runs of all models over them, and their errors."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from hybrid_mpc.scenario import Scenario
 
 Array = NDArray[np.float64]
 LONGEST = 60.0
-"""Most of a recording in :attr:`Recordings.long` [the machine's seconds]: drift shows by then."""
+"""Longest run in :attr:`Recordings.long` [time constants of the machine]; it is long enough to show drift."""
 SCORED = 50
-"""Fewest periods of a piece after its warm-up."""
+"""Smallest number of periods of a piece after its warm-up."""
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """The training files of a benchmark in pieces: for fit and training, to choose by, and held back for the test.
+    """The training files of a benchmark in pieces: for training, for validation, and held back for the test.
 
-    ``long`` are whole recordings that were split in order of time, from the first sample to where validation ends, at
-    most a minute (of the machine's own seconds). They were mostly trained on: they show drift, not accuracy.
+    ``long`` are recordings that were split in order of time, from the first sample to the end of validation, at most
+    :data:`LONGEST`. Most of them is training data: they show drift, not accuracy.
     """
 
     train: tuple[Trajectory, ...]
@@ -53,32 +53,32 @@ class Recordings:
 
 
 def benchmark_of(scenario: Scenario) -> BenchmarkSpec:
-    """The scenario's benchmark specification; InputError if it has none."""
+    """The scenario's benchmark specification; InputError if it is missing."""
     if scenario.benchmark is None:
         raise InputError(
-            f"scenario {scenario.name} has no benchmark: give it one with Scenario(benchmark=BenchmarkSpec(...))"
+            f"scenario {scenario.name}: no benchmark specification; add Scenario(benchmark=BenchmarkSpec(...))"
             " [HM-WORKFLOW-013]"
         )
     return scenario.benchmark
 
 
 def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
-    """Read training files; long ones are cut into pieces.
+    """Read training files, and cut long recordings into pieces.
 
     Raises:
-        InputError: If a file is bad, has windows where whole files validate, or nothing is left to train or validate
-        on.
+        InputError: If a file is bad or has windows although roles are given to whole files, or if no data remain for
+            training or validation.
     """
     prior, spec = scenario.prior(), benchmark_of(scenario)
     uncut = 0 < spec.valid_every <= len(paths)
     named = [path.name for path in paths if path.stem in scenario.data.windows]
     if uncut and named:
         raise InputError(
-            f"{named[0]} has windows in the data specification, and the benchmark's valid_every={spec.valid_every} "
-            "gives whole files their roles; leave out one of the two [HM-WORKFLOW-014]"
+            f"{named[0]}: has windows in the data specification, but the benchmark's valid_every={spec.valid_every} "
+            "gives roles to whole files. Remove one of the two [HM-WORKFLOW-014]"
         )
     needed: tuple[Role, ...] = () if spec.cycle or uncut else ("train", "valid")
-    data = replace(scenario.data, fractions=spec.fractions or scenario.data.fractions)  # and checked as given
+    data = replace(scenario.data, fractions=spec.fractions or scenario.data.fractions)
     dataset = load_trajectories(paths, prior, data, needed=needed)
     parts = _parts(dataset, scenario, uncut)
     train, valid, held_back = (
@@ -87,7 +87,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
     if not (train and valid):
         cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
         raise InputError(
-            f"nothing is left to {'validate on' if train else 'train on'}; give longer recordings"
+            f"recordings: no data remain to {'validate on' if train else 'train on'}; give longer recordings"
             f"{f'. Cut out:{cut}' if cut else ''} [HM-WORKFLOW-047]"
         )
     in_order = not (spec.cycle or uncut) and spec.length is None
@@ -96,7 +96,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
 
 
 def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory]:
-    """Pieces with roles: by the cycle, by whole files (``uncut``), or as the data specification splits."""
+    """Pieces with roles: by the benchmark's cycle, by whole files (``uncut``), or by the data specification."""
     spec, data = benchmark_of(scenario), scenario.data
     if not spec.cycle:
         runs = whole_runs(dataset, spec.valid_every) if uncut else dataset.trajectories
@@ -105,21 +105,21 @@ def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory
     shortest = data.warm_up + SCORED * data.dt
     if any(len(p.t) * p.dt < shortest for p in parts):
         raise InputError(
-            f"a recording is too short to be cut into {len(spec.cycle)} pieces of {shortest:.3g} s and more, which "
-            "training and validation need; give longer ones [HM-WORKFLOW-015]"
+            f"recordings: at least one is too short to be cut into {len(spec.cycle)} pieces of at least "
+            f"{shortest:.3g} s for training and validation. Give longer recordings [HM-WORKFLOW-015]"
         )
     return parts
 
 
 def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajectory, ...]:
-    """Recordings that were split in order of time, from the first sample to a gap or where validation ends.
+    """Recordings that were split in order of time, from the first sample to a gap or the end of validation.
 
-    Left out are stems with named ``windows``: what lies between these may be anything.
+    Files with ``windows`` are left out, because the data between their windows may be disturbed.
     """
     stems, found = {Path(file).stem for file in dataset.files}, []
     longest = LONGEST * time_unit(dataset.whole, dataset.whole[0].dt) if dataset.whole else 0.0
     for whole in dataset.whole:
-        # after a gap a recording begins in motion, and a test run does not
+        # skip parts after a gap: they begin in motion, unlike test runs
         if whole.name not in stems or whole.name in windows:
             continue
         ends = [p.t[-1] for p in dataset.by_role("valid") if _stem(p.name, stems) == whole.name]
@@ -130,7 +130,7 @@ def until_validated(dataset: Dataset, windows: Container[str]) -> tuple[Trajecto
 
 
 def _stem(name: str, stems: Container[str]) -> str:
-    """Stem of the file that a piece is from: later pieces of a file have # and their number after it.
+    """Stem of a piece's file: the names of later pieces of a file end with # and a number.
 
     Example:
         >>> _stem("run#12", {"run"}), _stem("run", {"run"}), _stem("take#2", {"take", "take#2"})
@@ -140,7 +140,7 @@ def _stem(name: str, stems: Container[str]) -> str:
 
 
 def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
-    """All recordings uncut, those of every so many-th file as validation; a gap stays a cut.
+    """All recordings uncut (except at gaps); every ``every``-th file is for validation.
 
     Example:
         >>> z = np.zeros((2, 1))
@@ -159,17 +159,18 @@ def whole_runs(dataset: Dataset, every: int) -> tuple[Trajectory, ...]:
 def read_test(
     scenario: Scenario, path: Path, warn: Callable[[str], None] = lambda text: None
 ) -> tuple[Trajectory, ...]:
-    """A test file as whole runs, one for each side of a gap; windows of the data specification are ignored.
+    """Read a test file as whole runs, cut at gaps; windows of the data specification are ignored.
 
     Raises:
-        InputError: If the file is bad or nothing of it is long enough.
+        InputError: If the file is bad, or every part is too short.
     """
     prior = scenario.prior()
     spec = replace(scenario.data, windows={})
     dataset = load_trajectories([path], prior, spec, needed=())
     if not dataset.whole:
         raise InputError(
-            f"{path}: no part is long enough for a free run after {spec.warm_up:g} s that are given [HM-WORKFLOW-016]"
+            f"{path}: every part is too short for a free run after a warm-up of {spec.warm_up:g} s. Give a longer "
+            "recording [HM-WORKFLOW-016]"
         )
     for finding in dataset.findings:
         warn(str(finding))
@@ -177,7 +178,7 @@ def read_test(
 
 
 def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tuple[Trajectory, ...]:
-    """Pieces of a whole recording with the cycle's roles in turn, ``distance`` [s] apart.
+    """Pieces of a whole recording with the roles of the benchmark's cycle in turn, ``distance`` [s] apart.
 
     Example:
         >>> z = np.zeros((400, 1))
@@ -197,7 +198,7 @@ def in_turn(trajectory: Trajectory, spec: BenchmarkSpec, distance: float) -> tup
 
 
 def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
-    """Equal pieces of about ``seconds`` each; a few samples at the end may be left over.
+    """Equal pieces of about ``seconds`` each; a few samples at the end may remain unused.
 
     Example:
         >>> z = np.zeros((101, 1))
@@ -218,7 +219,7 @@ def pieces(trajectory: Trajectory, seconds: float) -> tuple[Trajectory, ...]:
 
 
 def in_runs(trajectories: Sequence[Trajectory], n: int) -> list[Trajectory]:
-    """Parts of ``n`` samples one behind the other; a shorter trajectory stays as it is.
+    """Consecutive parts of ``n`` samples; a shorter trajectory stays as it is.
 
     Example:
         >>> z = np.zeros((101, 1))
@@ -231,8 +232,8 @@ def in_runs(trajectories: Sequence[Trajectory], n: int) -> list[Trajectory]:
 
 @dataclass(frozen=True)
 class BenchmarkRun:
-    """A free run of all candidates over one trajectory: the scored samples, commanded inputs as they act, measured
-    outputs, and those of each candidate ``(n, n_y)``.
+    """A free run of all candidates over one trajectory: evaluated times, inputs with their delay, measured outputs, and
+    outputs of each candidate ``(n, n_y)``.
     """
 
     name: str
@@ -254,8 +255,8 @@ def run_freely(
 ) -> list[BenchmarkRun]:
     """Free runs of the prior (``phy``), of each kind's model (the mean of its networks), and of linear models by name.
 
-    Only what lies within ``warm_up`` [s] is given: it yields the state that all models start from, and the networks'
-    hidden states. Everything after it is scored, or the first ``length`` [s]. Trajectories have the commanded inputs.
+    The first ``warm_up`` [s] determine the initial state of all models and the networks' hidden states. The rest is
+    evaluated, or its first ``length`` [s]. Trajectories have the commanded inputs.
     """
     dt = trajectories[0].dt
     warm = warm_samples(warm_up, fit.delay, dt)
@@ -263,7 +264,7 @@ def run_freely(
     if length is not None:
         n = warm + round(length / dt) + 1
         starts = [t.part(np.arange(len(t.t)) < n, t.name, t.role) for t in starts]
-    after = slice(1, -1)  # after the warm-up: neither the start nor what follows the last input
+    after = slice(1, -1)  # without the initial state and the state after the last input
     found = {"phy": model_states(PriorStep(prior, dt, fit.substeps), starts, warm)[:, after]}
     for kind, trained in networks.items():
         found[kind] = model_states(trained.step(prior, dt), starts, warm)[:, after]
@@ -277,7 +278,7 @@ def run_freely(
         )
         for name, x in found.items()
     }
-    first = lost_samples(fit.delay, dt) + warm + 1  # linear models have the inputs as they were commanded
+    first = lost_samples(fit.delay, dt) + warm + 1  # linear models use the inputs as commanded
     whole = [t.part(slice(0, first + len(s.t) - warm - 1)) for t, s in zip(trajectories, starts, strict=True)]
     straight = {name: model.free_runs(whole, first) for name, model in (linear or {}).items()}
     return [
@@ -294,10 +295,10 @@ def run_freely(
 
 
 def scored_signals(outputs: Sequence[Signal], spec: BenchmarkSpec) -> list[tuple[Signal, float]]:
-    """Outputs in the units of the figures, and how many of these are one of their own.
+    """Outputs in the units of the benchmark, and the factor from their own unit to that unit.
 
     Raises:
-        InputError: If the specification has a unit for what is no output.
+        InputError: If the specification has a unit for a signal that is not an output.
 
     Example:
         >>> found = scored_signals((Signal("q", "m"), Signal("v", "m/s")), BenchmarkSpec(units={"q": ("mm", 1e3)}))
@@ -313,7 +314,7 @@ def scored_signals(outputs: Sequence[Signal], spec: BenchmarkSpec) -> list[tuple
 def run_error(
     runs: Sequence[BenchmarkRun], name: str, outputs: Sequence[Signal], spec: BenchmarkSpec
 ) -> OutputErrors:
-    """Errors of one candidate over all runs of a file, in the benchmark's units; ``error`` is over the standard
+    """Errors of one candidate over all runs of a file, in the benchmark's units; ``error`` is divided by the standard
     deviations of the outputs in these runs.
 
     Example:
@@ -331,7 +332,7 @@ def run_error(
 
 
 def warm_samples(warm_up: float, delay: float, dt: float) -> int:
-    """Periods from the first sample whose acting input is known to the last one that is given.
+    """Periods of the warm-up, from the first sample with a known delayed input on.
 
     Example:
         >>> warm_samples(1.225, 0.0, 0.025), warm_samples(1.225, 0.03, 0.025)
@@ -341,5 +342,5 @@ def warm_samples(warm_up: float, delay: float, dt: float) -> int:
 
 
 def _padded(values: Array, length: int) -> Array:
-    """Rows up to a length, the last one again and again."""
+    """Rows up to a length; the last row is repeated."""
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

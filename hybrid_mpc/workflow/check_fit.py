@@ -1,4 +1,4 @@
-"""The fit of a prior as a run would make it, and what puts the prior in doubt, before anything is trained."""
+"""Fit a prior as a run does, and list the doubts about its structure, without training."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from hybrid_mpc.workflow.stages.identify import (
 @no_exit()
 @named_extra("the fit")
 def check_fit(settings: RunSettings, progress: Progress | None = None) -> PriorResult:
-    """Fit the prior as :func:`~hybrid_mpc.workflow.run.run` would, and compare it with simpler models; train nothing.
+    """Fit the prior as :func:`~hybrid_mpc.workflow.run.run` does, and compare it with simpler models; train nothing.
 
-    It computes the run's own stages data and prior, and writes no file.
+    It computes stages data and prior of the run, and writes no file.
 
     Args:
-        settings: What a run would compute.
+        settings: Settings of the run.
         progress: Where to report. Default: nowhere.
 
     Returns:
         ``fit``: values, standard errors, warnings. ``bounds``: parameters at a bound. ``errors`` and ``baselines``:
-        errors of free runs on the test recordings. ``in_doubt``: why the structure of the prior is in doubt.
-        ``no_gain``: why a run would stop; empty where it would not.
+        errors of free runs on the test recordings. ``in_doubt``: reasons to doubt the structure of the prior.
+        ``no_gain``: why a run would stop after the fit; empty if it would continue.
 
     Raises:
         InputError: For any bad input, and if the fit is impossible.
@@ -52,7 +52,7 @@ def check_fit(settings: RunSettings, progress: Progress | None = None) -> PriorR
 
 
 def fit_of(context: Context) -> PriorResult:
-    """:func:`check_fit` of a scenario that has been checked; a simulated machine records into a folder that is removed.
+    """:func:`check_fit` of a checked scenario; simulated recordings are written to a temporary folder.
 
     Raises:
         InputError: If there are no recordings, or the fit is impossible.

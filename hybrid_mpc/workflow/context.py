@@ -32,12 +32,16 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Context:
-    """A run in its folder: what it computes, the machine, and where it reports to.
+    """A run in its folder: settings, scenario, recordings, and the results of its stages.
 
-    ``given`` is the user's scenario; :attr:`scenario` is the one that stages work with.
-
-    ``pictures`` are those that this process has drawn, by part of the report: section, file, caption. On ``cluster``
-    (address of a dask scheduler or a ``distributed.Client``) networks are trained and loops run; None: on this machine.
+    Args:
+        settings: Settings of the run.
+        given: The user's scenario; stages use :attr:`scenario`.
+        out: Folder of the run.
+        progress: Where to report. Default: nowhere.
+        cluster: Address of a dask scheduler or a ``distributed.Client``, which trains networks and runs loops.
+            Default: processes of this machine.
+        pictures: Figures that this process has drawn, by part of the report: section, file, caption.
     """
 
     settings: RunSettings
@@ -53,7 +57,7 @@ class Context:
 
     @property
     def scenario(self) -> Scenario:
-        """The machine: the user's scenario, or the one with the terms that stage ``explain`` found."""
+        """The user's scenario, or the scenario with the terms that stage ``explain`` found."""
         file = self.explained
         if file is None:
             return self.given
@@ -63,7 +67,7 @@ class Context:
 
     @property
     def explained(self) -> Path | None:
-        """The scenario file of stage ``explain``; None where the stage found no term or is not asked for."""
+        """The scenario file of stage ``explain``; None if the stage found no term or was not requested."""
         if not self.settings.explain:
             return None
         from hybrid_mpc.workflow.stages.explain import EXPLAIN, FOLDER
@@ -75,7 +79,7 @@ class Context:
 
     @cached_property
     def as_given(self) -> Context:
-        """The same run with the user's scenario, whatever terms were found."""
+        """The same run with the user's scenario, without found terms."""
         return (
             replace(self, settings=replace(self.settings, explain=False)) if self.settings.explain else self
         )
@@ -86,15 +90,16 @@ class Context:
         budgets = self.scenario.budgets
         if self.settings.budget not in budgets:
             raise InputError(
-                f"scenario {self.scenario.name} has no budget {self.settings.budget!r}; "
-                f"it has: {', '.join(budgets)} [HM-WORKFLOW-017]"
+                f"budget: scenario {self.scenario.name} has no budget {self.settings.budget!r}; "
+                f"choose one of: {', '.join(budgets)} [HM-WORKFLOW-017]"
             )
         return budgets[self.settings.budget]
 
     @property
     def spec(self) -> DataSpec:
-        """The scenario's data specification with the user's columns, which hold for every file; units and delays of
-        columns in whose place others are read are left out.
+        """The scenario's data specification with the user's columns, which replace the scenario's in every file.
+
+        Units and delays of replaced columns are dropped.
         """
         s, own = self.settings, self.scenario.data
         spec = own
@@ -114,7 +119,7 @@ class Context:
 
     @property
     def scenario_path(self) -> str:
-        """Name of the scenario, or the full path of its file, as processes elsewhere find it."""
+        """Name of the scenario, or the full path of its file, which other processes can load."""
         if (file := self.explained) is not None:
             return str(file.resolve())
         name = self.settings.scenario
@@ -127,12 +132,12 @@ class Context:
 
     @property
     def files(self) -> list[Path]:
-        """The user's recordings, or those that the simulated machine made."""
+        """The user's recordings, or the simulated ones."""
         made = self.out / "data"
         return list(self.settings.data) or sorted(made.glob("*.csv")) or sorted(made.glob("*.npz"))
 
     def forget_data(self) -> None:
-        """Remove recordings that a simulated machine made before."""
+        """Remove simulated recordings."""
         self._data.clear()
         if not self.settings.data:
             for path in self.files:
@@ -148,7 +153,7 @@ class Context:
 
     @cached_property
     def time_unit(self) -> float:
-        """The machine's second [s], of the training recordings."""
+        """Time constant of the machine [s], estimated from the training recordings."""
         return time_unit(self.trajectories("train"), self.spec.dt)
 
     def trajectories(self, role: Role) -> list[Trajectory]:
@@ -156,16 +161,16 @@ class Context:
         return list(self.dataset.by_role(role))
 
     def smoothed(self, role: Role) -> list[Trajectory]:
-        """Trajectories of one role with the states that the fitted prior's equations smooth them to.
+        """Trajectories of one role with the states of the fitted prior's smoother.
 
-        Their inputs are those that act. Samples before the first delayed input arrives are left out.
+        Their inputs are delayed as they act on the machine. Samples before the first delayed input are left out.
         """
         from hybrid_mpc.identify.delay import shifted
 
         return self._with_states(shifted(self.trajectories(role), self.prior.fit.delay))
 
     def commanded(self, role: Role) -> list[Trajectory]:
-        """The same with the inputs as they were commanded: what the deployed models, which hold the delay, take."""
+        """The same with inputs as commanded; the deployed models contain the delay."""
         from hybrid_mpc.identify.delay import lost_samples
 
         found = []
@@ -183,7 +188,7 @@ class Context:
 
     @property
     def ready(self) -> Scenario:
-        """The scenario; where it gets default tasks, with those from where the fitted prior rests."""
+        """The scenario, with default tasks at the fitted prior's equilibrium if it declares none."""
         return ready(self.scenario, self.kit.fitted)
 
     def _with_states(self, trajectories: list[Trajectory]) -> list[Trajectory]:
@@ -192,9 +197,9 @@ class Context:
 
     @property
     def kit(self) -> Kit:
-        """The run's artifact as it is now, with the control problems that the scenario now states.
+        """The run's artifact with the scenario's present control problems.
 
-        It is read again only where one of its files has changed.
+        It is read again only if one of its files has changed.
         """
         folder = self.out / "model"
         content = artifact_digest(folder)
@@ -205,7 +210,7 @@ class Context:
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """Versions of what a result depends on."""
+        """Versions of the packages that results depend on."""
         return versions()
 
     def path(self, stage: str) -> Path:
@@ -213,12 +218,12 @@ class Context:
         return self.out / "checkpoints" / f"{stage}.json"
 
     def stored(self, stage: Stage[R]) -> Stored[R] | None:
-        """What the folder holds of a stage, or None; InputError, which names what to delete, if its file is damaged."""
+        """The stored result of a stage, or None; InputError with the file to delete if the file is damaged."""
         if stage.name not in self._read:
             path = self.path(stage.name)
             if not path.is_file():
                 return None
-            remedy = f"delete {stage.name}.* in {path.parent}, and --resume computes it anew"
+            remedy = f"delete {stage.name}.* in {path.parent}; then --resume computes this stage again"
             self._read[stage.name] = read_stage(path, stage, remedy)
         return self._read[stage.name]
 
@@ -227,22 +232,22 @@ class Context:
         self._read[stage.name] = write_stage(self.path(stage.name), stage, keys, result)
 
     def leave_out(self, stage: Stage[Any], reason: str) -> None:
-        """Go on without a stage; its file, if there is one, stays."""
+        """Continue without a stage; an existing file of the stage stays."""
         self._read[stage.name] = Stored({}, Absent(reason), digest(reason))
 
     def find(self, stage: Stage[R]) -> R | Absent:
-        """Result of a stage, or why there is none."""
+        """Result of a stage, or why the stage has no result."""
         stored = self.stored(stage)
         return Absent(f"stage {stage.name} has not run") if stored is None else stored.result
 
     def read(self, stage: Stage[R]) -> R:
-        """Result of a stage; InputError with the reason if there is none."""
+        """Result of a stage; InputError with the reason if the stage has no result."""
         found = self.find(stage)
         if isinstance(found, Absent):
             raise InputError(f"{found.reason} [HM-WORKFLOW-048]")
         return found
 
     def digest_of(self, stage: Stage[Any]) -> str:
-        """Digest of a stage's result, or of why there is none."""
+        """Digest of a stage's result, or of the reason why it has none."""
         stored = self.stored(stage)
         return "" if stored is None else stored.content

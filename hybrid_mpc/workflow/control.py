@@ -1,4 +1,4 @@
-"""``hybrid-mpc control``: closed loops of a trained model, results.json (docs/control-results.md), figures."""
+"""``hybrid-mpc control``: closed loops of a model, their results.json (docs/control-results.md) and figures."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SCHEMA_VERSION = 6
 
 @dataclass(frozen=True)
 class FaultNote:
-    """A fault that all loops had; ``channel`` is empty where there is only one."""
+    """A fault in all loops; ``channel`` is empty if there is only one channel."""
 
     target: str
     value: float
@@ -56,19 +56,20 @@ class FaultNote:
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the model is from."""
+    """Origin of the model."""
 
     provenance: Provenance
 
 
 @dataclass(frozen=True)
 class ControlResults:
-    """``results.json`` of ``hybrid-mpc control`` (docs/control-results.md): what was run, every loop, and means.
+    """Content of ``results.json`` of ``hybrid-mpc control`` (docs/control-results.md): settings, every loop, and means.
 
-    ``guard`` are the limits of the monitor that a guard listens to, ``reaction`` what it does; ``step_ms`` are
-    percentiles of the durations of steps by controller, ``summary`` is by task and controller. ``on_model`` names the
-    model that stood in for the machine, by controller, where there is no plant: then nothing here is of the machine,
-    and controllers, which met different plants, are not to be compared. ``promises`` are those of the model's folder.
+    ``guard`` are the limits of the monitor that triggers the guard, ``reaction`` is the guard's reaction; ``step_ms``
+    are percentiles of step durations by controller, ``summary`` is by task and controller. For a scenario without plant
+    ``on_model`` names the model that replaces the machine, by controller: then the figures say nothing about the
+    machine, and controllers must not be compared, since their plants differ. ``promises`` are those of the model's
+    folder.
     """
 
     schema: str
@@ -96,15 +97,15 @@ class ControlResults:
 def run_control(
     study: Study, out: Path, progress: Progress, *, gif: bool = True, resume: bool = False
 ) -> ControlResults:
-    """Run a study of one model, solver and set of faults alone in this process; write results and figures.
+    """Run a study of one model, solver and set of faults in this process; write results and figures.
 
-    Loops run one after the other, so that the durations of their steps count. Each is on the disk as it ends.
+    Loops run one after the other, so that the durations of their steps count. Each row is written when its loop ends.
 
     Raises:
-        InputError: If anything does not fit, the folder holds something else, or nothing can be written in it.
+        InputError: If model, tasks or settings do not match, the folder belongs to another job, or it is not writable.
     """
     check_out(out, NOUN, resume=resume)
-    progress.start("reading the model, and the filters' noise")
+    progress.start("reading the model and the observers' noise")
     (model,) = load_models(study, plant=False).values()
     bench = Bench(load_scenario(study.scenario), dict.fromkeys(study.folders, model.kit))
     progress.finish(model.noise_source)
@@ -124,7 +125,7 @@ def run_control(
 
 
 def _rows(bench: Bench, study: Study, model: StudyModel, folder: Path, progress: Progress) -> list[LoopRow]:
-    """The rows of all loops: those that the folder holds, and the others as they run."""
+    """Rows of all loops: read those that the folder holds, run the others."""
     first, specs = study.loop_seeds[0], dict[str, list[LoopSpec]]()
     for spec in study.runs():
         arrays = ("step_ms", *((*DRAWN, "plans", "alarm") if spec.seed == first else ()))
@@ -147,7 +148,7 @@ def _digest(spec: LoopSpec, model: StudyModel) -> str:
 
 
 def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[LoopRow]) -> ControlResults:
-    """The results of loops that have run."""
+    """Results of finished loops."""
     kit = bench.kits[next(iter(study.folders))]
     (faults,) = study.fault_sets
     filters = [name for name in study.controllers if not CONTROLLERS[name].truth]

@@ -1,4 +1,4 @@
-"""``hybrid-mpc explain``: fit the prior, search for the terms that it lacks, and write a scenario that has them."""
+"""``hybrid-mpc explain``: fit the prior, search for missing terms, and write a scenario with the found terms."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hybrid_mpc.workflow.settings import RunSettings
 SCHEMA, SCHEMA_VERSION = "hybrid-mpc explain", 1
 RESULT = "explain.json"
 NEEDED: tuple[Role, ...] = ("train", "valid")
-"""Roles whose recordings the search is made of; those for tests are left for a judgement of its end."""
+"""Roles that the search needs; test recordings only judge its result."""
 
 
 @no_exit()
@@ -39,23 +39,23 @@ def explain(
     most: int = STEPS,
     progress: Progress | None = None,
 ) -> ExplainResult:
-    """Fit the prior, search for the physical terms that it lacks, and write what was found into ``out``.
+    """Fit the prior, search for missing physical terms, and write the result into ``out``.
 
     ``explain.json`` holds the result, ``explain.html`` shows it, ``NAME_explained.py`` is a scenario whose prior has
-    the found terms, with the fitted values as nominal ones. A search that was stopped goes on where the same arguments
-    are given again. Nothing is trained.
+    the found terms, with the fitted values as nominal values. The same arguments continue an interrupted search.
+    Nothing is trained.
 
     Args:
-        settings: Scenario, recordings and columns, as of a run.
-        out: Folder to make.
-        terms: Names of laws (:mod:`hybrid_mpc.machine.terms`) that the search is limited to. Default: those of the
-            scenario's ``terms``, else all.
-        most: Steps that add terms, at most.
+        settings: Scenario, recordings and columns, as for a run.
+        out: Folder to write.
+        terms: Names of laws (:mod:`hybrid_mpc.machine.terms`) that limit the search. Default: those of the scenario's
+            ``terms``, else all.
+        most: Largest number of steps that add a term.
         progress: Where to report. Default: nowhere.
 
     Raises:
-        InputError: For any bad input: no recordings, too few to judge terms by, an unknown law, a term that does not
-            fit to the prior.
+        InputError: For any bad input: no recordings, too few recordings to judge terms, an unknown law, a term that
+            does not fit the prior.
 
     Example:
         >>> found = explain(RunSettings("my_machine.py", data=(Path("swing.csv"),)), Path("out"))  # doctest: +SKIP
@@ -63,15 +63,15 @@ def explain(
         ['Coulomb friction of phi_dot']
     """
     if most < 1:
-        raise InputError(f"most: a search of at least one step is needed, got {most} [HM-WORKFLOW-018]")
+        raise InputError(f"most: the search needs at least one step, got {most} [HM-WORKFLOW-018]")
     scenario = load_scenario(settings.scenario)
     chosen = chosen_terms(scenario, terms)
     context = Context(settings, scenario, out, progress or Progress())
     check_scenario(replace(scenario, plant=None, oracle=None, control=None, tasks=()))
     if not settings.data and scenario.make_data is None:
         raise InputError(
-            f"scenario {scenario.name} is a real machine: give its recordings with --data FILE.csv (once for each file)"
-            " [HM-WORKFLOW-019]"
+            f"scenario {scenario.name}: no recordings. It cannot simulate them; give recordings of the machine with "
+            "--data FILE.csv, once for each file [HM-WORKFLOW-019]"
         )
     make = prior_class(scenario)
     # bad recordings leave no folder behind
@@ -86,7 +86,7 @@ def explain(
 
 
 def read_result(out: Path) -> ExplainResult:
-    """What :func:`explain` left in a folder.
+    """Read the result of :func:`explain` from a folder.
 
     Raises:
         InputError: If it is missing or damaged.
@@ -96,7 +96,7 @@ def read_result(out: Path) -> ExplainResult:
 
 
 def _recordings(context: Context, make: type[Prior]) -> Dataset:
-    """Recordings, of which none need be left for tests."""
+    """Recordings; test recordings are optional."""
     data = load_trajectories(context.files, make(), context.spec, needed=NEEDED)
     for finding in data.findings:
         context.progress.warn(str(finding))
@@ -104,7 +104,7 @@ def _recordings(context: Context, make: type[Prior]) -> Dataset:
 
 
 def _simulated(context: Context, make: type[Prior]) -> Dataset:
-    """Recordings that a simulated machine makes; those that are there already are taken."""
+    """Simulated recordings; existing ones are reused."""
     scenario, folder = context.scenario, context.out / "data"
     assert scenario.make_data is not None
     done = folder / "made.json"
@@ -117,7 +117,7 @@ def _simulated(context: Context, make: type[Prior]) -> Dataset:
 
 
 def write(context: Context, found: ExplainResult, out: Path, command: Sequence[str]) -> None:
-    """Write page, scenario file and, last, ``explain.json``; ``command`` is what made them."""
+    """Write page, scenario file and, last, ``explain.json``; ``command`` is the command line that made them."""
     if found.file:
         write_text(
             out / found.file, scenario_code(context.scenario, context.scenario_path, found.explanation, out)

@@ -1,4 +1,4 @@
-"""The search of ``hybrid-mpc explain`` and of a run's stage, kept in a folder: fit, missing terms, free runs."""
+"""The search of ``hybrid-mpc explain`` and of stage explain, saved step by step: fit, missing terms, free runs."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from hybrid_mpc.workflow.stage import sources
 from nn_export.program import to_json
 
 SHOWN_LEFT = 5.0
-"""Time left [s] from which on it is told."""
+"""Remaining time [s] above which the progress text shows it."""
 
 
 def prior_class(scenario: Scenario) -> type[Prior]:
-    """The class of a scenario's prior, to which terms are added.
+    """The class of a scenario's prior, which the search extends by terms.
 
     Raises:
         InputError: If the class needs more than parameter values.
@@ -48,21 +48,21 @@ def prior_class(scenario: Scenario) -> type[Prior]:
         made()
     except TypeError as error:
         raise InputError(
-            f"scenario {scenario.name}: {made.__name__}() raised TypeError: {error}. Terms are added to a prior that "
-            "is made of parameter values alone; make the other arguments class attributes [HM-WORKFLOW-020]"
+            f"scenario {scenario.name}: {made.__name__}() raised TypeError: {error}. The search needs a prior class "
+            "whose only argument is parameter values; make the other arguments class attributes [HM-WORKFLOW-020]"
         ) from error
     return made
 
 
 @dataclass(frozen=True)
 class ChosenTerms:
-    """What a search chooses from: laws by name (none: all), and own terms."""
+    """Terms that a search chooses from: laws by name (empty: all), and the scenario's own terms."""
 
     laws: tuple[str, ...]
     own: tuple[Term, ...]
 
     def candidates(self, prior: Prior, points: Points, dt: float, length: float) -> tuple[Candidate, ...]:
-        """Candidates of the library; those whose names the prior has already are left out.
+        """Candidates of the library, without those whose parameter or state names the prior already has.
 
         Raises:
             InputError: If none of the laws can apply.
@@ -74,16 +74,16 @@ class ChosenTerms:
             apply = ", ".join(dict.fromkeys(_law(one) for one in every)) or "none"
             raise InputError(
                 f"terms: {', '.join(self.laws) or 'no law'} cannot apply to {type(prior).__name__}; "
-                f"laws that can: {apply} [HM-WORKFLOW-021]"
+                f"applicable laws: {apply} [HM-WORKFLOW-021]"
             )
         return found
 
 
 def chosen_terms(scenario: Scenario, names: Sequence[str] = ()) -> ChosenTerms:
-    """Laws and own terms that a search chooses from: ``names`` replace those of the scenario.
+    """Laws and own terms that a search chooses from; ``names`` replace the scenario's laws.
 
     Raises:
-        InputError: If a name is no law, or the scenario's ``terms`` hold something else.
+        InputError: If a name is not the name of a law.
 
     Example:
         >>> from hybrid_mpc.scenario import load_scenario
@@ -110,7 +110,7 @@ def _names(candidate: Candidate) -> set[str]:
 
 
 class Search:
-    """Fit and search of one machine, each kept in the folder."""
+    """Fit and search of one machine; each result is saved in the folder."""
 
     def __init__(
         self,
@@ -136,18 +136,18 @@ class Search:
         })  # fmt: skip
 
     def result(self) -> ExplainResult:
-        """What was found."""
+        """Fit, search, and errors over the test recordings."""
         progress = self.context.progress
         progress.start("fitting the prior")
         fit = self.fit()
         for warning in fit.warnings:
             progress.warn(f"fit of the prior: {warning}")
         progress.finish("")
-        told = self.searched(fit)
+        explanation = self.searched(fit)
         tests: dict[str, FreeRuns] = {}
         if self.test:
             progress.start("free runs over the test recordings")
-            tests = self.tests(fit, told)
+            tests = self.tests(fit, explanation)
             progress.finish("")
         name = self.context.scenario.name
         own = fit.smoother(self.make(fit.values), self.dt)
@@ -155,7 +155,12 @@ class Search:
             sum((s / size) ** 2 for s, size in zip(own.sigma, own.sizes.y, strict=True)) / len(own.sigma)
         )
         return ExplainResult(
-            name, told, fit.delay, floor, tests, f"{explained_name(name)}.py" if told.found else ""
+            name,
+            explanation,
+            fit.delay,
+            floor,
+            tests,
+            f"{explained_name(name)}.py" if explanation.found else "",
         )
 
     def fit(self) -> PriorFit:
@@ -172,7 +177,7 @@ class Search:
         return fit
 
     def searched(self, fit: PriorFit) -> Explanation:
-        """The search, from where it was stopped."""
+        """Result of the search; an interrupted search continues after its last saved step."""
         known_ = smoothed(self.make, fit, [*self.train, *self.valid], self.dt)
         candidates = self.chosen.candidates(self.make(fit.values), visited(known_), self.dt, self.length)
         done = self._held("search")
@@ -184,12 +189,14 @@ class Search:
         number = 1 + _added(begun)
         progress.start(f"search, step {number}: {count} candidates")
 
-        def keep(told: Explanation) -> None:
-            self._keep("steps", told)
-            last = next(step for step in reversed(told.steps) if step.action == "added")
-            progress.finish(f"{last.name}: the held-out error is {last.held_out.ratio:.2f} of that before")
-            if _added(told) < self.most:
-                progress.start(f"search, step {1 + _added(told)}")
+        def keep(explanation: Explanation) -> None:
+            self._keep("steps", explanation)
+            last = next(step for step in reversed(explanation.steps) if step.action == "added")
+            progress.finish(
+                f"{last.name}: the held-out error is {last.held_out.ratio:.2f} of the error before"
+            )
+            if _added(explanation) < self.most:
+                progress.start(f"search, step {1 + _added(explanation)}")
 
         found = search(
             self.make, fit.values, known_, dt=self.dt, length=self.length, warm_up=self.context.spec.warm_up,
@@ -200,8 +207,8 @@ class Search:
         self._keep("search", found)
         return found
 
-    def tests(self, fit: PriorFit, told: Explanation) -> dict[str, FreeRuns]:
-        """Errors over the test recordings, each model from states that its own equations smooth."""
+    def tests(self, fit: PriorFit, explanation: Explanation) -> dict[str, FreeRuns]:
+        """Errors over the test recordings; each model starts from the states of its own smoother."""
         from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
         from hybrid_mpc.identify.step import PriorStep
 
@@ -209,8 +216,8 @@ class Search:
         fitted, acting = self.make(fit.values), shifted([*self.train, *self.valid], fit.delay)
         own = fit.smoother(fitted, self.dt)
         models = {"fitted": (fitted, own)}
-        if told.found:
-            better = told.prior(self.make, self.chosen.own)(told.values)
+        if explanation.found:
+            better = explanation.prior(self.make, self.chosen.own)(explanation.values)
             substeps = required_substeps(better, self.dt)
             unit = time_unit(self.train, self.dt)
             models["explained"] = (
@@ -227,7 +234,7 @@ class Search:
         return found
 
     def _progress(self, part: str) -> Callable[[int, int, str], None]:
-        """Passes progress on, with the time that is left of a step."""
+        """A progress function that adds the remaining time of the step."""
         begun, last = time.monotonic(), 0
 
         def passed(done: int, total: int, text: str) -> None:
@@ -246,16 +253,16 @@ class Search:
         return self.out / "checkpoints" / f"{name}.json"
 
     def _held(self, name: str) -> Any:
-        """What the folder holds of a part; None where it holds nothing, or of something else."""
+        """Saved result of a part; None if it is missing or belongs to other settings."""
         path = self._path(name)
         if not path.is_file():
             return None
-        held = read_document(path, f"delete {path}, and the same command computes it anew")
+        held = read_document(path, f"delete {path}; then the same command computes it again")
         return held["value"] if held["key"] == self.key else None
 
     def _keep(self, name: str, value: object) -> None:
         write_document(self._path(name), {"key": self.key, "value": plain(value)})
 
 
-def _added(told: Explanation | None) -> int:
-    return 0 if told is None else sum(step.action == "added" for step in told.steps)
+def _added(explanation: Explanation | None) -> int:
+    return 0 if explanation is None else sum(step.action == "added" for step in explanation.steps)

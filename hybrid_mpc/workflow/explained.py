@@ -1,4 +1,4 @@
-"""What ``hybrid-mpc explain`` found, and the scenario file that has it. No torch in here."""
+"""Result of ``hybrid-mpc explain``, and the scenario file with the found terms. No torch in this module."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENDING = "_explained"
 
 @dataclass(frozen=True)
 class FreeRuns:
-    """Errors of free runs over the test recordings, which the search has not seen, of one prior.
+    """Errors of free runs of one prior over the test recordings, which the search does not use.
 
     Args:
         error: Root mean square over the outputs of the error over the output's spread [-].
@@ -31,16 +31,16 @@ class FreeRuns:
 
 @dataclass(frozen=True)
 class ExplainResult:
-    """What a search for missing terms leaves, beside its page.
+    """Result of a search for missing terms.
 
     Args:
         scenario: Name of the scenario.
-        explanation: Steps, terms, values and what they were judged by.
-        delay: Delay of the inputs [s] that was fitted with the prior.
-        floor: Error that the sensors' noise alone makes [-], of the fitted prior's smoother.
-        tests: Errors over the test recordings by model: ``"nominal"``, ``"fitted"``, ``"explained"``. Empty where there
-            are no test recordings.
-        file: Name of the scenario file with the found terms; empty where none was found.
+        explanation: Steps, terms, values and evidence.
+        delay: Fitted delay of the inputs [s].
+        floor: Error of a perfect model due to the sensor noise [-], as estimated by the fitted prior's smoother.
+        tests: Errors over the test recordings by model: ``"nominal"``, ``"fitted"``, ``"explained"``. Empty without
+            test recordings.
+        file: Name of the scenario file with the found terms; empty without a found term.
     """
 
     scenario: str
@@ -62,13 +62,13 @@ def explained_name(scenario: str) -> str:
 
 
 def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Path) -> str:
-    """A scenario file: the machine of another one, whose prior has the found terms, with fitted values as nominal ones.
+    """Code of a scenario file: the given scenario with the found terms in its prior, fitted values as nominal values.
 
     Args:
-        scenario: The scenario that was explained.
+        scenario: The given scenario.
         where: Its registered name, or the path of its file.
-        found: What was found.
-        folder: Where the new file will lie; it names a file by the way from there.
+        found: Result of the search.
+        folder: Folder of the new file, which refers to ``where`` by a relative path.
     """
     values = {p.name: p for p in found.parameters}
     own = [term for term in found.found if term.made is None]
@@ -87,10 +87,10 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Pa
         f"str(Path(__file__).parent / {_way(folder, where)!r})" if where.endswith(".py") else repr(where)
     )
     lines = [
-        f'"""{_plain(scenario.title)}: the prior with the terms that its recordings ask for.',
+        f'"""{_plain(scenario.title)}: the prior with the terms that the recordings support.',
         "",
         f"Written by hybrid-mpc explain. Judged by {found.evidence.text}: the held-out error is",
-        f"{found.after.ratio:.2f} of the fitted prior's. Edit the file as you like.",
+        f"{found.after.ratio:.2f} of the fitted prior's. You may edit this file.",
         '"""',
         "",
         "from dataclasses import replace",
@@ -128,7 +128,7 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Pa
 
 
 def _way(folder: Path, file: str) -> str:
-    """The way from a folder to a file; the whole path where there is none, as between drives."""
+    """Relative path from a folder to a file; the absolute path if they lie on different drives."""
     try:
         return Path(os.path.relpath(file, folder)).as_posix()
     except ValueError:
@@ -165,5 +165,5 @@ def _error(p: FittedParameter) -> str:
 
 
 def _plain(text: str) -> str:
-    """A text that can stand in a comment or docstring."""
+    """A text on one line without characters that would end a comment or docstring."""
     return " ".join(text.replace("\\", "/").replace('"""', "'''").split())

@@ -1,4 +1,4 @@
-"""``hybrid-mpc monitor``: what watches a machine over recordings of it, or what it alarms by learned from them."""
+"""``hybrid-mpc monitor``: replay the monitor over recordings, or learn its limits from recordings."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from hybrid_mpc.watch.replay import EstimatorLike, along
 
 @dataclass(frozen=True)
 class RecordingResult:
-    """Alarms on a recording, and why parts of it gave no valid reading: the window was not full (``warm_up_s``),
-    samples were missing, or model or estimator gave no finite number.
+    """Alarms on a recording, and the time [s] without valid readings: the window was not full (``warm_up_s``), samples
+    were missing, or model or estimator gave a non-finite value.
     """
 
     recording: str
@@ -44,7 +44,7 @@ class RecordingResult:
 
 @dataclass(frozen=True)
 class MonitorResult:
-    """What :func:`watch` found in each recording, the gaps in them, and parts too short to be watched."""
+    """Results of :func:`watch` for each recording, gaps of the recordings, and parts too short for the monitor."""
 
     recordings: tuple[RecordingResult, ...]
     gaps: tuple[Cut, ...]
@@ -53,14 +53,14 @@ class MonitorResult:
 
 @dataclass(frozen=True)
 class MonitorJob:
-    """What ``hybrid-mpc monitor`` needs.
+    """Input of ``hybrid-mpc monitor``.
 
     Args:
-        kit: The models, and what was learned with them.
+        kit: Models and learned limits.
         data: The recordings.
         kind: Kind of readings, ``"energy"`` or ``"residuals"``.
-        limits: What the channels are compared with. Default: none.
-        resolution: Step of each sensor. Default: the limits know how far each may be predicted to move.
+        limits: Limits of the channels. Default: none.
+        resolution: Resolution of each sensor ``(n_y,)``. Default: that of the limits.
     """
 
     kit: Kit
@@ -71,7 +71,7 @@ class MonitorJob:
 
     @property
     def model(self) -> HybridModel:
-        """The model that is compared with the machine: the recommended one."""
+        """The recommended model, which the monitor compares with the machine."""
         return self.kit.models[self.kit.recommended]
 
     @cached_property
@@ -81,7 +81,7 @@ class MonitorJob:
 
     @cached_property
     def monitor(self) -> Monitor:
-        """What watches the recordings."""
+        """The monitor."""
         rest = None if self.limits is not None and self.limits.rest_speed else self.kit.known_rest
         return make_monitor(
             self.model, self.limits, kind=self.kind, resolution=self.resolution, rest_speed=rest,
@@ -98,21 +98,24 @@ def prepared(
     calibration: Path | None = None,
     residuals: bool = False,
 ) -> MonitorJob:
-    """Load and check everything.
+    """Load and check model, recordings and limits.
 
-    ``model`` is an artifact's folder or its run's. Without a ``scenario`` the artifact says how recordings are read,
-    and what the estimator assumes; with one, the scenario does. The ``resolution`` is the step of each sensor; default:
-    the limits know it. ``calibration`` is a ``calibration.json`` with limits; default: the artifact's, if it has them.
-    ``residuals``: watch these where the energy can be watched, too.
+    Args:
+        scenario: Says how recordings are read, and the noise of the estimator. None: the artifact says both.
+        model: Folder of the artifact, or of its run.
+        recordings: Files.
+        resolution: Resolution of each sensor. Default: that of the limits.
+        calibration: ``calibration.json`` with limits. Default: the artifact's limits, if any.
+        residuals: Whether to watch residuals although the energy can be watched. Default: False.
 
     Raises:
-        InputError: If there is no control problem, a file is bad, or things do not fit each other; without a scenario
-            also if the artifact does not say how its recordings are read.
+        InputError: If there is no control problem, a file is bad, or model and recordings do not match; without a
+            scenario also if the artifact does not say how its recordings are read.
     """
     if scenario is not None and scenario.control is None:
         raise InputError(
-            f"scenario {scenario.name} defines no control problem, so the estimator knows no input range; give the "
-            "scenario control=OCP(...) [HM-WORKFLOW-022]"
+            f"scenario {scenario.name}: no control problem, so the estimator knows no input range. Give the scenario "
+            "control=OCP(...) [HM-WORKFLOW-022]"
         )
     folder = artifact_folder(model)
     kit = load(folder)
@@ -122,20 +125,23 @@ def prepared(
         spec = kit.predicting.data
     else:
         raise InputError(
-            f"{folder} does not say how its recordings are read: an older version wrote it; give --scenario, or run "
-            "the scenario again [HM-WORKFLOW-023]"
+            f"{folder}: an older version wrote it, without a data specification. Give --scenario, or run the scenario "
+            "again [HM-WORKFLOW-023]"
         )
     watched = kit.models[kit.recommended]
     if abs(watched.dt - spec.dt) > 1e-9:
         raise InputError(
-            f"the model's period is {watched.dt} s, scenario {kit.name} resamples to {spec.dt} s [HM-WORKFLOW-024]"
+            f"dt: the model's period is {watched.dt} s, but scenario {kit.name} resamples to {spec.dt} s. Give the "
+            "scenario of this model [HM-WORKFLOW-024]"
         )
-    # all of a recording is watched: nothing warms up, and no part of it has a role
+    # the monitor watches whole recordings: no warm-up, no roles
     spec = replace(spec, windows={}, warm_up=spec.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(recordings, watched, spec, needed=())
     if not data.whole:
         cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
-        raise InputError(f"no part of the recordings is long enough to be watched: {cut} [HM-WORKFLOW-025]")
+        raise InputError(
+            f"recordings: every part is too short for the monitor: {cut}. Give longer recordings [HM-WORKFLOW-025]"
+        )
     if scenario is not None:
         kit = kit.with_noise(find_noise(scenario, kit, (f"{kit.recommended}_observer",), 0)[0])
     kind = RESIDUALS if residuals or not reads_energy(watched) else ENERGY
@@ -148,12 +154,11 @@ def prepared(
 
 
 def read_limits(path: Path, kind: str) -> WatchLimits:
-    """Limits of a kind in a ``calibration.json`` that :func:`learn` wrote; InputError if there are none."""
+    """Read the limits of a kind from a ``calibration.json`` of :func:`learn`; InputError if they are missing."""
     stored = read_object(path)
     if stored.get(kind) is None:
         raise InputError(
-            f"{path} holds no limits of {kind}; make them with hybrid-mpc monitor ... --learn 1"
-            " [HM-WORKFLOW-026]"
+            f"{path}: no limits of {kind}; learn them with hybrid-mpc monitor ... --learn 1 [HM-WORKFLOW-026]"
         )
     return record(WatchLimits, stored[kind], f"{path}: {kind}")
 

@@ -1,4 +1,4 @@
-"""``hybrid-mpc predict``: what a model predicts of recordings, from its artifact alone; tables, figures, numbers."""
+"""``hybrid-mpc predict``: predictions of recordings by a model of an artifact; tables, figures, numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hybrid_mpc.records import known
 
 @dataclass(frozen=True)
 class RunFigures:
-    """RMSE and FIT [%] by output, and the share of measurements within the band beside that which it is to hold."""
+    """RMSE and FIT [%] by output, share of measurements within the band, and nominal coverage of the band."""
 
     rmse: Mapping[str, float | None]
     fit_percent: Mapping[str, float | None]
@@ -30,8 +30,8 @@ class RunFigures:
 
 @dataclass(frozen=True)
 class RecordingFigures:
-    """What ``predict.json`` says of a recording: its length after the warm-up, and both kinds of predictions; without
-    one-step predictions their reason.
+    """A recording in ``predict.json``: length after the warm-up [s], figures of free run and one-step prediction, and
+    why one-step predictions are missing.
     """
 
     recording: str
@@ -42,20 +42,21 @@ class RecordingFigures:
 
 
 def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory], list[str]]:
-    """Recordings as the artifact says that they are read, and what is doubtful about them.
+    """Read recordings as the artifact specifies, with warnings about them.
 
     Raises:
-        InputError: Naming all that is wrong with all files, a line each.
+        InputError: If a file is bad; the message lists the errors of all files, one a line.
     """
     if kit.predicting is None:
         raise InputError(
-            f"the model of scenario {kit.name or '(unnamed)'} does not say how its recordings are read: an older "
-            "version wrote it; run the scenario again [HM-WORKFLOW-027]"
+            f"model of scenario {kit.name or '(unnamed)'}: an older version wrote it, without a data specification. "
+            "Run the scenario again [HM-WORKFLOW-027]"
         )
     spec, problems, found, doubts = kit.predicting.data, [], [], []
     if twice := sorted({p.name for p in paths if [q.stem for q in paths].count(p.stem) > 1}):
         raise InputError(
-            f"recordings need different names, got {', '.join(twice)} more than once [HM-WORKFLOW-028]"
+            f"recordings: {', '.join(twice)} given more than once; file names must differ. Rename or remove a file "
+            "[HM-WORKFLOW-028]"
         )
     whole = replace(spec, fractions=(1.0, 0.0, 0.0))
     for path in paths:
@@ -67,8 +68,8 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
         doubts += [str(finding) for finding in data.findings]
         if data.sampling[0] > COARSE * spec.dt:
             problems.append(
-                f"{path}: sampled every {data.sampling[0]:.3g} s, the model's period is {spec.dt:g} s: what lies "
-                "between would be made up; record at least once a period [HM-WORKFLOW-029]"
+                f"{path}: sampled every {data.sampling[0]:.3g} s, too slow for the model's period of {spec.dt:g} s. "
+                "Record at least one sample a period [HM-WORKFLOW-029]"
             )
         late = lost_samples(kit.input_delay, spec.dt) * spec.dt
         least = spec.warm_up + MIN_SCORED * spec.dt + late
@@ -77,8 +78,9 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
             parts = [t.t[-1] - t.t[0] + spec.dt for t in data.whole]
             parts += [c.end - c.start for c in data.cuts if not c.why.startswith("gap")]
             problems.append(
-                f"{path}: too short: its longest part without a gap has {max(parts, default=0.0):.4g} s, the warm-up "
-                f"of {spec.warm_up:g} s and {MIN_SCORED} periods need {least:.4g} s [HM-WORKFLOW-030]"
+                f"{path}: too short. Its longest part without a gap has {max(parts, default=0.0):.4g} s; the warm-up "
+                f"of {spec.warm_up:g} s and {MIN_SCORED} periods need {least:.4g} s. Give a longer recording "
+                "[HM-WORKFLOW-030]"
             )
         found += long
     refuse(problems)
@@ -88,13 +90,13 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
 def predict_recordings(
     kit: Kit, trajectories: Sequence[Trajectory], out: Path, model: str = "", progress: Progress | None = None
 ) -> list[Prediction]:
-    """Predict recordings; write of each ``NAME.csv`` and ``NAME.png``, and last ``predict.json``.
+    """Predict recordings; write ``NAME.csv`` and ``NAME.png`` for each, and ``predict.json`` last.
 
     Raises:
-        InputError: If there is no such model, or a recording is too short.
+        InputError: If the model is unknown, or a recording is too short.
         StorageError: If something cannot be written.
     """
-    # half a second to import: what is refused, is refused before
+    # plots take half a second to import: check first
     known(model or kit.recommended, kit.models, "model")
     from hybrid_mpc.plots.fit import prediction
     from hybrid_mpc.plots.style import save

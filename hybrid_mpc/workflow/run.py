@@ -1,4 +1,4 @@
-"""The main job: its stages in their order, each computed only where what it reads has changed."""
+"""``hybrid-mpc run``: the stages of a run in their order; a stage runs only if something that it reads has changed."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ STAGES: tuple[Stage[Any], ...] = (
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
 ALWAYS = (TASKS.name, REPORT.name)
-"""Stages that ``only`` does not leave out: they copy what the scenario and the other stages say."""
+"""Stages that run even if ``only`` does not name them: they only write what scenario and other stages hold."""
 SECONDS = {
     "data": 2, "explain": 20, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4,
     "tasks": 1, "control": 42,
     "on_model": 14, "estimation": 1, "promises": 6, "watch": 36, "analysis": 1,
     "report": 9,
 }  # fmt: skip
-"""What each stage of `make demo` takes on two idle cores [s], ``on_model`` where there is no plant: how long the rest
-of a run may take follows from what its first stages took."""
+"""Duration of each stage of `make demo` on two idle cores [s]; ``on_model`` only runs without a plant. The remaining
+time of a run is estimated by these durations, scaled with the measured durations of its finished stages."""
 
 
 @no_exit()
@@ -61,29 +61,29 @@ def run(
     progress: Progress | None = None,
     cluster: Any = None,
 ) -> Results | None:
-    """Run the main job into the folder ``out``; the results stand in its ``results.json``, too.
+    """Compute all stages of a run into the folder ``out``; returns the content of its ``results.json``.
 
-    With ``only`` it ends at the first stage that nothing can be taken of, and gives None: ``only=("data", "prior")`` of
-    a new run fits the prior and leaves the first page of the report.
+    Every stage writes its result to ``out/checkpoints``. With ``resume`` a stage runs again only if something that it
+    reads has changed: after an edit of a task, its loops and the report are computed again, but nothing is trained. If
+    a stage after the export fails, the report gives the reason in place of its section.
 
-    Every stage leaves its result in ``out/checkpoints``. With ``resume`` a stage runs again only where something that
-    it reads has changed: after an edit of a task its loops and the report are made anew, and nothing is trained again.
-    A stage after the export that cannot run costs its own part of the report, which then has the reason.
+    With ``only`` the run ends before the first stage that has no stored result and is not named, and returns None:
+    ``only=("data", "prior")`` of a new run fits the prior and writes a first report.
 
     Args:
-        settings: What to compute.
-        out: Folder to make; it must be new or empty unless ``resume``.
-        resume: Go on with the run that ``out`` holds.
-        only: Names of the stages that may run; the others are taken as they are. ``tasks`` and ``report``
-            always run. Default: all.
-        skip: Names of stages after the export that are not to run. Default: none.
-        progress: Where to report; default: nowhere.
+        settings: Settings of the run.
+        out: Folder to write; it must be new or empty unless ``resume``.
+        resume: Whether to continue the run in ``out``. Default: False.
+        only: Names of the stages that may run; stored results are used for the others. ``tasks`` and ``report`` always
+            run. Default: all.
+        skip: Names of stages after the export to leave out. Default: none.
+        progress: Where to report. Default: nowhere.
         cluster: Address of a dask scheduler or a ``distributed.Client``, whose workers train the networks and run the
             closed loops; they must see ``out`` under the same path. Default: processes of this machine.
 
     Raises:
-        InputError: For any bad input; nothing half-written is left behind that a later run would trip over.
-        StorageError: If something cannot be written; finished stages are kept.
+        InputError: For any bad input. Files are written whole or not at all.
+        StorageError: If a file cannot be written; finished stages are kept.
 
     Example:
         >>> results = run(RunSettings("golf_robot"), Path("out"))  # doctest: +SKIP
@@ -130,11 +130,11 @@ def run(
 
 
 def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
-    """How long the stages ahead may take, for the user; nothing before the first long one is done.
+    """Estimated time of the remaining stages, as text; empty before the training has finished.
 
     Args:
-        took: What stages have taken [s].
-        ahead: Names of those that are still to run.
+        took: Durations of finished stages [s].
+        ahead: Names of the remaining stages.
 
     Example:
         >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["watch", "analysis", "report"])
@@ -153,20 +153,20 @@ def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
 
 
 def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
-    """Refuse names that are no stages, and leaving out what all others need."""
+    """Refuse unknown names of stages, and skipping a stage that the others need."""
     for name in (*only, *skip):
         known(name, NAMES, "stage")
     optional = [stage.name for stage in STAGES if stage.optional]
     needed = [name for name in skip if name not in optional]
     if needed:
         raise InputError(
-            f"--skip {needed[0]}: without it there is no model; what can be left out: {', '.join(optional)}"
+            f"--skip {needed[0]}: a model needs this stage. Stages that can be skipped: {', '.join(optional)}"
             " [HM-WORKFLOW-031]"
         )
 
 
 def _end(context: Context, only: Sequence[str]) -> Stage[Any] | None:
-    """The first stage that others need, and that has not run and may not; None where there is none.
+    """The first required stage without a stored result that ``only`` does not name; None if there is none.
 
     Raises:
         InputError: If a stage that may run needs it.
@@ -183,17 +183,17 @@ def _end(context: Context, only: Sequence[str]) -> Stage[Any] | None:
         if later:
             why = f"has not run in {context.out}" if stored is None else f"must run again: {stored.unfit}"
             raise InputError(
-                f"stage {stage.name} {why}, and {later[0]} needs it; leave --only out [HM-WORKFLOW-032]"
+                f"stage {stage.name} {why}, but stage {later[0]} needs it. Run without --only [HM-WORKFLOW-032]"
             )
         return stage
     return None
 
 
 def _as_it_is(context: Context, stage: Stage[Any], only: Sequence[str] = ()) -> str:
-    """Take a stage as the folder holds it; its part of the artifact is put back where nothing has changed.
+    """Use the stored result of a stage; its part of the artifact is restored if nothing has changed.
 
     Raises:
-        InputError: If what it read differs, and a stage that may run (``only``) needs it.
+        InputError: If something that the stage read has changed, and a stage that may run (``only``) needs it.
     """
     stored = context.stored(stage)
     if stored is None or stored.unfit:
@@ -204,24 +204,24 @@ def _as_it_is(context: Context, stage: Stage[Any], only: Sequence[str] = ()) -> 
         needing = [s.name for s in STAGES if s.name in only and s is not REPORT and stage in _needed(s)]
         if needing:
             raise InputError(
-                f"stage {stage.name} is out of date: {differ}, and {needing[0]} needs it; add --only {stage.name}, "
-                "or leave --only out [HM-WORKFLOW-033]"
+                f"stage {stage.name} is out of date: {differ}, but stage {needing[0]} needs it. Add --only "
+                f"{stage.name}, or run without --only [HM-WORKFLOW-033]"
             )
     why = changed(stored.keys, keys)
     if not why and not isinstance(stored.result, Absent):
         why = stage.restore(context, stored.result)
     if why:
         context.progress.warn(f"stage {stage.name} is out of date: {why}")
-    return "taken as it is"
+    return "stored result used"
 
 
 def _needed(stage: Stage[Any]) -> list[Stage[Any]]:
-    """All stages that a stage reads, directly or by others."""
+    """All stages that a stage reads, directly or indirectly."""
     return [one for need in stage.needs for one in (need, *_needed(need))]
 
 
 def failed_stages(out: Path) -> dict[str, str]:
-    """Why stages of a run could not run, by stage; empty where all did."""
+    """Reasons of failed stages of a run, by stage; empty if none failed."""
     context = Context(RunSettings(""), None, out)  # type: ignore[arg-type]
     found = {stage.name: context.stored(stage) for stage in STAGES}
     absent = {name: stored.result for name, stored in found.items() if stored is not None}

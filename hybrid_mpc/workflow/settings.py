@@ -1,4 +1,4 @@
-"""Settings of a run: what decides what it computes, networks from a file, the device."""
+"""Settings of a run, network settings from a file, and the check of the device."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ MOST = {
     "hidden": 4096, "networks": 1024, "teacher_steps": 10**8, "free_run_steps": 10**8, "horizon": 10**5,
     "validation_horizon": 10**6, "batch": 10**6, "decay": 1e12, "learning_rates": 1.0, "prior_replay": 1e12,
 }  # fmt: skip
-"""Largest values: a file of settings must not ask for more memory than a machine has."""
+"""Largest allowed values: a settings file must not request more memory than a computer has."""
 NETWORK = (*WHOLE, "decay", "learning_rates", "prior_replay")
-"""What a file of network settings may hold: arguments of :class:`~hybrid_mpc.identify.settings.TrainingSettings`."""
+"""Fields of a file of network settings: arguments of :class:`~hybrid_mpc.identify.settings.TrainingSettings`."""
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Everything that decides what a run computes.
+    """Everything that the results of a run depend on.
 
     Args:
         scenario: Registered name or path of a user's Python file.
@@ -35,11 +35,11 @@ class RunSettings:
         time: Column that replaces the scenario's time; default: the scenario's.
         network_file: JSON object with settings of the networks that replace the budget's, as ``hybrid-mpc tune``
             writes them; default: none.
-        device: Where the networks are trained, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
-        deploy: Model that is recommended whatever validation says: ``"phy"`` (the fitted prior), ``"pgrnn"`` or
-            ``"mopgrnn"``. Default: what validation recommends.
-        explain: Whether terms that the prior lacks are searched first; the run goes on with the prior that has them.
-            Default: no.
+        device: Torch device of the training, ``"cpu"`` or e.g. ``"cuda"``. Default: cpu.
+        deploy: Model to recommend regardless of the validation: ``"phy"`` (the fitted prior), ``"pgrnn"`` or
+            ``"mopgrnn"``. Default: the validation decides.
+        explain: Whether to search for missing terms first; later stages then use the prior with the found terms.
+            Default: False.
     """
 
     scenario: str
@@ -55,18 +55,18 @@ class RunSettings:
     explain: bool = False
 
     def network(self) -> dict[str, Any]:
-        """Settings of the networks that replace the budget's: what the file holds, checked."""
+        """Checked settings from the file, which replace those of the budget; empty without a file."""
         return {} if self.network_file is None else read_network(self.network_file)
 
     def options(self, name: Callable[[Path], str]) -> list[str]:
-        """Words of a command line that give the recordings, each file by its ``name``, and their columns."""
+        """Command-line options for the recordings and their columns; ``name`` turns a file into text."""
         words = [word for path in self.data for word in ("--data", name(path))]
         for option, columns in (("--input-column", self.inputs), ("--output-column", self.outputs)):
             words += [word for column in columns for word in (option, column)]
         return words + (["--time-column", self.time] if self.time else [])
 
     def identity(self) -> dict[str, Any]:
-        """Settings as plain data, with the content hash of every file in place of where it lies."""
+        """Settings as plain data; files are given by name and content hash, not by their path."""
         files = [{"name": path.name, "sha256": sha256(path)} for path in self.data]
         scenario = self.scenario
         if scenario.endswith(".py") and Path(scenario).is_file():
@@ -76,16 +76,16 @@ class RunSettings:
 
 
 def read_network(path: Path) -> dict[str, Any]:
-    """Settings of networks from a JSON file: any of ``NETWORK``; ``learning_rates`` are four numbers.
+    """Read network settings from a JSON file with any fields of ``NETWORK``; ``learning_rates`` are four numbers.
 
     Raises:
-        InputError: If the file is missing, damaged or holds anything else.
+        InputError: If the file is missing or damaged, or holds unknown fields or wrong values.
     """
     held = read_json(path)
     if not isinstance(held, dict) or (unknown := sorted(set(held) - set(NETWORK))):
         what = "no JSON object" if not isinstance(held, dict) else f"also {', '.join(unknown)}"
         raise InputError(
-            f"{path} holds {what}; network settings are any of: {', '.join(NETWORK)} [HM-WORKFLOW-034]"
+            f"{path}: holds {what}. Write a JSON object with any of: {', '.join(NETWORK)} [HM-WORKFLOW-034]"
         )
     for name, value in held.items():
         numbers = value if name == "learning_rates" and isinstance(value, list) else [value]
@@ -100,12 +100,12 @@ def read_network(path: Path) -> dict[str, Any]:
 
 
 def run_note(settings: RunSettings) -> JobNote:
-    """What the folder of the main job says of it. Only the machine must stay the same; stages see all the rest."""
+    """Note in the run's folder. Only the scenario must stay the same; stages compare everything else themselves."""
     return JobNote("run", {"scenario": Path(settings.scenario).name}, {"run": settings.identity()})
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that cannot compute with 64-bit floats, before a long job starts."""
+    """Refuse a device that cannot compute with 64-bit floats, before the training starts."""
     if device == "cpu":
         return
     with named_extra(f"--device {device}"):
@@ -113,8 +113,9 @@ def check_device(device: str) -> None:
 
     try:
         torch.ones(1, dtype=torch.float64, device=device).sum().item()
-    except (RuntimeError, AssertionError, TypeError, ImportError) as error:  # torch raises any of them
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:  # torch may raise any of these
         reason = str(error).strip().splitlines()[0]
         raise InputError(
-            f"--device {device}: torch cannot compute there ({reason}); leave it out to use cpu [HM-WORKFLOW-036]"
+            f"--device {device}: torch cannot compute on this device ({reason}). Omit --device to use the CPU "
+            "[HM-WORKFLOW-036]"
         ) from error

@@ -1,7 +1,7 @@
-"""A stage of a job: what it reads, what it computes, and its typed result on disk.
+"""A stage of a job: its inputs, its computation, and its typed result on disk.
 
-A stage is computed again only where something that it reads has changed: a setting, a part of the scenario, the result
-of a stage before it. What cannot be checked counts as changed.
+A stage runs again only if one of its inputs has changed: a setting, a part of the scenario, the result of an earlier
+stage. An input that cannot be checked counts as changed.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 R = TypeVar("R")
 UNKNOWN = object()
-"""Stands for an input whose change cannot be detected: the stage always runs again."""
+"""Value of an input whose change cannot be detected: the stage always runs again."""
 LIBRARY = ("hybrid_mpc", "nn_export")
-"""Packages whose modules count where a stage imports them, see :func:`sources`."""
+"""Packages whose modules belong to the digest of a stage that imports them, see :func:`sources`."""
 CONTEXT = "hybrid_mpc.workflow.context"
-"""Read by every stage and importing for all of them: it counts alone, what it imports does not."""
+"""This module imports for all stages: its own source belongs to every digest, its imports do not."""
 
 
 @dataclass(frozen=True)
 class Absent:
-    """Why a stage has no result: it could not run (``failed``), the scenario has none, or the user left it out."""
+    """Why a stage has no result: it failed, the scenario does not allow it, or the user left it out."""
 
     reason: str
     failed: bool = False
@@ -52,15 +52,15 @@ class Stage(Generic[R]):
     """A stage of a job.
 
     Args:
-        name: Its name, and that of its file.
-        title: What it does, for the terminal.
-        result: Frozen dataclass of what it finds. A field ``arrays`` holds arrays by name, all other fields plain data.
+        name: Name of the stage and of its file.
+        title: Text for the terminal.
+        result: Frozen dataclass of the result. A field ``arrays`` holds arrays by name, all other fields plain data.
         compute: Computes the result, or says why there is none.
-        reads: What it reads beside other stages, by name. ``UNKNOWN`` counts as changed.
-        needs: Stages whose results it reads.
-        optional: Whether there is a model, and a report on it, without this stage.
-        restore: Called with a result that is still right; it puts back what the stage leaves outside its own file, or
-            says why it must be computed again (an empty text: all is well).
+        reads: Inputs besides other stages, by name. ``UNKNOWN`` counts as changed.
+        needs: Stages whose results it reads. Default: none.
+        optional: Whether model and report are possible without this stage. Default: False.
+        restore: Called with an up-to-date result; restores what the stage writes outside its own file, or returns why
+            the stage must run again (empty: it need not). Default: nothing to restore.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Stage(Generic[R]):
     restore: Callable[[Context, R], str] = lambda context, result: ""
 
     def keys(self, context: Context) -> dict[str, str]:
-        """Digest of each thing that the stage reads; an empty one where it is not known."""
+        """Digest of each input of the stage; empty for an unknown input."""
         code = sources(self.compute.__module__)
         read = dict(self.reads(context)) | {"library": context.versions, "the program": code}
         read |= {f"result of {stage.name}": context.digest_of(stage) for stage in self.needs}
@@ -82,9 +82,9 @@ class Stage(Generic[R]):
 
 @functools.cache
 def sources(module: str) -> str:
-    """Digest of the source of a module of :data:`LIBRARY` and of all that it imports there, directly or by others.
+    """Digest of the source of a module of :data:`LIBRARY` and of all modules that it imports there, also indirectly.
 
-    Imports within functions count, those for type checkers do not. C sources and templates count with their room.
+    Imports within functions count, imports for type checkers do not. C sources and templates count with their room.
 
     Example:
         >>> len(sources("hybrid_mpc.workflow.stages.choose"))
@@ -144,9 +144,9 @@ def _module(name: str) -> tuple[Path, tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class Stored(Generic[R]):
-    """What a stage's file holds: digests of what was read, the result, and its digest.
+    """Content of a stage's file: digests of its inputs, the result, and the result's digest.
 
-    ``unfit`` says why a whole file holds no result of today's kind: another version wrote it. Empty: it does.
+    ``unfit`` says why the file cannot be used: another version wrote it. Empty if it can be used.
     """
 
     keys: Mapping[str, str]
@@ -164,7 +164,7 @@ class _File:
 
 
 def write_stage(path: Path, stage: Stage[R], keys: Mapping[str, str], result: R | Absent) -> Stored[R]:
-    """Write a stage's result, its arrays first; the file means that the stage is done."""
+    """Write a stage's result, its arrays first: if the file exists, the stage is finished."""
     if isinstance(result, Absent):
         content = digest(result)
         write_document(path, plain(_File(keys, result, {}, content)))
@@ -178,7 +178,7 @@ def write_stage(path: Path, stage: Stage[R], keys: Mapping[str, str], result: R 
 
 
 def read_stage(path: Path, stage: Stage[R], remedy: str) -> Stored[R]:
-    """Read a stage's result; of a file that another version wrote, why it does not fit.
+    """Read a stage's result; for a file of another version, ``unfit`` says so.
 
     Raises:
         InputError: If the file is missing or damaged; the message ends with ``remedy``.
@@ -211,30 +211,28 @@ def _has_arrays(stage: Stage[Any]) -> bool:
 
 
 def differing(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What surely differs of what a stage reads, in words; empty for nothing."""
+    """Text that names the changed inputs of a stage; empty if none has changed."""
     differ = [name for name, key in now.items() if key and key != before.get(name)]
     differ += [name for name in before if name not in now]
     return f"{', '.join(differ)} {'has' if len(differ) == 1 else 'have'} changed" if differ else ""
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What has changed of what a stage reads, in words, and of what that is not known; empty for nothing."""
+    """Text that names the changed inputs of a stage, and those that cannot be checked; empty if there are none."""
     unknown = [name for name, key in now.items() if not key]
     words = [found] if (found := differing(before, now)) else []
     if unknown:
-        words.append(
-            f"nobody knows whether {', '.join(unknown)} {'has' if len(unknown) == 1 else 'have'} changed"
-        )
+        words.append(f"a change of {', '.join(unknown)} cannot be detected, so it counts as changed")
     return "; ".join(words)
 
 
 def bring_up_to_date(context: Context, stage: Stage[Any], skip: bool = False) -> str:
-    """Run a stage, unless the folder holds its result and nothing that it reads has changed; says what was done.
+    """Run a stage unless its stored result is up to date; returns a text for the terminal.
 
-    With ``skip`` it is left out if it would have to run.
+    With ``skip`` a stage without an up-to-date result is left out.
 
     Raises:
-        InputError: If a stage that is not optional cannot run.
+        InputError: If a required stage cannot run.
     """
     stored, keys = context.stored(stage), stage.keys(context)
     why = ""
@@ -257,7 +255,7 @@ def bring_up_to_date(context: Context, stage: Stage[Any], skip: bool = False) ->
 
 
 def _computed(context: Context, stage: Stage[Any]) -> Any:
-    """The stage's result; of an optional stage that cannot run the reason."""
+    """The stage's result, or the reason why an optional stage failed."""
     if not stage.optional:
         return stage.compute(context)
     try:
@@ -268,7 +266,7 @@ def _computed(context: Context, stage: Stage[Any]) -> Any:
     except InputError as error:
         context.progress.warn(f"stage {stage.name} could not run: {error}")
         return Absent(str(error), failed=True)
-    except Exception as error:  # whatever it is, it must not cost what came before
+    except Exception as error:  # an optional stage must not stop the run: keep the traceback and continue
         path = context.out / "checkpoints" / f"{stage.name}.error.txt"
         write_text(path, traceback.format_exc())
         reason = f"{type(error).__name__}: {error} (where: {path.relative_to(context.out)})"
@@ -282,11 +280,10 @@ def _digest_of_array(array: Any) -> str:
 
 
 def source_of(made: object) -> object:
-    """What a function or class of a scenario is made of: the code, by module, of its module and of those that it
-    imports.
+    """Code of a function or class of a scenario: by module, that of its own module and of the modules that it imports.
 
-    Comments, docstrings and the statement ``scenario = ...`` do not count: what a scenario says is compared by itself.
-    Packages from elsewhere do not count either. ``UNKNOWN`` where there is no source; None for None.
+    Comments, docstrings and the statement ``scenario = ...`` do not count; the scenario's fields are compared
+    separately. Installed packages do not count either. ``UNKNOWN`` without a source file; None for None.
     """
     if made is None:
         return None
@@ -301,13 +298,13 @@ def source_of(made: object) -> object:
 
 
 def _is_own_source(made: object) -> bool:
-    """Whether the code of ``made`` stands in its module's file: an ``eval`` or a console leaves none."""
+    """Whether the code of ``made`` stands in its module's file; code of ``eval`` or of a console has no file."""
     code = getattr(inspect.unwrap(made) if callable(made) else made, "__code__", None)
     return code is None or Path(code.co_filename).is_file()
 
 
 def _home(module: ModuleType) -> Path:
-    """Folder of the outermost package that is the scenario's own; a module by itself: its own file."""
+    """Folder of the scenario's package; for a single module its file."""
     path = Path(str(module.__file__)).resolve()
     parent = path.parent
     return parent if (parent / "__init__.py").is_file() else path
@@ -341,7 +338,7 @@ def _imported(tree: ast.Module) -> Iterator[str]:
 
 
 def _code(tree: ast.Module) -> str:
-    """The code without docstrings, comments and the scenario's own statement."""
+    """The code without docstrings, comments and the statement ``scenario = ...``."""
     own = ["scenario"]
     body = [
         n for n in tree.body if not (isinstance(n, ast.Assign) and list(map(ast.unparse, n.targets)) == own)

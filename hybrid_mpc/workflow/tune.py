@@ -1,4 +1,4 @@
-"""``hybrid-mpc tune``: data and prior of the main job, then trainings of one kind of network with other settings."""
+"""``hybrid-mpc tune``: stages data and prior of a run, then trials of one kind of network with other settings."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ RATES = ("learning_rate", "free_run_learning_rate")
 
 @dataclass(frozen=True)
 class TuneSettings(RunSettings):
-    """What ``hybrid-mpc tune`` computes: the settings of a run, whose networks are the first trial, the kind of
-    network, and what is searched.
+    """Settings of ``hybrid-mpc tune``: those of a run, whose networks are the first trial; kind of network; search
+    space.
     """
 
     kind: str = "mopgrnn"
@@ -39,11 +39,12 @@ class TuneSettings(RunSettings):
         kinds = [name for name in MODELS if not name.startswith("phy")]
         if self.kind not in kinds:
             raise InputError(
-                f"kind: unknown {self.kind!r}; choose one of: {', '.join(kinds)} [HM-WORKFLOW-045]"
+                f"kind: unknown network {self.kind!r}; choose one of: {', '.join(kinds)} [HM-WORKFLOW-045]"
             )
         if self.kind == "rnn" and self.space.prior_replay is not None:
             raise InputError(
-                "an rnn has no prior to replay; leave prior_replay out of what is varied [HM-WORKFLOW-046]"
+                "prior_replay: an rnn has no prior, so it cannot be varied; remove it from the search space "
+                "[HM-WORKFLOW-046]"
             )
 
 
@@ -58,16 +59,23 @@ def run_tuning(
 ) -> SearchResult:
     """Search the settings of one kind of network, and write settings, tables and figures into ``out``.
 
-    Data and prior are the main job's stages with the same seed: a run with the settings found trains what the best
-    trial trained. Only training and validation recordings are read. A resumed search may be given more ``trials``; none
-    starts after ``timeout`` [s] of searching.
+    Stages data and prior are those of a run with the same seed, so a run with the best settings trains the networks of
+    the best trial. Only training and validation recordings are used.
+
+    Args:
+        settings: Settings of the run, kind of network, search space.
+        out: Folder to write.
+        trials: Number of trials. Default: 20. A resumed search may have more.
+        timeout: Time [s] after which no new trial starts. Default: none.
+        resume: Whether to continue the search in ``out``. Default: False.
+        progress: Where to report. Default: nowhere.
 
     Raises:
         InputError: For any bad input.
     """
     check_numbers(trials, settings.seed, timeout)
     context = Context(settings, load_scenario(settings.scenario), out, progress or Progress())
-    check_scenario(replace(context.scenario, plant=None), context.budget)  # no loop is closed here
+    check_scenario(replace(context.scenario, plant=None), context.budget)  # tuning runs no closed loop
     check_data(context)
     with open_folder(out, JobNote("run", settings.identity()), resume=resume):
         for stage in (DATA, PRIOR):
@@ -97,14 +105,14 @@ def run_tuning(
 
 
 def usage(settings: RunSettings, out: Path) -> str:
-    """The command line of a run with the settings found."""
+    """The command line of a run with the best settings."""
     effort = "--seed", str(settings.seed), "--budget", settings.budget
     found = "--settings", str(out / "settings.json"), "--out", f"{out}-run"
     return shlex.join(["hybrid-mpc", "run", settings.scenario, *settings.options(str), *effort, *found])
 
 
 def best_settings(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
-    """The best settings as ``settings.json`` holds them: what was searched and what goes with it."""
+    """The best settings, as ``settings.json`` holds them."""
     names = {"learning_rates" if name in RATES else name: None for name in space.names}
     return {name: getattr(found.settings, name) for name in names}
 

@@ -32,7 +32,7 @@ class CoupledDrivesPrior(Prior):
 
     Source of the linear third order part: T. Wigren, M. Schoukens, *Coupled electric drives data set and reference
     models*, Uppsala TR 2017-024. Friction, bend, window and ``zeta_v`` were found on its two uniform records, samples 1
-    to 300 (docs/machines.md).
+    to 300 (docs/results/real_machines.md).
     """
 
     states: ClassVar[tuple[Signal, ...]] = (

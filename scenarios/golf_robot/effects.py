@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 SMOOTHING = 0.25
 """Window [s] of the differentiation, the scenario's own: noise and bias in the acceleration together are least
-between 0.2 and 0.25 s (see docs/golf-robot.md)."""
+between 0.2 and 0.25 s (see docs/machines/golf_robot_rig.md)."""
 MOVING = 0.05  # [rad/s]
 PUBLISHED = {p.name: p.value for p in PARAMETERS}
 FREE = [p for p in PARAMETERS if not p.fixed]
@@ -202,7 +202,7 @@ def table(effects: Effects) -> str:
 
 
 def main() -> None:
-    """Print the table; with ``--figures DIR`` draw the pictures of docs/golf-robot.md too."""
+    """Print the table; with ``--figures DIR`` draw the pictures of docs/machines/golf_robot_rig.md too."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--budget", default="quick", help="quick or full")

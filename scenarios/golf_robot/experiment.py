@@ -18,7 +18,7 @@ DATA = DataSpec(
     outputs=("phi_rad",),
     dt=0.02,
     max_gap=0.05,
-    smoothing=0.25,  # noise in the acceleration goes with length^-2.5, bias grows: docs/golf-robot.md
+    smoothing=0.25,  # noise in the acceleration goes with length^-2.5, bias grows: docs/results/golf_robot.md
     warm_up=0.5,
     windows=windows(),
 )

@@ -27,7 +27,7 @@ recordings it also makes the data."""
 LARGEST_DELAY = 0.06
 PRIOR_REPLAY = 10.0
 """The tasks stand upright, where no recording was: there the prior is to stand alone. Of 0, 1, 10, 30 and 100 the one
-with the least validation error of the MOPGRNN (docs/disk.md)."""
+with the least validation error of the MOPGRNN (docs/results/unbalanced_disk.md)."""
 
 
 def draw(x: NDArray[np.float64]) -> Sequence[NDArray[np.float64]]:

@@ -19,8 +19,8 @@ class DiskParameters:
     """What the simulated disk is made of.
 
     Gravity, torque a volt, friction and delay are near what the prior's fit to the recording of 2024 says of the real
-    one (docs/machines.md); what the recordings do not tell (inductance, bristle, Stribeck's effect, friction over a
-    turn, cogging) has sizes that are usual for a small motor.
+    one (docs/results/real_machines.md); what the recordings do not tell (inductance, bristle, Stribeck's effect,
+    friction over a turn, cogging) has sizes that are usual for a small motor.
 
     Args:
         J: Inertia of disk and mass [kg m^2].

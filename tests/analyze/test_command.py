@@ -219,7 +219,7 @@ def test_machines_without_positions_are_analyzed_around_their_operating_point(ma
     model = make()
     given = AnalysisInput({"prior": model}, {}, state_range(model), input_range(model, None), np.zeros(0))
     found = analyze_models(given)
-    assert "are not positions and then their speeds" in found.friction.reason
+    assert "must be positions followed by their speeds" in found.friction.reason
     (rest,) = (p for p in found.equilibria["prior"].points if np.allclose(p.x, model.x0, rtol=1e-6))
     assert rest.stability == "stable"
     linear = found.linear["prior"]

@@ -31,10 +31,10 @@ def test_it_says_what_it_understood(call, machine):
         "networks may correct the rates of: phi_dot",
         "operating point (given): phi = 0 rad, phi_dot = 0 rad/s, tau = 0 N m",
         "(-3.142, 0) unstable; (0, 0) stable; (3.142, 0) unstable",
-        "4 s; 1 Runge-Kutta steps a period of 0.02 s",  # 2 J / d: the envelope of the swing
+        "4 s; 1 Runge-Kutta steps per period of 0.02 s",  # 2 J / d: the envelope of the swing
         "control: 50 periods, 1 s",
         "monday.csv 11.98 s 0.01 s",
-        "Nothing to be mended",
+        "No errors",
     ):
         assert words in told
     assert not list(machine.glob("runs"))
@@ -49,8 +49,8 @@ def test_machine_and_recordings_are_told_in_one_pass(call, machine, tmp_path):
     (tmp_path / "monday.csv").write_text(table)
     code, told = checked(call, tmp_path / "wrong.py", "--data", tmp_path / "monday.csv")
     assert code == 2
-    assert "3 to be mended" in told
-    for words in ("its unit must be rad/s", "sensor_sigma must be positive", "no column 'tau_nm'"):
+    assert "3 errors" in told
+    for words in ("its unit must be rad/s", "sensor_sigma: must be positive", "no column 'tau_nm'"):
         assert words in told
 
 

@@ -10,11 +10,11 @@ from importlib.metadata import PackageNotFoundError, version
 import pytest
 
 from hybrid_mpc.check import doctor
-from hybrid_mpc.check.doctor import examined
+from hybrid_mpc.check.doctor import examine
 
 
 def by_name():
-    return {one.name: one for one in examined()}
+    return {one.name: one for one in examine()}
 
 
 def test_it_names_versions_compiler_threads_and_folders(call):
@@ -50,7 +50,7 @@ def test_what_lacks_is_told_with_its_remedy(monkeypatch, tmp_path):
     assert (found["extra studies"].state, found["extra studies"].remedy) == (
         "absent", "pip install 'hybrid-mpc[studies]'"
     )  # fmt: skip
-    assert "dask absent" in found["extra studies"].found
+    assert "dask missing" in found["extra studies"].found
     assert (found["needed"].state, found["needed"].remedy) == ("wrong", "pip install hybrid-mpc")
     assert found["extra report"].state == "ok"
     assert "no-such-compiler" in found["C compiler"].found
@@ -65,7 +65,7 @@ def test_a_job_that_could_not_run_has_an_exit_code(call, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
     code, told, _ = call("doctor")
     assert code == 1
-    assert "-> point XDG_CACHE_HOME at a folder" in told
+    assert "-> set XDG_CACHE_HOME" in told
 
 
 def test_a_gpu_that_torch_cannot_use_is_told(monkeypatch, tmp_path):

@@ -62,7 +62,12 @@ def test_the_command_prints_it_and_opens_a_picture(call, file, monkeypatch):
     monkeypatch.setattr("typer.launch", opened.append)
     code, said, _ = call(file)
     assert code == 0
-    for words in ("200 rows, 5 columns", "sampled every 0.01 s", "header in row 3", "code for missing ones"):
+    for words in (
+        "200 rows, 5 columns",
+        "sampled every 0.01 s",
+        "header in row 3",
+        "code for missing values",
+    ):
         assert words in said
     assert not opened
     code, said, _ = call(file, "--plot")

@@ -123,7 +123,7 @@ def test_what_is_written_from_a_real_recording_passes_the_check_with_it(
     assert [c.full for c in draft.outputs] == outputs
     code, told, _ = call("check", machine, "--data", RECORDINGS / file)
     assert code == 0, told
-    assert "'hybrid-mpc run' may start" in told
+    assert "continue with 'hybrid-mpc run'" in told
 
 
 def test_columns_may_be_named_and_may_have_any_names(tmp_path):
@@ -142,7 +142,7 @@ def test_without_a_column_of_time(tmp_path):
     draft = write_scenario(tmp_path / "b.py", file)
     assert draft.time is None
     assert load_scenario(str(tmp_path / "b.py")).data.time == 1.0
-    assert any("the sampling time [s]" in line for line in left_to_decide(tmp_path / "b.py"))
+    assert any("the sampling period [s]" in line for line in left_to_decide(tmp_path / "b.py"))
 
 
 def test_what_cannot_be_is_refused(tmp_path):
@@ -195,7 +195,7 @@ def test_several_files_after_one_option_are_explained(call, tmp_path):
     for command in ("check", "run"):
         code, _, told = call(command, path, "--data", file, file)
         assert code == 2
-        assert "--data takes one value; give it once for each: --data A --data B" in told
+        assert "--data takes one value; repeat it: --data A --data B" in told
     code, _, told = call("check", path, "something")
     assert (code, "give it once" in told) == (2, False)
 
@@ -460,7 +460,7 @@ def test_the_good_one_of_two_times_is_taken(tmp_path):
     draft = write_scenario(tmp_path / "m.py", logged(tmp_path / "a.csv", stamps(), "elapsed [s]", days))
     assert draft.time.full == "elapsed [s]"
     assert set(draft.left_out) == {"Time [s]"}
-    assert draft.left_out["Time [s]"] == "its name says time"
+    assert draft.left_out["Time [s]"] == "by its name it is a time"
 
 
 @pytest.mark.parametrize("name", ["index", "n", "sample", "Data_Point", "Unnamed: 0", "No.", "k", "row"])
@@ -469,7 +469,7 @@ def test_a_count_of_samples_is_no_signal_and_the_last_to_stand_for_time(tmp_path
     file = logged(tmp_path / "a.csv", map(str, range(300)), name, before=False)
     code, told, _ = call("new", tmp_path / "m.py", "--data", file)
     assert code == 0
-    assert "it counts samples and stands for the time" in told
+    assert "the column counts samples" in told
     scenario = loaded(tmp_path / "m.py")
     assert (scenario.data.time, scenario.data.inputs, scenario.data.outputs) == (name, ("u",), ("y",))
     assert scenario.data.units == {name: 1.0}
@@ -516,7 +516,7 @@ def test_a_single_number_is_the_sampling_time(tmp_path, name, ending):
     ("change", "match"),
     [
         (lambda rows: [*rows[:50], "1,2", *rows[50:]], r"51.*the header.*HM-DATA-093"),
-        (lambda rows: ["t,u,u", *rows[1:]], r"the name stands 2 times.*HM-CHECK-014"),
+        (lambda rows: ["t,u,u", *rows[1:]], r"its name appears 2 times.*HM-CHECK-014"),
     ],
 )
 def test_the_readers_reason_is_passed_on(tmp_path, change, match):

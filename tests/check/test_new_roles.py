@@ -11,7 +11,7 @@ import pytest
 from hybrid_mpc import InputError, load_scenario, write_csv
 from hybrid_mpc.check.first_model import Runs, first_lag, slowest
 from hybrid_mpc.check.new import horizon_of, left_to_decide, write_scenario
-from hybrid_mpc.check.roles import Trait, copy_of, follows, is_rate, judged
+from hybrid_mpc.check.roles import Trait, copy_of, follows, is_rate, judge_roles
 from hybrid_mpc.data.names import role_said_by, unit_behind
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
@@ -69,7 +69,7 @@ def test_some_are_told_right_even_without_names(name):
 
 @pytest.mark.full
 def test_how_many_are_told_right_otherwise():
-    """The figures of docs/own-machine.md."""
+    """The figures of docs/columns.md."""
     rows = list(benchmark.simulated())
     assert sum(row["right"] for row in rows) >= 16
     assert len(rows) == 20
@@ -86,7 +86,7 @@ TOLD = [make for make in benchmark.MADE_UP if make.__name__ not in ("heating", "
 def test_made_up_loops_are_told_right(make):
     for seed in range(3):
         table, truth = make(np.random.default_rng(100 + seed))
-        found = judged([Trait(name, "", (values,)) for name, values in table.items()])
+        found = judge_roles([Trait(name, "", (values,)) for name, values in table.items()])
         for kind, names in (
             ("input", truth.inputs),
             ("output", truth.outputs),
@@ -129,7 +129,7 @@ def steps(m=1500, seed=0):
 
 
 def kinds(table, units=None, given=None):
-    found = judged([Trait(name, (units or {}).get(name, ""), (v,)) for name, v in table.items()], given)
+    found = judge_roles([Trait(name, (units or {}).get(name, ""), (v,)) for name, v in table.items()], given)
     return {name: verdict.kind for name, verdict in found.items()}
 
 
@@ -229,7 +229,7 @@ def test_what_no_input_reaches_and_what_acts():
     u, w = benchmark.steps_of(rng, m, 50), np.cumsum(0.1 * rng.standard_normal(m))
     y = benchmark.lagged(u + 0.5 * w, 1.0, 20, rng, 0.02)
     idle = rng.standard_normal(m)
-    found = judged([Trait(n, "", (v,)) for n, v in {"a": u, "b": y, "c": w, "d": idle}.items()])
+    found = judge_roles([Trait(n, "", (v,)) for n, v in {"a": u, "b": y, "c": w, "d": idle}.items()])
     assert {name: verdict.kind for name, verdict in found.items()} == {
         "a": "input", "b": "output", "c": "disturbance", "d": "output",
     }  # fmt: skip
@@ -280,7 +280,9 @@ def test_several_recordings(call, tmp_path):
     words = [word for file in files for word in ("--data", file)]
     code, told, error = call("new", tmp_path / "m.py", *words)
     assert code == 0, error
-    assert [line for line in told.splitlines() if "push" in line] == ["not used: push (it is not in a.csv)"]
+    assert [line for line in told.splitlines() if "push" in line] == [
+        "not used: push (it is missing in a.csv)"
+    ]
     assert all(f"--data {file}" in told.splitlines()[-1] for file in files)
     scenario = load_scenario(str(tmp_path / "m.py"))
     assert (scenario.data.inputs, scenario.data.outputs) == (("valve",), ("level_m",))
@@ -295,7 +297,7 @@ def test_columns_that_move_in_one_recording_alone(tmp_path):
     moving = written(tmp_path / "b.csv", 1, more={"fan_pct": 30 + 10 * steps(900, 5)})
     draft = write_scenario(tmp_path / "m.py", [still, moving])
     assert [c.full for c in draft.inputs] == ["valve", "fan_pct"]
-    assert write_scenario(tmp_path / "n.py", still).left_out == {"fan_pct": "it is 30 throughout"}
+    assert write_scenario(tmp_path / "n.py", still).left_out == {"fan_pct": "it is constant at 30"}
 
 
 def test_recordings_that_do_not_fit_together(tmp_path):

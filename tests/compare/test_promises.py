@@ -164,7 +164,7 @@ def test_ranks_that_lack_and_economic_costs_promise_nothing():
     task = Task("hold", "Hold", 6.0, (0.0, 0.0), lambda t: np.full((len(t), 2), 0.1))
     found = no_offset_of(kit_of(model, problem), task, draws=1)
     assert found.verdict == "not promised"
-    assert "2 outputs (left, right) are held by 1 input" in found.evidence
+    assert "2 outputs (left, right) are controlled by 1 input" in found.evidence
     level = ca.MX.sym("level")
     price = ca.Function("price", [level, u], [u])
     cheap = OCP(20, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0], economic=price)
@@ -196,7 +196,7 @@ def test_the_error_of_the_run_s_own_hold_task_is_a_doubt():
     swings = replace(end, deviations=(p.Deviation(angle, 0.1, 0.0, 2.0),))
     assert p.tasks_end([swings], "").verdict == "doubted"
     lost = replace(end, deviations=(p.Deviation(angle, 0.1, np.nan, np.nan),))
-    assert "runs away" in p.tasks_end([lost], "").evidence
+    assert "diverges" in p.tasks_end([lost], "").evidence
     assert p.tasks_end([], "").verdict == "not promised"
 
 
@@ -267,7 +267,7 @@ def test_a_hard_bound_that_no_plan_keeps_is_a_doubt():
     assert [float(x[0]) for _, x in p.starts_near(point)] == pytest.approx([-0.95, 0.95])
     row = p.limits([point], [], {})
     assert row.verdict == "doubted"
-    assert "level = 0.95 m the bound of level gives way" in row.evidence
+    assert "level = 0.95 m the bound of level is relaxed" in row.evidence
     kept = point_of(kit_of(tank(), problem), hold(0.0))
     assert p.limits([kept], [], {}).verdict == "shown"
     told = p.limits([kept], [], {"hold": {"level": 0.02}})

@@ -80,25 +80,25 @@ def test_what_is_decided():
 def test_the_terminal_names_the_baseline_that_the_hybrid_does_least_well_against():
     none = ControllerCosts(1.0, {})
     own = {"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": Comparison(0.8, 0.7, 0.9, 6)}
-    none_of_it = Comparison(None, None, None, 6, "a loop diverged, the baseline's")
+    none_of_it = Comparison(None, None, None, 6, "a loop diverged: the baseline's")
     lost = {"prior": none_of_it, "prior_observer": own["prior"]}
     both = {"prior": none_of_it, "prior_observer": none_of_it}
     details = ControlDetails({}, {}, {"track": own, "stroke": lost, "push": both}, most_seeds=6)
     assert comparison_lines(Control(none, none, none, 0.5, details=details)) == [
         "track: hybrid_observer / prior_observer 0.8 (0.7 to 0.9), 6 seeds: cheaper",
         "stroke: hybrid_observer / prior_observer 0.5 (0.4 to 0.6), 6 seeds: cheaper",
-        "push: hybrid_observer / prior – (a loop diverged, the baseline's), 6 seeds: undecided",
+        "push: hybrid_observer / prior – (a loop diverged: the baseline's), 6 seeds: undecided",
     ]
     assert comparison_lines(Control(none, none, none, 0.5)) == []
 
 
 def test_costs_without_a_ratio_are_told_and_decide_nothing():
     lost = compare_costs([1.0, math.inf], [1.0, 1.0], most=2)
-    assert (lost.ratio, lost.reason, lost.decided) == (None, "a loop diverged, its own", False)
-    assert compare_costs([1.0, 1.0], [math.inf, 1.0], most=2).reason == "a loop diverged, the baseline's"
+    assert (lost.ratio, lost.reason, lost.decided) == (None, "a loop diverged: its own", False)
+    assert compare_costs([1.0, 1.0], [math.inf, 1.0], most=2).reason == "a loop diverged: the baseline's"
     far = compare_costs([1e-3, 1e60], [1.0, 1.0], most=2)  # e to the power of half the width is no number
     assert (far.low, far.high, far.finding) == (None, None, "undecided")
-    assert far.words == "3.16e+28 (the ratios scatter too far for an interval)"
+    assert far.words == "3.16e+28 (the ratios scatter too much for an interval)"
     gain = compare_costs([-1.0, 2.0], [1.0, 1.0], most=2)
     assert (gain.ratio, gain.reason, gain.decided) == (None, "a cost is not positive", False)
     single = compare_costs([1.0], [2.0], most=1)

@@ -223,7 +223,7 @@ def test_a_problem_as_a_user_writes_it():
         ({"q": [-1]}, "q: weights must be finite and not negative"),
         ({"horizon": 2.5}, "horizon: a whole number is needed, got 2.5"),
         ({"horizn": 5}, "no field 'horizn'; did you mean 'horizon'?"),
-        ({"u_max": ["-inf"]}, "input bounds cross"),
+        ({"u_max": ["-inf"]}, "HM-MODEL-013"),
         ({"terminal": [[1, 0], [0]]}, "terminal: "),
         ({"terminal": "lyapunov"}, "terminal: "),
         ({"starts": [[[0.0]]]}, r"starts\[0\]: shape \(1, 1\) given"),

@@ -1,5 +1,6 @@
 """What recordings of any machine hold: disturbances, missing samples, sensors that end, delays, any headers."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -83,7 +84,7 @@ def test_a_slow_sensor_of_a_disturbance_is_bridged_and_what_it_does_not_cover_is
     told = finding.kind, finding.channel, finding.count, finding.start
     assert told == ("missing", "wind", 594, 0.0)
     assert "594 of 600 rows (99 %)" in str(finding)
-    assert "the longest time without one is 1 s" in str(finding)
+    assert "without a number is 1 s" in str(finding)
 
 
 def test_trajectories_are_made_without_disturbances():
@@ -376,14 +377,14 @@ def test_delays_are_taken_off_each_side_of_a_gap(tmp_path):
 
 def test_delays_longer_than_a_piece_leave_nothing(tmp_path):
     (told,) = problems(wrote(tmp_path), replace(SPEC, delays={"u": 7.0}))
-    assert "what all columns cover, known delays taken off, is shorter than the 0.4 s" in told
+    assert "shorter than the 0.4 s" in told
 
 
 def test_bad_delays(tmp_path):
     file = wrote(tmp_path)
     spec = replace(SPEC, delays={"yy": 0.1}, delays_of={"run": {"t": 0.1}})
     told = problems(file, spec)
-    assert "delays names column 'yy', which is none of 'u', 'y'" in told[0]
+    assert "delays names column 'yy'" in told[0]
     assert "delays_of 'run' names column 't'" in told[1]
     with pytest.raises(InputError, match="HM-RECORDS-007"):
         replace(SPEC, delays={"y": float("nan")})
@@ -422,7 +423,7 @@ def test_a_disturbance_may_be_a_files_own_input(tmp_path):
 def test_one_column_under_two_names(tmp_path):
     savemat(tmp_path / "run.mat", {"run": GOOD})
     (told,) = problems(tmp_path / "run.mat", replace(SPEC, inputs=("run.y",)))
-    assert "columns 'run.y' and 'y' are one, 'run.y'" in told
+    assert re.search(r"'run.y' and 'y'.*HM-DATA-069", told)
 
 
 def test_counts_of_columns_name_the_signals(tmp_path):
@@ -496,7 +497,7 @@ def test_two_decimal_marks_are_refused(tmp_path):
     file = tmp_path / "run.csv"
     file.write_text("t;u;y\n0;1;1,5\n0.01;1;1,5\n")
     (told, *_) = problems(file)
-    assert "numbers have commas and points, e.g. 0.01 and 1,5" in told
+    assert re.search(r"0\.01 and 1,5.*HM-DATA-097", told)
     file.write_text("t;u;y\n0;1\n")
     assert "row 2 has 2 cells" in problems(file)[0]
 
@@ -516,7 +517,7 @@ def test_names_with_units_in_brackets(tmp_path):
     (whole,) = read(tmp_path / "run.csv", replace(SPEC, units={"u": 1.0})).whole
     np.testing.assert_allclose(whole.y, plain.y, atol=1e-9)  # its own name comes first
     write_csv(tmp_path / "run.csv", {"t": T, "u": GOOD["u"], "y [m]": GOOD["y"], "y [mm]": T})
-    assert "column 'y' may be 'y [m]' or 'y [mm]'" in problems(tmp_path / "run.csv")[0]
+    assert re.search(r"'y \[m\]' or 'y \[mm\]'.*HM-DATA-084", problems(tmp_path / "run.csv")[0])
 
 
 def test_units_in_brackets_are_those_of_their_signals(tmp_path):
@@ -546,4 +547,4 @@ def test_names_and_units():
 def test_a_period_far_finer_than_the_sampling_is_refused(tmp_path):
     """Before it takes gigabytes."""
     (told,) = problems(wrote(tmp_path), replace(SPEC, dt=1e-6), states=STATES)
-    assert "the model's period of 1e-06 s is more than 1000 times finer than the sampling, 0.01 s" in told
+    assert re.search(r"1e-06 s.* 1000 times.* 0\.01 s.*HM-DATA-103", told)

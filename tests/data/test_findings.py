@@ -8,7 +8,7 @@ import pytest
 from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_scenario, load_trajectories, write_csv
-from hybrid_mpc.data.findings import still_stretches, unwrapped
+from hybrid_mpc.data.findings import still_stretches, unwrap
 from hybrid_mpc.data.recording import read_recording
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
@@ -75,7 +75,7 @@ def test_a_sensor_that_stops_at_rest_is_told_by_the_inputs(tmp_path):
     """It never moves again, so nothing is abrupt: the inputs go on as before."""
     resting = quantised(SWING * np.clip((10 - T) / 3, 0, 1) ** 2)  # comes to rest at 10 s
     (one,) = findings(tmp_path, resting)
-    assert (one.kind, "while the inputs move as they do elsewhere" in one.message) == ("frozen", True)
+    assert (one.kind, "while the inputs move" in one.message) == ("frozen", True)
     assert one.start == pytest.approx(10.0, abs=0.3)
     assert findings(tmp_path, resting, tau=np.where(T > 9.5, 0.2 * TAU, TAU)) == ()  # too little to move it
     # a file that stands still from its begin to its end, among others that move
@@ -90,7 +90,7 @@ def test_clipped_sensors(tmp_path, sensor):
     (one,) = findings(tmp_path, phi)
     assert (one.kind, one.channel, one.count) == ("clipped", "phi", int((phi == 1.0).sum()))
     assert one.start == pytest.approx(T[np.argmax(phi == 1.0)])
-    for words in ("stands at its largest value, 1 rad", "clipped", "against a stop"):
+    for words in ("largest value, 1 rad", "clipped", "against a stop"):
         assert words in str(one)
     both = findings(tmp_path, np.clip(sensor(SWING), -0.8, 1.0))
     assert [one.message.split("its ")[1].split(" ")[0] for one in both] == ["largest", "smallest"]
@@ -153,7 +153,7 @@ def test_speeds_beyond_what_is_plausible(tmp_path):
     assert (one.kind, one.channel, one.refused) == ("speed", "phi", False)
     assert 6.9 < one.start < 7.1
     assert 0 < one.count < 10
-    for words in ("reaches", "rad/s at", "-20 to 20 rad/s", "unit is wrong", "DataSpec.units"):
+    for words in ("reaches", "rad/s at", "-20 to 20 rad/s", "DataSpec.units"):
         assert words in str(one)
     # degrees that a wide range of the position lets pass
     free = {**SIGNALS, "outputs": (Signal("phi", "rad"),)}
@@ -177,8 +177,13 @@ def test_all_files_are_told_at_once(tmp_path):
     with pytest.raises(InputError) as caught:
         load_trajectories(files, machine(**SIGNALS), SPEC)
     told = caught.value.problems
-    words = ("a.csv: column 'phi' jumps", "b.csv: row 502", "c.csv: row 3", "d.csv: there is no such file",
-             "f.csv: row")  # fmt: skip
+    words = (
+        "a.csv: column 'phi' jumps",
+        "b.csv: row 502",
+        "c.csv: row 3",
+        "d.csv: file not found",
+        "f.csv: row",
+    )
     assert len(told) == len(words)
     for problem, start in zip(told, words, strict=True):
         assert start in problem
@@ -225,7 +230,7 @@ def test_turns_are_counted_over_missing_samples_at_any_speed(speed, lost):
     k = np.arange(600)
     angle = 2 * np.pi * speed * k + 0.2 * np.sin(k / 40)
     there = ~np.isin(k % 37, range(1, 1 + lost))
-    found = unwrapped(0.01 * k[there], turned(angle)[there], 2 * np.pi, 1.0)
+    found = unwrap(0.01 * k[there], turned(angle)[there], 2 * np.pi, 1.0)
     np.testing.assert_allclose(found.angle - found.angle[0], angle[there] - angle[0], atol=1e-9)
     assert not len(found.unclear)
 
@@ -235,7 +240,7 @@ def test_where_the_number_of_turns_is_not_known_the_recording_is_cut(tmp_path):
     k = np.arange(1200)
     angle = np.where(k < 600, 0.5 * k, 300 - 0.5 * (k - 600))
     angle[560:640] = np.nan
-    found = unwrapped(0.01 * k[np.isfinite(angle)], turned(angle)[np.isfinite(angle)], 2 * np.pi, 5.0)
+    found = unwrap(0.01 * k[np.isfinite(angle)], turned(angle)[np.isfinite(angle)], 2 * np.pi, 5.0)
     assert found.unclear.tolist() == [560]
     np.testing.assert_allclose(np.diff(found.angle)[:559], 0.5)
     np.testing.assert_allclose(np.diff(found.angle)[560:], -0.5)
@@ -244,7 +249,7 @@ def test_where_the_number_of_turns_is_not_known_the_recording_is_cut(tmp_path):
 def test_an_angle_that_is_not_periodic_may_step_by_half_a_turn():
     t = 0.01 * np.arange(300)
     slider = np.where(t < 1.5, -1.0, 2.5)  # 0.56 turns
-    assert not len(unwrapped(t, slider, 2 * np.pi, 1.0, periodic=False).jumps)
+    assert not len(unwrap(t, slider, 2 * np.pi, 1.0, periodic=False).jumps)
 
 
 def test_settled_answers_to_steps_are_not_frozen(tmp_path):

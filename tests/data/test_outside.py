@@ -8,8 +8,8 @@ from machine_signals import machine
 from recording_bombs import GOOD, SPEC, T
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
-from hybrid_mpc.data.findings import folded
-from hybrid_mpc.data.recording import even, read_recording
+from hybrid_mpc.data.findings import find_folding
+from hybrid_mpc.data.recording import make_even, read_recording
 
 FREE = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
 PLAIN = machine((Signal("n", "rpm"),), (Signal("u", "V"),))
@@ -187,8 +187,8 @@ def test_stamps_that_are_uneven_stay_so():
     rng = np.random.default_rng(0)
     t = 0.01 * np.arange(500)
     for stamps in (t, t + 1e-3 * rng.random(500), np.round(t + 2e-3 * rng.random(500), 3), t**1.5, 1.7e9 + t):
-        assert even(stamps) is stamps or np.array_equal(even(stamps), stamps)
-    np.testing.assert_allclose(np.diff(even(np.round(0.0025 * np.arange(500), 3))), 0.0025, rtol=1e-3)
+        assert make_even(stamps) is stamps or np.array_equal(make_even(stamps), stamps)
+    np.testing.assert_allclose(np.diff(make_even(np.round(0.0025 * np.arange(500), 3))), 0.0025, rtol=1e-3)
 
 
 @pytest.mark.parametrize("parts", [2, 3, 4])
@@ -217,7 +217,7 @@ def test_steps_swings_and_impacts_are_not_folded():
         np.pi / 2 * np.sin(3 * t),
         np.pi / 2 * np.abs(np.sin(3 * t)),
     ):
-        assert folded(t, angle, 2 * np.pi, 0.05) is None
+        assert find_folding(t, angle, 2 * np.pi, 0.05) is None
 
 
 @pytest.mark.parametrize("bits", [8, 16, 32])

@@ -106,7 +106,7 @@ def test_bad_columns(tmp_path, kind):
 @pytest.mark.parametrize(
     ("phi", "match"),
     [
-        (np.rad2deg(np.sin(3 * T)), r"In deg it would be plausible: say units=\{'phi': 'deg'\}"),
+        (np.rad2deg(np.sin(3 * T)), r"In deg it would be plausible: write units=\{'phi': 'deg'\}"),
         (
             np.where(np.arange(60) == 40, 1e307, np.rad2deg(np.sin(3 * T))),
             r"1e\+307 in row 42\)\. Check unit",
@@ -210,7 +210,7 @@ def test_no_such_format(tmp_path, vectors):
     path.write_bytes(whole[: len(whole) // 2])
     refused(path, "damaged|cannot be read")
     path.rename(tmp_path / "run.csv")
-    refused(tmp_path / "run.csv", "no text|damaged")
+    refused(tmp_path / "run.csv", "not text|damaged")
 
 
 def test_versions_of_mat(tmp_path):
@@ -323,11 +323,11 @@ def test_damaged_vectors_are_an_input_error_or_what_was_written(tmp_path, vector
 @pytest.mark.parametrize(
     ("cell", "match"),
     [
-        ("ON", "a word for a switch"), ("2 V", r"a number with a unit.*'name \[V\]'"),
-        ("5m/s", "a number with a unit"), ('"1,5"', "a decimal comma"), ('"1.200,5"', "a mark between thousands"),
+        ("ON", "a word for a switch"), ("2 V", r"a unit.*'name \[V\]'"),
+        ("5m/s", "a unit"), ('"1,5"', "a decimal comma"), ('"1.200,5"', "a mark between thousands"),
         ("2024-01-31 10:00:00", "a date or a time"),
         ("31.01.2024", "a date or a time"), ("31-Jan-2024 10:00:00", "a date or a time"),
-        ("10:00:00.5", "a date or a time"), ("abc", "repair the value"), ("0x1f", "repair the value"),
+        ("10:00:00.5", "a date or a time"), ("abc", "Correct the value"), ("0x1f", "Correct the value"),
     ],
 )  # fmt: skip
 def test_a_cell_that_is_no_number_is_named_with_what_it_is(tmp_path, cell, match):

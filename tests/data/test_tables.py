@@ -275,7 +275,7 @@ AMBIGUOUS = {
     "no table": ("nothing here\nis a number\n", "HM-DATA-093"),
     "day or month": (
         text(with_cells(lambda k, c: f"0{1 + k % 2}/0{2 + k % 3}/2024 10:00:{k:02d}", 0)),
-        "day or month first",
+        "day or month may",
     ),
     "hours or minutes": (text(with_cells(lambda k, c: f"10:{k:02d}", 0)), "hours and minutes"),
     "no such day": (text(with_cells(lambda k, c: f"30.02.2024 10:00:{k:02d}", 0), ";"), "does not exist"),
@@ -296,7 +296,7 @@ AMBIGUOUS = {
     "a switch among numbers": (text(cell(7, 1, "ON")), "row 9, .*switch"),
     "a short row": (text([*PLAIN[:9], PLAIN[9][:2], *PLAIN[10:]]), r"11.*HM-DATA-093"),
     "a long row": (text([*PLAIN[:9], [*PLAIN[9], "1"], *PLAIN[10:]]), r"11.*HM-DATA-093"),
-    "a header of numbers": (text(PLAIN, header=("0", "1", "2")), r"row 1 counts columns.*HM-DATA-089"),
+    "a header of numbers": (text(PLAIN, header=("0", "1", "2")), r"row 1 .*HM-DATA-089"),
     "decimal commas between commas": (text(GERMAN), "HM-DATA-089"),
     "a month a row": (text(with_cells(lambda k, c: f"0{1 + k % 9}/0{1 + k // 9}/2024", 0)), "day or month"),
     "a header too short": (text(PLAIN, header=("t", "u")), "HM-DATA-089"),

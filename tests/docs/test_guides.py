@@ -1,16 +1,19 @@
 """The code that the guides show runs, from top to bottom, and gives what the text beside it says."""
 
 import importlib.util
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_mpc import InputError, load_scenario
+from hybrid_mpc import OCP, DataSpec, InputError, Scenario, Trajectory, fit_prior, load_scenario, random_steps
 from hybrid_mpc.check.preflight import check_scenario
-from hybrid_mpc.errors import CODE
 
 ROOT = Path(__file__).parents[2]
 
@@ -28,13 +31,48 @@ def executed(page, sources):
     return namespace
 
 
+def words(page):
+    """The words of a page, a blank between two."""
+    return " ".join((ROOT / page).read_text().split())
+
+
 @pytest.fixture(scope="module")
 def machines():
-    return executed("docs/machines.md", blocks("docs/machines.md"))
+    """What the pages on priors and plants define."""
+    pages = ("docs/writing-a-prior.md", "docs/mechanical-priors.md", "docs/plant.md")
+    return {name: value for page in pages for name, value in executed(page, blocks(page)).items()}
+
+
+@pytest.fixture(scope="module")
+def tanks(machines):
+    """The two tanks of the guide with a plant of their own, whose upper level nothing measures."""
+    return Scenario(
+        "tanks", "Two tanks", "", prior=machines["TwoTanks"], plant=machines["TankPlant"], tasks=(machines["fill"],),
+        data=DataSpec("time_s", ("pump",), ("lower_m",), dt=2.0, max_gap=5.0, smoothing=20.0, warm_up=60.0),
+        control=OCP(30, q=(0.0, 0.0), r=(1e5,), r_delta=(1e6,), u_min=(0.0,), u_max=(3e-4,), q_y=(10.0,)),
+        sensor_sigma=(1e-3,), first_sigma=(0.05,), safe_input=(0.0,),
+    )  # fmt: skip
 
 
 def test_the_tanks_are_found_though_one_is_not_measured(machines):
-    fit, plant = machines["fit"], machines["plant"]
+    """Half an hour of the prior itself with other outlets and 1 mm of noise."""
+    prior = machines["TwoTanks"]
+    plant, dt = prior({"k_upper": 2.4e-4, "k_lower": 1.7e-4}), 2.0
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    rates = ca.Function("rates", [x, u], [plant.equations.xdot(x, u, ca.SX(0, 1), plant.p)])
+    step = ca.simpleRK(rates, 1, 4)
+
+    def recorded(role, seed):
+        rng, t = np.random.default_rng(seed), dt * np.arange(900)
+        pump = random_steps(t, 5e-5, 1.5e-4, hold=(60.0, 300.0), rng=rng)[:, None]
+        levels = [np.array([0.2, 0.3])]
+        for k in range(len(t) - 1):
+            levels.append(step(levels[-1], pump[k], dt).full().ravel())
+        y = np.array(levels)[:, 1:] + 1e-3 * rng.standard_normal((len(t), 1))
+        unknown = np.zeros((len(t), 2))  # states and their rates: the fit finds them
+        return Trajectory(f"{role}{seed}", role, dt, t, pump, y, unknown, unknown)
+
+    fit = fit_prior(prior, [recorded("train", 0)], [recorded("valid", 1)], dt=dt)
     for name in ("k_upper", "k_lower"):
         # half an hour at 1 mm of noise: standard errors are a thousandth of the values
         assert abs(fit.values[name] - plant.values[name]) < 5 * fit.standard_errors[name]
@@ -49,33 +87,45 @@ def test_the_tanks_in_torch_are_the_same(machines):
     np.testing.assert_allclose(rates[0], rates[1], rtol=1e-12)  # the same operations, rounded alike
 
 
-@pytest.mark.parametrize("name", ["TwoTanks", "TorchTanks", "Arm", "RubbingArm", "Pendulum", "Loaded"])
-def test_every_prior_of_the_guide_passes_the_preflight(machines, name):
-    prior, scenario = machines[name], machines["scenario"]
+@pytest.mark.parametrize(
+    "name", ["TwoTanks", "TorchTanks", "Sensed", "Arm", "RubbingArm", "Pendulum", "Loaded"]
+)
+def test_every_prior_of_the_guide_passes_the_preflight(machines, tanks, name):
+    prior, scenario = machines[name], tanks
     if name != "TwoTanks":  # other columns, and no control problem
         columns = {key: tuple(s.name for s in getattr(prior, key)) for key in ("inputs", "outputs")}
-        data = replace(scenario.data, **columns, **({} if "Tanks" in name else {"dt": 0.01, "warm_up": 1.0}))
-        scenario = replace(scenario, prior=prior, data=data, control=None, sensor_sigma=(), first_sigma=None)
+        process = {"TorchTanks", "Sensed"}
+        data = replace(scenario.data, **columns, **({} if name in process else {"dt": 0.01, "warm_up": 1.0}))
+        scenario = replace(
+            scenario,
+            prior=prior,
+            data=data,
+            plant=None,
+            tasks=(),
+            control=None,
+            sensor_sigma=(),
+            first_sigma=None,
+        )
     check_scenario(scenario)
 
 
-def test_what_is_refused_is_refused_in_the_words_of_the_guide(machines):
-    tanks, ca, balance = machines["TwoTanks"], machines["ca"], machines["Balance"]
+def test_what_is_refused_is_refused_in_the_words_of_the_guide(machines, tanks):
+    good, balance = machines["TwoTanks"], machines["Balance"]
 
-    class Root(tanks):
+    class Root(good):
         def flows(self, x, p):
             return p.k_upper * ca.sqrt(x.upper), p.k_lower * ca.sqrt(x.lower)
 
-    class Sign(tanks):
+    class Sign(good):
         def balances(self, x, u, w, p):
             volume = p.area * (x.upper + x.lower)
             return (balance("volume", volume, -u.pump, self.flows(x, p)[1], "m^3", "m^3/s"),)
 
-    page = " ".join((ROOT / "docs/machines.md").read_text().split())
+    page = words("docs/checks.md")
     for wrong in (Root, Sign):
         with pytest.raises(InputError) as told:
-            check_scenario(replace(machines["scenario"], prior=wrong))
-        assert CODE.sub("", str(told.value)).strip() in page
+            check_scenario(replace(tanks, prior=wrong, plant=None, tasks=()))
+        assert str(told.value) in page
 
 
 @pytest.mark.full
@@ -94,33 +144,40 @@ def what_fits():
     return module
 
 
-@pytest.fixture(scope="module")
-def own():
-    return executed("docs/own-machine.md", blocks("docs/own-machine.md"))
-
-
-def test_every_prior_of_ones_own_machine_passes_the_preflight(own):
-    kinds = {
-        name: kind for name, kind in own.items() if isinstance(kind, type) and issubclass(kind, own["Prior"])
-    }
-    del kinds["Prior"], kinds["MechanicalPrior"], kinds["TorchPrior"], kinds["Wrong"]
-    assert len(kinds) == 7
-    for prior in kinds.values():
-        columns = {
-            key: tuple(s.name for s in getattr(prior, key)) for key in ("inputs", "outputs", "disturbances")
-        }
-        dt = 0.02 if prior is own["Crane"] else 5.0
-        data = replace(own["data"], **columns, dt=dt, warm_up=12 * dt)
-        check_scenario(replace(own["tank"], prior=prior, data=data))
-    with pytest.raises(InputError, match="HM-CHECK-015"):
-        check_scenario(replace(own["tank"], prior=own["Wrong"]))
-    leaking = replace(own["scenario"], disturbance_model=own["leak"], data=own["delayed"])
-    check_scenario(leaking)
-    tank, other = own["Tank"](), own["TorchTank"]()
+def test_the_tank_of_the_guide_is_the_one_in_its_file():
+    """The page shows parts of docs/examples/tank.py; the whole of it passes."""
+    page = [source for source in blocks("docs/own-machine.md") if "runs/tank" not in source]
+    shown = executed("docs/own-machine.md", page)
+    whole = load_scenario(str(ROOT / "docs/examples/tank.py"))
+    assert (shown["scenario"].data, shown["scenario"].control) == (whole.data, whole.control)
+    one, other = shown["Tank"](), whole.prior()
     point = [0.3], [5.0], []
-    assert float(tank.equations.xdot(*point, tank.p)) == pytest.approx(
-        float(other.equations.xdot(*point, other.p)), rel=1e-12
+    assert float(one.equations.xdot(*point, one.p)) == float(other.equations.xdot(*point, other.p))
+    assert one.parameters == other.parameters
+    check_scenario(whole)
+
+
+def test_the_way_from_a_recording_to_a_fit(tmp_path):
+    """The first commands of docs/own-machine.md, in their order."""
+    python = {"cwd": tmp_path, "capture_output": True, "text": True, "check": True}
+    subprocess.run([sys.executable, ROOT / "docs/examples/tank_record.py"], **python)
+    page, head = (ROOT / "docs/own-machine.md").read_text(), (tmp_path / "monday.csv").read_text()[:40]
+    assert "\n".join(head.splitlines()[:3]) in page
+    for command in (
+        "data monday.csv",
+        "new my_tank.py --data monday.csv",
+        "check my_tank.py --data monday.csv",
+    ):
+        assert command.startswith("check") or f"hybrid-mpc {command}" in page
+        subprocess.run([sys.executable, "-m", "hybrid_mpc.cli", *command.split()], **python)
+    fitted = "check docs/examples/tank.py --data monday.csv --data tuesday.csv --fit"
+    assert f"hybrid-mpc {fitted}" in page
+    command = fitted.replace("docs/examples", str(ROOT / "docs/examples")).split()
+    done = subprocess.run(
+        [sys.executable, "-m", "hybrid_mpc.cli", *command], env={**os.environ, "COLUMNS": "110"}, **python
     )
+    (line,) = (" ".join(line.split()) for line in done.stdout.splitlines() if re.match(r"k .* 5 to 40", line))
+    assert line in " ".join(page.split())
 
 
 @pytest.mark.full
@@ -133,6 +190,11 @@ def test_what_does_not_fit_is_refused_as_the_page_says(what_fits):
     check_scenario(what_fits.machine(what_fits.rod(5), 2.0))
     with pytest.raises(InputError, match="no output tells of"):
         check_scenario(what_fits.machine(what_fits.rod(20), 2.0))
+
+
+def test_the_comparison_of_the_page_on_seeds():
+    found = executed("docs/seeds.md", blocks("docs/seeds.md"))["found"]
+    assert f"({found.words!r}, {found.finding!r})" in (ROOT / "docs/seeds.md").read_text()
 
 
 def test_the_machines_of_the_readme():

@@ -21,7 +21,7 @@ from hybrid_mpc import (
 )
 from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.estimate.offset_free import distinguishable
-from hybrid_mpc.estimate.tuning import FOUND, load_left
+from hybrid_mpc.estimate.tuning import FOUND, remaining_load
 from hybrid_mpc.kit.assembly import FOUND_HORIZONS, first_deviations, tuned_noise
 
 ALL = (two_tanks, dc_motor, thermal)
@@ -247,7 +247,7 @@ def test_no_filter_explains_a_load_that_lasts_by_noise(noise):
     estimator = make_estimator(model, NOISY, np.array([noise]))
     periods = round(FOUND_HORIZONS * NOISY.control.horizon)
     for one in estimator.filters:
-        assert load_left(one, periods)[0] <= FOUND
+        assert remaining_load(one, periods)[0] <= FOUND
     rng, x = np.random.default_rng(0), 0.0
     estimate = estimator.start([0.0])
     for _ in range(3 * periods):
@@ -276,7 +276,7 @@ def test_a_state_without_noise_that_stays_hides_no_load():
         control=OCP(20, [1, 0], [0], [1], [-1], [1]),
     )  # fmt: skip
     estimator = make_estimator(model, scenario, np.array([0.002, 0.0]))
-    assert np.isnan(load_left(estimator.filters[0], 100)).all()
+    assert np.isnan(remaining_load(estimator.filters[0], 100)).all()
 
 
 def test_tuned_noise_stays_within_the_spread_of_the_states():

@@ -8,7 +8,14 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise
-from hybrid_mpc.estimate.tuning import _error, _left, load_left, log_likelihood, most_likely, periods_to_find
+from hybrid_mpc.estimate.tuning import (
+    _error,
+    _left,
+    choose_most_likely,
+    log_likelihood,
+    periods_to_find,
+    remaining_load,
+)
 from hybrid_mpc.kit.assembly import MOST_DOUBLED, QUIET_SHARE, quiet_shares
 
 DT, SIGMA_Y, SIGMA_X = 0.1, 0.02, (0.0, 0.05)
@@ -60,7 +67,7 @@ def test_likelihood_is_that_of_the_joint_gaussian():
 def test_the_true_noise_is_the_most_likely():
     runs = [recording(600, seed) for seed in (1, 2)]
     # 1200 samples: a factor of 3 in the noise lowers the likelihood by hundreds
-    assert most_likely(filter_with, runs, (0.1, 0.3, 1.0, 3.0, 10.0)) == 1.0
+    assert choose_most_likely(filter_with, runs, (0.1, 0.3, 1.0, 3.0, 10.0)) == 1.0
 
 
 def test_process_noise_is_the_error_of_one_period():
@@ -97,16 +104,18 @@ def test_what_is_left_of_a_load_is_what_the_filter_shows():
         estimate = ekf.update(estimate, x[:1], np.zeros(1))
     left = abs(load - estimate.d[0]) / load
     # to rounding: the filter before the first measurement and after it differ by one gain, the covariance has settled
-    assert load_left(ekf, periods)[0] == pytest.approx(left, rel=1e-6)
+    assert remaining_load(ekf, periods)[0] == pytest.approx(left, rel=1e-6)
 
 
 @pytest.mark.parametrize(("noise", "periods"), [(0.05, 5000), (0.05, 400), (0.05, 100)])
 def test_the_quiet_filter_finds_a_constant_load_in_time(noise, periods):
     shares = quiet_shares(lambda s: observer_of(s, (0.0, noise)), periods, 1)
     doubled = round(np.log2(shares[0] / QUIET_SHARE))
-    assert load_left(observer_of(shares, (0.0, noise)), periods)[0] < np.exp(-1) or doubled == MOST_DOUBLED
+    assert (
+        remaining_load(observer_of(shares, (0.0, noise)), periods)[0] < np.exp(-1) or doubled == MOST_DOUBLED
+    )
     if doubled:  # no more than it takes
-        assert load_left(observer_of(shares / 2, (0.0, noise)), periods)[0] > np.exp(-1)
+        assert remaining_load(observer_of(shares / 2, (0.0, noise)), periods)[0] > np.exp(-1)
     assert doubled == {5000: 0, 400: 3, 100: 5}[periods]
 
 
@@ -129,12 +138,12 @@ def test_friction_that_hides_a_load_at_rest_does_not_make_the_filter_quick():
     quiet, periods = np.array([QUIET_SHARE]), 500
     ekf = filter_of(quiet)
     at_rest = _left([_error(ekf, ekf.start(np.full(1, np.nan)))], periods, 1)
-    assert at_rest[0] > np.exp(-1) > load_left(ekf, periods)[0]
+    assert at_rest[0] > np.exp(-1) > remaining_load(ekf, periods)[0]
     assert quiet_shares(filter_of, periods, 1).tolist() == quiet.tolist()
 
 
 def test_a_filter_that_does_not_settle_keeps_its_step():
     """No noise reaches the speed, which nothing damps."""
     still = observer_of(0.0, (0.0, 0.0))
-    assert np.isnan(load_left(still, 10)).tolist() == [True]
+    assert np.isnan(remaining_load(still, 10)).tolist() == [True]
     assert np.isnan(periods_to_find(still, 100)).tolist() == [True]

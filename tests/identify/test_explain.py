@@ -274,6 +274,54 @@ def test_a_slow_disturbance_is_not_taken_for_a_second_capacity(drift):
     assert [term.name for term in found.found] == ([] if drift else ["second capacity of temperature"])
 
 
+class Bath(Prior):
+    states = (Signal("water", "degC", 0.0, 120.0),)
+    inputs = (Signal("power", "W", 0.0, 500.0),)
+    disturbances = (Signal("room", "degC", 0.0, 40.0),)
+    outputs = states
+    parameters = (Parameter("C", 2000.0, "J/K", 500.0, 8000.0), Parameter("G", 3.0, "W/K", 0.0, 20.0))
+    operating_point = OperatingPoint((40.0,), (60.0,), (20.0,))
+
+    def xdot(self, x, u, w, p):
+        return ((u.power - p.G * (x.water - w.room)) / p.C,)
+
+
+def cooled(exponent, count=5, n=400, dt=5.0):
+    """Recordings of a bath that loses its heat by free convection alone."""
+    rng, runs = np.random.default_rng(0), []
+    for k in range(count):
+        power, room = np.repeat(rng.uniform(0, 400, n // 40), 40)[:, None], 15.0 + 3 * k
+        water = [room + rng.uniform(0, 20)]
+        for u in power[:-1, 0]:
+            one = water[-1]
+            for _ in range(5):
+                one += 0.2 * dt * (u - 1.2 * np.sign(one - room) * abs(one - room) ** exponent) / 2000.0
+            water.append(one)
+        y, nothing = np.array(water)[:, None] + 0.05 * rng.standard_normal((n, 1)), np.full((n, 1), np.nan)
+        rooms = np.full((n, 1), room)
+        runs.append(Trajectory(f"run{k}", "train", dt, dt * np.arange(n), power, y, nothing, nothing, rooms))
+    return runs
+
+
+def test_a_loss_with_an_exponent_between_those_of_the_library_is_one_term():
+    runs = cooled(1.33)
+    fit = fit_prior(Bath, runs, [], dt=5.0, length=1000.0)
+    found = explain(Bath, fit.values, smoothed(Bath, fit, runs, 5.0), dt=5.0, length=1000.0, warm_up=50.0)
+    assert [term.name for term in found.found] == ["loss to room of water"]
+    (exponent,) = (p for p in found.parameters if p.name.startswith("n_"))
+    assert exponent.value == pytest.approx(1.33, abs=0.05)
+    assert abs(exponent.value - 1.33) < 4 * exponent.standard_error
+
+
+def test_a_short_recording_is_fewer_pieces_of_evidence():
+    """Ten seconds of a machine with a natural frequency of 4 rad/s are no eight pieces."""
+    dry = Candidate("dry", (terms.coulomb("phi_dot", Parameter("F_c", 0.0, "N m", 0.0, 1.0), width=0.05),))
+    short, long = (begun(runs=recorded(Pendulum(), 1, t), candidates=(dry,)).evidence for t in (10.0, 40.0))
+    assert short.pieces == 4
+    assert long.pieces == 8
+    assert short.text == "4 blocks of one recording in 5 groups"
+
+
 def test_the_page_of_terms_is_that_of_the_library():
     assert {law for laws in term_table.GROUPS.values() for law in laws} == set(terms.EXPLANATIONS)
     assert (Path(__file__).parents[2] / "docs/terms.md").read_text() == term_table.document()

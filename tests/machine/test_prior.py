@@ -358,8 +358,8 @@ REFUSED = {
     ),
     "torch in a Prior": (wrong(xdot=lambda s, x, u, w, p: (torch.sqrt(x.level),)), "HM-MACHINE-014"),
     "a tensor's method in a Prior": (wrong(xdot=lambda s, x, u, w, p: (x.level.relu(),)), "HM-MACHINE-014"),
-    "a tensor from a Prior": (wrong(xdot=lambda s, x, u, w, p: (torch.ones(()),)), "must be a TorchPrior"),
-    "torch in a potential": (wrong(Swing, potential=lambda s, q, p: torch.cos(q.phi)), "must be a TorchPrior"),
+    "a tensor from a Prior": (wrong(xdot=lambda s, x, u, w, p: (torch.ones(()),)), "needs a TorchPrior"),
+    "torch in a potential": (wrong(Swing, potential=lambda s, q, p: torch.cos(q.phi)), "needs a TorchPrior"),
     "CasADi in a TorchPrior": (wrong(TorchLevel, xdot=lambda s, x, u, w, p: (ca.sin(x.level),)), "HM-MACHINE-040"),
     "an expression from a TorchPrior": (
         wrong(TorchLevel, xdot=lambda s, x, u, w, p: (ca.SX.sym("a"),)), "HM-MACHINE-041",

@@ -135,14 +135,14 @@ def test_a_lag_has_a_state_of_its_own_that_starts_where_its_signal_is():
 def test_terms_of_processes_add_to_rates_and_balances():
     made = extended(
         Tank,
-        terms.overflow("level", p("s", 0.5, "1/s"), edge=0.8, width=1e-6),
-        terms.loss("heat", p("h", 0.02, "1/s"), exponent=1.25, reference="room"),
+        terms.overflow("level", p("s", 0.5, "1/s"), p("edge", 0.8, "m"), width=1e-6),
+        terms.loss("heat", p("h", 0.02, "1/s"), p("n", 1.25, "-"), scale=5.0, reference="room"),
         terms.coupling("level", p("c", 0.1, "m/s/K"), source="heat", centre=20.0),
     )()
     x, u, w = [1.0, 30.0], [0.2], [20.0]
     rates = made.equations.xdot(x, u, w, made.p).full().ravel()
     np.testing.assert_allclose(
-        rates, [0.2 - 0.1 - 0.5 * 0.2 + 0.1 * 10.0, -0.1 - 0.02 * 10.0**1.25], rtol=1e-5
+        rates, [0.2 - 0.1 - 0.5 * 0.2 + 0.1 * 10.0, -0.1 - 0.02 * 10.0 * 2.0**0.25], rtol=1e-5
     )
     (volume,) = made.equations.balances
     assert float(volume.loss(x, u, w, made.p)) == pytest.approx(0.1 + 0.5 * 0.2, rel=1e-5)

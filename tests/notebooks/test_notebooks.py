@@ -7,6 +7,9 @@ from pathlib import Path
 import nbformat
 import pytest
 
+from hybrid_mpc import Loop
+from hybrid_mpc import load as load_kit
+
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "notebooks"
 FILES = sorted(FOLDER.glob("*.ipynb"))
@@ -40,6 +43,23 @@ def texts(notebook):
 
 def errors(notebook):
     return [o.ename for cell in code(notebook) for o in cell.outputs if o.output_type == "error"]
+
+
+def test_cells_are_short_and_the_last_one_says_what_to_try_next():
+    for path in FILES:
+        notebook = read(path)
+        longest = max(len(cell.source.splitlines()) for cell in code(notebook))
+        assert longest <= 25, (path.name, longest)
+        assert notebook.cells[-1].cell_type == "markdown", path.name
+        assert "## Next\n" in notebook.cells[-1].source, path.name
+
+
+def test_the_model_of_the_notebooks_can_be_used():
+    """It has the present format: a kit with models, noise and control problem."""
+    kit = load_kit(FOLDER / "golf_robot")
+    assert set(kit.models) == {"prior", "hybrid"}
+    loop = Loop(kit.observer(), kit.controller())
+    assert loop.start([0.1]).shape == (1,)
 
 
 def test_there_are_notebooks_and_they_are_numbered():
@@ -83,6 +103,7 @@ def test_links_between_the_notebooks(path):
 def test_a_notebook_on_recordings_says_what_it_needs(monkeypatch, tmp_path):
     """Without its recordings the first cell ends with where they are from, their columns and where to put them."""
     monkeypatch.setenv("HYBRID_MPC_RECORDINGS", str(tmp_path))
+    monkeypatch.syspath_prepend(FOLDER)
     for path in FILES:
         first, *_ = code(read(path))
         if "HYBRID_MPC_RECORDINGS" in first.source:

@@ -62,7 +62,7 @@ def test_what_it_refuses(call, few, tmp_path):
         (("golf_robot", "--out", tmp_path / "x", "--set", "c"), "a, b"),
         (("golf_robot", "--out", tmp_path / "x", "--budget", "huge"), "quick, full"),
         (("golf_robott", "--out", tmp_path / "x"), "golf_robot"),
-        (("torque_pendulum", "--out", tmp_path / "x"), "no data of its own"),
+        (("torque_pendulum", "--out", tmp_path / "x"), "HM-CLI-001"),
     ):
         code, _, said = call(*words)
         assert code == 2, words

@@ -26,7 +26,7 @@ from scenarios.unbalanced_disk.tasks import PEAK, UP_AT, standing
 
 TASKS = {task.name: task for task in scenario.tasks}
 FITTED = {"w_0": 11.67, "gamma": 1.113, "F_c": 6.36, "K_u": 28.55, "phi_0": -0.034}
-"""The prior as fitted to the recording of 2024 (docs/machines.md): no parameter of the plant was shown to it."""
+"""The prior as fitted to the recording of 2024 (docs/results/real_machines.md): not shown to the plant."""
 DELAY = 0.0248
 NOISE = np.array([8e-4, 0.08])
 """Process noise a period: the prior's error over a period on the plant is of this size."""

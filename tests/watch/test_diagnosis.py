@@ -113,7 +113,7 @@ def test_two_sensors_at_once_are_both_named(limits):
 
 def test_a_measured_disturbance_out_of_its_range_is_named_and_breaks_nothing(limits):
     text, k = seen(limits, room=28.0)
-    assert text == "room is where it never was when nothing was wrong"
+    assert text == "room is outside its range in the nominal data"
     assert k <= START + 5
 
 

@@ -80,7 +80,7 @@ def test_the_kit_s_own_limits_need_no_option(folder, noisy_artifact, tmp_path):
     set_limits(model, {"hybrid": [limits]})
     done = command(folder, model, tmp_path / "out")
     assert done.exit_code == 0, done.output
-    told = "watched: force of phi, power of the free run; limits for 2 false alarms an hour, learned from 3.0 min"
+    told = "channels: force of phi, power of the free run; limits for 2 false alarms per hour, learned from 3.0 min"
     assert told in done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())
     assert found["limits"]["data_hash"] == limits.data_hash
@@ -92,7 +92,7 @@ def test_the_kit_s_own_limits_need_no_option(folder, noisy_artifact, tmp_path):
 
 def test_too_little_nominal_data_says_how_much_is_needed(folder, noisy_artifact, tmp_path):
     done = command(folder, noisy_artifact, tmp_path / "out", "--learn", "1")
-    assert "zero or missing throughout the nominal data; record the machine in motion" in str(done.exception)
+    assert "HM-WATCH-025" in str(done.exception)
     assert not (tmp_path / "out" / "calibration.json").exists()
 
 

@@ -170,7 +170,7 @@ def test_the_command_fails_where_no_reading_is_valid(recordings, tmp_path):
     done = command(recordings, model, tmp_path / "out", "long")
     assert done.exit_code == 1, done.output
     assert "long: 10.0 s, 1 alarm; NO VALID READING" in done.output
-    assert "model or estimator gives no finite number" in done.output
+    assert "results of model or estimator are not finite" in done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())["recordings"][0]
     assert found["valid_s"] == 0.0
     assert found["not_finite_s"] > 9.0

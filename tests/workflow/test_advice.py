@@ -57,7 +57,7 @@ def test_each_finding_is_told_with_what_to_do(results):
         results.watch, details=replace(results.watch.details, clean=CleanAlarms(250.0, 4))
     ))  # fmt: skip
     (said,) = bad(noisy)
-    assert "Alarms of the monitor: 4 in 250 s" in said
+    assert "false alarms: 4 in 250 s" in said
     within = replace(noisy.watch.details, clean=CleanAlarms(250.0, 1))  # 0.14 are to be expected
     assert bad(replace(noisy, watch=replace(noisy.watch, details=within))) == []
     warned = replace(results, data=replace(
@@ -71,21 +71,21 @@ def test_each_finding_is_told_with_what_to_do(results):
     assert bad(follows) == []  # its windows with free first states are explained
     stages = ({"stage": "nominal", "validation_error": 0.5},)
     poor = changed(follows, prior_parameters=replace(found.details.prior_parameters, stages=stages))
-    assert bad(poor) == ["The fitted prior has a FIT of 41 % on phi: it lacks much."]
+    assert bad(poor) == ["The fitted prior has a FIT of 41 % on phi: the prior is too coarse."]
     bands = found.details.bands
     own = found.details.choice.recommended
     thin = changed(results, bands={**bands, own: replace(bands[own], coverage=0.6)})
-    assert bad(thin) == [f"The 90% band of {own.upper()} holds 60% of unseen measurements."]
+    assert bad(thin) == [f"The 90% band of {own.upper()} contains 60% of the test data: it is too narrow."]
     arx = found.details.baselines["ARX"]
     assert arx.errors is not None
     linear = changed(results, baselines={"ARX": replace(arx, errors=replace(arx.errors, error=0.02))})
     error = found.error[own]
     assert bad(linear) == [
-        f"On unseen data the linear model ARX has an error of 0.02, {own.upper()} {error:.3g}."
+        f"On test data the linear model ARX has an error of 0.02, {own.upper()} {error:.3g}."
     ]
     control = results.control
     assert control.details is not None
-    for ratio, said_of in ((Comparison(1.5, 1.2, 1.9, 6), ["costs 1.5 (1.2 to 1.9) times as much as prior_observer."]),
+    for ratio, said_of in ((Comparison(1.5, 1.2, 1.9, 6), ["has 1.5 (1.2 to 1.9) times the cost of prior_observer."]),
                            (Comparison(1.01, 1.005, 1.015, 6), []), (Comparison(1.2, 0.9, 1.6, 6), [])):  # fmt: skip
         own = {"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": ratio}
         dear = replace(results, control=replace(
@@ -138,14 +138,14 @@ def test_an_error_that_is_the_sensor_s_noise_is_told(results):
     }
     assert said[2.0] == []
     (text,) = said[1.2]
-    assert text.startswith(f"Free runs of phi err by {error:.2g} rad, 1.2 of the noise")
+    assert text.startswith(f"The free-run error of phi is {error:.2g} rad: 1.2 times its sensor noise")
 
 
 @pytest.mark.parametrize(
     ("upper", "ratio", "remedy"),
     [
-        (None, 0.7, "three recordings"), (float("inf"), 0.7, "three recordings"), (1.1, 0.9, "More recordings"),
-        (1.5, 1.1, "residuals of the free runs"), (None, None, "Shorter free runs"),
+        (None, 0.7, "three recordings"), (float("inf"), 0.7, "three recordings"), (1.1, 0.9, "Record more"),
+        (1.5, 1.1, "residuals of the free runs"), (None, None, "shorter free runs"),
     ],
 )  # fmt: skip
 def test_why_the_prior_is_recommended_says_what_may_help(results, upper, ratio, remedy):

@@ -32,9 +32,9 @@ def test_a_good_run_is_answered_with_its_figures(results):
     name = results.identification.details.choice.recommended
     (error,) = results.identification.rmse[name].values()
     assert f"{error:.3g} rad" in lines(model)
-    assert "of the 20 ms period" in lines(controller)
+    assert "the period is 20 ms" in lines(controller)
     found = results.watch.faults
-    assert f"{len(found)} of {len(found)} found" in lines(monitor)
+    assert f"{len(found)} of {len(found)} detected" in lines(monitor)
 
 
 def test_a_model_is_in_doubt_weak_or_diverged(results):
@@ -65,7 +65,7 @@ def test_a_controller_is_in_doubt_where_a_limit_is_passed_a_step_late_or_a_promi
         )
         open_ = replace(results, promises=replace(results.promises, rows=rows))
         assert controller_answer(open_).verdict == verdict
-        assert f"1 of 2 are shown; not {name} (not promised)" in lines(controller_answer(open_))
+        assert f"1 of 2 are shown. Open: {name} (not promised)" in lines(controller_answer(open_))
 
 
 def test_without_a_loop_nothing_is_said_to_be_safe(results):
@@ -81,10 +81,10 @@ def test_a_monitor_is_judged_by_its_false_alarms_and_by_the_faults_that_it_finds
     assert monitor_answer(noisy).verdict == "bad"
     blind = replace(found, faults=(replace(found.faults[0], delay_s=None), *found.faults[1:]))
     assert monitor_answer(blind).verdict == "bad"
-    assert f"Not found: {found.faults[0].title}" in lines(monitor_answer(blind))
+    assert f"Not detected: {found.faults[0].title}" in lines(monitor_answer(blind))
     none = replace(found, faults=None, faults_reason="the scenario has no plant")
     assert monitor_answer(none).verdict == "plain"
-    assert monitor_answer(replace(found, alarms=None, reason="too little data")).short == "No alarms here"
+    assert monitor_answer(replace(found, alarms=None, reason="too little data")).short == "Not examined"
 
 
 def test_the_answers_come_first_on_the_page_and_hints_after_them(results):

@@ -90,7 +90,7 @@ def test_what_is_not_there(call, machine, tmp_path, command, words):
             "from hybrid_mpc import DataSpec, Scenario\n"
             "spec = DataSpec('t', ('u',), ('y',), dt=0.02, max_gap=0.1, smoothing=0.1, warm_up=0.5)\n"
             "scenario = Scenario('mine', 'Mine', '', prior=None, data=spec)\n",
-            ["prior: something that can be called"],
+            ["prior: a callable"],
         ),
     ],
 )

@@ -207,9 +207,9 @@ def test_bad_models(call, run_folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "told"),
-    [("plant=None", "no model to stand in for the machine"), ("control=None", "has no control problem"),
-     ("tasks=()", "has no task"),
-     ("make_data=None", "holds no process noise"), ("oracle=None", "has no oracle")],
+    [("plant=None", "HM-COMPARE-013"), ("control=None", "HM-COMPARE-015"),
+     ("tasks=()", "no task"),
+     ("make_data=None", "HM-COMPARE-002"), ("oracle=None", "has no oracle")],
 )  # fmt: skip
 def test_scenarios_without_what_is_needed(call, golf_artifact, tmp_path, change, told):
     path = tmp_path / "machine.py"
@@ -231,7 +231,7 @@ def test_the_folder_must_be_empty(call, run_folder, tmp_path):
     (tmp_path / "mine.txt").write_text("keep")
     code, _, error = call("golf_robot", "--model", run_folder, "--out", tmp_path)
     assert code == 2
-    assert "something else than a control" in error
+    assert "not the folder of a control" in error
     assert (tmp_path / "mine.txt").read_text() == "keep"
 
 

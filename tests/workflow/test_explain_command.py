@@ -57,7 +57,7 @@ def test_its_page_shows_the_steps_and_the_term(explained):
         "Coulomb friction of phi_dot",
         "-F_c_phi_dot sign(phi_dot)",
         found.file,
-        "sensors&#39; noise",
+        "sensor noise",
     ):
         assert words in page
     assert {p.name for p in (out / "figures").iterdir()} == {"error_by_step.png", "step_1_1.png"}

@@ -46,7 +46,7 @@ def test_a_stage_that_cannot_run_leaves_its_reason_and_a_report(
     code, told, _ = call(*arguments, "--out", out, "--resume", *others)
     assert code == 1
     for name in names:
-        assert f"stage {name} could not run: no {name} on Sundays" in told
+        assert f"stage {name} failed: no {name} on Sundays" in told
         assert failed_stages(out)[name] == f"no {name} on Sundays"
         assert f"no {name} on Sundays" in (out / "report.html").read_text()
     results = json.loads((out / "results.json").read_text())
@@ -62,12 +62,12 @@ def test_a_stage_that_later_ones_need_ends_the_run(call, arguments, finished, tm
 
 def test_a_page_is_there_long_before_the_end(call, arguments, finished, tmp_path, monkeypatch):
     """After the fit it has the recordings and the prior, and says that the run goes on; at the end it does not."""
-    assert "This run goes on" not in (finished / "report.html").read_text()
+    assert "The run is not finished" not in (finished / "report.html").read_text()
     out = without(finished, tmp_path, "prior")
     monkeypatch.setattr(job, "STAGES", broken(job.STAGES, "training", InputError("none")))
     assert call(*arguments, "--out", out, "--resume")[0] == 2
     page = (out / "report.html").read_text()
-    assert "This run goes on" in page
+    assert "The run is not finished" in page
     assert "standard error" in page  # of the prior's parameters
     assert "Closed loops" not in page
 
@@ -79,5 +79,5 @@ def test_a_full_disk_is_no_reason_to_go_on(call, arguments, finished, tmp_path, 
     code, _, message = call(*arguments, "--out", out, "--resume")
     assert code == 2
     assert "No space left" in message
-    assert "finished stages are saved: the same command with --resume goes on" in message
+    assert "finished stages are saved; repeat the command with --resume" in message
     assert not (out / "checkpoints" / "watch.json").exists()

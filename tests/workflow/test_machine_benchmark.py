@@ -243,12 +243,12 @@ def test_the_command_judges_a_model_and_draws_it(call, machine, made, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "--data FILE, or a model made before"),
-        (("--data", "a.csv", "--model", "m"), "leave --data out"),
+        ((), "HM-WORKFLOW-005"),
+        (("--data", "a.csv", "--model", "m"), "HM-WORKFLOW-006"),
         (("--model", "nowhere"), "--test FILE"),
-        (("--data", "a.csv", "--budget", "huge"), "no benchmark budget 'huge'; it has: quick"),
-        (("--data", "missing.csv"), "there is no such file"),
-        (("--model", "nowhere", "--test", "TEST"), "holds no model of a benchmark"),
+        (("--data", "a.csv", "--budget", "huge"), "'huge'; choose one of: quick [HM-WORKFLOW-004]"),
+        (("--data", "missing.csv"), "HM-DATA-025"),
+        (("--model", "nowhere", "--test", "TEST"), "HM-WORKFLOW-009"),
     ],
 )
 def test_what_the_command_refuses(call, machine, tmp_path, words, message):
@@ -278,7 +278,7 @@ def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
     assert "other settings (data, pieces differ)" in told
     code, _, told = call("golf_robot", "--data", machine[2], "--out", made[0])
     assert code == 2
-    assert "has no benchmark" in told
+    assert "HM-WORKFLOW-013" in told
 
 
 def test_a_scheduler_s_workers_train_the_networks(machine, tmp_path, monkeypatch):

@@ -73,7 +73,7 @@ def bodies(jobs_here, tmp_path_factory):
     words = ("run", folder / "bodies.py", "--data", data, *SKIPPED, "--out", out)
     done = CliRunner().invoke(app, [*map(str, words)])
     assert done.exit_code == 0, done.output
-    return out, done.stdout.partition("free runs on unseen data:")[2]
+    return out, done.stdout.partition("free runs on held-out data:")[2]
 
 
 def test_every_output_has_its_figures_and_there_is_no_mopgrnn(bodies):

@@ -90,7 +90,7 @@ def test_a_study_which_compares_wants_a_plant(call, bare_tanks, tmp_path):
 def test_check_names_the_default_tasks(call, bare_tanks):
     code, told, _ = call("check", bare_tanks / "tanks.py")
     assert code == 0
-    assert "none declared, so default ones: A step of lower by 0.1 m" in told
+    assert "none given; default tasks: A step of lower by 0.1 m" in told
     assert "there is no plant" in told
 
 

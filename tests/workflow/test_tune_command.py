@@ -94,13 +94,13 @@ def test_what_is_refused(searched, words, arguments, tmp_path, call):
         ([*words, "--out", searched, "--resume", "--seed", "1"], "seed differ"),
         ([*words[:-1], "decay=1:2", "--out", searched, "--resume"], "space differ"),
         ([*map(str, words[:4]), "--out", searched, "--resume"], "space differ"),
-        (["run", *map(str, words[1:4]), "--out", searched, "--resume"], "differ); give the same ones"),
+        (["run", *map(str, words[1:4]), "--out", searched, "--resume"], "differ). Give the same settings"),
         ([*words, *new, "--kind", "gru"], "kind: unknown 'gru'"),
         ([*words, *new, "--vary", "units=1:2"], "no setting 'units' to vary"),
         ([*words, *new, "--vary", "decay=8:4"], "lower one first"),
         ([*words, *new, "--timeout", "0"], "timeout above 0 s"),
         ([*words, *new, "--budget", "huge"], "no budget 'huge'"),
-        ([*arguments, *new, "--settings", tmp_path / "none.json"], "none.json is missing"),
+        ([*arguments, *new, "--settings", tmp_path / "none.json"], "none.json: the file is missing"),
     ):
         code, _, told = call(*given)
         assert code == 2, given

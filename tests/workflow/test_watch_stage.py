@@ -171,7 +171,7 @@ def test_the_faulted_loops_are_reported(context, resumed):
     # In motion: the estimator predicts three steps of the sensor, 5 mrad, within a few periods at some 1 rad/s.
     assert 0 <= freeze.delay_s < 0.5
     assert freeze.switches[-1].after == "REST"
-    assert freeze.diagnosis == "the sensor of phi repeats itself while motion is predicted"
+    assert freeze.diagnosis == "sensor of phi frozen: its readings repeat although motion is predicted"
     group = watch_results(context)
     assert [row.fault for row in group.faults] == list(by_name)
     assert (group.wanted_per_hour, group.hours) == (2.0, pytest.approx(6 * 45 / 3600))

@@ -1,4 +1,4 @@
-"""Keep the results of machine benchmarks beside this file and print them as tables for docs/machines.md.
+"""Keep the results of machine benchmarks beside this file and print them as tables for docs/results/real_machines.md.
 
 ``python docs/results/machines/table.py`` prints the tables of all that are here;
 ``python docs/results/machines/table.py --take runs/disk24 --name unbalanced_disk_2024`` first takes ``results.json``

@@ -1,4 +1,4 @@
-"""What to do next: hints that a run's own figures give, in words, each with a remedy."""
+"""Hints of the report's section "What to do next": a finding from the run's figures, and its remedy."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from hybrid_mpc.workflow.stages.promises import STRUCTURE
 from hybrid_mpc.workflow.stages.results import Identification, Results
 
 EXPLAINED = 60.0
-"""FIT [%] of the fitted prior below which it lacks more than a network should have to learn."""
+"""FIT [%] of the fitted prior below which a network would have to learn too much."""
 HELD = (0.10, 0.07)
-"""By how much less and more than its share of unseen measurements a band may hold: 80 to 97 % of one for 90 %."""
+"""How far a band's coverage of test data may lie below and above its nominal share: 80 to 97 % for a 90 % band."""
 FLOOR = 1.5
-"""Error of a free run over the sensor's noise up to which the noise is what is left."""
+"""Ratio of free-run error to sensor noise up to which sensor noise explains the error."""
 SEARCH = "hybrid-mpc explain looks for missing terms (docs/explain.md)."
 MOST = 4
-"""Warnings of one kind that are told here; the sections have all."""
+"""Largest number of warnings of one kind among the hints; the report's sections list all."""
 
 
 def advice(results: Results, *, explained: bool = False) -> list[Hint]:
-    """Hints about a finished run, what needs the user first; where nothing does, how to go on.
+    """Hints about a finished run: problems first; without a problem, the next step.
 
     Args:
         results: The run's results.
-        explained: Whether missing terms have been searched. Default: they have not, and a hint may name the command.
+        explained: Whether the run has searched for missing terms. Default: False; a hint may then name the command.
 
     Example:
         ``[hint.finding for hint in advice(read_results(read_object(path), str(path))) if hint.verdict == "bad"]``
@@ -44,7 +44,7 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
         found.append(
             Hint(
                 "good",
-                "Nothing on this page speaks against a first try on the machine.",
+                "No problem found: the controller is ready for a first test on the machine.",
                 "Close the loop with hm.Runner (docs/hardware.md), or export the controller as C (docs/embedded.md).",
             )
         )
@@ -54,12 +54,14 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
 def _recordings(results: Results) -> Iterator[Hint]:
     for warning in results.data.details.warnings[:MOST]:
         yield Hint(
-            "bad", f"Recordings: {warning}", "Section Data shows it; record again, or say so in the DataSpec."
+            "bad",
+            f"Recordings: {warning}",
+            "Look at section Data. Record again, or set the DataSpec accordingly.",
         )
 
 
 def doubt_of(in_doubt: Sequence[str]) -> str:
-    """What the terminal and the report say of doubts about the prior before all else; empty without any.
+    """First line of terminal and report about doubts in the prior's structure; empty without a doubt.
 
     Example:
         >>> doubt_of(["k * u in the rate of v: its sign seems wrong", "ARX has less error"])
@@ -78,14 +80,14 @@ def _doubt(found: Identification) -> Iterator[Hint]:
     for doubt in found.details.prior_parameters.in_doubt:
         yield Hint(
             "bad", f"The structure of the prior is in doubt: {doubt}.",
-            "Correct the prior first (docs/prior-wrong.md): a sign, a unit, or a state, a delay or an input that is "
-            "missing. A network or an observer on top of it only hides the fault.",
+            "Correct the prior first (docs/prior-wrong.md): a wrong sign or unit, or a missing state, delay or input. "
+            "A network or an observer only hides such an error.",
         )  # fmt: skip
 
 
 def _prior(found: Identification, explained: bool) -> Iterator[Hint]:
     for warning in found.details.prior_parameters.warnings[:MOST]:
-        yield Hint("plain", f"Fit of the prior: {warning}", "docs/fit-trouble.md says what to do.")
+        yield Hint("plain", f"Fit of the prior: {warning}", "Look the warning up in docs/fit-trouble.md.")
     windows = min(
         (row["validation_error"] for row in found.details.prior_parameters.stages), default=math.inf
     )
@@ -95,15 +97,15 @@ def _prior(found: Identification, explained: bool) -> Iterator[Hint]:
         what = f"The fitted prior has a FIT of {fit:.0f} % on {label.partition(' [')[0]}"
         if windows <= POOR:
             yield Hint(
-                "plain", f"{what}, but an error of only {windows:.2g} of the spread over the windows of the fit, whose "
-                "initial states are free.",
-                "Errors of initial states grow (docs/unstable.md), or the test data differ from the training data.",
+                "plain", f"{what}. Over the windows of the fit, with free initial states, its error is only "
+                f"{windows:.2g} of the spread.",
+                "Either errors of the initial state grow (docs/unstable.md), or test and training data differ.",
             )  # fmt: skip
         else:
             yield Hint(
-                "bad", f"{what}: it lacks much.",
-                "Look at signs, units, and a term that is missing, in the sensor too; a network is for what is small."
-                + ("" if explained else f" {SEARCH}"),
+                "bad", f"{what}: the prior is too coarse.",
+                "Check signs and units. Look for a missing term, in the sensor equation too. A network can only "
+                "correct small errors." + ("" if explained else f" {SEARCH}"),
             )  # fmt: skip
 
 
@@ -112,27 +114,29 @@ def _choice(found: Identification, explained: bool) -> Iterator[Hint]:
     own = choice.candidates[choice.hybrid]
     if choice.recommended != "phy":
         if not explained:
-            yield Hint("plain", "A network was needed: the prior may lack a physical term.", SEARCH)
+            yield Hint("plain", "A network improves the prior, so a physical term may be missing.", SEARCH)
         return  # the page's first answer says why
     why = choice.reason
     if own.error is None or own.ratio is None:
-        yield Hint(
-            "plain", why, "Shorter free runs or fewer units may train; the prior alone is a model, too."
-        )
+        yield Hint("plain", why, "Train with shorter free runs or fewer units, or use the prior alone.")
     elif own.upper is None or not math.isfinite(own.upper):
-        yield Hint("plain", why, "Give three recordings or more: of fewer nobody can tell what carries over.")
+        yield Hint(
+            "plain", why, "Give at least three recordings: a confidence interval needs several of them."
+        )
     elif own.ratio < 1.0:
-        yield Hint("plain", why, "More recordings, in the conditions of the tasks, make the bound narrower.")
+        yield Hint(
+            "plain", why, "Record more under the conditions of the tasks: the confidence interval shrinks."
+        )
     else:
         yield Hint(
             "plain", why,
-            "What the prior lacks differs from recording to recording, or is noise: look at the residuals of the free "
-            "runs for a term of the prior or a curve of the sensor.",
+            "The prior's error is noise, or it differs between recordings. Look at the residuals of the free runs for "
+            "a missing term of the prior or a nonlinear sensor.",
         )  # fmt: skip
 
 
 def _linear(found: Identification) -> Iterator[Hint]:
-    """A simpler model that has less error on unseen data than the recommended one, unless a doubt says so already."""
+    """A linear or constant model with less test error than the recommended model, unless a doubt names it already."""
     if found.details.prior_parameters.in_doubt:
         return
     chosen = found.details.choice.recommended
@@ -142,14 +146,14 @@ def _linear(found: Identification) -> Iterator[Hint]:
     if name and isinstance(own, float) and errors[name] < own:
         model = "a constant" if name == "constant" else f"the linear model {name}"
         yield Hint(
-            "bad", f"On unseen data {model} has an error of {errors[name]:.3g}, {name_of(chosen)} {own:.3g}.",
-            "The prior lacks something that is linear: a state (a lag, a wall, a filter), a delay, or an input that "
-            "the recordings have. Look at the residuals of its free runs.",
+            "bad", f"On test data {model} has an error of {errors[name]:.3g}, {name_of(chosen)} {own:.3g}.",
+            "The prior lacks a linear effect: a state (lag, wall, filter), a delay, or a recorded input. "
+            "Look at the residuals of its free runs.",
         )  # fmt: skip
 
 
 def _floor(found: Identification) -> Iterator[Hint]:
-    """Outputs whose error is the sensor's own noise."""
+    """Outputs whose free-run error is about the sensor noise."""
     errors = _by_output(found.rmse.get(found.details.choice.recommended))
     if len(errors) != len(found.details.smoother.sigma):
         return
@@ -157,9 +161,9 @@ def _floor(found: Identification) -> Iterator[Hint]:
         name, _, unit = label.partition(" [")
         if error < FLOOR * noise:
             yield Hint(
-                "good", f"Free runs of {name} err by {error:.2g} {unit.rstrip(']')}, {error / noise:.1f} of the noise "
-                "that the fit finds in its sensor.",
-                "There is nothing left to learn: a better sensor, or harder recordings, would show more.",
+                "good", f"The free-run error of {name} is {error:.2g} {unit.rstrip(']')}: {error / noise:.1f} times "
+                "its sensor noise as estimated by the fit.",
+                "These recordings allow no better model. Use a better sensor, or excite the machine more.",
             )  # fmt: skip
 
 
@@ -170,25 +174,26 @@ def _bands(found: Identification) -> Iterator[Hint]:
         return
     if band.coverage < band.share - HELD[0]:
         yield Hint(
-            "bad", f"The {band.share:.0%} band of {name_of(name)} holds {band.coverage:.0%} of unseen measurements.",
-            "Unseen recordings differ from those that calibrated it: train on such ones; its width is too small.",
+            "bad", f"The {band.share:.0%} band of {name_of(name)} contains {band.coverage:.0%} of the test data: "
+            "it is too narrow.",
+            "Test recordings differ from those that calibrated the band. Add such recordings to the training.",
         )  # fmt: skip
     elif band.coverage > band.share + HELD[1]:
         yield Hint(
-            "plain", f"The {band.share:.0%} band holds {band.coverage:.0%} of unseen measurements: it is wide.",
-            "Validation recordings were harder than the unseen ones.",
+            "plain", f"The {band.share:.0%} band contains {band.coverage:.0%} of the test data: it is wide.",
+            "Validation recordings were harder to predict than the test recordings.",
         )  # fmt: skip
 
 
 def _promises(results: Results) -> Iterator[Hint]:
-    """What the kit does not promise, in one hint."""
+    """Promises that the kit does not give, one hint for each verdict."""
     rows = results.promises.rows or ()
     for verdict, say in (("doubted", "Doubted"), ("not promised", "Not promised")):
         names = [one.name for one in rows if one.verdict == verdict and one.name != STRUCTURE]  # said first
         if names:
             yield Hint(
-                "bad" if verdict == "doubted" else "plain", f"{say} of this kit: {', '.join(names)}.",
-                'The table "What this kit promises" says why, and what to do.',
+                "bad" if verdict == "doubted" else "plain", f"{say} by this kit: {', '.join(names)}.",
+                'Read evidence and remedy in the table "What this kit promises".',
             )  # fmt: skip
 
 
@@ -196,8 +201,9 @@ def _loops(results: Results) -> Iterator[Hint]:
     times, period = results.timing.controller_step_ms, results.timing.period_ms
     if times.p99 is not None and times.p99 > period:
         yield Hint(
-            "bad", f"A controller step takes {times.p99:.3g} ms in 99 of 100 periods, the period is {period:g} ms.",
-            "Was the computer busy? Else the solver native (compiled C), a shorter horizon or a longer dt.",
+            "bad", f"Controller step time: the 99th percentile is {times.p99:.3g} ms, but the period is {period:g} ms.",
+            "Measure again on an idle computer. Else use the solver native (compiled C), a shorter horizon or a "
+            "longer dt.",
         )  # fmt: skip
     details = results.control.details
     for task, own in (details.comparisons if details is not None else {}).items():
@@ -205,15 +211,15 @@ def _loops(results: Results) -> Iterator[Hint]:
         means = {name: details.tasks[task][name].cost.mean for name in (REPORTED["hybrid"], *own)}  # type: ignore[union-attr]
         lost = means.pop(REPORTED["hybrid"]) is None and any(cost is not None for cost in means.values())
         if found.finding == "dearer" or lost:
-            worse = "diverges" if lost else f"costs {found.words} times as much as {base}"
+            worse = "diverges" if lost else f"has {found.words} times the cost of {base}"
             yield Hint(
                 "bad", f"In {task} hybrid_observer {worse}.",
-                f"Control such tasks with {base}: hybrid-mpc control --controller {base}, and from Python the kit's "
-                "observer('prior') and controller('prior').",
+                f"Control such tasks with {base}: hybrid-mpc control --controller {base}; in Python with "
+                "kit.observer('prior') and kit.controller('prior').",
             )  # fmt: skip
     if not results.on_model.reason:
         yield Hint(
-            "plain", "There is no plant: loops ran on a model, which shows no more than that they run.",
+            "plain", "The scenario has no plant: its loops ran on a model and say nothing about the machine.",
             "Write a plant that differs from the prior as your machine may (Scenario(plant=...)).",
         )  # fmt: skip
 
@@ -222,13 +228,14 @@ def _watching(results: Results) -> Iterator[Hint]:
     clean, rate = results.watch.details.clean, results.watch.wanted_per_hour
     if clean is not None and rate is not None and clean.too_many(rate):
         yield Hint(
-            "bad", f"Alarms of the monitor: {clean.words(rate)}.",
-            "Recordings that it learned from are too few or too unlike: look where it alarms before you act on it.",
+            "bad", f"The monitor has too many false alarms: {clean.words(rate)}.",
+            "The limits were learned from too few or too different recordings. Look at the alarms, then record more "
+            "nominal data.",
         )  # fmt: skip
 
 
 def _by_output(fit: object) -> dict[str, float]:
-    """FIT by output, of those that have one."""
+    """Finite values by output."""
     if not isinstance(fit, dict):
         return {}
     return {label: float(v) for label, v in fit.items() if isinstance(v, int | float) and math.isfinite(v)}

@@ -1,4 +1,4 @@
-"""Stage analysis: prior and hybrid linearized at the operating point, a mechanical one at working speed too."""
+"""Stage analysis: prior and hybrid linearized at the operating point; mechanical ones also at working speed."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class LinearPoint:
 
 @dataclass(frozen=True)
 class ModelAnalysis:
-    """A model at rest and, if it is mechanical and has a control problem, at working speed.
+    """A model linearized at rest and, if it is mechanical and has a control problem, at working speed.
 
-    ``fixed_point`` is the state at rest ``(n_x,)``; None where there is none near the operating point, and the reason
-    why.
+    ``fixed_point`` is the steady state ``(n_x,)``; None if none lies near the operating point, with the reason in
+    ``fixed_point_reason``.
     """
 
     rest: LinearPoint
@@ -85,9 +85,9 @@ def analysis_stage(context: Context) -> AnalysisResult:
         try:
             x, h = fixed_point(model, u, x)
             rest = tuple(x.tolist())
-        except InputError as none:  # a learned correction may leave no point of rest nearby
+        except InputError as none:  # a learned correction may leave no equilibrium nearby
             h = hidden_fixed_point(model, x, u)
-            reason = f"linearized at the operating point instead: {none}"
+            reason = f"linearized at the operating point, because no equilibrium was found: {none}"
         systems = {"rest": linearize(model, x, u, h)}
         speeds = list(kinematics(model).values())
         if control is not None and speeds:

@@ -12,12 +12,12 @@ from hybrid_mpc.workflow.stages.compare import REPORTED
 from hybrid_mpc.workflow.stages.results import Control, Identification, Results, Timing, Watch
 
 SAFE = ("structure of the prior", "no offset", "step time", "stability margins", "limits")
-"""Promises without which a controller is not called safe."""
+"""Promises that must not be open if the controller is to be called safe."""
 SHOWN_OUTPUTS = 3
 TOUCHED = 1e-6
-"""Share of a limit by which rounding may pass it."""
+"""Relative overshoot of a limit that counts as rounding."""
 FEW_FALLBACKS = 0.01
-"""Share of periods up to which fallback inputs are no reason for doubt."""
+"""Largest share of periods with fallback inputs that raises no doubt."""
 
 
 def answer_all(results: Results) -> tuple[Answer, Answer, Answer]:
@@ -42,14 +42,14 @@ def model_answer(found: Identification) -> Answer:
     labels = list(_values(found.rmse.get(name)))
     lines += [_error_line(found, name, label) for label in labels[:SHOWN_OUTPUTS]]
     if more := len(labels) - SHOWN_OUTPUTS:
-        lines += [f"{more} more outputs: section Free runs."] if more > 0 else []
+        lines += [f"{more} more outputs are in section Free runs."] if more > 0 else []
     own = choice.candidates[choice.hybrid]
     if name == "phy" or own.ratio is None or own.upper is None:
         lines.append(f"{choice.reason.rstrip('.').capitalize()}.")
     else:
         lines.append(
-            f"On recordings that it was not trained on, its error is {own.ratio:.2f} of the fitted prior's "
-            f"(95 % bound {own.upper:.2f})."
+            f"On held-out recordings, its error is {own.ratio:.2f} times that of the fitted prior "
+            f"(95 % upper bound {own.upper:.2f})."
         )
     return Answer("Is the model good?", verdict, short, lines)
 
@@ -74,7 +74,7 @@ def _error_line(found: Identification, name: str, label: str) -> str:
 
 
 def controller_answer(results: Results) -> Answer:
-    """Whether loops kept limits and time, and what the kit promises of them."""
+    """Whether the loops kept limits and deadlines, and which promises of the kit are shown."""
     lines, bad = [], False
     for one, wrong in (*_loop_lines(results), *_time_lines(results.timing)):
         lines.append(one)
@@ -94,7 +94,7 @@ def controller_answer(results: Results) -> Answer:
             "Is the controller safe?", "bad", f"In doubt: {', '.join(doubted) or 'see below'}", lines
         )
     if results.control.details is None and results.on_model.details is None:
-        return Answer("Is the controller safe?", "plain", "Not shown: no loop was closed", lines)
+        return Answer("Is the controller safe?", "plain", "Not shown: no closed loop was simulated", lines)
     simulated = "Yes, in simulation" if results.control.details is not None else "Yes, on its own model"
     return Answer("Is the controller safe?", "good", simulated, lines)
 
@@ -103,11 +103,11 @@ def _promise_line(rows: Sequence[Promise], open_: Sequence[Promise]) -> str:
     if not open_:
         return f"Promises: all {len(rows)} are shown."
     names = ", ".join(f"{row.name} ({row.verdict})" for row in open_)
-    return f"Promises: {len(rows) - len(open_)} of {len(rows)} are shown; not {names}."
+    return f"Promises: {len(rows) - len(open_)} of {len(rows)} are shown. Open: {names}."
 
 
 def _loop_lines(results: Results) -> Iterator[tuple[str, bool]]:
-    """Limits and fallbacks of the recommended model's loops, each with whether it is wrong."""
+    """Lines about limits and fallback inputs of the recommended model's loops, each with whether it is a problem."""
     control: Control = results.control
     if control.details is None:
         yield f"Closed loops: {control.gap_closed_reason.rstrip('.')}.", False
@@ -122,8 +122,8 @@ def _loop_lines(results: Results) -> Iterator[tuple[str, bool]]:
     if used:
         share, limit, task = max(used)
         over = share > 1.0 + TOUCHED
-        words = f"passed by {100 * (share - 1):.2g} %" if over else "kept"
-        yield f"Limits: {words}; the most used is that of {limit} ({100 * share:.0f} % in {task}).", over
+        words = f"violated by {100 * (share - 1):.2g} %" if over else "kept"
+        yield f"Limits: {words}. Most used: {limit}, {100 * share:.0f} % of its limit in {task}.", over
     fallback, task = max((1.0 - cell.sources["MPC"], task) for task, cell in own.items())
     words = f"Fallback inputs: {100 * fallback:.2g} % of the periods of {task}."
     yield words if fallback else "No fallback input was needed.", fallback > FEW_FALLBACKS
@@ -133,19 +133,19 @@ def _time_lines(timing: Timing) -> Iterator[tuple[str, bool]]:
     p99 = timing.controller_step_ms.p99
     if timing.misses is None or p99 is None:
         return
-    late = f"{timing.misses} steps were late" if timing.misses else "No step was late"
+    late = f"{timing.misses} steps missed the deadline" if timing.misses else "No step missed its deadline"
     yield (
-        f"{late}: 99 % take less than {p99:.3g} ms of the {timing.period_ms:g} ms period, by the clock.",
+        f"{late}: 99 % of the steps take less than {p99:.3g} ms; the period is {timing.period_ms:g} ms.",
         timing.misses > 0,
     )
 
 
 def monitor_answer(found: Watch) -> Answer:
-    """False alarms beside the wanted rate, and how many of the simulated faults were seen, after what delay."""
+    """False alarms compared with the wanted rate; number of simulated faults detected, and the largest delay."""
     question, clean, wanted = "Is the monitor trustworthy?", found.details.clean, found.wanted_per_hour
     if found.alarms is None or clean is None or wanted is None:
         return Answer(
-            question, "plain", "No alarms here", (f"{(found.reason or found.faults_reason).rstrip('.')}.",)
+            question, "plain", "Not examined", (f"{(found.reason or found.faults_reason).rstrip('.')}.",)
         )
     many = clean.too_many(wanted)
     lines = [f"False alarms: {clean.words(wanted)}."]
@@ -153,19 +153,19 @@ def monitor_answer(found: Watch) -> Answer:
     seen = [row.delay_s for row in faults if row.delay_s is not None]
     if faults:
         slowest = f", the slowest after {max(seen):.2g} s" if seen else ""
-        lines.append(f"Simulated faults: {len(seen)} of {len(faults)} found{slowest}.")
+        lines.append(f"Simulated faults: {len(seen)} of {len(faults)} detected{slowest}.")
     else:
-        lines.append(f"Faults: {found.faults_reason.rstrip('.')}.")
+        lines.append(f"No faults were simulated: {found.faults_reason.rstrip('.')}.")
     missed = [row.title for row in faults if row.delay_s is None]
     if missed:
-        lines.append(f"Not found: {', '.join(missed)}.")
+        lines.append(f"Not detected: {', '.join(missed)}.")
     if many:
         return Answer(question, "bad", "No: too many false alarms", lines)
     if missed:
         return Answer(question, "bad", "In part", lines)
     if not faults:
-        return Answer(question, "plain", "Not tried with faults", lines)
-    return Answer(question, "good", f"Yes, as far as {clean.seconds:.0f} s show", lines)
+        return Answer(question, "plain", "Not tested with faults", lines)
+    return Answer(question, "good", f"Yes, on {clean.seconds:.0f} s of data", lines)
 
 
 def _values(by: object) -> Mapping[str, float | None]:

@@ -1,4 +1,4 @@
-"""Stage choice: which model is recommended, and the bands around free runs, both by data that no network saw."""
+"""Stage choice: the recommended model and the bands around free runs, both from held-out data."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ CANDIDATES = ("phy", "pgrnn", "mopgrnn")
 
 @dataclass(frozen=True)
 class ChoiceResult:
-    """What validation says of the candidates.
+    """Result of the comparison of all candidates on held-out data.
 
     Args:
-        choice: Which one is recommended, and why.
+        choice: The recommended candidate and the reason.
         bands: Bands around free runs, by candidate.
-        longest: Length [s] of the longest of these runs.
+        longest: Length [s] of the longest of these free runs.
     """
 
     choice: Choice
@@ -46,10 +46,10 @@ class ChoiceResult:
 
 
 def choice_stage(context: Context) -> ChoiceResult:
-    """Free runs of all candidates, as long as those on unseen data, over what no network was trained on.
+    """Choose a model by free runs of all candidates over held-out data, as long as those over the test data.
 
-    Of the training recordings that is the part that each network left out: it runs there alone. So the model is chosen.
-    The bands are calibrated on the validation recordings, too, to which the prior was not fitted.
+    Each network leaves out one part of the training recordings; only that network is evaluated on that part. The bands
+    are calibrated on these parts and on the validation recordings, to which the prior was not fitted.
     """
     prior, spec, warm = context.prior, context.spec, context.warm
     phy = context.scenario.prior(prior.fit.values)
@@ -67,7 +67,7 @@ def choice_stage(context: Context) -> ChoiceResult:
 
     @cache
     def scored(name: str, share: float = 1.0) -> list[tuple[FreeRun, ...]]:
-        """A candidate's runs; beside each those of its networks."""
+        """A candidate's free runs; beside each run those of its networks."""
         context.progress.update(
             "candidates", candidates.index(name), len(candidates), f"{name}, {100 * share:.0f} %"
         )
@@ -87,7 +87,7 @@ def choice_stage(context: Context) -> ChoiceResult:
         recordings=recordings, evidence=evidence, shrunk=errors_of,
     )  # fmt: skip
     if found.recommended != "phy" and prior.in_doubt:  # networks must not hide a wrong structure
-        doubt = f"But the structure of the prior is in doubt: {prior.in_doubt[0]}."
+        doubt = f"However, the structure of the prior is in doubt: {prior.in_doubt[0]}."
         found = replace(found, reason=f"{found.reason} {doubt}")
     bands: dict[str, Bands] = {}
     for name in candidates:
@@ -114,7 +114,10 @@ def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt:
 
 
 def by_parameters(phy: Prior, fit: PriorFit, runs: Sequence[FreeRun], dt: float) -> list[Array]:
-    """Variance of each run's outputs ``(n, n_y)`` by that of the fitted parameters; runs of a length side by side."""
+    """Variance of each run's outputs ``(n, n_y)`` due to the covariance of the fitted parameters.
+
+    Runs of equal length are evaluated together.
+    """
     covariance, found = np.array(fit.covariance(phy.parameters)), [np.zeros((0, 0))] * len(runs)
     for length in sorted({len(run.t) for run in runs}):
         same = [i for i, run in enumerate(runs) if len(run.t) == length]

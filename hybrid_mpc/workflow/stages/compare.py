@@ -1,4 +1,4 @@
-"""The closed loops of a run: every task under every controller, seeds until costs are told apart."""
+"""Stage control: closed loops of every task under every controller, until cost differences are significant."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ BASELINES = ("prior", "prior_observer")
 REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
 """Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
 TIMED_PERIODS = 1000
-"""Periods timed on recordings, where there is no plant; enough for a 99th percentile."""
+"""Periods timed on recordings if the scenario has no plant; enough for a 99th percentile."""
 TIMED = OBSERVERS
 """Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Loops that run and are kept together: one task under one controller, by their numbers.
+    """Loops that run together and share one checkpoint: one task under one controller, with some seeds.
 
     A ``timed`` part runs alone on the machine, so that the durations of its steps count.
     """
@@ -120,7 +120,7 @@ class ControlResult:
 
 
 def control_stage(context: Context) -> ControlResult | Absent:
-    """Closed loops of every task with prior, hybrid and oracle; or only timing where there is no plant."""
+    """Closed loops of every task with prior, hybrid and oracle; without a plant only the timing of steps."""
     if context.scenario.control is None:
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     context.read(NOISE)
@@ -133,9 +133,8 @@ def control_stage(context: Context) -> ControlResult | Absent:
 def compare(context: Context) -> list[LoopRow]:
     """Run the loops on the run's model; the timed ones alone, the others side by side in processes.
 
-    A task gets no more seeds where the costs of its hybrid and of the harder baseline are told apart
-    (:mod:`hybrid_mpc.compare.sequential`). Every part is kept as it ends; what a run that was killed has kept is not
-    run again.
+    A task gets no more seeds once its comparison of hybrid and better baseline is decided
+    (:mod:`hybrid_mpc.compare.sequential`). Every finished part is written, so an interrupted run does not repeat it.
     """
     scenario, budget, settings = context.scenario, context.budget, context.settings
     every = tasks_of(scenario, budget.tasks)
@@ -160,7 +159,7 @@ def comparisons(cells: Mapping[str, Sequence[LoopRow]], most: int) -> dict[str, 
 
 
 def decided(cells: Mapping[str, Sequence[LoopRow]], most: int) -> bool:
-    """Whether more seeds of a task would tell nothing more: its hybrid is told apart from the harder baseline."""
+    """Whether a task needs no more seeds: the comparison of its hybrid with the better baseline is decided."""
     found = comparisons(cells, most)
     return found[hardest(found)].decided
 
@@ -185,8 +184,8 @@ def time_on_recording(
 ) -> Array:
     """Durations [ms] of a loop's steps on at most ``most`` recorded samples, without a plant.
 
-    The controller is asked to hold the rest position from wherever the recording is; the loop takes the recorded input
-    as the one that acted, not its own.
+    The reference is the operating point, whatever the state of the recording. The loop gets the recorded input as the
+    applied one.
     """
     loop = Loop(estimator, controller, monitor=monitor)
     loop.start(trajectory.y[0])
@@ -202,7 +201,7 @@ def time_on_recording(
 def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     if name not in ORACLES:
         return seeds
-    # with the true state, seeds differ only in the rivals' plans
+    # with the true state no measurement is used: seeds differ only by the rival plans of BestOf
     return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
 
 
@@ -214,7 +213,7 @@ def run_specs(
 ) -> list[LoopRow]:
     """Rows of loops on a run's own model.
 
-    Loops whose monitors alarm by nothing that was learned run as in a run's first pass, which has learned nothing yet.
+    Loops whose monitors use no learned limits run without limits, as in a run whose stage watch has not run yet.
     """
     learned = any(spec.monitor not in ("own", "none") for spec in specs)
     bench = _bench(scenario, folder, artifact_digest(folder), learned)
@@ -223,7 +222,7 @@ def run_specs(
 
 @lru_cache(maxsize=1)
 def _bench(scenario: str, folder: Path, content: str, learned: bool) -> Bench:
-    """A bench with a run's model, of the folder with this ``content``, with what its monitors have learned or not."""
+    """A bench with the model of a run's folder with digest ``content``; ``learned``: with the monitor's limits."""
     kit = load(folder)
     return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, watch={})})
 
@@ -233,9 +232,9 @@ def run_or_read(
 ) -> dict[str, list[LoopRow]]:
     """Rows of loops on the run's model: those that ``checkpoints`` holds are read, the others run.
 
-    A part is what runs together. It is written as it ends, so a killed run goes on from there. It is read only if it
-    was run with the present model, noise, machine and control problem. Parts named in ``alone`` run in this process
-    with nothing beside them, so that the durations of their steps count; the others side by side in processes.
+    A part is written when it ends, so an interrupted run continues from there. A checkpoint is read only if it belongs
+    to the present model, noise, machine and control problem. Parts named in ``alone`` run one by one in this process,
+    so that the durations of their steps count; the others run in parallel processes.
     """
     of = {part: identity(context, specs) for part, specs in parts.items()}
     found = {part: read_rows(context.path(part), of[part]) for part in parts}
@@ -260,7 +259,7 @@ def run_or_read(
 
 
 def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
-    """Digest of all that decides what loops of a run compute: specifications, machine, tasks, model and program."""
+    """Digest of everything that the loops of a run depend on: specifications, machine, tasks, model and program."""
     parts = read_parts(context.out / "model")
     model = parts.description
     scenario = context.ready
@@ -277,9 +276,9 @@ def identity(context: Context, specs: Sequence[LoopSpec]) -> str:
 
 
 def task_content(task: Task, dt: float, loop: LoopSettings) -> object:
-    """All of a task that decides how its loops go: its references sampled on the grid, its control problem.
+    """Everything of a task that its loops depend on: references sampled on the grid, control problem, faults.
 
-    ``UNKNOWN`` where nobody knows what its figures are made of.
+    ``UNKNOWN`` if the source of its figures cannot be read.
     """
     figures = source_of(task.figures)
     if figures is UNKNOWN:

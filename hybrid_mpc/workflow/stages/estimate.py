@@ -1,4 +1,4 @@
-"""Stage estimation: do the observers believe what they should, on recordings that nothing was tuned on."""
+"""Stage estimation: consistency of the observers' innovations on test recordings."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 PERIODS = 1000
 RECORDINGS = 4
-"""So many periods of so many test recordings are looked at: a few seconds of computing for both observers."""
+"""Periods and number of the test recordings that are used; both observers then take a few seconds."""
 
 
 @dataclass(frozen=True)
 class ObserverTest:
-    """What the innovations of an observer say; see :func:`~hybrid_mpc.estimate.consistency.consistency`.
+    """Statistics of an observer's innovations; see :func:`~hybrid_mpc.estimate.consistency.consistency`.
 
     Args:
-        mean_nis: Mean normalised innovation squared; 1 for an observer that believes what it should.
+        mean_nis: Mean normalised innovation squared; 1 if the observer's covariance is right.
         nis_low: Lower end of its 95 % band.
         nis_high: Upper end.
         nis_inside: Share of samples below the 95 % quantile.
         ljung_box: Statistic of their autocorrelation.
         ljung_box_limit: Its 95 % quantile for white innovations.
-        samples: Samples looked at.
+        samples: Number of samples.
         correlation_band: 95 % band of one autocorrelation.
     """
 
@@ -65,8 +65,8 @@ class EstimationResult:
     """Tests of the observers.
 
     Args:
-        recordings: What they were tested on.
-        observers: What was found, by observer, or why nothing.
+        recordings: The test recordings.
+        observers: Statistics by observer, or why there are none.
         arrays: ``"OBSERVER/autocorrelation"``, and ``"OBSERVER/nis/k"`` of recording ``k``.
     """
 
@@ -78,7 +78,9 @@ class EstimationResult:
 def estimation_stage(context: Context) -> EstimationResult | Absent:
     """Test the innovations of the observers on prior and hybrid; skipped where no control problem tunes them."""
     if context.scenario.control is None:
-        return Absent("the observers need the scenario's control problem (input range, sensor noise)")
+        return Absent(
+            "the scenario defines no control problem, which gives the observers input range and sensor noise"
+        )
     context.read(NOISE)
     kit, parts = context.kit, parts_for_tests(context.trajectories("test"))
     found: dict[str, ObserverTest | Absent] = {}
@@ -101,7 +103,7 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
 
 
 def parts_for_tests(recordings: Sequence[Trajectory]) -> list[Trajectory]:
-    """The first samples of a few recordings, evenly chosen, that the tests can take the time for."""
+    """The first samples of a few evenly chosen recordings, to limit the time of the tests."""
     chosen = [recordings[i] for i in evenly(len(recordings), RECORDINGS)]
     return [r.part(slice(PERIODS // max(1, len(chosen)))) for r in chosen]
 

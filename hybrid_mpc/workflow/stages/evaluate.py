@@ -1,4 +1,4 @@
-"""Stage evaluation: free runs of every model over recordings that none was trained or chosen on."""
+"""Stage evaluation: free runs of every model over the test recordings."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ DRAWN = ("t", "u", "x", "x_hat", "y", "y_hat", "balances", "balances_hat")
 
 @dataclass(frozen=True)
 class BandScores:
-    """What the bands around a model's free runs hold of unseen measurements.
+    """Coverage and width of the bands around a model's free runs on test data.
 
     Args:
-        share: Share that they are to hold.
-        coverage: Share that they hold.
-        width: Their mean width by output, ``"phi [rad]"``.
-        score: Mean interval score by output; the less the better.
-        score_of_constant: That of a band of constant width with the same calibration.
+        share: Nominal coverage.
+        coverage: Share of the measurements within the band.
+        width: Mean width by output, ``"phi [rad]"``.
+        score: Mean interval score by output; lower is better.
+        score_of_constant: Interval score of a band of constant width with the same calibration.
     """
 
     share: float
@@ -48,7 +48,7 @@ class BandScores:
 
 @dataclass(frozen=True)
 class ModelScores:
-    """Errors of a model on unseen data, and of each of its networks alone, if it is the mean of several."""
+    """Errors of a model on test data, and of each of its networks alone, if the model is the mean of several."""
 
     model: Scores
     networks: tuple[Scores, ...]
@@ -62,7 +62,7 @@ class EvaluationResult:
         scores: Errors by model.
         by_file: Errors by model and recording.
         runs: Names of the free runs.
-        bands: What the bands around the free runs hold, by model.
+        bands: Coverage of the bands around the free runs, by model.
         arrays: Signals of each run, ``"MODEL/RUN/SIGNAL"``.
     """
 
@@ -76,7 +76,7 @@ class EvaluationResult:
 def evaluation_stage(context: Context) -> EvaluationResult:
     """Free runs of every model over the test trajectories.
 
-    The figures show them whole, or their beginning where a machine that runs away is judged by short ones.
+    The figures show whole runs; for an unstable machine, which is judged by short runs, they show the beginning.
     """
     prior, spec, chosen = context.prior, context.spec, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
@@ -115,7 +115,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
 
 
 def _band_scores(runs: Sequence[RunParts], bands: Bands, outputs: Sequence[str]) -> BandScores:
-    """What a band holds of unseen runs, and its score beside that of a band of constant width as calibrated."""
+    """Coverage and score of a band on test runs, and the score of a band of constant width with its calibration."""
     widths = [2 * bands.half_width(run.parts).mean(axis=0) for run in runs]
     sizes = [len(run.error) for run in runs]
 
@@ -144,6 +144,6 @@ def _by_file(runs: Sequence[FreeRun]) -> dict[str, list[FreeRun]]:
 
 
 EVALUATION = Stage(
-    "evaluation", "free runs on unseen data", EvaluationResult, evaluation_stage,
+    "evaluation", "free runs on test data", EvaluationResult, evaluation_stage,
     lambda context: {"free runs": (context.warm, context.spec.free_run)}, (DATA, PRIOR, TRAINING, CHOICE),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Stage explain: terms that the prior lacks are searched, and the run goes on with the prior that has them."""
+"""Stage explain: search for missing terms of the prior; later stages use the prior with the found terms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FOLDER = "explain"
 
 
 def what_explain_reads(context: Context) -> dict[str, object]:
-    """Whether it is asked for; then the user's prior and what is chosen from."""
+    """Whether the search is requested; then the user's prior and the candidate terms."""
     if not context.settings.explain:
         return {"asked for": False}
     own = context.as_given
@@ -34,10 +34,10 @@ def what_explain_reads(context: Context) -> dict[str, object]:
 
 
 def explain_stage(context: Context) -> ExplainResult | Absent:
-    """Search for the terms that the user's prior lacks, and write the scenario that has them.
+    """Search for the terms that the user's prior lacks, and write the scenario with them.
 
     Raises:
-        InputError: If there are too few recordings to judge terms by, or an own term does not fit to the prior.
+        InputError: If there are too few recordings to judge terms, or an own term does not fit the prior.
     """
     if not context.settings.explain:
         return Absent("--explain was not given")
@@ -49,9 +49,11 @@ def explain_stage(context: Context) -> ExplainResult | Absent:
 
 
 def scenario_is_there(context: Context, found: ExplainResult) -> str:
-    """Whether the scenario file lies where the stage left it; a text if not."""
+    """Why the stage must run again: its scenario file is missing; empty otherwise."""
     path: Path = context.out / FOLDER / found.file
-    return "" if not found.file or path.is_file() else "the scenario with the found terms is gone"
+    return (
+        "" if not found.file or path.is_file() else f"{path}, the scenario with the found terms, is missing"
+    )
 
 
 EXPLAIN = Stage(

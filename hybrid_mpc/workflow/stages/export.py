@@ -1,4 +1,4 @@
-"""Stages export, noise and tasks: the models of an artifact, what their estimators assume, and the control problems."""
+"""Stages export, noise and tasks: models, process noise of the estimators, and control problems of the artifact."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, trained_models
 
 FEW = 10
-"""Samples at which a network is compared that is another one's program with its own weights; one of ten is extreme."""
+"""Samples of the comparison with torch for a network that shares another network's program; one of ten is extreme."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class TasksResult:
 
 
 def export_stage(context: Context) -> ExportResult:
-    """Write the hybrid, the fitted prior and each network of the hybrid's as one artifact; compare all with torch."""
+    """Write hybrid, fitted prior and each network of the hybrid as one artifact; compare all of them with torch."""
     dt, settings, prior, chosen = context.spec.dt, context.settings, context.prior, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
     trained = trained_models(context, chosen.deployed).shrunk(phy, chosen.choice.share(chosen.deployed))
@@ -117,7 +117,7 @@ def export_stage(context: Context) -> ExportResult:
 
 
 def _spread(recordings: Sequence[NDArray[np.float64]]) -> tuple[float, ...]:
-    """Spread of each column of recordings ``(n, m)``; 0 of one that moves by rounding alone."""
+    """Spread of each column of recordings ``(n, m)``; 0 for a column that varies by rounding only."""
     found = [
         (robust_spread(c), float(np.nanmax(np.abs(c), initial=0.0))) for c in np.concatenate(recordings).T
     ]
@@ -125,7 +125,7 @@ def _spread(recordings: Sequence[NDArray[np.float64]]) -> tuple[float, ...]:
 
 
 def predicting(context: Context, phy: Prior) -> Predicting | None:
-    """What predictions need beside the models."""
+    """Settings that predictions need besides the models; None without a smoother."""
     fit, chosen = context.prior.fit, context.read(CHOICE)
     if fit.sizes is None:
         return None
@@ -144,13 +144,13 @@ def predicting(context: Context, phy: Prior) -> Predicting | None:
 
 
 def artifact_is_there(context: Context, found: ExportResult) -> str:
-    """Whether the artifact lies where the run left it; a text if not."""
+    """Why the artifact must be written again: it is damaged or was changed; empty otherwise."""
     folder = context.out / "model"
     try:
         held = {read_description(folder).programs_sha256, sha256(folder / PROGRAMS)}
     except InputError as damaged:
         return str(damaged)
-    return "" if held == {found.programs_sha256} else "the artifact was changed"
+    return "" if held == {found.programs_sha256} else f"the artifact in {folder} was changed"
 
 
 def noise_stage(context: Context) -> NoiseResult | Absent:
@@ -168,7 +168,7 @@ def noise_stage(context: Context) -> NoiseResult | Absent:
 
 
 def put_noise(context: Context, found: NoiseResult) -> str:
-    """Write ``observer.json``: the noise, and what the scenario says of its sensors and disturbances."""
+    """Write ``observer.json``: process noise, and the scenario's sensor noise and disturbance model."""
     folder, scenario = context.out / "model", context.scenario
     write_observer(
         folder,
@@ -181,7 +181,7 @@ def put_noise(context: Context, found: NoiseResult) -> str:
 
 
 def tasks_stage(context: Context) -> TasksResult:
-    """Write the control problems that the scenario states now."""
+    """Write the scenario's present control problems."""
     found = TasksResult(digest(loop_settings(context.scenario)))
     put_tasks(context, found)
     return found
@@ -194,7 +194,7 @@ def put_tasks(context: Context, found: TasksResult) -> str:
 
 
 def observed(context: Context) -> dict[str, object]:
-    """What estimators of the scenario's loops are made of."""
+    """Everything of the scenario that the estimators of its loops depend on."""
     scenario, control = context.scenario, context.scenario.control
     return {
         "sensors": (scenario.sensor_sigma, scenario.first_sigma),

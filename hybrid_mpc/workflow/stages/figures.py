@@ -1,4 +1,4 @@
-"""The main job's pictures, drawn from the results of its stages."""
+"""Figures of a run's report, drawn from the results of its stages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ OBSERVER_TITLES = {
 }
 SHOWN_RUNS = 2
 LAGS, FEWEST_LAGS = 50, 5
-"""Lags of the correlation of errors with inputs [samples], and so few that a picture of them tells nothing."""
+"""Largest lag of the correlation of errors with inputs [samples], and the smallest one that is worth a picture."""
 
 
 def draw_all(context: Context) -> Figures:
@@ -57,7 +57,7 @@ def draw_all(context: Context) -> Figures:
 
 
 def draw_first(context: Context) -> Figures:
-    """Draw the figures of the stages up to the free runs, of those that have run."""
+    """Draw the figures of the finished stages up to the free runs."""
     there: dict[Callable[[Context], Any], Stage[Any]] = {
         _data: PRIOR, _explain: EXPLAIN, _training: TRAINING, _free_runs: EVALUATION,
     }  # fmt: skip
@@ -67,7 +67,7 @@ def draw_first(context: Context) -> Figures:
 
 
 def _draw(context: Context, parts: Sequence[Callable[[Context], Any]]) -> Figures:
-    """Figures of some parts by section; what this process has drawn of the run's results is not drawn again."""
+    """Figures of some parts by section; figures that this process has already drawn are reused."""
     figures: Figures = {}
     for i, part in enumerate(parts):
         name_of_part = part.__name__.strip("_")
@@ -83,7 +83,7 @@ def _draw(context: Context, parts: Sequence[Callable[[Context], Any]]) -> Figure
 
 
 def _saved(figure: Figure, path: Path) -> Path:
-    """A picture, and beside it its interactive form if it lies over time."""
+    """Save a picture, and its interactive form beside it if its axis is time."""
     path.with_suffix(".json").unlink(missing_ok=True)  # of another picture of this name
     save(figure, path)
     if over_time(figure):
@@ -92,13 +92,18 @@ def _saved(figure: Figure, path: Path) -> Path:
 
 
 def _explain(context: Context) -> Any:
-    """What each found term removed of the error, and the terms over their data."""
+    """Error after each found term, and the terms over their data."""
     found = context.find(EXPLAIN)
     if isinstance(found, Absent):
         return
     labels, errors = bars_of(found.explanation)
     figure = explain.error_steps(labels, errors, "held-out error, over the outputs' spreads [-]", found.floor)
-    yield "explain", "explain_steps", figure, "Held-out error of free runs: what each found term removed."
+    yield (
+        "explain",
+        "explain_steps",
+        figure,
+        "Held-out error of free runs, and its reduction by each found term.",
+    )
     for number, step in enumerate(found.explanation.steps, 1):
         for k, picture in enumerate(step.pictures, 1):
             name = picture.ordinate.partition(" [")[0]
@@ -114,11 +119,11 @@ def _data(context: Context) -> Any:
     prior = context.scenario.prior()
     pieces = [t for t in context.dataset.trajectories if t.role != "nominal"]
     figure = data.recordings(pieces, prior.outputs, prior.inputs, disturbances=prior.disturbances)
-    yield "data", "recordings", figure, "Recordings with what each part is used for."
+    yield "data", "recordings", figure, "Recordings and the use of each part."
     parts = {role: context.smoothed(role) for role in ("train", "test")}  # states that no sensor sees, too
     smoothed = [t for part in parts.values() for t in part]
     caption = (
-        "Where training and test data lie." if prior.kinematics else "States over time, measured or not."
+        "Training and test data in the state space." if prior.kinematics else "Estimated states over time."
     )
     yield "data", "coverage", data.coverage(smoothed, prior.states, prior.kinematics), caption
 
@@ -136,9 +141,7 @@ def _training(context: Context) -> Any:
         starts[kind] = float(trained.settings.teacher_steps)
     units = {b.name: b.rate_unit for b in context.scenario.prior().equations.balances}
     figure = fit.curves(curves, free_run_start=starts, units=units)
-    caption = (
-        "Objectives and bounds of the network of each kind that validates best, on fixed training windows."
-    )
+    caption = "Objectives and bounds on fixed training windows, for the best network of each kind by validation error."
     yield "training", "training", figure, caption
 
 
@@ -164,7 +167,7 @@ def _free_runs(context: Context) -> Any:
             signals=signals, inputs=prior.inputs, balances=balances, hybrid=deployed,
             title=f"Free run on {run}", band=_band(prior, arrays, f"{deployed}/{run}"),
         )  # fmt: skip
-        caption = f"Free run over the unseen piece {run}; the warm-up before it is left out."
+        caption = f"Free run over the test piece {run}, without the warm-up."
         yield "free_run", f"free_run_{run.replace('#', '-')}", figure, caption
     yield from _unexplained(context, deployed)
     metrics = metrics_of(prior)
@@ -175,12 +178,12 @@ def _free_runs(context: Context) -> Any:
         for m, own in every.items()
         if own and all(n[k] is not None for n in own for k in metrics)
     }
-    caption = "Errors over all unseen pieces; whiskers: standard deviation over the networks of a kind."
+    caption = "Errors over all test pieces; whiskers: standard deviation over the networks of a kind."
     yield "free_run", "errors", fit.errors_bar(values, metrics, spread=spread), caption
 
 
 def _unexplained(context: Context, deployed: str) -> Any:
-    """What of the errors the inputs explain, for the fitted prior and the hybrid."""
+    """Correlation of the errors with the inputs, for the fitted prior and the hybrid."""
     found, prior = context.read(EVALUATION), context.scenario.prior()
     arrays, runs = found.arrays, found.runs
     shortest = min((len(arrays[f"phy/{run}/t"]) for run in runs), default=0)
@@ -199,24 +202,24 @@ def _unexplained(context: Context, deployed: str) -> Any:
         return
     figure = fit.input_correlations(context.spec.dt * np.arange(lags + 1.0), correlations)
     caption = (
-        "Correlation of the errors with the input of before. Beyond the dotted lines (95 % of errors that the input "
-        "does not explain) something that this input drives is missing, or has another size or delay."
+        "Correlation of the errors with earlier inputs. Beyond the dotted lines (95 % interval of independent errors), "
+        "the model lacks an effect of this input, or has a wrong gain or delay."
     )
     yield "free_run", "unexplained", figure, caption
 
 
 def metrics_of(prior: Prior) -> dict[str, str]:
-    """Figures of free runs by the name that they have in :func:`_flat`, with unit: what the bars are of."""
+    """Titles of the error bars with units, by the names of :func:`_flat`."""
     rmse = {f"rmse {s.label}": f"RMSE of {s.label}" for s in prior.outputs}
     balances = [f"{b.name} [{b.rate_unit}]" for b in prior.equations.balances]
     violation = {f"violation {label}": f"violation of {label}" for label in balances}
-    # one output's error over its spread is its RMSE once more
+    # with one output, error over spread and RMSE differ by a constant factor only
     over = {"error": "error over the spread [-]"} if len(prior.outputs) > 1 else {}
     return {**over, **rmse, "e_sim": "simulation error $E_{sim}$ [-]", **violation}
 
 
 def _flat(scores: Scores) -> dict[str, Any]:
-    """Figures by name; None where a run diverged."""
+    """Errors by name; None if a run diverged."""
     every = {"error": scores.error, "e_sim": scores.e_sim}
     every |= {f"rmse {label}": value for label, value in scores.rmse.items()}
     every |= {f"violation {label}": value for label, value in scores.violation.items()}
@@ -245,7 +248,7 @@ def _loops(context: Context) -> Any:
 
 
 def _on_model(context: Context) -> Any:
-    """A figure a task and controller: each controller met another plant."""
+    """One figure for each task and controller, since the plants differ."""
     found = context.find(LOOPS_ON_MODEL)
     if isinstance(found, Absent):
         return
@@ -283,7 +286,7 @@ def _number(value: float | None) -> float:
 
 
 def _moving(context: Context) -> list[tuple[Path, str]]:
-    """One loop of the hybrid as a moving picture, with what it planned at every instant."""
+    """One loop of the hybrid as an animation, with its plan in every period."""
     scenario, found = context.scenario, context.find(CONTROL)
     if scenario.draw is None or scenario.control is None or isinstance(found, Absent) or not found.rows:
         return []
@@ -300,7 +303,7 @@ def _moving(context: Context) -> list[tuple[Path, str]]:
         draw=scenario.draw, u=own["u"], title=task.title, curves=curves_of(prior), inputs=prior.inputs,
         limits=(control.u_min, control.u_max),
     )  # fmt: skip
-    return [(path, f"{task.title}: the machine, and in outline what the hybrid MPC plans.")]
+    return [(path, f"{task.title}: the machine, and in outline the plan of the hybrid MPC.")]
 
 
 def _estimation(context: Context) -> Any:
@@ -317,7 +320,7 @@ def _estimation(context: Context) -> Any:
             dt=context.spec.dt, outputs=context.scenario.prior().outputs, mean_band=(own.nis_low, own.nis_high),
             correlation_band=own.correlation_band, title=OBSERVER_TITLES[name],
         )  # fmt: skip
-        caption = f"{OBSERVER_TITLES[name]}: how surprised it was by test recordings."
+        caption = f"{OBSERVER_TITLES[name]}: innovations on test recordings."
         yield "estimation", f"innovations_{name}", figure, caption
 
 
@@ -325,13 +328,13 @@ def _timing(context: Context) -> Any:
     times = step_times(context)
     if times:
         caption = (
-            "Whole controller steps: estimation, optimisation and monitoring, the Python calls included."
+            "Duration of controller steps: estimation, optimization and monitoring, including Python calls."
         )
         yield "timing", "step_times", loops.solve_times(times, 1e3 * context.spec.dt), caption
 
 
 def _watch(context: Context) -> Any:
-    """The monitor over recordings, those with alarms first, and over loops in which something breaks."""
+    """The monitor over recordings, those with alarms first, and over loops with a fault."""
     found = context.find(WATCH)
     if isinstance(found, Absent) or found.limits is None:
         return

@@ -11,7 +11,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from hybrid_mpc.check.preflight import rests_no_more
+from hybrid_mpc.check.preflight import warn_of_drift
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.excitation import check_excitation, short_runs
 from hybrid_mpc.data.trajectories import ROLES, Trajectory
@@ -64,16 +64,16 @@ Array = NDArray[Any]
 MODELS = ("phy_nominal", "phy", *KINDS)
 """Models that may be evaluated; those of a prior: :func:`models_of`."""
 PARTS = 4
-"""Parts of the training data at least: a network that leaves one out still sees three quarters."""
+"""Smallest number of parts of the training data: a network that leaves one out still uses three quarters."""
 REMEDY = (
-    "Correct the prior: a sign, a unit, or a term or state that is missing (docs/prior-wrong.md). Fix parameters that "
-    "the recordings do not tell. 'hybrid-mpc check MACHINE --data FILE --fit' shows the fit"
+    "Correct the prior: a wrong sign or unit, or a missing term or state (docs/prior-wrong.md). Fix parameters that "
+    "the recordings do not identify. 'hybrid-mpc check MACHINE --data FILE --fit' shows the fit"
 )
-"""What to do about a fit that nothing may be built on."""
+"""Remedy for a fit that later stages must not use."""
 IN_DOUBT = "the structure of the prior is in doubt"
-"""Said before each reason for it."""
+"""Begins the warning about each doubt."""
 ERRORS = {"error": "E_sim", "output": "RMSE over the spread"}
-"""What the validation of a training is called, by its first objective."""
+"""Name of the validation error of a training, by its first objective."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ class DataResult:
     Args:
         files: Names of the files.
         hash: Hash of their contents.
-        cuts: What is not used as it was recorded, and why.
+        cuts: Parts that are cut out or interpolated, and why.
         pieces: Number of trajectories by role.
         seconds: Their length [s] by role.
-        warnings: What is doubtful about the recordings.
+        warnings: Warnings about the recordings.
     """
 
     files: tuple[str, ...]
@@ -99,7 +99,7 @@ class DataResult:
 
 @dataclass(frozen=True)
 class CutInterval:
-    """A part of a recording that is not used as it was recorded: its file, from and to [s]."""
+    """A part of a recording that is cut out or interpolated: its file, start and end [s]."""
 
     file: str
     start_s: float
@@ -108,14 +108,14 @@ class CutInterval:
 
 @dataclass(frozen=True)
 class CutPart(CutInterval):
-    """The same, and why."""
+    """A cut interval and its reason."""
 
     why: str
 
 
 @dataclass(frozen=True)
 class BaselineScores:
-    """Free-run errors of a simpler model and its orders, or why there is none."""
+    """Free-run errors of a baseline model and its chosen orders, or why the model is missing."""
 
     errors: OutputErrors | None = None
     chosen: str = ""
@@ -132,13 +132,13 @@ class PriorResult:
         units: Units of the parameters.
         baselines: Errors on the test recordings of simpler models, by name: ``"constant"`` (the training mean) and
             linear models of inputs and outputs.
-        bounds: Parameters at a bound, and what each bound costs.
-        in_doubt: Why the prior's structure is in doubt, what names the cause first.
+        bounds: Parameters at a bound, and the error that each bound costs.
+        in_doubt: Reasons to doubt the prior's structure, those that name a cause first.
         errors: Errors on the test recordings of the prior with nominal (``"phy_nominal"``) and fitted (``"phy"``)
             parameters.
-        no_gain: Why nothing may be built on this fit: a constant or the nominal parameters are better. Empty: it may.
-        error_correlation: Correlation of the smoother's one-step errors with those of the sample before, by output;
-            zero is white.
+        no_gain: Why later stages must not use this fit: a constant or the nominal parameters are better. Empty if they
+            may.
+        error_correlation: Correlation of successive one-step errors of the smoother, by output; zero is white.
         longest_run: Length [s] of the free runs that models are judged by; None: whole recordings.
         arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
     """
@@ -164,7 +164,7 @@ class TrainingResult:
         folder: Folder of the weights in ``checkpoints/training``.
         validation: Validation error of the best network by kind, of its first objective.
         skipped_updates: Updates that were skipped because a number was not finite, by kind.
-        failures: What went wrong in a training, by kind.
+        failures: Failed trainings, by kind.
         weights: Digest of the weights by kind.
     """
 
@@ -176,18 +176,18 @@ class TrainingResult:
 
 
 def check_data(context: Context) -> None:
-    """Read the user's recordings before anything is written: bad ones leave no folder behind."""
+    """Read and check the user's recordings before the run's folder is made: bad recordings leave no folder behind."""
     if context.settings.data:
         doubts(context)  # reads and checks the recordings
     elif context.scenario.make_data is None:
         raise InputError(
-            f"scenario {context.scenario.name} is a real machine: give its recordings with --data FILE.csv "
-            f"(once for each file) [HM-WORKFLOW-037]"
+            f"scenario {context.scenario.name}: no recordings. It cannot simulate them; give recordings of the machine "
+            f"with --data FILE.csv, once for each file [HM-WORKFLOW-037]"
         )
 
 
 def what_data_reads(context: Context) -> dict[str, object]:
-    """What the recordings and their roles are made of."""
+    """Everything that the recordings and their roles depend on."""
     context = context.as_given
     prior, settings = context.scenario.prior(), context.settings
     read: dict[str, object] = {
@@ -201,7 +201,7 @@ def what_data_reads(context: Context) -> dict[str, object]:
 
 
 def data_stage(context: Context) -> DataResult:
-    """Take the user's recordings, or let a simulated machine make its own; note what is in them, and all doubts."""
+    """Read the user's recordings, or let the scenario simulate recordings; list files, parts and warnings."""
     context = context.as_given
     if not context.settings.data:
         assert context.scenario.make_data is not None
@@ -222,24 +222,24 @@ def data_stage(context: Context) -> DataResult:
 
 
 def recordings_are_there(context: Context, found: DataResult) -> str:
-    """Whether the recordings of a simulated machine lie where the run left them; a text if not."""
+    """Why simulated recordings must be made again: files are missing or changed; empty otherwise."""
     context = context.as_given
     if context.settings.data or (context.files and context.dataset.hash == found.hash):
         return ""
-    return "the recordings are gone or were changed"
+    return f"the recordings in {context.out / 'data'} are missing or were changed"
 
 
 def doubts(context: Context) -> tuple[str, ...]:
-    """What is doubtful about the recordings, and what the training ones do not excite; some of it is refused.
+    """Warnings about the recordings, and about poor excitation of the training recordings.
 
     Raises:
-        InputError: If a recording is bad, an input does nothing in those for training, or an output.
+        InputError: If a recording is bad, or an input or output is constant in all training recordings.
     """
     found = tuple(str(finding) for finding in context.dataset.findings)
     prior = context.scenario.prior()
     free = sum(not p.fixed for p in prior.parameters)
     train = context.trajectories("train")
-    if not train:  # the prior's fit says so
+    if not train:  # the prior's fit refuses this
         return found
     return (
         *found,
@@ -261,10 +261,10 @@ def what_prior_reads(context: Context) -> dict[str, object]:
 
 
 def prior_stage(context: Context) -> PriorResult:
-    """Fit the prior's parameters, and the input's delay where there may be one, and smooth all recordings by it.
+    """Fit the prior's parameters and, if allowed, the inputs' delay; smooth all recordings with the fitted prior.
 
     Raises:
-        InputError: If the fit is impossible, or what it gives is of no use to later stages.
+        InputError: If the fit is impossible, or later stages must not use its result.
     """
     found = examined_prior(context)
     refuse(stops(found))
@@ -272,7 +272,7 @@ def prior_stage(context: Context) -> PriorResult:
 
 
 def stops(found: PriorResult, *, cause: bool = True) -> tuple[str, ...]:
-    """What must be mended before anything is built on a fitted prior, with the likeliest ``cause``."""
+    """Errors that stop a run after the fit of the prior; ``cause``: with the first reason for doubt."""
     if not found.no_gain:
         return ()
     why = f". In doubt: {found.in_doubt[0]}" if found.in_doubt and cause else ""
@@ -280,10 +280,10 @@ def stops(found: PriorResult, *, cause: bool = True) -> tuple[str, ...]:
 
 
 def examined_prior(context: Context) -> PriorResult:
-    """:func:`prior_stage` without its end: a fit that nothing may be built on is told in ``no_gain``.
+    """:func:`prior_stage` without the final refusal: ``no_gain`` says why later stages must not use the fit.
 
     Raises:
-        InputError: If the fit is impossible, or what it gives is not finite or has run away
+        InputError: If the fit is impossible, or its result is not finite or far out of range
             (:func:`~hybrid_mpc.identify.sound.problems`).
     """
     make, spec = context.scenario.prior, context.spec
@@ -307,33 +307,35 @@ def examined_prior(context: Context) -> PriorResult:
     context.progress.update("free runs", 1, 1, "comparing with simpler models")
     trial = trial_length(make, fit, every, spec.dt, longest, context.time_unit)
     bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)
-    told = *beyond_ranges(fitted, every), *rests_no_more(fitted, max(10 * spec.dt, spec.warm_up))
-    fit = replace(fit, warnings=(*fit.warnings, *(str(one) for one in bounds if one.costs), *told))
+    ranges = *beyond_ranges(fitted, every), *warn_of_drift(fitted, max(10 * spec.dt, spec.warm_up))
+    fit = replace(fit, warnings=(*fit.warnings, *(str(one) for one in bounds if one.costs), *ranges))
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     unseen = every[len(train) + len(valid) :]
     judge, linear = _Judge(context, fitted, fit, smoother), _linear_models(context)
     longest_run = spec.free_run
     errors, baselines = judge.errors(unseen, longest_run, linear)
-    told, shorter = (), growth_time(make, fit, every, spec.dt)
+    growth: tuple[str, ...] = ()
+    shorter = growth_time(make, fit, every, spec.dt)
     grows = shorter < (longest or 0.0)
     if longest_run is None and grows and errors["phy"].error > _error_of(baselines["constant"]):
-        # whole runs say nothing of a machine that runs away
+        # free runs over whole recordings do not compare models of an unstable machine
         longest_run = max(shorter, 2 * spec.dt)
         errors, baselines = judge.errors(unseen, longest_run, linear)
-        told = (
-            f"small errors grow tenfold in {shorter:.2g} s, so long free runs say nothing of a model: models are "
-            "trained and judged by free runs of that length; free_run of the DataSpec sets another",
+        growth = (
+            f"small errors grow tenfold in {shorter:.2g} s, so long free runs do not compare models. Models are "
+            "trained and compared by free runs of that length; free_run of the DataSpec sets another length",
         )
-        context.progress.warn(told[0])
-    fit = replace(fit, warnings=(*fit.warnings, *told))
+        context.progress.warn(growth[0])
+    fit = replace(fit, warnings=(*fit.warnings, *growth))
     own = {name: one.error for name, one in errors.items()} | {"constant": _error_of(baselines["constant"])}
     training: dict[str, float] = {}
     if own["phy"] >= own["constant"]:
         seen, mean = judge.errors(every[: len(train)], longest_run)
         training = {"phy": seen["phy"].error, "constant": _error_of(mean["constant"])}
-    # of a machine that runs away, recorded under its controller, inputs tell linear models what outputs will be
-    compared = baselines if not told else {"constant": baselines["constant"]}
+    # an unstable machine is recorded under its controller: there the inputs alone predict the outputs, so linear
+    # models look better than they are
+    compared = baselines if not growth else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
     acting, unit = shifted(train, fit.delay), context.time_unit
     length = longest_run or longest or trial
@@ -343,7 +345,8 @@ def examined_prior(context: Context) -> PriorResult:
         named(causes(make, fit.values, acting, spec.dt, length, unit)),
         bounds_doubt(bounds, len(fit.standard_errors)),
     ]
-    # where small errors grow, those of first states do: free runs with fitted ones tell whether the equations are right
+    # where small errors grow, errors of initial states grow too: then the windows of the fit, with free initial states,
+    # test the equations
     short = grows and longest_run is not None
     follows = short and min(row["validation_error"] for row in fit.stages) <= POOR
     if not follows:
@@ -373,12 +376,12 @@ def examined_prior(context: Context) -> PriorResult:
 
 
 def _error_of(baseline: BaselineScores) -> float:
-    """Error of a baseline; infinite where there is none."""
+    """Error of a baseline; infinite if the baseline has no errors."""
     return math.inf if baseline.errors is None else baseline.errors.error
 
 
 def _linear_models(context: Context) -> dict[str, LinearModel | str]:
-    """Linear models of inputs and outputs by name, or why there is none."""
+    """Linear input-output models by name, or why the model is missing."""
     train, valid = context.trajectories("train"), context.trajectories("valid")
     found: dict[str, LinearModel | str] = {}
     for name, fit_linear in BASELINES.items():
@@ -409,7 +412,7 @@ class _Judge:
         Args:
             trajectories: Smoothed trajectories.
             length: Length [s] of the runs; None: whole trajectories.
-            linear: Linear models, or why there is none.
+            linear: Linear models by name, or why the model is missing.
         """
         context, fitted = self.context, self.fitted
         runs = evaluation_trajectories(trajectories, self.smoother, context.warm, length)
@@ -420,7 +423,7 @@ class _Judge:
         ):
             found = score(free_runs(step, fitted, runs, context.warm), fitted, self.smoother.sizes.y)
             own[name] = OutputErrors(found.error, found.rmse, found.fit_percent)
-        warm = context.warm + 1  # the prior starts from a state that knows this sample
+        warm = context.warm + 1  # the prior's initial state is estimated with this sample
         simpler = {
             "constant": self._scored(constant_runs(context.trajectories("train"), runs, warm), runs, warm)
         }
@@ -450,13 +453,13 @@ def what_training_reads(context: Context) -> dict[str, object]:
 
 
 def models_of(prior: Prior) -> tuple[str, ...]:
-    """Models of a prior that are evaluated: without and with fitted parameters, and each kind of network."""
+    """Names of the models to evaluate: nominal prior, fitted prior, and each kind of network."""
     return ("phy_nominal", "phy", *kinds_of(prior))
 
 
 def training_stage(context: Context) -> TrainingResult:
     """Train the networks of every kind, two kinds at once."""
-    # networks of other settings or data lie in a folder of their own
+    # networks of other settings or data have a folder of their own
     name = digest(TRAINING.keys(context))[:12]
     folder = context.out / "checkpoints" / "training" / name
     trained = train_kinds(
@@ -492,7 +495,7 @@ def train_kinds(
     on_progress: Callable[[str, int, int, str], None] = lambda key, done, total, text: None,
     cluster: Any = None,
 ) -> dict[str, Trained]:
-    """Train the networks of every kind that ``folder`` does not hold yet; an interrupted training is resumed."""
+    """Train the networks of every kind that ``folder`` does not hold yet; continue an interrupted training."""
     jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         kind: (_train_kind, (scenario, dict(values), training, validation, settings[kind], folder, device))
         for kind in reversed(list(settings))
@@ -512,7 +515,7 @@ def _train_kind(
     device: str,
     report: Callable[[int, int, str], None],
 ) -> None:
-    """Job of one process: train one kind and leave its files."""
+    """Job of one process: train one kind and write its files."""
     label = ERRORS.get(settings.objectives[0], settings.objectives[0])
     trained = train(
         load_scenario(scenario).prior(values),
@@ -527,12 +530,12 @@ def _train_kind(
 
 
 def networks_are_there(context: Context, found: TrainingResult) -> str:
-    """Whether the weights lie where the training left them; a text if not."""
+    """Why the networks must be trained again: files are missing or changed; empty otherwise."""
     folder = context.out / "checkpoints" / "training" / found.folder
     for kind, content in found.weights.items():
         path = folder / f"{kind}.json"
         if not path.is_file() or sha256(path) != content:
-            return f"networks {kind} are gone or were changed"
+            return f"{path}, the networks {kind}, is missing or was changed"
     return ""
 
 
@@ -545,10 +548,10 @@ def runs_of(
     context: Context, name: str, phy: Prior, trajectories: Sequence[Trajectory], own: int | None = None,
     share: float = 1.0,
 ) -> list[list[FreeRun]]:  # fmt: skip
-    """Free runs of one model: of the model itself, then of each of its networks, if it has several.
+    """Free runs of one model, then of each of its networks if it has several.
 
-    The model is the mean of its networks, or network ``own`` alone, where the others have seen what it runs over. Of
-    the networks' correction ``share`` counts.
+    The model is the mean of its networks; with ``own`` it is network ``own`` alone, the only network that did not train
+    on these trajectories. The networks' correction is multiplied by ``share``.
     """
     dt, warm = context.spec.dt, context.warm
     if name in ("phy_nominal", "phy"):
@@ -566,7 +569,7 @@ def runs_of(
 
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:
-    """What the networks of a kind are trained with: the budget, and what the run's own file replaces of it."""
+    """Training settings of a kind: those of the budget, replaced by those of the run's settings file."""
     b = context.budget
     settings = TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
@@ -584,7 +587,7 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
 
 
 def _as_long_as_judged(context: Context, kind: str) -> TrainingSettings:
-    """The same, with free runs no longer than those by which a machine that runs away is judged."""
+    """Training settings whose free runs are no longer than those that compare the models of an unstable machine."""
     settings, longest = training_settings(context, kind), context.prior.longest_run
     if context.spec.free_run is not None or longest is None:
         return settings
@@ -595,7 +598,7 @@ def _as_long_as_judged(context: Context, kind: str) -> TrainingSettings:
 
 @dataclass(frozen=True)
 class _Note:
-    """What the JSON file of trained networks holds; the arrays are in a file next to it."""
+    """Content of the JSON file of trained networks; their arrays are in a file next to it."""
 
     settings: TrainingSettings
     scaling: Scaling
@@ -628,8 +631,8 @@ def is_trained(folder: Path, settings: TrainingSettings) -> bool:
     changed = [f"{name} {found[name]} instead of {own[name]}" for name in own if found[name] != own[name]]
     if changed:
         raise InputError(
-            f"{folder} holds finished networks of other settings ({settings.kind}: {'; '.join(changed)}), from another "
-            "version or scenario; choose another --out [HM-WORKFLOW-039]"
+            f"{folder}: holds networks of other settings ({settings.kind}: {'; '.join(changed)}). Another version or "
+            "scenario wrote them; choose another --out [HM-WORKFLOW-039]"
         )
     return True
 
@@ -641,7 +644,7 @@ def load_trained(folder: Path, kind: str) -> Trained:
         InputError: If a file is missing or damaged.
     """
     path = folder / f"{kind}.json"
-    remedy = f"delete {kind}.* in {folder}, and the same command trains these networks anew"
+    remedy = f"delete {kind}.* in {folder}; then the same command trains these networks again"
     note = record(_Note, read_document(path, remedy), str(path))
     arrays = read_document_arrays(path, remedy)
     part: dict[str, dict[str, Any]] = {"weights": {}, "curve": {}, "own": {}}

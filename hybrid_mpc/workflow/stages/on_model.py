@@ -1,4 +1,4 @@
-"""Stage on_model: closed loops of a machine without plant, a model in its place. They tell nothing of the machine."""
+"""Stage on_model: closed loops on a model, for a scenario without plant. They say nothing about the machine."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class OnModelResult:
 
 
 def on_model_stage(context: Context) -> OnModelResult | Absent:
-    """Every task, on another model than the controller's; where there is no plant alone."""
+    """Every task on another model than the controller's; only for a scenario without plant."""
     if context.scenario.control is None:
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     if context.scenario.plant is not None:
-        return Absent("the scenario has a plant: its loops are those of the section before")
+        return Absent("the scenario has a plant; its closed loops are in section Closed loops")
     context.read(NOISE)
     try:
         tasks = tasks_of(context.ready, context.budget.tasks)
@@ -87,7 +87,7 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
 
 
 def what_on_model_reads(context: Context) -> dict[str, object]:
-    """The tasks, what the loops are made of, and how many there are."""
+    """Tasks, estimators, control problem, and number of the loops."""
     scenario, budget = context.scenario, context.budget
     read: dict[str, object] = {
         **observed(context),
@@ -109,7 +109,7 @@ def what_on_model_reads(context: Context) -> dict[str, object]:
 
 
 def by_controller(rows: Sequence[LoopRow]) -> dict[str, list[LoopRow]]:
-    """The loops of each controller by itself: each met another plant, so nothing compares them."""
+    """The loops by controller: each controller has another plant, so they must not be compared."""
     return {name: [row for row in rows if row.controller == name] for name in OBSERVERS}
 
 

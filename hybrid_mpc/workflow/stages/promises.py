@@ -1,4 +1,4 @@
-"""Stage promises: what the kit promises of its loops, examined and written beside its models."""
+"""Stage promises: examine the properties of the recommended loop, and write the table beside the models."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from hybrid_mpc.workflow.stages.identify import PRIOR, PriorResult
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, what_on_model_reads
 
 STRUCTURE = "structure of the prior"
-"""Name of the row about the prior on which all models stand."""
-MEND = "Correct the prior first: docs/prior-wrong.md says how to read each reason."
-"""What to do about a prior whose structure is in doubt."""
+"""Name of the row about the prior, which all models are based on."""
+MEND = "Correct the prior first: docs/prior-wrong.md explains each reason."
+"""Remedy for a prior whose structure is in doubt."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +60,21 @@ def promises_stage(context: Context) -> PromisesResult | Absent:
 
 
 def structure(prior: PriorResult) -> Promise:
-    """Whether the structure of the fitted prior, on which all models stand, is in doubt."""
+    """Row of the table: whether the structure of the fitted prior is in doubt."""
     errors = {
         "the fitted prior": prior.errors["phy"].error,
         "the nominal one": prior.errors["phy_nominal"].error,
     }
     errors |= {name: one.errors.error for name, one in prior.baselines.items() if one.errors is not None}
     figures = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
-    evidence = f"error of free runs on unseen recordings over the outputs' spread: {figures}"
+    evidence = f"free-run error on test recordings over the outputs' spread: {figures}"
     if not prior.in_doubt:
         return Promise(STRUCTURE, "shown", f"no term or signal is in doubt; {evidence}")
     return Promise(STRUCTURE, "doubted", f"{'; '.join(prior.in_doubt)}; {evidence}", MEND)
 
 
 def _tasks(context: Context) -> tuple[Task, ...]:
-    """The scenario's tasks, or the default ones; none where these cannot be made."""
+    """The scenario's tasks, else default tasks; empty if default tasks are impossible."""
     try:
         return tasks_of(context.ready, context.budget.tasks)
     except InputError:  # the stage on_model says so
@@ -82,7 +82,7 @@ def _tasks(context: Context) -> tuple[Task, ...]:
 
 
 def _loops(context: Context, controller: str) -> tuple[list[LoopRow], str]:
-    """The run's loops of a controller, with what was kept of them, and what they ran on."""
+    """The run's loops of a controller with their kept signals, and a text that names their plant."""
     control, on_model = context.find(CONTROL), context.find(LOOPS_ON_MODEL)
     if not isinstance(control, Absent) and control.rows:
         drawn = {(row.task, row.controller, row.seed): row for row in control.drawn}
@@ -95,7 +95,7 @@ def _loops(context: Context, controller: str) -> tuple[list[LoopRow], str]:
 
 
 def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
-    """What the innovations of the controller's observer said on test recordings, or why nothing."""
+    """Statistics of the observer's innovations on test recordings, or why there are none."""
     found = context.find(ESTIMATION)
     if isinstance(found, Absent):
         return found.reason
@@ -107,11 +107,11 @@ def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
 
 
 def put_promises(context: Context, found: PromisesResult) -> str:
-    """Write the table beside the models, unless it is there."""
+    """Write the table beside the models, unless the same table is already there."""
     folder, table = context.out / "model", PromiseTable(found.of, found.rows)
     try:
         there = read_promises(folder) == table
-    except InputError:  # damaged, or of another version: it is written anew
+    except InputError:  # damaged or of another version: write it again
         there = False
     if not there:
         write_promises(folder, table)
@@ -119,11 +119,11 @@ def put_promises(context: Context, found: PromisesResult) -> str:
 
 
 def what_promises_read(context: Context) -> Mapping[str, object]:
-    """What loops read, on a plant or on a model."""
+    """Everything that the loops depend on, with a plant or with a model as plant."""
     return {**what_on_model_reads(context), **what_loops_read(context)}
 
 
 PROMISES = Stage(
-    "promises", "examining what the kit promises", PromisesResult, promises_stage, what_promises_read,
+    "promises", "examining the kit's promises", PromisesResult, promises_stage, what_promises_read,
     (PRIOR, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
 )  # fmt: skip

@@ -65,7 +65,7 @@ TITLES: Mapping[str, str] = {
     "export": "Export",
     "control": "Closed loops",
     "on_model": "Closed loops on the model, not the machine",
-    "estimation": "Estimation: are the observers as sure as they may be",
+    "estimation": "Estimation: consistency of the observers",
     "timing": "Time of a controller step",
     "watch": "Monitor",
     "analysis": "Linear analysis",
@@ -92,7 +92,7 @@ def report_stage(context: Context) -> ReportResult:
 
 
 def report_so_far(context: Context) -> None:
-    """Write a page of the stages up to the free runs, of those that have run, while the others go on."""
+    """Write a first report of the finished stages up to the free runs, while the run continues."""
     figures = draw_first(context)
     tables: dict[str, Sequence[Table]] = {
         "data": [_data_table(recordings(context))],
@@ -104,7 +104,7 @@ def report_so_far(context: Context) -> None:
     texts = words("run_words.html")
     shown = [key for key in TITLES if key in figures or key in tables]
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
-    going = "This run goes on: the page is written anew after the first stages and at the end. Load it again."
+    going = "The run is not finished. It updates this page after its first stages and at its end; reload the page."
     s, title = context.scenario, f"hybrid-mpc: {context.scenario.name}"
     doubt = doubt_of(context.prior.in_doubt)
     page = Report(title, s.title, s.description, command(context), (), sections, going, doubt=doubt)
@@ -112,13 +112,13 @@ def report_so_far(context: Context) -> None:
 
 
 def report_is_there(context: Context, found: ReportResult) -> str:
-    """Whether the report and the results lie where the run left them; a text if not."""
+    """Why the report must be written again: a file is missing; empty if both files exist."""
     there = all((context.out / name).is_file() for name in (found.file, "results.json"))
-    return "" if there else "the report is gone"
+    return "" if there else "report.html or results.json is missing"
 
 
 def what_report_reads(context: Context) -> dict[str, object]:
-    """What the report says of the machine beside the results."""
+    """Texts and drawings of the scenario that the report shows beside the results."""
     scenario, prior = context.scenario, context.scenario.prior()
     return {
         "titles": (scenario.title, scenario.description, [task.title for task in scenario.tasks]),
@@ -130,7 +130,7 @@ def what_report_reads(context: Context) -> dict[str, object]:
 
 
 def command(context: Context, scenario: str = "") -> str:
-    """The command line that makes this run; ``scenario`` stands for the scenario as it was given."""
+    """The command line of this run; ``scenario`` replaces the scenario as it was given."""
     s = context.settings
     words = ["hybrid-mpc", "run", scenario or s.scenario, *s.options(lambda path: path.name)]
     words += ["--settings", s.network_file.name] if s.network_file else []
@@ -162,7 +162,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
     }
     instead, after = _notes(context, results)
     for key in ("estimation", "timing", "watch"):
-        # words about pictures that are not there help nobody
+        # without pictures and tables the general text of the section has nothing to explain
         if key in after and not figures.get(key) and not any(t is not None and t.rows for t in tables[key]):
             instead[key] = after.pop(key)
     texts = words("run_words.html")
@@ -202,16 +202,16 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     control = results.control
     if results.promises.rows is None:
         instead["promises"] = (
-            f"It was not examined what the kit promises: {results.promises.reason.rstrip('.')}.",
+            f"The promises of the kit were not examined: {results.promises.reason.rstrip('.')}.",
         )
     if control.gap_closed is None:
         reason = control.gap_closed_reason.rstrip(".")
         if control.hybrid.cost is None:
-            timed = " The controller was built and timed on recordings instead."
+            timed = " Instead, the controller was timed on recordings."
             timed = "" if results.timing.misses is None else timed
             if results.on_model.plants:
                 timed += f" Loops {ON_MODEL}, are in the next section."
-            instead["control"] = (f"There is no closed loop here: {reason}.{timed}",)
+            instead["control"] = (f"No closed loop was simulated: {reason}.{timed}",)
         else:
             after["control"] = (f"The gap closed is not defined: {reason}.",)
     after["control"] = (*after.get("control", ()), *oracle_words(control))
@@ -219,16 +219,16 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     after["on_model"] = tuple(f"{name}: {why}." for name, why in on_model.left_out.items())
     if DRAWN_PRIOR in on_model.plants.values():
         after["on_model"] += (
-            f"{DRAWN_PRIOR} is the prior with parameters drawn from their fitted covariance: the networks correct "
-            "nothing, so no other model differs from the controller's.",
+            f"The networks correct nothing, so no other model differs from the controller's. {DRAWN_PRIOR} is the "
+            "prior with parameters drawn from their fitted covariance.",
         )
     if on_model.default_tasks:
-        after["on_model"] += ("The tasks are default ones, since the scenario declares none.",)
+        after["on_model"] += ("The scenario declares no tasks; the loops use default tasks.",)
     tested = results.estimation
     observers = (tested.prior_observer, tested.hybrid_observer)
     without = [text for text in (tested.reason, *(o.reason for o in observers if o is not None)) if text]
     if without:
-        after["estimation"] = (f"Not tested: {'; '.join(dict.fromkeys(without))}.",)
+        after["estimation"] = (f"Observers were not tested: {'; '.join(dict.fromkeys(without))}.",)
     after["data"] = tuple(f"Warning: {text}" for text in results.data.details.warnings)
     replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
     lacking = "mopgrnn" not in models_of(context.scenario.prior())
@@ -238,11 +238,11 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if context.prior.fit.warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
     if results.timing.misses is None:
-        after["timing"] = (f"No step was timed: {results.timing.misses_reason.rstrip('.')}.",)
+        after["timing"] = (f"No controller step was timed: {results.timing.misses_reason.rstrip('.')}.",)
     watched: WatchResult | Absent = context.find(WATCH)
     after["watch"] = (*_watch_words(watched), *coverage_words(results.watch.details.recordings))
     if results.analysis.details is None:
-        instead["analysis"] = (f"There is no analysis here: {results.analysis.reason.rstrip('.')}.",)
+        instead["analysis"] = (f"No linear analysis: {results.analysis.reason.rstrip('.')}.",)
     else:
         models = results.analysis.details.models
         after["analysis"] = tuple(
@@ -252,7 +252,7 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
 
 
 def oracle_words(control: Control) -> tuple[str, ...]:
-    """A sentence about the tasks in which another controller costs less than the oracle; nothing without any."""
+    """A note on tasks in which another controller costs less than the oracle; empty without such a task."""
     tasks = control.details.tasks if control.details is not None else {}
     beaten = []
     for task, cells in tasks.items():
@@ -262,15 +262,15 @@ def oracle_words(control: Control) -> tuple[str, ...]:
     if not beaten:
         return ()
     return (
-        f"In {', '.join(beaten)} the oracle does not cost least. It knows the machine's equations, but it estimates "
-        "state and load from the same measurements as the others, so its cost is no lower bound there.",
+        f"In {', '.join(beaten)} the oracle does not have the least cost. The oracle knows the machine's equations, "
+        "but it estimates state and load from the same measurements as the others. So its cost is no lower bound.",
     )
 
 
 def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
-    """What limits were learned from, what they do not promise, and how many alarms there were beside those expected."""
+    """Source and rate of the limits, and the number of false alarms compared with that rate."""
     if isinstance(found, Absent) or found.limits is None or found.clean is None:
-        return (f"No alarms here: {found.reason.rstrip('.')}.",)
+        return (f"The monitor was not examined: {found.reason.rstrip('.')}.",)
     limits, clean = found.limits, found.clean
     rate, wanted = limits.false_alarms_per_hour, RATES[0] / limits.time_unit
     learned = f"Limits were learned from {found.sources[found.kind]}, for {rate:g} false alarms an hour."
@@ -278,35 +278,35 @@ def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
         learned = f"Limits are {limits.method}; they were learned from {found.sources[found.kind]}."
     elif rate > wanted:
         learned += (
-            f" Nominal data are too short for {wanted:g} an hour; a longer run (budget full), or recordings of the "
-            f"machine with hybrid-mpc monitor --learn {wanted:g}, give better limits."
+            f" Nominal data are too short for {wanted:g} an hour. Use a longer run (budget full), or recordings of the "
+            f"machine with hybrid-mpc monitor --learn {wanted:g}."
         )
-    verdict = "more than they promise" if clean.too_many(rate) else "within what they promise"
-    test = f"In the {clean.test_seconds:.0f} s of test data among them: {clean.test_alarms}."
-    words: tuple[str, ...] = (learned, f"Alarms: {clean.words(rate)}: {verdict}. {test}")
+    verdict = "too many for these limits" if clean.too_many(rate) else "consistent with these limits"
+    test = f"Alarms in the {clean.test_seconds:.0f} s of test data among them: {clean.test_alarms}."
+    words: tuple[str, ...] = (learned, f"False alarms: {clean.words(rate)}: {verdict}. {test}")
     if found.loops:
         words += (
-            "Recordings were driven otherwise, and wider, than the loops that limits were learned from: an alarm there "
-            "says that the model is less right where the loops do not go.",
+            "The limits were learned from closed loops. Recordings cover a wider range; an alarm there can mean that "
+            "the model is less accurate outside the range of the loops.",
         )
     return words
 
 
 def _prior_replay_text(weight: float) -> tuple[str, ...]:
-    words = "Corrections were asked to fade where no recording comes near; the prior stands alone there"
+    words = "Training penalized the network's correction far away from all recordings"
     return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
 
 
 def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """What the monitor could not see of the recordings, in a sentence; nothing if that is but the warm-up.
+    """A sentence on parts of the recordings that were not monitored, warm-up apart; empty without such a part.
 
     Example:
         >>> coverage_words([{"valid_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
-        ('Not monitored: 2 s in which model or estimator gave no finite number.',)
+        ('Not monitored: 2 s with a non-finite value of model or estimator.',)
     """
     why = {
         "missing_s": "with missing samples",
-        "not_finite_s": "in which model or estimator gave no finite number",
+        "not_finite_s": "with a non-finite value of model or estimator",
     }
     sums = {key: sum(float(row[key]) for row in recordings) for key in why}
     parts = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
@@ -334,10 +334,12 @@ def _explain_tables(context: Context) -> list[Table]:
     found = context.find(EXPLAIN)
     if isinstance(found, Absent):
         return []
-    told = found.explanation
+    explanation = found.explanation
     tests = [tests_table(found)] if found.tests else []
     return [
-        table for table in (steps_table(told), *tests, terms_table(told), trials_table(told)) if table.rows
+        table
+        for table in (steps_table(explanation), *tests, terms_table(explanation), trials_table(explanation))
+        if table.rows
     ]
 
 
@@ -350,8 +352,8 @@ def _prior_table(context: Context) -> Table:
     ]  # fmt: skip
     colours = ", ".join(f"{label} {value:.2f}" for label, value in prior.error_correlation.items())
     caption = (
-        "Parameters of the prior. Standard errors suppose that the prior's structure is right. Correlation of one-step "
-        f"errors with those of the sample before (0 is white): {colours}."
+        "Parameters of the prior. Standard errors assume that the prior's structure is right. Correlation of "
+        f"successive one-step errors (0 is white): {colours}."
     )
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
@@ -375,7 +377,7 @@ def _free_run_tables(context: Context, found: Identification) -> list[Table]:
         rows.append((model, error, _percent(error, base), *rmse, *fit))
     columns = ("model", "error [spreads]", "over the prior's", *(f"RMSE of {label}" for label in outputs),
                *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
-    tables = [Table(columns, rows, "Free runs on unseen data: outputs.")]
+    tables = [Table(columns, rows, "Free runs on test data: outputs.")]
     balances = [f"{b.name} [{b.rate_unit}]" for b in prior.equations.balances]
     base = _number(found.e_sim["phy"])
     rows = []
@@ -389,7 +391,7 @@ def _free_run_tables(context: Context, found: Identification) -> list[Table]:
         "over the prior's",
         *(f"violation of {label}" for label in balances),
     )
-    caption = "Free runs on unseen data: rates of the states" + (" and balances." if balances else ".")
+    caption = "Free runs on test data: rates of the states" + (" and balances." if balances else ".")
     return [*tables, Table(columns, rows, caption), _choice_table(found), _band_table(context, found)]
 
 
@@ -401,11 +403,12 @@ def _choice_table(found: Identification) -> Table:
          "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]  # fmt: skip
-    columns = ("model", "correction", "error [spreads]", "over the prior's", "at most, by 95 %", "")
+    columns = ("model", "correction", "error [spreads]", "over the prior's", "95 % upper bound", "")
     caption = (
-        f"Parts of the training data that networks left out. {choice.reason} The error is that of all. Where there are "
-        "several, the ratio is the geometric mean of the ratios of each, and the bound is a bound of this mean. "
-        "Correction: how much of what its networks say a model has; less where the whole is not surely better."
+        f"Choice of the model on held-out parts of the training data. {choice.reason} The error is that of all parts "
+        "together. The ratio is the geometric mean of the ratios by part, and the upper bound belongs to this mean. "
+        "Correction: share of the networks' correction that the model uses; below 100 % if the full correction is not "
+        "significantly better."
     )
     return Table(columns, rows, caption)
 
@@ -418,16 +421,16 @@ def _band_table(context: Context, found: Identification) -> Table:
         for output in context.scenario.prior().outputs
     ]  # fmt: skip
     what = ("mean width", "interval score", "of a constant band")
-    columns = ("model", "output", "is to hold", "all hold", *what)
+    columns = ("model", "output", "nominal coverage", "coverage", *what)
     caption = (
-        "Bands around free runs, calibrated on what was not trained on, on unseen data, in the outputs' units; a low "
-        "score is good."
+        "Prediction bands of free runs, calibrated on held-out data and evaluated on test data, in the outputs' units. "
+        "A lower interval score is better."
     )
     return Table(columns, rows, caption)
 
 
 def _by(values: Any, label: str) -> float | None:
-    """The number of a signal, where there are any and all are finite."""
+    """The number of a signal; None without finite numbers of all signals."""
     return values.get(label) if isinstance(values, Mapping) else None
 
 
@@ -466,17 +469,16 @@ def _control_table(control: Control) -> Table | None:
         costs = (_cost(cells.get(name)) for name in names)
         rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
     caption = (
-        "Closed-loop cost J on the true state: mean over its seeds with a 95 % interval of its own that holds although "
-        "a task's loops may stop early (none for one seed); squared deviations of all signals, each times its weight "
-        "in the control problem, which brings them to one scale. Gap: share of the distance from the better baseline "
-        "to the measuring oracle that the hybrid with observer covers; a dash where baseline and oracle do not differ "
-        "enough to say."
+        "Closed-loop cost J on the true state: sum of the squared deviations of all signals, weighted as in the "
+        "control problem. Mean over the seeds with a 95 % interval that holds with early stopping (no interval for "
+        "one seed). Gap closed: share of the distance from the better baseline to the measuring oracle that the "
+        "hybrid with observer covers; a dash if baseline and oracle do not differ significantly."
     )
     return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
 
 
 def _comparison_table(control: Control) -> Table | None:
-    """The hybrid's cost over that of each baseline on the same seeds, with the interval that early stopping leaves."""
+    """The hybrid's cost over that of each baseline on the same seeds, with an interval valid under early stopping."""
     details = control.details
     if details is None:
         return None
@@ -487,15 +489,15 @@ def _comparison_table(control: Control) -> Table | None:
     ]
     caption = (
         f"Cost of the hybrid with observer over a baseline's on the same seeds: geometric mean, and a 95 % interval "
-        f"that holds although a task's loops stop where the larger ratio (*) is decided, at most after "
-        f"{details.most_seeds} seeds. Ratios within {100 * SAME:.0f} % of 1 are the same. The 95 % are those of one "
-        "row: of twenty rows one may be wrong."
+        f"that holds with early stopping. The loops of a task stop once the larger ratio (*) is decided, at most after "
+        f"{details.most_seeds} seeds. Ratios within {100 * SAME:.0f} % of 1 count as the same. The 95 % hold for each "
+        "row alone: one of twenty rows may be wrong."
     )
     return Table(("task", "baseline", "ratio of costs", "seeds", "finding"), rows, caption)
 
 
 def untracked(context: Context) -> set[str]:
-    """Names of the tasks whose references are not to be followed throughout: their weights change over time."""
+    """Names of the tasks without tracking errors: their weights change over time."""
     return {task.name for task in context.scenario.tasks if task.weight is not None}
 
 
@@ -512,8 +514,8 @@ def _tracking_table(control: Control, untracked: Collection[str]) -> Table | Non
     signals, errors = _tracking([cell for *_, cell in cells])
     rows = [(task, name.replace("_", ", "), *own) for (task, name, _), own in zip(cells, errors, strict=True)]
     caption = (
-        "Root mean square deviations from the reference, means over seeds: of true states, or of measured outputs "
-        "where references are theirs."
+        "Root mean square deviations from the reference, means over seeds: of true states, or of outputs if the "
+        "reference is one of outputs."
     )
     return Table(("task", "controller", *(f"RMSE of {s}" for s in signals)), rows, caption)
 
@@ -536,16 +538,16 @@ def _response_table(context: Context) -> Table | None:
         for signal, answer in step_responses(task.control or scenario.control, prior, row.arrays).items()
     ]  # fmt: skip
     caption = (
-        "Answers to the last set-point of each task that ends at one, first seed: time from 10 to 90 % of the step, "
-        "time until it stays within 5 % of it, how far it goes beyond, and the mean deviation over the last fifth, in "
-        "the signal's unit. A dash: there is no clear step, as where a load is rejected."
+        "Step response to the last set-point of each task that ends at one, first seed: rise time from 10 to 90 % of "
+        "the step, settling time to 5 % of the step, overshoot, and mean deviation over the last fifth of the task in "
+        "the signal's unit. A dash: the task has no clear step, for example if it rejects a load."
     )
     heads = ("task", "controller", "signal", "rise [s]", "settling [s]", "overshoot [%]", "offset")
     return Table(heads, rows, caption)
 
 
 def _on_model_tables(found: OnModel) -> list[Table | None]:
-    """A table a controller: each met another plant, so no table holds two."""
+    """One table for each controller: their plants differ, so one table must not compare two controllers."""
     tables: list[Table | None] = []
     for name, cells in (found.details.controllers if found.details is not None else {}).items():
         signals, errors = _tracking(list(cells.values()))
@@ -565,7 +567,7 @@ def _on_model_tables(found: OnModel) -> list[Table | None]:
 
 
 def _tracking(cells: Sequence[Summary]) -> tuple[list[str], list[list[float | None]]]:
-    """Signals that any cell has an error of, and the means of each cell."""
+    """Signals with a tracking error in any cell, and the mean errors of each cell."""
     signals = list(dict.fromkeys(s for cell in cells for s in cell.tracking_rmse))
     errors = [{s: found.mean for s, found in cell.tracking_rmse.items()} for cell in cells]
     return signals, [[own.get(s) for s in signals] for own in errors]
@@ -589,7 +591,9 @@ def _observer_table(results: Results) -> Table:
         if r is not None and r.mean_nis is not None
     ]  # fmt: skip
     columns = ("observer", "mean NIS", "consistent", "below 95 %", "Ljung-Box", "white below", "samples")
-    return Table(columns, rows, "Innovations on test recordings, the first 25 samples of each left out.")
+    return Table(
+        columns, rows, "Innovations on test recordings, without the first 25 samples of each recording."
+    )
 
 
 def _timing_table(timing: Timing) -> Table | None:
@@ -601,13 +605,13 @@ def _timing_table(timing: Timing) -> Table | None:
 
 
 def _watch_tables(context: Context) -> list[Table | None]:
-    """All that watches, the loops in which something breaks, and the alarms on recordings."""
+    """Tables of the channels, of the loops with a fault, and of the alarms on recordings."""
     found = context.find(WATCH)
     if isinstance(found, Absent) or found.limits is None:
         return []
     tables = [watching_table(found)]
     if found.faults:
-        heads = ("what breaks", "at [s]", "alarm after [s]", "alarms before", "guard")
+        heads = ("fault", "at [s]", "detection delay [s]", "alarms before", "guard")
         rows = [
             (
                 row.title, row.start_s, "never" if row.delay_s is None else f"{row.delay_s:.3g}", row.false_alarms,
@@ -616,10 +620,10 @@ def _watch_tables(context: Context) -> list[Table | None]:
             for row in found.faults
         ]  # fmt: skip
         tables.append(
-            Table(heads, rows, f"Loops of the task {found.faults[0].task} in which something breaks.")
+            Table(heads, rows, f"Closed loops of the task {found.faults[0].task} with a simulated fault.")
         )
     alarms = [(a.file, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for a in found.alarms]
-    heads = ("recording", "from [s]", "to [s]", "channels", "what explains it")
+    heads = ("recording", "from [s]", "to [s]", "channels", "diagnosis")
     return [*tables, Table(heads, alarms, "Alarms over the whole recordings.")]
 
 
@@ -637,7 +641,7 @@ def _pole_table(analysis: Analysis) -> Table | None:
     there = [
         points[p] for p in points if any(p in found.points for found in analysis.details.models.values())
     ]
-    return Table(columns, rows, f"Linearizations {' and '.join(there)}.")
+    return Table(columns, rows, f"Poles of the models linearized {' and '.join(there)}.")
 
 
 REPORT = Stage(

@@ -1,7 +1,7 @@
-"""What a run found, as ``results.json`` holds it: the dataclasses below, field by field.
+"""Results of a run: the dataclasses below are the content of ``results.json``, field by field.
 
-A value that a run does not have is null, and its reason stands beside it as ``NAME_reason``, or as ``reason`` for the
-whole object. Signals and balances are named with their unit, ``"phi [rad]"``.
+A missing value is null; its reason stands beside it as ``NAME_reason``, or as ``reason`` for the whole object. Names of
+signals and balances contain their unit, ``"phi [rad]"``.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from hybrid_mpc.workflow.stages.watch import WATCH, CleanAlarms, FaultedLoop, No
 Array = NDArray[np.float64]
 SCHEMA_VERSION = 11
 Errors = Mapping[str, Mapping[str, float] | str | None]
-"""Error by model, each by signal with unit; a model without one has null, and ``MODEL_reason``."""
+"""Errors by model, each by signal with unit; a model without errors has null and ``MODEL_reason``."""
 
 
 @dataclass(frozen=True)
 class DataDetails:
-    """Seconds by role, why each cut was made, and what is doubtful about the recordings."""
+    """Seconds by role, reason of each cut, and warnings about the recordings."""
 
     seconds: Mapping[str, float]
     why_cut: tuple[str, ...]
@@ -53,7 +53,7 @@ class DataDetails:
 
 @dataclass(frozen=True)
 class Data:
-    """The recordings: names of the files, hash of their contents, and what is not used of them."""
+    """The recordings: names of the files, hash of their contents, and the parts cut out."""
 
     files: tuple[str, ...]
     hash: str
@@ -63,8 +63,8 @@ class Data:
 
 @dataclass(frozen=True)
 class FittedPrior:
-    """Parameters of the fitted prior, their standard errors, those before the fit, warnings, each stage's error, and
-    why the prior's structure is in doubt.
+    """Parameters of the fitted prior, their standard errors, nominal parameters, warnings, error of each stage of the
+    fit, and reasons to doubt the prior's structure.
     """
 
     values: Mapping[str, float]
@@ -77,7 +77,7 @@ class FittedPrior:
 
 @dataclass(frozen=True)
 class SmootherNoise:
-    """What the smoother assumes: noise of each sensor, and the random walk of the unexplained acceleration."""
+    """Noise of the smoother: of each sensor, and of the random walk of each unexplained rate."""
 
     sigma: tuple[float, ...]
     walk: tuple[float, ...]
@@ -85,9 +85,9 @@ class SmootherNoise:
 
 @dataclass(frozen=True)
 class IdentificationDetails:
-    """Behind the errors. ``by_file`` is the RMSE by recording, model and output, None where a run diverged;
-    ``hybrid_over_phy`` the hybrid's ``error`` and ``e_sim`` over the fitted prior's; ``network_settings`` what replaced
-    the budget's.
+    """Details of the errors. ``by_file`` is the RMSE by recording, model and output, None if a run diverged;
+    ``hybrid_over_phy`` are the hybrid's ``error`` and ``e_sim`` over the fitted prior's; ``network_settings`` are the
+    settings that replaced the budget's.
     """
 
     prior_parameters: FittedPrior
@@ -103,7 +103,7 @@ class IdentificationDetails:
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """Which model validation recommends, which hybrid is exported, figures of all candidates, and the reason."""
+    """The recommended model, the exported hybrid, the reason, and the figures of all candidates."""
 
     recommended: str
     hybrid: str
@@ -113,9 +113,11 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class CandidateErrors:
-    """Error of a candidate on left-out parts of the training data [spreads of the outputs], its ratio to the prior's
-    (of several recordings the geometric mean of each one's), and that one's upper bound; None where a run diverged or
-    the bound is not known. ``share`` is that of the networks' correction that the model has.
+    """Errors of a candidate on held-out parts of the training data.
+
+    ``error`` is in spreads of the outputs. ``ratio`` is the geometric mean over the recordings of the ratio to the
+    prior's error, ``upper`` its upper confidence bound. None if a run diverged or the bound is unknown. ``share`` is
+    the factor of the networks' correction.
     """
 
     error: float | None
@@ -126,7 +128,7 @@ class CandidateErrors:
 
 @dataclass(frozen=True)
 class Identification:
-    """Errors of free runs on unseen data by model; see :class:`~hybrid_mpc.identify.evaluate.Scores`."""
+    """Errors of free runs on test data by model; see :class:`~hybrid_mpc.identify.evaluate.Scores`."""
 
     error: Mapping[str, float | str | None]
     rmse: Errors
@@ -146,8 +148,8 @@ class Export:
 
 @dataclass(frozen=True)
 class ControllerCosts:
-    """Cost on the plant's true state, summed over the tasks, and tracking error by signal: that of the states, or
-    of the outputs where tasks have references of those.
+    """Cost on the plant's true state, summed over the tasks, and tracking error by signal: of the states, or of the
+    outputs for tasks with references of outputs.
     """
 
     cost: float | None
@@ -158,7 +160,7 @@ class ControllerCosts:
 
 @dataclass(frozen=True)
 class Gap:
-    """Share of the distance from the better baseline to the oracle that the hybrid covers; or why there is none."""
+    """Share of the distance from the better baseline to the oracle that the hybrid covers, or why it is undefined."""
 
     value: float | None
     reason: str = ""
@@ -168,7 +170,7 @@ class Gap:
 class ControlDetails:
     """Figures by task and controller, the gap closed by task, and the hybrid's cost over that of each baseline by task.
 
-    ``most_seeds`` is the number of seeds at which a task's loops stop at the latest.
+    ``most_seeds`` is the largest number of seeds of a task.
     """
 
     tasks: Mapping[str, Mapping[str, Summary]]
@@ -198,11 +200,11 @@ class OnModelDetails:
 
 @dataclass(frozen=True)
 class OnModel:
-    """Closed loops of a machine without plant, by controller, each on another model than its own. They tell whether two
-    models agree, and nothing of the machine; each controller met another plant, so they compare nothing.
+    """Closed loops for a scenario without plant, by controller, each on another model than the controller's own.
 
-    ``plants`` names the models in place of the machine; ``default_tasks`` says that the scenario declares no tasks;
-    ``left_out`` why a controller has no loops.
+    They show whether two models agree, and nothing about the machine. Each controller has another plant, so do not
+    compare their figures. ``plants`` names the models in place of the machine; ``default_tasks`` is true if the
+    scenario declares no tasks; ``left_out`` says why a controller has no loops.
     """
 
     plants: Mapping[str, str] = field(default_factory=dict)
@@ -214,14 +216,14 @@ class OnModel:
 
 @dataclass(frozen=True)
 class EstimationDetails:
-    """What the observers were tested on."""
+    """Recordings that the observers were tested on."""
 
     recordings: tuple[ObservedRecording, ...]
 
 
 @dataclass(frozen=True)
 class ObserverFigures:
-    """What the innovations of an observer say; see :class:`~hybrid_mpc.workflow.stages.estimate.ObserverTest`."""
+    """Statistics of an observer's innovations; see :class:`~hybrid_mpc.workflow.stages.estimate.ObserverTest`."""
 
     mean_nis: float | None = None
     nis_low: float | None = None
@@ -245,7 +247,7 @@ class Estimation:
 
 @dataclass(frozen=True)
 class Promises:
-    """The table "What this kit promises" (:attr:`~hybrid_mpc.kit.artifact.Kit.promises`); None: it was not examined."""
+    """The table "What this kit promises" (:attr:`~hybrid_mpc.kit.artifact.Kit.promises`); None if not examined."""
 
     rows: tuple[Promise, ...] | None = None
     reason: str = ""
@@ -274,8 +276,8 @@ class Timing:
 
 @dataclass(frozen=True)
 class WatchDetails:
-    """What limits were learned from, limits by model and kind of readings, how much of each recording was watched, and
-    alarms where nothing disturbs the machine, in all and by channel.
+    """Data that limits were learned from, limits by model and kind of readings, monitored time of each recording, and
+    false alarms, in total and by channel.
     """
 
     sources: Mapping[str, str] = field(default_factory=dict)
@@ -288,8 +290,8 @@ class WatchDetails:
 
 @dataclass(frozen=True)
 class Watch:
-    """What watches the machine: the kind of its readings, wanted false alarms [1/h], length of the nominal data [h],
-    alarms an hour where nothing disturbs it, alarms on the recordings, and loops in which something breaks.
+    """The monitor: kind of its readings, wanted false alarm rate [1/h], length of the nominal data [h], measured false
+    alarm rate [1/h], alarms on the recordings, and loops with a fault.
     """
 
     kind: str | None = None
@@ -305,7 +307,7 @@ class Watch:
 
 @dataclass(frozen=True)
 class AnalysisDetails:
-    """The models by name at rest and at working speed, and that speed."""
+    """Linearized models by name, at rest and at working speed, and the working speed."""
 
     models: Mapping[str, ModelAnalysis]
     working_speed: tuple[float, ...] | None = None
@@ -362,16 +364,16 @@ def _without_empty(value: Any) -> Any:
 
 
 def read_results(values: Mapping[str, Any], where: str = "results") -> Results:
-    """Results from the content of ``results.json``, checked; ``where`` is the file, for messages.
+    """Results from the content of ``results.json``, checked; ``where`` names the file in messages.
 
     Raises:
-        InputError: Naming what is missing, unknown or of the wrong kind, or null without a reason.
+        InputError: If a field is missing, unknown, of the wrong kind, or null without a reason.
     """
     results = record(Results, values, where)
     if results.schema_version != SCHEMA_VERSION:
         raise InputError(
-            f"{where}: schema_version is {results.schema_version}; this version reads {SCHEMA_VERSION}"
-            " [HM-WORKFLOW-040]"
+            f"{where}: schema_version is {results.schema_version}, but this version reads {SCHEMA_VERSION}. Run the "
+            "scenario again with this version [HM-WORKFLOW-040]"
         )
     for group in (
         "identification", "control", "estimation", "promises", "timing", "watch", "analysis",
@@ -389,7 +391,7 @@ def _check_values(values: Mapping[str, Any], path: str, where: str) -> None:
             )
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(
-                f"{where}: {path}.{key} is {value}; it must be a finite number [HM-WORKFLOW-042]"
+                f"{where}: {path}.{key} is {value}; write a finite number, or null with a reason [HM-WORKFLOW-042]"
             )
         if isinstance(value, Mapping) and key != "details":
             _check_values(value, f"{path}.{key}", where)
@@ -417,7 +419,7 @@ def collect(context: Context) -> Results:
 
 
 def recordings(context: Context) -> Data:
-    """What the recordings are."""
+    """Results of stage data."""
     data = context.read(DATA)
     return Data(
         data.files,
@@ -428,7 +430,7 @@ def recordings(context: Context) -> Data:
 
 
 def identification(context: Context) -> Identification:
-    """How well the models predict, and which one is recommended."""
+    """Results of the identification: errors of all models, and the recommended model."""
     found, prior, chosen = context.read(EVALUATION), context.prior, context.read(CHOICE).choice
     network = context.settings.network()
     model = {name: scores.model for name, scores in found.scores.items()}
@@ -477,24 +479,24 @@ def identification(context: Context) -> Identification:
 
 
 def _with_reasons(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by model; those that are none with their reason."""
+    """Values of all models, with a reason for each missing value."""
     every = {name: values.get(name) for name in MODELS}
     reasons = {name: "a free run diverged" if name in values else NO_BALANCE for name in MODELS}
     return every | {f"{name}_reason": reasons[name] for name, value in every.items() if value is None}
 
 
 def _all_finite(values: Mapping[str, float]) -> dict[str, float] | None:
-    """Values by signal, or None where one of them is not finite."""
+    """Values by signal, or None if one of them is not finite."""
     return dict(values) if all(math.isfinite(value) for value in values.values()) else None
 
 
 def finite(value: float) -> float | None:
-    """The number, or None where it is none."""
+    """The number, or None if it is not finite."""
     return float(value) if math.isfinite(float(value)) else None
 
 
 def ratio(value: float | None, baseline: float | None) -> float | None:
-    """A value over the baseline's, or None where one of them is missing, or the baseline is zero."""
+    """A value over the baseline's, or None if one of them is missing or the baseline is zero."""
     return None if value is None or not baseline else value / baseline
 
 
@@ -546,8 +548,10 @@ def _costs(
 def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, str]:
     """Share of the distance from the better baseline to the measuring oracle that the hybrid covers in a task.
 
-    The baselines are the fitted prior with and without disturbance observer; the hybrid is the one with it. None, with
-    a reason, where the distance is below twice its standard error; one seed has no standard error.
+    The baselines are the fitted prior with and without disturbance observer; the hybrid has the observer. Returns None
+    and a reason if the distance is below twice its standard error; one seed has no standard error.
+
+    gap closed = (J_baseline - J_hybrid) / (J_baseline - J_oracle), with mean costs J over the seeds.
     """
     if "oracle" not in cells:
         return None, "the scenario has no oracle"
@@ -556,13 +560,15 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
     if min(len(baseline), len(oracle)) < 2:
         single = "the oracle ran" if len(oracle) < 2 else "the prior ran"
-        return None, f"{single} with one seed, which has no standard error; budget full has more"
+        return None, f"{single} with one seed only, which gives no standard error; use --budget full"
     if not all(np.all(np.isfinite(c)) for c in (baseline, hybrid, oracle)):
         return None, "a loop diverged"
     gap = float(baseline.mean() - oracle.mean())
     error = math.sqrt(sum(float(c.var(ddof=1)) / len(c) for c in (baseline, oracle)))
     if gap <= 2.0 * error:
-        return None, f"baseline {baseline.mean():.4g} and oracle {oracle.mean():.4g} do not differ enough"
+        return None, (
+            f"the costs of baseline {baseline.mean():.4g} and oracle {oracle.mean():.4g} do not differ significantly"
+        )
     return float(baseline.mean() - hybrid.mean()) / gap, ""
 
 
@@ -596,7 +602,7 @@ def _observer(test: ObserverTest | Absent) -> ObserverFigures:
 
 
 def promises(context: Context) -> Promises:
-    """What the kit promises, or why that was not examined."""
+    """The promises of the kit, or why they were not examined."""
     found = context.find(PROMISES)
     return Promises(reason=found.reason) if isinstance(found, Absent) else Promises(found.rows)
 
@@ -636,7 +642,7 @@ def _watch(context: Context) -> Watch:
     if found.limits is None or found.clean is None:
         return Watch(found.kind, details=details, reason=found.reason)
     clean, own = found.clean, found.limits
-    lacks = "plant that could break" if context.scenario.plant is None else "task in which nothing goes wrong"
+    lacks = "plant to simulate faults with" if context.scenario.plant is None else "task without faults"
     return Watch(
         found.kind, own.false_alarms_per_hour, own.hours,
         clean.alarms / (clean.seconds / 3600.0) if clean.seconds else 0.0,

@@ -1,4 +1,4 @@
-"""Stage watch: limits of all channels, learned, put into the kit, tried on recordings and on loops with faults."""
+"""Stage watch: learn the limits of all channels, write them to the kit, test them on recordings and faulted loops."""
 
 from __future__ import annotations
 
@@ -38,27 +38,27 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 RATES = (1.0, 2.0, 5.0, 10.0)
-"""False alarms an hour (of the machine's seconds, see :func:`rates`) on nominal data: the first that the data are long
-enough for."""
+"""False alarm rates [per hour, scaled with the time constant of the machine by :func:`rates`]; limits are learned for
+the first rate that the nominal data are long enough for."""
 NOMINAL = ("train", "valid", "nominal")
 """Roles of undisturbed parts of recordings."""
 HELD: tuple[str, ...] = ("valid", "nominal")
 WITH_TRAINING = (*HELD, "train")
-"""Those that no parameter was fitted to, and with them the training's. Test recordings are kept to try limits on."""
+"""Held-out roles, and these with the training data. Limits are tested on the test recordings."""
 LEARNED_FROM: Mapping[tuple[str, ...], str] = {
-    HELD: "recordings that nothing was trained on",
-    WITH_TRAINING: "undisturbed recordings, also those of the training, which the model fits better than new ones",
+    HELD: "held-out recordings",
+    WITH_TRAINING: "undisturbed recordings including training data, which the model fits better than new data",
 }
-"""What limits are learned from, in words."""
+"""Data that limits are learned from, in words."""
 FAULT_SEED = 600
-"""Number of the loops in which something breaks, away from those that limits are learned from."""
+"""Seed of the loops with a fault; loops that limits are learned from have other seeds."""
 UNLIKELY = 0.05
-"""Alarms of which so many or more are less likely than this are more than the limits were learned for."""
+"""Significance level of too many false alarms: probability of at least that many alarms at the rate of the limits."""
 SHOWN_RECORDINGS = 4
-"""Recordings that are drawn."""
+"""Number of recordings that are drawn."""
 KEPT = ("t", "values", "levels", "share", "on", "frozen", "alarm")
-"""What of a trace is kept for the report."""
-NO_PROBLEM = "the monitor's estimator needs the scenario's control problem (input range, sensor noise)"
+"""Fields of a trace that are kept for the report."""
+NO_PROBLEM = "the scenario defines no control problem, which gives the monitor's estimator input range and sensor noise"
 
 
 def rates(model: HybridModel) -> tuple[float, ...]:
@@ -73,7 +73,7 @@ def rates(model: HybridModel) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class RecordedAlarm:
-    """An alarm on a recording: file, from and to [s], the channels that alarmed in their order, what explains it."""
+    """An alarm on a recording: file, start and end [s], channels in the order of their alarms, diagnosis."""
 
     file: str
     start_s: float
@@ -84,16 +84,14 @@ class RecordedAlarm:
     def __post_init__(self) -> None:
         if not self.start_s <= self.end_s:
             raise InputError(
-                f"an alarm on {self.file} ends at {self.end_s} s, before it starts at {self.start_s} s"
+                f"{self.file}: alarm ends at {self.end_s} s, before its start at {self.start_s} s. Correct the interval"
                 " [HM-WORKFLOW-043]"
             )
 
 
 @dataclass(frozen=True)
 class CleanAlarms:
-    """Alarms where nothing disturbs the machine: time known to be undisturbed [s] and the alarms that begin in it, then
-    those of test data alone.
-    """
+    """False alarms: undisturbed time [s] and the alarms that begin in it, of all data and of the test data alone."""
 
     seconds: float = 0.0
     alarms: int = 0
@@ -101,8 +99,7 @@ class CleanAlarms:
     test_alarms: int = 0
 
     def too_many(self, per_hour: float) -> bool:
-        """Whether these are more than a rate of false alarms [1/h] explains: so many or more have a probability below
-        5 % (Poisson).
+        """Whether the alarms are significantly more than a rate [1/h] explains: P(N >= alarms) < 5 %, N Poisson.
 
         Example:
             >>> [CleanAlarms(300.0, alarms).too_many(10.0) for alarms in (0, 1, 3, 4)]
@@ -115,23 +112,21 @@ class CleanAlarms:
         return per_hour * self.seconds / 3600.0
 
     def words(self, per_hour: float) -> str:
-        """The alarms beside those that the limits were learned for.
+        """Text that compares the alarms with those expected at a rate of false alarms [1/h].
 
         Example:
             >>> CleanAlarms(300.0, 1).words(10.0)
-            '1 in 300 s without a disturbance; at 10 false alarms an hour 0.83 are expected'
+            '1 in 300 s of undisturbed data; 0.83 are expected at 10 false alarms an hour'
         """
         return (
-            f"{self.alarms} in {self.seconds:.0f} s without a disturbance; at {per_hour:g} false alarms an hour "
-            f"{self.expected(per_hour):.2g} are expected"
+            f"{self.alarms} in {self.seconds:.0f} s of undisturbed data; {self.expected(per_hour):.2g} are expected "
+            f"at {per_hour:g} false alarms an hour"
         )
 
 
 @dataclass(frozen=True)
 class NominalLoop:
-    """A loop that limits were learned from: its task and number, the share to which friction drifts, its length [s] and
-    its cost.
-    """
+    """A loop that limits were learned from: task, seed, factor that friction drifts to, length [s], cost."""
 
     task: str
     seed: int
@@ -142,18 +137,18 @@ class NominalLoop:
 
 @dataclass(frozen=True)
 class FaultedLoop:
-    """A loop in which something breaks.
+    """A closed loop with a simulated fault.
 
     Args:
         fault: Short name of the fault.
-        title: In words.
+        title: Description of the fault.
         task: Name of the task.
-        start_s: When it sets in [s].
-        delay_s: Time to the first alarm that begins from then on [s]; None: never.
-        channels: The channels of that alarm, in the order in which they alarmed.
-        diagnosis: What the diagnosis takes it for; empty where it says nothing.
-        false_alarms: Alarms before it sets in.
-        switches: Changes of the guard's mode.
+        start_s: Begin of the fault [s].
+        delay_s: Detection delay [s]: time from the begin of the fault to the first alarm after it; None: no alarm.
+        channels: The channels of that alarm, in the order of their alarms.
+        diagnosis: Diagnosis of that alarm; empty without a diagnosis.
+        false_alarms: Number of alarms before the fault begins.
+        switches: Changes of the guard's mode. Default: none.
     """
 
     fault: str
@@ -169,19 +164,19 @@ class FaultedLoop:
 
 @dataclass(frozen=True)
 class WatchResult:
-    """What was learned, and what the monitor of the recommended model says of recordings and loops.
+    """Learned limits, and the results of the recommended model's monitor on recordings and loops.
 
     Args:
-        watch: What the kit holds, by model, the recommended one last.
-        kind: Kind of the readings that watch the machine.
-        sources: What limits were learned from, in words, by kind.
-        reason: Why nothing watches. Default: limits were learned.
-        loops: Loops that limits were learned from. Default: recordings.
-        channels: The channels. Default: nothing watches.
-        recordings: Seconds that were watched and that were not, by recording and reason.
+        watch: Limits in the kit, by model, the recommended model last.
+        kind: Kind of the monitor's readings.
+        sources: Description of the data that limits were learned from, by kind.
+        reason: Why there are no limits. Default: limits were learned.
+        loops: Loops that limits were learned from. Default: none, limits were learned from recordings.
+        channels: The channels. Default: none.
+        recordings: Monitored and unmonitored seconds, by recording and reason.
         alarms: Alarms on whole recordings.
-        clean: Alarms where nothing disturbs the machine; ``by_channel`` those of each channel and frozen sensor.
-        faults: Loops in which something breaks; None without a plant or without a calm task.
+        clean: False alarms; ``by_channel`` those of each channel and frozen-sensor check.
+        faults: Loops with a fault; None without a plant or without a task that has no faults of its own.
         shown: Names of the recordings whose traces are kept.
         arrays: Traces, see :func:`read_trace`.
     """
@@ -202,14 +197,14 @@ class WatchResult:
 
     @property
     def limits(self) -> WatchLimits | None:
-        """What the machine is watched by; None: nothing was learned."""
+        """Limits of the monitor that watches the machine; None if none were learned."""
         own = list(self.watch.values())
         return own[-1].limits.get(self.kind) if own else None
 
 
 @dataclass(frozen=True)
 class Data:
-    """What limits are learned from: records, which samples of each count, in words what they are, their hash."""
+    """Data that limits are learned from: records, a mask of the counted samples of each, description, hash."""
 
     records: Sequence[TrajectoryLike]
     masks: Sequence[NDArray[np.bool_]]
@@ -219,9 +214,9 @@ class Data:
 
 
 def watch_stage(context: Context) -> WatchResult | Absent:
-    """Learn limits with hybrid, prior and the recommended model, put them into the kit, and try those of the last.
+    """Learn limits with hybrid and prior, write them to the kit, and test those of the recommended model.
 
-    Where none can be learned for the readings that would watch the machine the result holds the reason.
+    If no limits can be learned for the readings of the machine, the result holds the reason.
     """
     scenario = context.scenario
     if scenario.control is None:
@@ -249,7 +244,7 @@ def watch_stage(context: Context) -> WatchResult | Absent:
             try:
                 limits[kind], sources[kind] = _learned(context, kit, name, kind, rest or kit.known_rest, data)
             except InputError as none:
-                missing.append(f"no limits of {kind} could be learned: {none} [HM-WORKFLOW-044]")
+                missing.append(f"limits of {kind} could not be learned: {none} [HM-WORKFLOW-044]")
         watch[name] = WatchFile(limits, "; ".join(missing), rest, parts.observer(name))
     write_watch(context.out / "model", watch)
     kit = context.kit
@@ -259,7 +254,7 @@ def watch_stage(context: Context) -> WatchResult | Absent:
         return replace(found, reason=watch[kit.recommended].reason)
     found = _on_recordings(context, kit, found)
     if scenario.plant is not None and _calm(context) and kind in watch["hybrid"].limits:
-        context.progress.update("faults", 0, 1, "loops in which something breaks")
+        context.progress.update("faults", 0, 1, "loops with simulated faults")
         found = _faulted(context, kit, found)
     return found
 
@@ -277,9 +272,9 @@ def _calm(context: Context) -> bool:
 def _learned(
     context: Context, kit: Kit, name: str, kind: str, rest: tuple[float, ...] | None, data: Data | None
 ) -> tuple[WatchLimits, str]:
-    """Limits of a model's readings, and what they were learned from.
+    """Limits of a model's readings, and a description of the data that they were learned from.
 
-    Of recordings those that nothing was fitted to, if they suffice; else with those of the training.
+    Without ``data``, held-out recordings are used if they suffice, else all undisturbed recordings.
     """
     model, estimator = kit.models[name], kit.observer(name)
     readings = make_readings(model, kind, rest_speed=rest)
@@ -305,19 +300,19 @@ def _learned(
         if found.rated:
             return found, source
     except InputError:
-        pass  # nothing of them is long enough; the others may be
+        pass  # held-out recordings are too short; with the training data they may suffice
     return from_data(_recorded(context, WITH_TRAINING))
 
 
 def _recorded(context: Context, roles: tuple[str, ...]) -> Data:
-    """Undisturbed parts of recordings with these roles; recordings without one are left out."""
+    """Undisturbed parts of recordings with these roles; recordings without such a part are left out."""
     masks = {r.name: inside(context, r, roles) for r in context.dataset.whole}
     records = [r for r in context.dataset.whole if masks[r.name].any()]
     return Data(records, [masks[r.name] for r in records], LEARNED_FROM[roles], context.dataset.hash)
 
 
 def _loop_data(context: Context) -> Data:
-    """Loops of the simulated machine, like those that will be watched."""
+    """Fault-free loops of the simulated machine, similar to the loops to be monitored."""
     settings, model = context.settings, context.kit.models["hybrid"]
     wanted = nominal_loops(
         context.scenario, context.budget, model, named=settings.scenario, run_seed=settings.seed
@@ -338,7 +333,7 @@ def _loop_data(context: Context) -> Data:
 
 
 def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
-    """Whole recordings, watched: alarms, those where nothing disturbs the machine, and traces to be drawn."""
+    """Monitor whole recordings: all alarms, false alarms, and traces for the figures."""
     whole, monitor, estimator = context.dataset.whole, kit.monitor(), kit.observer()
     made: list[Diagnoser] = []
 
@@ -372,8 +367,9 @@ def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResul
 
 
 def _faulted(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
-    """A loop of each fault, from the middle of a calm task on; a guard takes the input away where a sensor freezes, if
-    the scenario says with which input the machine may be left.
+    """A loop for each fault, which begins in the middle of a fault-free task.
+
+    If the scenario declares a safe input, a guard switches to it when a sensor freezes.
     """
     scenario, settings = context.scenario, context.settings
     bench, model, task = Bench(scenario, {MODEL: kit}), kit.models["hybrid"], nominal_tasks(scenario)[0]
@@ -388,7 +384,7 @@ def _faulted(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
         context.progress.update("faults", i, len(tried), case.title)
         spec = replace(base, faults=(case.fault,))
         row, result = bench.run(spec)
-        # the estimator is deterministic: over the record it says again what it said in the loop
+        # the estimator is deterministic: a replay of the record repeats its estimates in the loop
         trace, alarms = explained(
             kit.monitor("hybrid", task=task.name),
             bench.parts(spec)[0],
@@ -419,7 +415,7 @@ def trace_arrays(name: str, trace: Trace, y: Array) -> dict[str, Array]:
 
 
 def read_trace(arrays: Mapping[str, Any], name: str, found: WatchResult, outputs: Sequence[str]) -> Trace:
-    """The trace that :func:`trace_arrays` kept; what the report does not show is empty."""
+    """The trace that :func:`trace_arrays` kept; fields that the report does not show are empty."""
     own, none = {key: arrays[f"{name}/{key}"] for key in KEPT}, np.zeros((0, 0))
     return Trace(
         channels=found.channels,
@@ -438,9 +434,9 @@ def read_trace(arrays: Mapping[str, Any], name: str, found: WatchResult, outputs
 def clean_alarms(
     context: Context, recordings: Sequence[Trajectory], on: Sequence[NDArray[np.bool_]]
 ) -> CleanAlarms:
-    """Alarms that are ``on`` ``(n,)`` in the undisturbed parts of the recordings, which have any role.
+    """False alarms: alarms ``on`` ``(n,)`` that begin in undisturbed parts of the recordings, whatever their role.
 
-    An alarm counts where it begins: it may reach in from a disturbed part.
+    An alarm that began in a disturbed part and lasts into an undisturbed part does not count.
     """
     seconds, counts = [0.0, 0.0], [0, 0]
     for recording, alarm in zip(recordings, on, strict=True):
@@ -455,7 +451,7 @@ def clean_alarms(
 def clean_windows(
     context: Context, recording: Trajectory, roles: tuple[str, ...]
 ) -> list[tuple[float, float]]:
-    """Stretches of a recording whose role says that nothing disturbs the machine there, ``(start, end)`` [s]."""
+    """Intervals ``(start, end)`` [s] of a recording with one of these roles, all of them undisturbed."""
     stem = recording.file
     if stem in context.spec.windows:
         return [(w.start, w.end) for w in context.spec.windows[stem] if w.role in roles]
@@ -464,7 +460,7 @@ def clean_windows(
 
 
 def inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> NDArray[np.bool_]:
-    """Which samples ``(n,)`` of a recording lie in stretches of such roles in which nothing disturbs the machine."""
+    """Mask ``(n,)`` of the samples of a recording within the intervals of these roles."""
     found = np.zeros(len(recording.t), dtype=bool)
     for start, end in clean_windows(context, recording, roles):
         found |= (recording.t >= start) & (recording.t <= end)
@@ -472,7 +468,7 @@ def inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> N
 
 
 WATCH = Stage(
-    "watch", "learning what to alarm by", WatchResult, watch_stage,
+    "watch", "learning the monitor's limits", WatchResult, watch_stage,
     lambda context: {**what_loops_read(context), "causes": context.scenario.causes}, (DATA, EXPORT, NOISE),
     optional=True, restore=put_limits,
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""One table of all that watches a machine: channels, thresholds, false alarms, how soon faults are seen."""
+"""The report's table of the monitor: channels, thresholds, false alarms, detection delays of faults."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ from scipy.stats import chi2
 from hybrid_mpc.report.page import Table
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 
-HEADS = ("channel", "threshold", "false alarms an hour (95 % interval)", "faults: alarm after", "taken for")
+HEADS = (
+    "channel",
+    "threshold",
+    "false alarms an hour (95 % interval)",
+    "detection delay of faults",
+    "diagnosis",
+)
 CAPTION = (
-    "All that watches the machine. False alarms are those that begin where nothing disturbs it, with the interval of a "
-    "Poisson count. Each fault stands beside the channel that alarms first in a closed loop with it."
+    "Channels of the monitor. False alarms begin where nothing disturbs the machine; their interval is that of a "
+    "Poisson count. Each simulated fault stands beside the channel that alarms first."
 )
 
 
 def watching_table(found: WatchResult) -> Table | None:
-    """The table of the channels that have limits, of frozen sensors, and of all together; None without limits."""
+    """Table of the channels with limits, of the frozen-sensor checks, and of all together; None without limits."""
     limits = found.limits
     if limits is None:
         return None
@@ -65,7 +71,7 @@ def _row(
 
 
 def _seen(faults: Sequence[FaultedLoop]) -> tuple[str, str]:
-    """How soon faults are seen, and what they are taken for."""
+    """Detection delays and diagnoses of faults, as text."""
     after = [f"{row.fault} {'never' if row.delay_s is None else f'{row.delay_s:.2g} s'}" for row in faults]
-    told = [f"{row.fault}: {row.diagnosis or 'nothing'}" for row in faults if row.delay_s is not None]
-    return "; ".join(after), "; ".join(told)
+    causes = [f"{row.fault}: {row.diagnosis or 'none'}" for row in faults if row.delay_s is not None]
+    return "; ".join(after), "; ".join(causes)
