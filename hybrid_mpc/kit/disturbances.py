@@ -37,8 +37,8 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     Disturbances of controlled outputs act at the inputs. If errors of the parameters require disturbances larger than
     the inputs' ranges, they act on the rates of the states that the controlled outputs measure. An output
     without weight has a disturbance of its own if errors of the parameters move it in a way that no load at an input
-    explains; otherwise the controlled outputs would have an offset. There are never more disturbances than outputs, since more are not observable. A
-    problem with references of states has one disturbance at each input.
+    explains; otherwise the controlled outputs would have an offset. There are never more disturbances than outputs,
+    since more are not observable. A problem with references of states has one disturbance at each input.
 
     Args:
         model: The fitted prior.
