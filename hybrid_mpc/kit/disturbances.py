@@ -40,10 +40,10 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
 
     Disturbances of controlled outputs act at the inputs. If errors of the parameters require disturbances larger than
     the inputs' ranges, they act on the rates of the states that the controlled outputs measure; if those would change
-    the effect of the inputs (:func:`gain_left`), they act on the outputs. An output without weight has a disturbance of its
-    own if errors of the parameters move it in a way that no load at an input explains; otherwise the controlled outputs
-    would have an offset. There are never more disturbances than outputs, since more are not observable. A problem with
-    references of states has one disturbance at each input.
+    the effect of the inputs (:func:`gain_left`), they act on the outputs. An output without weight has a disturbance of
+    its own if errors of the parameters move it in a way that no load at an input explains; otherwise the controlled
+    outputs would have an offset. There are never more disturbances than outputs, since more are not observable. A
+    problem with references of states has one disturbance at each input.
 
     Args:
         model: The fitted prior.
@@ -153,8 +153,8 @@ def gain_left(model: HybridModel, control: OCP) -> float:
         for column in np.linalg.lstsq(matrix, asked, rcond=RANK)[0].T:
             x, h, d = np.split(column, [model.n_x, n_z])
             for sign in (1.0, -1.0):
-                there = (v + sign * by for v, by in zip(point, (x, h, on_u @ d), strict=True))
-                after = _slow_gain(model, *there, control.horizon)[held]
+                x_1, h_1, u_1 = (v + sign * by for v, by in zip(point, (x, h, on_u @ d), strict=True))
+                after = _slow_gain(model, x_1, h_1, u_1, control.horizon)[held]
                 if np.all(np.isfinite(after)) and np.all(np.isfinite(before)):
                     found.append(float(np.linalg.eigvals(after @ np.linalg.pinv(before)).real.min()))
     return min(found)
