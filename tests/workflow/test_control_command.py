@@ -224,7 +224,7 @@ def test_noise_that_does_not_fit(call, run_folder, tmp_path):
     folder = shutil.copytree(run_folder / "model", tmp_path / "model")
     set_process_noise(folder, {"prior_observer": [1e-3], "hybrid_observer": [1e-4, 2e-2]})
     code, _, error = call("golf_robot", "--model", folder, "--out", tmp_path / "o")
-    assert (code, "process_noise" in error) == (2, True)
+    assert (code, "HM-KIT-009" in error) == (2, True)
 
 
 def test_the_folder_must_be_empty(call, run_folder, tmp_path):
