@@ -137,11 +137,11 @@ def test_a_folder_alone_has_loops_where_it_holds_what_they_need(golf_artifact, t
     save_loop(folder, loop_settings(scenario))
     given, notes = analysis_input(AnalysisSettings(folder))
     assert given.filters == {}
-    assert "holds no process noise" in notes[1]
+    assert "no process noise" in notes[1]
     set_process_noise(folder, {name: [1e-4, 2e-2] for name in ("prior_observer", "hybrid_observer")})
     given, notes = analysis_input(AnalysisSettings(folder))
     assert set(given.filters) == {(m, f) for m in ("prior", "hybrid") for f in ("quiet", "jump")}
-    assert notes[1] == "filters' noise: the model's own"
+    assert notes[1] == "observers' noise: the model's own"
 
 
 def test_the_command_of_the_page_repeats_the_analysis(tmp_path):
