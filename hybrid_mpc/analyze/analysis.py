@@ -450,7 +450,7 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
     unit = machine_second(some.dt, some.time_unit)
     if some.n_u != 1:
         raise InputError(
-            f"responses are estimated for one input; this machine has {some.n_u} [HM-ANALYZE-001]"
+            f"responses: only estimated for machines with one input; this machine has {some.n_u} [HM-ANALYZE-001]"
         )
     if given.recordings:
         length = min(10.0 * unit, 0.25 * max(u.size for u, _, _ in given.recordings) * some.dt)
@@ -479,7 +479,7 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
         source = f"odd multisine of {size}{around}, {low:g} to {high:g} Hz, {PERIODS} periods"
     else:
         raise InputError(
-            "there is neither a recording nor a simulated machine to take a response from; give --data FILE"
+            "responses: neither a recording nor a simulated machine is available; give --data FILE"
             " [HM-ANALYZE-002]"
         )
     tried = {name: _tried(partial(response, model)) for name, model in models.items()}
@@ -494,7 +494,7 @@ def _response_error(model: MeasuredResponse, machine: MeasuredResponse) -> Respo
     clean = (machine.coherence > 0.8) & np.isfinite(machine.response) & np.isfinite(model.response)
     if not clean.any():
         raise InputError(
-            "responses: at no frequency is the coherence above 0.8; excite the machine harder"
+            "responses: the coherence is below 0.8 at all frequencies. Excite the machine more strongly"
             " [HM-ANALYZE-003]"
         )
     error = np.abs(model.response - machine.response)[clean] / np.abs(machine.response[clean])
@@ -506,12 +506,13 @@ def schedules_of(given: AnalysisInput) -> dict[str, ScheduleAnalysis]:
     ocp = given.ocp
     if ocp is None:
         raise InputError(
-            "a gain schedule needs the weights of the scenario's control problem [HM-ANALYZE-004]"
+            "gain schedule: it needs the weights of a control problem; give the scenario control=OCP(...) "
+            "[HM-ANALYZE-004]"
         )
     found = {}
     for name, model in sorted(given.models.items(), key=lambda m: m[1].n_h):
         if model.n_x != 2 or model.n_u != 1:
-            raise InputError("the schedule is made over one position with one input [HM-ANALYZE-005]")
+            raise InputError("gain schedule: only computed for one position and one input [HM-ANALYZE-005]")
         points, not_held = _held(model, np.linspace(given.x_range[0, 0], given.x_range[0, 1], POSITIONS))
         weights = ocp.q * model.dt, (ocp.r + ocp.r_delta) * model.dt
         found[name] = ScheduleAnalysis(
@@ -534,7 +535,7 @@ def _held(model: HybridModel, positions: Array) -> tuple[list[tuple[Array, Array
             lost.append(q)
     if not found:
         raise InputError(
-            f"model {model.name}: no input was found that holds a position of the range [HM-ANALYZE-006]"
+            f"model {model.name}: no input holds a position of the range; check the input limits [HM-ANALYZE-006]"
         )
     return [(np.array([q, 0.0]), found[q]) for q in sorted(found)], sorted(lost)
 
@@ -544,7 +545,10 @@ def loops_of(
 ) -> dict[str, dict[str, dict[str, LoopAnalysis]]]:
     """Each model's controller and filter around itself, and the prior's around the hybrid."""
     if given.ocp is None or not given.filters:
-        raise InputError("loops need the scenario's control problem and the filters' noise [HM-ANALYZE-007]")
+        raise InputError(
+            "loops: the scenario's control problem or the observers' noise is missing; run the scenario with "
+            "control=OCP(...) [HM-ANALYZE-007]"
+        )
     around = [(n, n) for n in given.models]
     if {"prior", "hybrid"} <= set(given.models):
         around.append(("prior", "hybrid"))

@@ -106,7 +106,7 @@ def equilibria(
             " [HM-ANALYZE-008]"
         )
     if starts < 1:
-        raise InputError(f"equilibria: at least one start is needed, got {starts} [HM-ANALYZE-009]")
+        raise InputError(f"equilibria: give at least one start, got {starts} [HM-ANALYZE-009]")
     from scipy.stats import qmc  # a second of start-up that few need
 
     size = box[:, 1] - box[:, 0]

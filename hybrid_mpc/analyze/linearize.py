@@ -32,7 +32,7 @@ def period(sys: Any) -> float:
     dt = sys.dt
     if dt is None or dt is True or not dt > 0:
         raise InputError(
-            f"linear analysis: needs a discrete system with a period, its dt is {dt} [HM-ANALYZE-010]"
+            f"linear analysis: give a discrete system with a period; its dt is {dt} [HM-ANALYZE-010]"
         )
     return float(dt)
 
@@ -70,8 +70,8 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
     """
     if continuous and model.n_h:
         raise InputError(
-            f"model {model.name} has {model.n_h} hidden states, which step once a period of {model.dt:g} s and have "
-            "no rate; leave continuous=True out, or linearize the prior [HM-ANALYZE-011]"
+            f"model {model.name}: its {model.n_h} hidden states are discrete with a period of {model.dt:g} s and "
+            "have no rate. Omit continuous=True, or linearize the prior [HM-ANALYZE-011]"
         )
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
     if continuous:
@@ -240,7 +240,7 @@ def friction_slopes(
     size = _positive(speeds, np.size(speeds))
     if not 0 <= axis < n_q:
         raise InputError(
-            f"friction: axis {axis} given, model {model.name} has axes 0 to {n_q - 1} [HM-ANALYZE-013]"
+            f"friction: no axis {axis}; model {model.name} has axes 0 to {n_q - 1} [HM-ANALYZE-013]"
         )
     held = np.zeros(model.n_u) if u is None else vector(u, model.n_u, "u")
     x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
@@ -323,16 +323,15 @@ class AlongTrajectory:
         """
         if not 0 <= skip < len(self.A):
             raise InputError(
-                f"mean: {skip} periods to leave out, the trajectory has {len(self.A)} [HM-ANALYZE-015]"
+                f"mean: skip of {skip} periods is too large; the trajectory has {len(self.A)} [HM-ANALYZE-015]"
             )
         return _state_space(self.model, *(m[skip:].mean(axis=0) for m in (self.A, self.B, self.C, self.D)))
 
     def transition(self, start: int, end: int) -> Array:
-        """``A_{end-1} ... A_start`` ``(n_z, n_z)``: what a deviation at ``start`` has become at ``end``."""
+        """Transition matrix ``A_{end-1} ... A_start`` ``(n_z, n_z)`` from ``start`` to ``end``."""
         if not 0 <= start <= end <= len(self.A):
             raise InputError(
-                f"transition: 0 <= start <= end <= {len(self.A)} needed, got {start} and {end}"
-                " [HM-ANALYZE-016]"
+                f"transition: give 0 <= start <= end <= {len(self.A)}, got {start} and {end} [HM-ANALYZE-016]"
             )
         product = np.eye(self.A.shape[1])
         for a in self.A[start:end]:
@@ -370,12 +369,13 @@ def linearize_along(
     free = given.shape == (model.n_x,)
     if inputs.shape != (n, model.n_u) or not n or start.shape != (model.n_h,):
         raise InputError(
-            f"model {model.name}: u {inputs.shape} and h {start.shape} given, (n, {model.n_u}) with n > 0 and "
-            f"({model.n_h},) needed [HM-ANALYZE-017]"
+            f"model {model.name}: got the shapes {inputs.shape} of u and {start.shape} of h; give (n, {model.n_u}) "
+            f"with n > 0 and ({model.n_h},) [HM-ANALYZE-017]"
         )
     if not free and given.shape != (n, model.n_x):
         raise InputError(
-            f"model {model.name}: x {given.shape} given, ({model.n_x},) or ({n}, {model.n_x}) needed [HM-ANALYZE-018]"
+            f"model {model.name}: got the shape {given.shape} of x; give ({model.n_x},) or ({n}, {model.n_x}) "
+            "[HM-ANALYZE-018]"
         )
     states, hidden = np.empty((n, model.n_x)), np.empty((n, model.n_h))
     now, h_now = given if free else given[0], start
@@ -384,7 +384,7 @@ def linearize_along(
         now, h_now = (m.full().ravel() for m in model.step(states[k], h_now, inputs[k], model.w, model.p))
     if not (np.all(np.isfinite(states)) and np.all(np.isfinite(hidden))):
         raise InputError(
-            f"model {model.name}: the free run is not finite; take a shorter one or other inputs [HM-ANALYZE-019]"
+            f"model {model.name}: the free run is not finite. Use a shorter run or other inputs [HM-ANALYZE-019]"
         )
     every = jacobians(model).map(n)(states.T, hidden.T, inputs.T)
     a, b, c, d = (m.full().reshape(m.shape[0], n, -1).transpose(1, 0, 2) for m in every)

@@ -100,18 +100,20 @@ def mpc_gain(
     x0, u0, h0 = operating_point(model, x, u, h)
     if np.any(u0 <= ocp.u_min) or np.any(u0 >= ocp.u_max):
         raise InputError(
-            f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, where it does not move [HM-ANALYZE-020]"
+            f"MPC gain: the input {u0.tolist()} lies on or outside the bounds, so its gain is zero. Choose another "
+            "point [HM-ANALYZE-020]"
         )
     if ocp.economic is not None or ocp.n_y:
         raise InputError(
-            "MPC gain: the problem has an economic stage cost, or weights on outputs; its gain depends on its plan"
+            "MPC gain: the problem has an economic stage cost or weights on outputs, so its gain depends on its plan"
             " [HM-ANALYZE-021]"
         )
     z0 = np.concatenate([x0, h0])
     plan, z = np.tile(u0, (n, 1)), np.tile(z0, (n + 1, 1))
     if np.any(controller.problem.soft.excess(controller.problem.soft.values(z[:, :n_x], plan)) > 0):
         raise InputError(
-            f"MPC gain: the point x = {x0.tolist()} violates a soft bound; take one where none acts [HM-ANALYZE-022]"
+            f"MPC gain: the point x = {x0.tolist()} violates a soft bound. Choose a point without an active bound "
+            "[HM-ANALYZE-022]"
         )
     sys = linearize(model, x0, u0, h0) if system is None else system
     a, b = np.asarray(sys.A, dtype=float), np.asarray(sys.B, dtype=float)
@@ -177,7 +179,8 @@ def solved_gain(
         found = controller.solve(last.beginning_with(before), estimate, np.tile(goal, (ocp.horizon + 1, 1)))
         if not found.status.ok:
             raise InputError(
-                f"MPC gain: a solve at x = {x0.tolist()} fails: {found.status.value} [HM-ANALYZE-023]"
+                f"MPC gain: the solve at x = {x0.tolist()} failed: {found.status.value}. Choose another point "
+                "[HM-ANALYZE-023]"
             )
         return found
 
@@ -185,7 +188,7 @@ def solved_gain(
         plan = solved(at, u0, row, plan)
     if np.any(plan.u[0] <= ocp.u_min) or np.any(plan.u[0] >= ocp.u_max):
         raise InputError(
-            f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, where it does not move"
+            f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, so its gain is zero. Choose another point"
             " [HM-ANALYZE-024]"
         )
     steps = DIFFERENCE * np.concatenate(
@@ -249,7 +252,7 @@ def gain_schedule(
     """
     given = [operating_point(model, x, u, None) for x, u in points]
     if not given:
-        raise InputError("gain schedule: no operating point given [HM-ANALYZE-025]")
+        raise InputError("gain schedule: give at least one operating point [HM-ANALYZE-025]")
     weights = np.diag(np.concatenate([vector(q, model.n_x, "q"), np.zeros(model.n_h)]))
     costs = np.diag(vector(r, model.n_u, "r"))
     gains, radii = [], []
@@ -308,7 +311,7 @@ def steady_filter(
     sys = linearize(model, x0, u0, h0) if system is None else system
     if np.any(np.asarray(sys.D) != 0):
         raise InputError(
-            f"model {model.name}: an output depends on the input at once; the loop here has no such path"
+            f"model {model.name}: an output depends directly on the input (feedthrough), which is not supported"
             " [HM-ANALYZE-026]"
         )
     n_z, n_u, n_d = model.n_x + model.n_h, model.n_u, model.n_d
@@ -330,8 +333,8 @@ def steady_filter(
         before = solve_discrete_are(f[where].T, c[:, alive].T, np.diag(noise[alive]), noise_y)
     except (LinAlgError, ValueError) as error:
         raise InputError(
-            f"model {model.name}: the filter's covariance does not settle ({error}); its noise must reach, and the "
-            "outputs show, every mode on or outside the unit circle [HM-ANALYZE-027]"
+            f"model {model.name}: the filter's covariance does not converge ({error}). Every mode on or outside the "
+            "unit circle must be observable and excited by the process noise [HM-ANALYZE-027]"
         ) from error
     seen = c[:, alive]
     gain[alive] = np.linalg.solve(seen @ before @ seen.T + noise_y, seen @ before).T
@@ -392,7 +395,9 @@ class LinearLoop:
         """The loop transfer function with one input cut open, the others closed, in negative-feedback sign."""
         n_u = self.plant.ninputs
         if not 0 <= input < n_u:
-            raise InputError(f"loop: input {input} asked for, the plant has {n_u} [HM-ANALYZE-028]")
+            raise InputError(
+                f"loop: no input {input}; the plant has {n_u} inputs, counted from 0 [HM-ANALYZE-028]"
+            )
         a, b, c, d = _open(self.plant, self.feedback)
         others = [j for j in range(n_u) if j != input]
         if others:
@@ -413,7 +418,7 @@ class LinearLoop:
         """
         if not self.stable:
             raise InputError(
-                f"loop: the closed loop is not stable (spectral radius {abs(self.poles[0]):.6g}); it has no margins"
+                f"loop: the closed loop is unstable (spectral radius {abs(self.poles[0]):.6g}), so it has no margins"
                 " [HM-ANALYZE-029]"
             )
         control, dt, broken = control_toolbox(), period(self.plant), self.broken(input)
@@ -510,16 +515,17 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
     if (plant.ninputs, plant.noutputs, n_w) != (n_u, n_y, n_z + n_d):
         raise InputError(
             f"loop: plant with {plant.ninputs} inputs and {plant.noutputs} outputs, filter over {n_w} with {n_y} "
-            f"outputs, gain of {n_u} inputs by {n_z} states and {n_d} disturbances; these do not fit each other"
+            f"outputs, gain of {n_u} inputs by {n_z} states and {n_d} disturbances: the sizes do not match"
             " [HM-ANALYZE-030]"
         )
     if np.any(np.asarray(plant.D) != 0):
         raise InputError(
-            "loop: an output of the plant depends on its input at once; the loop here has no such path [HM-ANALYZE-031]"
+            "loop: an output of the plant depends directly on the input (feedthrough), which is not supported "
+            "[HM-ANALYZE-031]"
         )
     if delay < 0:
         raise InputError(
-            f"loop: delay must be a whole number of periods, not negative, got {delay} [HM-ANALYZE-032]"
+            f"loop: delay must be a whole number of periods, at least 0, got {delay} [HM-ANALYZE-032]"
         )
     # a disturbance that the filter takes for constant stays zero: it is no state of the loop
     alive = (np.arange(n_w) < n_z) | np.any(filter.gain != 0, axis=1)

@@ -77,7 +77,7 @@ def welch_response(
         u, y = np.asarray(given_u, dtype=float).ravel(), np.asarray(given_y, dtype=float).ravel()
         if u.shape != y.shape:
             raise InputError(
-                f"frequency response: {u.size} inputs and {y.size} outputs given, as many of each needed"
+                f"frequency response: got {u.size} samples of the input and {y.size} of the output; give equally many"
                 " [HM-ANALYZE-033]"
             )
         if n < 8 or u.size < n:
@@ -90,8 +90,8 @@ def welch_response(
         count += windows
     if count < 4:
         raise InputError(
-            f"frequency response: {count} windows of {length:g} s in the recordings, at least 4 needed; take shorter "
-            "windows or more data [HM-ANALYZE-034]"
+            f"frequency response: only {count} windows of {length:g} s in the recordings, but at least 4 are needed. "
+            "Use shorter windows or more data [HM-ANALYZE-034]"
         )
     uu, yy, uy = total[0].real[1:-1], total[1].real[1:-1], total[2][1:-1]
     omega = np.asarray(2 * np.pi * np.arange(1, n // 2) / (n * dt), dtype=np.float64)
@@ -130,8 +130,8 @@ def multisine_response(
     n = round(period / dt)
     if periods < 2 or settle < 0 or abs(n * dt - period) > 1e-9 * period:
         raise InputError(
-            f"multisine: at least 2 periods of a multiple of {dt:g} s needed, got {periods} of {period:g} s, {settle} "
-            "left out [HM-ANALYZE-035]"
+            f"multisine: give at least 2 periods of a multiple of {dt:g} s after settling, got {periods} of {period:g} "
+            f"s, {settle} of them for settling [HM-ANALYZE-035]"
         )
     t = np.asarray(dt * np.arange((settle + periods) * n), dtype=np.float64)
     u = multisine(t, amplitude, *band, period=period, odd=odd, offset=bias)
@@ -188,7 +188,10 @@ def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *,
         ``welch_response([(u, run_model(model, x0)(u))], model.dt, length=5.0)``
     """
     if model.n_u != 1:
-        raise InputError(f"model {model.name} has {model.n_u} inputs; a run drives one [HM-ANALYZE-037]")
+        raise InputError(
+            f"model {model.name}: it has {model.n_u} inputs, but the response is only estimated for one "
+            "[HM-ANALYZE-037]"
+        )
 
     def run(u: Array) -> Array:
         x, h = np.asarray(x0, dtype=float), np.zeros(model.n_h) if h0 is None else np.asarray(h0, dtype=float)
@@ -206,7 +209,7 @@ def _check_power(signal: Array, what: str) -> None:
     wrong = np.flatnonzero(~(np.abs(signal) <= LARGEST))
     if wrong.size:
         raise InputError(
-            f"frequency response: the {what} diverges, sample {wrong[0]} is {signal[wrong[0]]:.3g}; take shorter "
+            f"frequency response: the {what} diverges, sample {wrong[0]} is {signal[wrong[0]]:.3g}. Use shorter "
             "recordings, or leave this model out [HM-ANALYZE-038]"
         )
 

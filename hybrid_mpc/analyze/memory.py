@@ -52,7 +52,8 @@ def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple
             work[into[0]] = _RULES[op](*(work[i] for i in at))
         else:
             raise InputError(
-                f"interval: operation {op} of CasADi (casadi.OP_...) is not known here [HM-ANALYZE-039]"
+                f"interval: operation {op} of CasADi (casadi.OP_...) is not supported. Rewrite the expression "
+                "without it [HM-ANALYZE-039]"
             )
     return result[0], result[1]
 
@@ -74,7 +75,7 @@ def _times(a: Interval, b: Interval) -> Interval:
 def _inverse(a: Interval) -> Interval:
     if a[0] <= 0 <= a[1]:
         raise InputError(
-            f"interval: division by a range {a} that holds zero; take a smaller box [HM-ANALYZE-041]"
+            f"interval: division by the range {a}, which contains zero. Use a smaller box [HM-ANALYZE-041]"
         )
     return 1 / a[1], 1 / a[0]
 
@@ -186,13 +187,13 @@ def gru_weights(program: Program) -> GruWeights:
         name = argument.get("weight") if isinstance(argument, dict) else None
         if name is None:
             raise InputError(
-                "contraction: the cell's weights are computed in the program; only stored ones are read"
+                "contraction: the cell's weights are computed in the program, but only stored weights are supported"
                 " [HM-ANALYZE-043]"
             )
         found.append(np.asarray(program.weights[name], dtype=float))
     if len(found) != 4:
         raise InputError(
-            "contraction: the GRU cell has no biases; only cells with them are read [HM-ANALYZE-044]"
+            "contraction: the GRU cell has no biases, but only cells with biases are supported [HM-ANALYZE-044]"
         )
     return GruWeights(*found)
 
@@ -221,7 +222,8 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
     s = f.call([z[:n_x], rest[0], z[n_x:], *rest[1:]], True, False)[0]
     if ca.depends_on(s, ca.veccat(*rest)):
         raise InputError(
-            "contraction: the GRU cell's inputs depend on more than x and u, of which there is a box [HM-ANALYZE-045]"
+            "contraction: the GRU cell's inputs depend on more than x and u, so the box does not bound them "
+            "[HM-ANALYZE-045]"
         )
     return interval_bounds(ca.Function("s", [z], [ca.vec(s)]), box[:, 0], box[:, 1])
 
@@ -288,7 +290,7 @@ def _cell(program: Program) -> Node:
     if len(cells) != 1:
         raise InputError(
             f"contraction: the program has {len(cells)} GRU cells{' beside ' + ', '.join(others) if others else ''}; "
-            "the condition is for exactly one [HM-ANALYZE-046]"
+            "the condition needs exactly one [HM-ANALYZE-046]"
         )
     return cells[0]
 
@@ -357,12 +359,14 @@ def lyapunov_exponent(
     maps = along.A
     if part == "hidden":
         if not model.n_h:
-            raise InputError(f"model {model.name} has no hidden state [HM-ANALYZE-047]")
+            raise InputError(
+                f"model {model.name}: no hidden state; give a model with a network [HM-ANALYZE-047]"
+            )
         maps = maps[:, model.n_x :, model.n_x :]
     n = len(maps)
     if n < 50:
         raise InputError(
-            f"Lyapunov exponent: {n} periods given, at least 50 needed for a mean over time [HM-ANALYZE-048]"
+            f"Lyapunov exponent: got {n} periods; give at least 50 for a mean over time [HM-ANALYZE-048]"
         )
     v: Array = np.asarray(np.random.default_rng(0).normal(size=maps.shape[1]), dtype=np.float64)
     v = np.asarray(v / np.linalg.norm(v))
@@ -372,7 +376,7 @@ def lyapunov_exponent(
         size = float(np.linalg.norm(v))
         if not size > 0:
             raise InputError(
-                "Lyapunov exponent: a step forgets everything at once; the exponent is minus infinity [HM-ANALYZE-049]"
+                "Lyapunov exponent: minus infinity, because one step removes every deviation [HM-ANALYZE-049]"
             )
         steps[k] = np.log(size)
         v = np.asarray(v / size)

@@ -181,7 +181,8 @@ def steady_gain(sys: Any) -> SteadyGain:
     away = np.eye(a.shape[0]) - a
     if a.size and np.linalg.cond(away) > 1.0 / EDGE:
         raise InputError(
-            "steady gain: a pole lies at 1, so the outputs do not settle under a held input [HM-ANALYZE-051]"
+            "steady gain: not defined, because a pole lies at 1 and the outputs do not settle. Choose another output "
+            "or point [HM-ANALYZE-051]"
         )
     gain = np.asarray(c @ np.linalg.solve(away, b) + d)
     square = gain.shape[0] == gain.shape[1] and np.linalg.cond(gain) < 1.0 / EDGE
@@ -241,8 +242,8 @@ def balanced_truncation(sys: Any, order: int) -> Reduced:
     fixed, n = len(kept[0]), len(sys.A)
     if not fixed <= order <= n:
         raise InputError(
-            f"balanced truncation: order {order} asked for; the system has {n} states, {fixed} of them not stable and "
-            f"kept, so give {fixed} to {n} [HM-ANALYZE-052]"
+            f"balanced truncation: order {order} is not possible. The system has {n} states, of which {fixed} are not "
+            f"stable and must be kept; give {fixed} to {n} [HM-ANALYZE-052]"
         )
     r = min(order - fixed, right.shape[1])
     t, w = right[:, :r], left[:r]
@@ -298,8 +299,8 @@ def physical_states(
     turn = by_x[:, None] * np.asarray(reduced.system.C)  # reduced state to physical states
     if reduced.order < n_x or np.linalg.cond(turn / by_x[:, None]) > 1.0 / np.sqrt(np.finfo(float).eps):
         raise InputError(
-            f"model {model.name}: {n_x} states of the reduced system do not tell the physical states apart "
-            "(one is not reached by any input); keep the full linearization [HM-ANALYZE-053]"
+            f"model {model.name}: the {n_x} states of the reduced system do not determine the physical states "
+            "(one of them is not controllable). Keep the full linearization [HM-ANALYZE-053]"
         )
     small = control.ss(
         turn @ reduced.system.A @ np.linalg.inv(turn), turn @ reduced.system.B / by_u, c[:, :n_x], d, sys.dt,
@@ -312,7 +313,7 @@ def physical_states(
 def _scale(value: ArrayLike | None, n: int, name: str) -> Array:
     scale = np.ones(n) if value is None else np.asarray(value, dtype=float).reshape(-1)
     if scale.shape != (n,) or not np.all(np.isfinite(scale)) or not np.all(scale > 0):
-        raise InputError(f"{name}: {n} positive numbers needed, got {scale.tolist()} [HM-ANALYZE-054]")
+        raise InputError(f"{name}: give {n} positive numbers, got {scale.tolist()} [HM-ANALYZE-054]")
     return scale
 
 

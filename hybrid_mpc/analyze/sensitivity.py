@@ -67,8 +67,8 @@ class Sensitivities:
         scaled = rows / np.where(size > 0, size, 1.0)
         if np.any(size == 0) or np.linalg.cond(scaled) > 1e7:
             raise InputError(
-                f"sensitivities: this run does not tell {', '.join(self.names)} apart; leave some out (a product of "
-                "two parameters is one) [HM-ANALYZE-055]"
+                f"sensitivities: {', '.join(self.names)} are not identifiable together in this run. Leave some out "
+                "(only the product of two parameters may be identifiable) [HM-ANALYZE-055]"
             )
         inverse = np.linalg.inv(scaled.T @ scaled)
         spread = np.sqrt(np.diag(inverse))
@@ -98,14 +98,15 @@ def parameter_sensitivities(
     chosen = tuple(there if names is None else names)
     if not chosen or not set(chosen) <= set(there):
         raise InputError(
-            f"sensitivities: parameters {list(chosen)} of model {model.name} asked for; it has: "
+            f"sensitivities: model {model.name} does not have all of {list(chosen)}; choose from: "
             f"{', '.join(there) or 'none'} [HM-ANALYZE-056]"
         )
     n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
     inputs, now = np.asarray(u, dtype=float), np.asarray(x, dtype=float).reshape(-1)
     if inputs.ndim != 2 or inputs.shape[1] != n_u or now.shape != (n_x,):
         raise InputError(
-            f"sensitivities: x {now.shape} and u {inputs.shape} given, ({n_x},) and (n, {n_u}) needed [HM-ANALYZE-057]"
+            f"sensitivities: got the shapes {now.shape} of x and {inputs.shape} of u; give ({n_x},) and (n, {n_u}) "
+            "[HM-ANALYZE-057]"
         )
     columns = [there.index(name) for name in chosen]
     z, v, p = ca.MX.sym("z", n_x + n_h), ca.MX.sym("v", n_u), ca.MX.sym("p", model.n_p)
@@ -122,6 +123,6 @@ def parameter_sensitivities(
     found = Sensitivities(chosen, model.p[columns], np.stack(states), np.stack(slopes))
     if not (np.all(np.isfinite(found.x)) and np.all(np.isfinite(found.by))):
         raise InputError(
-            "sensitivities: the free run is not finite; take a shorter one or other inputs [HM-ANALYZE-058]"
+            "sensitivities: the free run is not finite. Use a shorter run or other inputs [HM-ANALYZE-058]"
         )
     return found

@@ -133,7 +133,7 @@ def _scalar(model: HybridModel, name: str, point: list[ca.MX], value: ca.MX) -> 
         return f.expand()
     except RuntimeError as error:
         raise InputError(
-            f"model {model.name}: its {name} is no scalar code: {last_line(error)} [HM-EMBEDDED-001]"
+            f"model {model.name}: its {name} cannot be written as scalar code: {last_line(error)} [HM-EMBEDDED-001]"
         ) from error
 
 

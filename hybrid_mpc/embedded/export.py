@@ -173,7 +173,7 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
     gcc, size = shutil.which("gcc"), shutil.which("size")
     if gcc is None or size is None:
         raise InputError(
-            "the check needs gcc and size (binutils), which are not installed; leave it out [HM-EMBEDDED-002]"
+            "check: gcc and size (binutils) are not installed. Install them, or omit the check [HM-EMBEDDED-002]"
         )
     with tempfile.TemporaryDirectory() as work:
         flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fstack-usage"]
@@ -188,7 +188,7 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
         )
         if made.returncode or linked.returncode:
             raise InputError(
-                f"the generated C does not compile: {(made.stderr + linked.stderr)[-2000:]} [HM-EMBEDDED-003]"
+                f"check: the generated C does not compile: {(made.stderr + linked.stderr)[-2000:]} [HM-EMBEDDED-003]"
             )
         table_of = subprocess.run([size, *objects], capture_output=True, text=True, check=True).stdout
         flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in table_of.splitlines()[1:])
@@ -200,7 +200,7 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
         done = subprocess.run([str(Path(work) / "test")], capture_output=True, text=True, check=False)
         if done.returncode:
             raise InputError(
-                f"the generated C decides otherwise than Python: {done.stderr[-2000:]} [HM-EMBEDDED-004]"
+                f"check: inputs of the generated C differ from those of Python: {done.stderr[-2000:]} [HM-EMBEDDED-004]"
             )
         state = re.search(r"the state has (\d+) bytes", done.stderr)
         return Footprint(flash, int(state[1]) if state else 0, sum(frames))

@@ -122,7 +122,9 @@ def make_sources(
     except InputError as error:
         refused.append(f"its guard's backup: {error} [HM-EMBEDDED-005]")
     if refused or parts is None:
-        raise InputError("no C for this controller: " + "; ".join(refused) + " [HM-EMBEDDED-011]")
+        raise InputError(
+            "controller: the C export is not possible: " + "; ".join(refused) + " [HM-EMBEDDED-011]"
+        )
     problem = Problem(model, ocp)
     soft = problem.soft
     expressions = sum(int(f.numel_out(0)) for f in soft.functions)
@@ -410,7 +412,8 @@ def _scalar(what: str, f: ca.Function) -> ca.Function:
         return f.expand()
     except RuntimeError as error:
         raise InputError(
-            f"no C for this controller: {what} is no scalar code: {last_line(error)} [HM-EMBEDDED-006]"
+            f"controller: the C export is not possible, because {what} cannot be written as scalar code: "
+            f"{last_line(error)} [HM-EMBEDDED-006]"
         ) from error
 
 

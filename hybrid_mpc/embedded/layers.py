@@ -76,7 +76,9 @@ def _scalar(what: str, given: Sequence[ca.MX], value: ca.MX) -> ca.Function:
     try:
         return f.expand()
     except RuntimeError as error:
-        raise InputError(f"{what} is no scalar code: {last_line(error)} [HM-EMBEDDED-007]") from error
+        raise InputError(
+            f"{what}: it cannot be written as scalar code: {last_line(error)} [HM-EMBEDDED-007]"
+        ) from error
 
 
 def written_out(point: Sequence[ca.MX], value: ca.MX, but: str = "\0") -> ca.MX:

@@ -102,8 +102,9 @@ def c_function(
     f = ca.Function("f", list(inputs.values()), [values], {"cse": True})
     if f.n_instructions() > MOST:
         raise InputError(
-            f"{name}: {f.n_instructions()} scalar operations, at most {MOST} become C; products with constant matrices "
-            f"of more than {SMALL} numbers do not count: write networks with them (torch's Linear, GRUCell, LSTM)"
+            f"{name}: {f.n_instructions()} scalar operations, but the C export allows at most {MOST}. Products with "
+            f"constant matrices of more than {SMALL} numbers do not count: write networks with them (torch's Linear, "
+            "GRUCell, LSTM)"
             " [HM-EMBEDDED-008]"
         )
     lines, names = [], list(inputs)
@@ -128,7 +129,8 @@ def c_function(
             else:
                 called = " (a lookup table or a solver)" if code == ca.OP_CALL else ""
                 raise InputError(
-                    f"{name}: no C for {_NAMES.get(code, code)}{called}; write the prior with other operations"
+                    f"{name}: the C export does not support {_NAMES.get(code, code)}{called}. Write the prior with "
+                    "other operations"
                     " [HM-EMBEDDED-009]"
                 )
             operations += 1

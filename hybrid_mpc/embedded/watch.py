@@ -176,7 +176,8 @@ def _scalar(what: str, given: list[ca.MX], value: ca.MX) -> ca.Function:
         return ca.Function("watched", given, [value]).expand()
     except RuntimeError as error:
         raise InputError(
-            f"no C for this monitor: {what} is no scalar code: {last_line(error)} [HM-EMBEDDED-010]"
+            f"monitor: the C export is not possible, because {what} cannot be written as scalar code: "
+            f"{last_line(error)} [HM-EMBEDDED-010]"
         ) from error
 
 

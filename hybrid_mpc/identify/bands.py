@@ -124,7 +124,9 @@ def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:
     113 (2018), for locally weighted split conformal prediction.
     """
     if not runs:
-        raise InputError("bands: there is no validation run to calibrate them on [HM-IDENTIFY-001]")
+        raise InputError(
+            "bands: no validation run for their calibration; give longer recordings [HM-IDENTIFY-001]"
+        )
     if not 0 < share < 1:
         raise InputError(f"bands: share must lie between 0 and 1, got {share} [HM-IDENTIFY-002]")
     weights, scale, constant = [], [], []

@@ -125,10 +125,12 @@ def recommend(
     Source: Efron, *The jackknife, the bootstrap and other resampling plans* (1982).
     """
     if deploy and deploy not in errors:
-        raise InputError(f"deploy: no candidate {deploy!r}; choose of: {', '.join(errors)} [HM-IDENTIFY-003]")
+        raise InputError(
+            f"deploy: no candidate {deploy!r}; choose one of: {', '.join(errors)} [HM-IDENTIFY-003]"
+        )
     if not errors.get(prior):
         raise InputError(
-            "there is no validation run to choose a model by; give longer recordings [HM-IDENTIFY-004]"
+            "choice: no validation run to compare the models on; give longer recordings [HM-IDENTIFY-004]"
         )
     compared = _Compared(errors[prior], samples, recordings)
     figures = {name: compared.figures(runs) for name, runs in errors.items()}
@@ -149,7 +151,7 @@ def recommend(
     of_what = f"{evidence}, their geometric mean" if compared.whole else "block" if pieces == 1 else "blocks"
     reason = _reason(figures, best, chosen, prior, f"{pieces} {of_what}")
     if deploy and deploy != chosen:
-        reason = f"{deploy} is deployed as asked for. {reason}"
+        reason = f"{deploy} is deployed as requested. {reason}"
     asked = deploy if deploy != prior else ""
     hybrid = asked or (chosen if chosen != prior else best)
     return Choice(deploy or chosen, hybrid, figures, reason, pieces, tuple(safe))
@@ -190,13 +192,13 @@ class _Compared:
 
 
 def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tuple[list[str], str]:
-    """Which piece of evidence each run is of, and what these are called.
+    """Independent piece of evidence of each run, and the name of such pieces.
 
-    A recording is one: errors within it hang together. Of a single recording each part that a network left out is one.
-    Its blocks agreed by chance on the EMPS, and a hybrid with twice the prior's error was recommended.
+    A recording is one piece, because the errors within a recording are correlated. With a single recording, each part
+    that a network left out is one piece; blocks of a recording are not independent enough (EMPS).
 
     Args:
-        runs: What a training is evaluated on (:func:`~hybrid_mpc.identify.evaluate.unseen_runs`).
+        runs: Held-out runs of a training (:func:`~hybrid_mpc.identify.evaluate.unseen_runs`).
     """
     files = [t.file for _, them in runs for t in them]
     if len(set(files)) > 1:
@@ -207,13 +209,13 @@ def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tupl
 
 def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str) -> str:
     if best == prior:
-        return "There is no hybrid to compare with the fitted prior."
+        return "The fitted prior is recommended: there is no hybrid."
     if not math.isfinite(figures[best].error):
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
     own = figures[best if chosen == prior else chosen]
     bound = f"at most {own.upper:.2f}" if math.isfinite(own.upper) else "without a bound: record more"
-    of_it = "its error" if own.share == 1 else f"with {own.share:g} of its correction its error"
-    said = f"{of_it} on data that were left out is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
+    of_it = "its error" if own.share == 1 else f"with {own.share:g} of its correction, its error"
+    said = f"{of_it} on held-out data is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
     if chosen == prior and own.upper < CONFIDENT:
         said += ", but over all of them together the prior's is no larger"
     if chosen == prior:
@@ -222,7 +224,7 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
 
 
 def _cuts(lengths: Sequence[int], samples: int) -> list[list[tuple[int, int]]]:
-    """Blocks of each run as first and last sample: whole runs, or parts of them where there are few."""
+    """Blocks of each run as first and last sample: whole runs, or parts of runs if there are few runs."""
     parts = math.ceil(BLOCKS / max(1, len(lengths)))
     cuts = []
     for n in lengths:

@@ -79,9 +79,9 @@ def cut_windows(
     if not x:
         longest = max((len(t.t) for t in trajectories), default=0)
         raise InputError(
-            f"no training trajectory is long enough: the longest has {longest} samples, a window of "
-            f"{warm} warm-up and {horizon} scored periods needs {length + 1}. Record longer runs or lower "
-            "warm_up. [HM-IDENTIFY-005]"
+            f"training recordings: too short. The longest has {longest} samples, but a window of {warm} periods of "
+            f"warm-up and {horizon} evaluated periods needs {length + 1}. Record longer runs, or reduce warm_up "
+            "[HM-IDENTIFY-005]"
         )
     x_all, u_all, w_all, xdot_all = (torch.tensor(np.stack(parts)) for parts in (x, u, w, xdot))
     weight = torch.tensor(np.array(rows, dtype=np.float64).T) if rows else None
@@ -171,5 +171,5 @@ def _check_finite(trajectory: Trajectory, names: Sequence[str] = ("x", "u", "w")
         if len(bad):
             raise InputError(
                 f"{trajectory.name}: {name} is not finite at {trajectory.t[bad[0]]:g} s ({len(bad)} samples "
-                "in all); leave these samples out of the file [HM-IDENTIFY-006]"
+                "in total). Remove these samples from the file [HM-IDENTIFY-006]"
             )

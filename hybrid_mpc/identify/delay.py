@@ -27,7 +27,8 @@ def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
     n = len(trajectory.t)
     if n <= first + 1:
         raise InputError(
-            f"{trajectory.name}: a delay of {delay:g} s leaves nothing of {n} samples [HM-IDENTIFY-007]"
+            f"{trajectory.name}: too short for a delay of {delay:g} s, with only {n} samples. Give a longer recording "
+            "[HM-IDENTIFY-007]"
         )
     younger = trajectory.u[first - whole : n - whole]
     older = trajectory.u[first - whole - 1 : n - whole - 1] if share > 0 else younger
@@ -50,7 +51,7 @@ def _split(delay: float, dt: float) -> tuple[int, float]:
     """Whole periods of a delay and what is left [s]."""
     if not (delay > 0 and math.isfinite(delay)):
         raise InputError(
-            f"delay must be positive, got {delay} s; without one use the prior as it is [HM-IDENTIFY-008]"
+            f"delay: give a positive number, got {delay} s; without a delay, use the prior itself [HM-IDENTIFY-008]"
         )
     whole = math.floor(delay / dt + TINY)
     rest = delay - whole * dt

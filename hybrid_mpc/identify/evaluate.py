@@ -266,14 +266,15 @@ def output_errors(
         (0.1, 87.75)
     """
     if not y:
-        raise InputError("there is no free run to score; give longer recordings [HM-IDENTIFY-009]")
+        raise InputError("evaluation: no free run; give longer recordings [HM-IDENTIFY-009]")
     measured, predicted = np.concatenate(y), np.concatenate(y_hat)
     rmse, sizes = [], []
     for signal, truth, guess in zip(outputs, measured.T, predicted.T, strict=True):
         seen = np.isfinite(truth)
         if not seen.any():
             raise InputError(
-                f"output {signal.label} was never measured in the free runs that are scored [HM-IDENTIFY-010]"
+                f"output {signal.label}: never measured in the evaluated free runs. Give recordings with it "
+                "[HM-IDENTIFY-010]"
             )
         with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinitely wrong
             rmse.append(_finite(np.sqrt(np.mean(np.square(guess[seen] - truth[seen])))))

@@ -102,7 +102,7 @@ def _with_weights(program: nn_export.Program, module: nn.Module) -> nn_export.Pr
     strange = [name for name, value in held.items() if value.shape != program.weights[name].shape]
     if strange:
         raise InputError(
-            f"{strange[0]} has another shape than in the program to be like; trace the model"
+            f"{strange[0]}: its shape differs from that in the given program. Trace the model without that program"
             " [HM-IDENTIFY-016]"
         )
     return replace(program, weights=held)

@@ -144,8 +144,8 @@ def fit_prior(
     first_states.check(fit.prior, largest_delay)
     if most_samples(train) < fit.lead + 3:
         raise InputError(
-            f"no recording is long enough to fit {type(fit.prior).__name__} to: the longest has {most_samples(train)} "
-            f"samples, {fit.lead + 3} are needed at least [HM-IDENTIFY-017]"
+            f"recordings: too short to fit {type(fit.prior).__name__}. The longest has {most_samples(train)} samples, "
+            f"but at least {fit.lead + 3} are needed. Give longer recordings [HM-IDENTIFY-017]"
         )
     if length is None:
         length = max(LENGTHS[-1] * unit, SLOWEST * slowest(fit.prior))
@@ -222,12 +222,11 @@ def fit_prior(
         errors = _errors_of([one.theta for one in solved], scoring)
         candidates.append((name, solved[int(np.argmin(errors))]))
     scores = _errors_of([c.theta for _, c in candidates], scoring)
-    on_progress(total - 1, total, "smoothing by the fitted prior")
+    on_progress(total - 1, total, "smoothing with the fitted prior")
 
     if not np.isfinite(min(scores)):
         raise InputError(
-            "the prior diverges with every set of parameters tried; check its signs and units"
-            " [HM-IDENTIFY-018]"
+            "prior: it diverges with all tested parameters. Check its signs and units [HM-IDENTIFY-018]"
         )
 
     def smoother_of(found: Fitted) -> Smoother:
@@ -356,18 +355,18 @@ def parameter_variance(
 
 
 def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
-    """Refuse a prior with states that no output tells of.
+    """Refuse a prior with unobservable states.
 
     Raises:
         InputError: Naming the states.
     """
     unseen = unseen_states(prior, dt, time_unit)
     if unseen:
+        are, them = ("are", "them") if len(unseen) > 1 else ("is", "it")
         raise InputError(
-            f"{type(prior).__name__}: no output tells of {', '.join(unseen)} (outputs: "
-            f"{', '.join(s.name for s in prior.outputs)}): nothing that is measured changes with "
-            f"{'them' if len(unseen) > 1 else 'it'}. Measure it, leave it out of the states, or check output()"
-            " [HM-IDENTIFY-019]"
+            f"{type(prior).__name__}: {', '.join(unseen)} {are} not observable: no output "
+            f"({', '.join(s.name for s in prior.outputs)}) depends on {them}. Measure {them}, remove {them} from the "
+            "states, or check output() [HM-IDENTIFY-019]"
         )
 
 

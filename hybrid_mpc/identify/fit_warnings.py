@@ -1,4 +1,4 @@
-"""Warnings of a fit: bounds, feedback, no improvement, inputs that act late."""
+"""Warnings of a fit: bounds, feedback, no improvement, delayed inputs."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ Array = NDArray[np.float64]
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
 HARDLY = 0.98
-"""Share of the nominal values' error from which on a fit counts as none."""
+"""Error of a fit over that of the nominal values above which the fit is no improvement."""
 LATE = 4.0
-"""Longest delay of the inputs [model periods] that is looked for where none is fitted."""
+"""Longest delay of the inputs [model periods] that is tested if no delay is fitted."""
 SHORTEST = 0.01
-"""Shortest delay that is told of [periods]. Exact data leave the integrator's error alone; a delay of 4e-5 periods
-explained four fifths of that."""
+"""Shortest delay that causes a warning [periods]. With noise-free data only the integration error remains, most of
+which a delay of 4e-5 periods can explain."""
 TELLING = 0.9
-"""Share of the error, of training and of validation, to which such a delay must bring it to be told; it must be twice
-its standard error, too."""
+"""Share of the training error and of the validation error below which a delay causes a warning; the delay must also be
+at least twice its standard error."""
 HOPELESS = 0.98
-"""Share of the error that a linear step with a delay must get below, over one without, for a delay to be fitted."""
+"""Error after a linear step with a delay over that without, above which no delay is fitted."""
 
 
 def warnings_of(
     fit: OutputFit, chosen: Fitted, answered: float = 0.0, gained: float = 0.0
 ) -> tuple[str, ...]:
-    """What is doubtful about a fit; ``gained`` is its error over that of the nominal values."""
+    """Warnings of a fit; ``gained`` is its error over that of the nominal values."""
     warnings = []
     if answered > 1.0:
         warnings.append(
-            "inputs answer to the outputs, as in closed loop: parameters may be biased where the machine is disturbed; "
-            "predictions were fitted too, and validation chose"
+            "inputs respond to the outputs, as in a closed loop: disturbances may bias the parameters; prediction "
+            "errors were fitted, too, and the validation chose"
         )
     if not len(chosen.covariance):
         return (*warnings, "no fit improved on the nominal parameters") if fit.free else ()
     if gained > HARDLY:
         warnings.append(
-            f"the fit hardly improves on the nominal parameters (its error is {gained:.3f} of theirs): they are right, "
-            "or the prior lacks something that no parameter stands for"
+            f"the fit hardly improves on the nominal parameters (its error is {gained:.3f} of theirs): either they are "
+            "right, or the prior lacks an effect that no parameter describes"
         )
     warnings += [str(one) for one in chosen.unidentified]
     for p, value, low, high in zip(fit.free, chosen.theta, fit.lower, fit.upper, strict=False):
@@ -64,8 +64,8 @@ def late_inputs(
     sizes: Array,
     first_states: FirstStates,
 ) -> tuple[str, ...]:
-    """A warning where inputs that act later than they are recorded explain the first of the parts, and each other one
-    that is long enough, better than parameters alone; both are fitted to the same windows of the first part.
+    """A warning if a delay of the inputs explains the first part, and every other part that is long enough, better than
+    the parameters alone; both are fitted to the same windows of the first part.
     """
     late = fit.with_delay(LATE * fit.dt)
     known = fit.prior.states, fit.prior.outputs, first_states
@@ -88,9 +88,9 @@ def late_inputs(
     left = " and ".join(f"{then / before:.2f}" for before, then in both)
     least = "at least " if found.theta[-1] > (1.0 - AT_BOUND) * LATE else ""
     return (
-        f"inputs seem to act {least}{delay:.2g} s later than they are recorded (standard error {error:.1g} s): of the "
-        f"error over training and validation recordings this would leave {left}. Let the fit find the delay "
-        "(largest_delay of the data), or write the lag of the actuator into the prior",
+        f"inputs seem to act {least}{delay:.2g} s later than recorded (standard error {error:.1g} s): such a delay "
+        f"would reduce the errors over training and validation recordings to {left}. Fit the delay (largest_delay of "
+        "the data), or add the lag of the actuator to the prior",
     )
 
 

@@ -129,8 +129,8 @@ class Horizon:
         first = np.array([_Linearized.at(self, stretches, z, ELASTIC[-1]).cost for z in starts])
         if not np.isfinite(first.min(axis=0)).all():
             raise InputError(
-                "the equations give no number where a smoother starts; see their square roots and logs"
-                " [HM-IDENTIFY-020]"
+                "prior: its equations are not finite at the start of the smoother. Check its square roots and "
+                "logarithms [HM-IDENTIFY-020]"
             )
         lengths = np.diff([*stretches.begins, len(stretches.y)])
         order = np.repeat(np.argsort(first, axis=0, kind="stable"), lengths, axis=1)

@@ -170,18 +170,20 @@ class LinearModel:
             or (y.shape[-1], v.shape[-1]) != (n_y, n_u)
         ):
             raise InputError(
-                f"free run: y_past is {y.shape} and u is {v.shape}; needed are (..., warm, {n_y}) and (..., n, {n_u}) "
-                "with the same windows in front (measured disturbances are the last columns of u) [HM-IDENTIFY-021]"
+                f"free run: y_past has the shape {y.shape} and u {v.shape}; give (..., warm, {n_y}) and (..., n, "
+                f"{n_u}) with equal leading dimensions (measured disturbances are the last columns of u) "
+                "[HM-IDENTIFY-021]"
             )
         warm, n = y.shape[-2], v.shape[-2]
         if not 1 <= warm <= n:
             raise InputError(
-                f"free run: y_past has {warm} samples and u has {n}; a warm-up needs at least one, and u "
-                "starts with it and goes on after it [HM-IDENTIFY-022]"
+                f"free run: y_past has {warm} samples and u has {n}; give at least one warm-up sample, and inputs of "
+                "the warm-up and the free run [HM-IDENTIFY-022]"
             )
         if not np.isfinite(v).all():
             raise InputError(
-                "free run: an input is not finite; a free run needs every input, fill the gap first [HM-IDENTIFY-023]"
+                "free run: an input is not finite, but a free run needs all inputs. Fill the gap first "
+                "[HM-IDENTIFY-023]"
             )
         y, v = (y - self.y_centre) / self.y_scale, (v - self.u_centre) / self.u_scale
         windows = math.prod(y.shape[:-2])
@@ -202,7 +204,8 @@ class LinearModel:
         """
         pairs = [_signals(r) for r in recordings]
         refuse([
-            f"recording {i + 1}: {len(y)} samples; a free run after a warm-up of {warm} needs more [HM-IDENTIFY-024]"
+            f"recording {i + 1}: {len(y)} samples are too few for a free run after a warm-up of {warm}. Give a longer "
+            "one [HM-IDENTIFY-024]"
             for i, (y, _) in enumerate(pairs) if len(y) <= warm
         ])  # fmt: skip
         longest = max((len(y) for y, _ in pairs), default=0)
@@ -376,7 +379,7 @@ def fit_subspace(
     data = _checked(train, valid, dt, warm)
     if weighting not in ("cva", "n4sid"):
         raise InputError(
-            f"fit_subspace: weighting is {weighting!r}; there are 'cva' and 'n4sid' [HM-IDENTIFY-025]"
+            f"fit_subspace: unknown weighting {weighting!r}; choose 'cva' or 'n4sid' [HM-IDENTIFY-025]"
         )
     states = _naturals(orders, [n for n in ORDERS if n <= MOST_STATES], "orders", 1)
     enough, short = [], []
@@ -427,22 +430,22 @@ def _signals(recording: Measured) -> tuple[Array, Array]:
         u = np.hstack([u, np.asarray(w, dtype=float)])
     elif w is not None:
         raise InputError(
-            f"measured disturbances w: shape {np.shape(w)}; needed is ({len(u)}, n_w), as long as u [HM-IDENTIFY-026]"
+            f"measured disturbances w: shape {np.shape(w)}; give ({len(u)}, n_w), as many rows as u [HM-IDENTIFY-026]"
         )
     return np.asarray(recording.y, dtype=float), u
 
 
 def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, warm: int) -> _Data:
-    """The training data, scaled; everything that can be said against the input before computing is said."""
+    """The scaled training data; the error lists all problems of the input together."""
     problems = []
     if not positive(dt):
-        problems.append(f"dt is {dt!r:.80}; a period above 0 s is needed [HM-IDENTIFY-027]")
+        problems.append(f"dt: got {dt!r:.80}; give a period above 0 s [HM-IDENTIFY-027]")
     if isinstance(warm, bool) or not isinstance(warm, int | np.integer) or warm < 1:
-        problems.append(f"warm is {warm}; a whole number of samples is needed, at least 1 [HM-IDENTIFY-028]")
+        problems.append(f"warm: got {warm}; give a whole number of samples, at least 1 [HM-IDENTIFY-028]")
     for role, recordings in (("training", train), ("validation", valid)):
         if not len(recordings):
             problems.append(
-                f"there is no {role} recording; models are fitted on some and chosen on others: give both"
+                f"{role} recordings: none given; give training recordings and validation recordings"
                 " [HM-IDENTIFY-029]"
             )
     refuse(problems)
@@ -454,7 +457,7 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
     for name, (y, u) in pairs.items():
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or not y.shape[1] or not u.shape[1]:
             problems.append(
-                f"{name}: y is {y.shape}, u is {u.shape}; needed are (n, n_y) and (n, n_u), a row a sample"
+                f"{name}: y has the shape {y.shape}, u {u.shape}; give (n, n_y) and (n, n_u), one row for each sample"
                 " [HM-IDENTIFY-030]"
             )
         elif first[0].ndim == 2 == first[1].ndim and (y.shape[1], u.shape[1]) != (
@@ -474,7 +477,7 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
             problems.append(f"{name}: an output is infinite; a missing sample is NaN [HM-IDENTIFY-033]")
         elif name.startswith("valid") and not np.isfinite(y[warm:]).any(axis=0).all():
             problems.append(
-                f"{name}: {len(y)} samples, none of some output measured after a warm-up of {warm}; record longer ones"
+                f"{name}: {len(y)} samples, but an output is never measured after the warm-up of {warm}. Record longer"
                 " [HM-IDENTIFY-034]"
             )
     refuse(problems)
@@ -486,12 +489,12 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
         seen = y[np.isfinite(y[:, j]), j]
         if not len(seen) or is_constant(seen):
             problems.append(
-                f"output {j + 1} never changes in the training recordings; leave it out, or train where it moves"
+                f"output {j + 1}: constant in the training recordings. Leave it out, or record it in motion"
                 " [HM-IDENTIFY-035]"
             )
     problems += [
-        f"input {j + 1} never changes in the training recordings, so nothing says what it does; leave it out, or "
-        "train on recordings where it moves [HM-IDENTIFY-036]"
+        f"input {j + 1}: constant in the training recordings, so its effect is unknown. Leave it out, or give "
+        "recordings in which it changes [HM-IDENTIFY-036]"
         for j in still if j < n_commanded
     ]  # fmt: skip
     refuse(problems)
@@ -508,7 +511,7 @@ def _naturals(given: Sequence[int] | None, default: Sequence[int], name: str, le
         isinstance(v, bool) or not isinstance(v, int | np.integer) or v < least for v in values
     ):
         raise InputError(
-            f"{name}: {values} given; whole numbers from {least} on are needed, at least one"
+            f"{name}: got {values}; give at least one number, all of them whole and at least {least}"
             " [HM-IDENTIFY-037]"
         )
     return sorted({int(v) for v in values})
@@ -531,7 +534,7 @@ def _long_enough(enough: Sequence[int], short: Sequence[str], default: bool, dat
     told = short[:1] if default else short
     raise InputError(
         f"recordings too short: {'; '.join(told)} without a missing sample in the training recordings "
-        f"(samples: {lengths}). Record longer ones, or ask for less [HM-IDENTIFY-038]"
+        f"(samples: {lengths}). Record longer ones, or use smaller orders [HM-IDENTIFY-038]"
     )
 
 
@@ -803,8 +806,8 @@ def _best(tried: Iterable[LinearModel | Candidate], valid: Sequence[Measured], w
         candidates.append(one if isinstance(one, Candidate) else models[-1].chosen)
     if not models:
         raise InputError(
-            "no candidate became a model: the recordings say nothing of so many states; ask for fewer (orders), or "
-            "train on recordings that move more [HM-IDENTIFY-039]"
+            "orders: no candidate gave a model, because the recordings do not excite so many states. Give smaller "
+            "orders, or recordings with more excitation [HM-IDENTIFY-039]"
         )
     stable = [m for m in models if m.chosen.stable]
     able = stable or models

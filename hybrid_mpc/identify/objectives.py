@@ -156,8 +156,9 @@ def objectives_of(prior: Prior, names: Sequence[str]) -> dict[str, Objective]:
     unknown = [name for name in wanted if name not in OBJECTIVES and name not in balances]
     if unknown or not wanted:
         raise InputError(
-            f"objectives: {', '.join(unknown) or 'there is none'}; choose of: {', '.join([*OBJECTIVES, BALANCES])}, "
-            f"and the balances of {type(prior).__name__}: {', '.join(balances) or 'it has none'} [HM-IDENTIFY-040]"
+            f"objectives: unknown or missing ({', '.join(unknown) or 'none given'}); choose from: "
+            f"{', '.join([*OBJECTIVES, BALANCES])}, and the balances of {type(prior).__name__}: "
+            f"{', '.join(balances) or 'it has none'} [HM-IDENTIFY-040]"
         )
     return {name: OBJECTIVES.get(name) or balance_objective(name) for name in wanted}
 

@@ -115,8 +115,8 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     lost = lost_samples(delay, dt)
     if len(trajectory.t) < lost + warm + 2:
         raise InputError(
-            f"{trajectory.name}: {len(trajectory.t) * dt:.4g} s are too short: {(lost + warm + 2) * dt:.4g} s are "
-            f"needed, of which {warm * dt:.4g} s are the warm-up [HM-IDENTIFY-041]"
+            f"{trajectory.name}: {len(trajectory.t) * dt:.4g} s are too short. Give at least "
+            f"{(lost + warm + 2) * dt:.4g} s, including a warm-up of {warm * dt:.4g} s [HM-IDENTIFY-041]"
         )
     (acting,) = shifted([trajectory], delay)
     smoother = Smoother(prior, dt, held.sigma, held.walk, held.sizes, held.fading, held.substeps)
@@ -149,20 +149,22 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
 
 
 def _checked(kit: Kit, trajectory: Trajectory, model: str) -> tuple[str, Predicting]:
-    """Name of the model, and what predictions need."""
+    """Name of the model, and the settings of predictions."""
     name = model or kit.recommended
     if not isinstance(name, str) or name not in kit.models:
-        raise InputError(f"no model {name!r}; there are: {', '.join(kit.models)} [HM-IDENTIFY-042]")
+        raise InputError(
+            f"model: no model {name!r}; choose one of: {', '.join(kit.models)} [HM-IDENTIFY-042]"
+        )
     if kit.predicting is None or "prior" not in kit.models:
         raise InputError(
-            f"the model of scenario {kit.name or '(unnamed)'} was saved without what predictions need (columns, "
-            "smoother, bands): an older version wrote it, or save_artifact without predicting; run the scenario again"
+            f"model of scenario {kit.name or '(unnamed)'}: saved without settings of predictions (columns, smoother, "
+            "bands), by an older version or by save_artifact without predicting. Run the scenario again"
             " [HM-IDENTIFY-043]"
         )
     chosen = kit.models[name]
     if abs(trajectory.dt - chosen.dt) > 1e-9 * chosen.dt:
         raise InputError(
-            f"{trajectory.name} has a period of {trajectory.dt:g} s, the model one of {chosen.dt:g} s; resample it"
+            f"{trajectory.name}: its period is {trajectory.dt:g} s, but the model's is {chosen.dt:g} s. Resample it"
             " [HM-IDENTIFY-044]"
         )
     return name, kit.predicting

@@ -112,7 +112,7 @@ class PriorFit:
     def smoother(self, prior: Prior, dt: float) -> Smoother:
         """The smoother around the fitted prior."""
         if self.sizes is None:
-            raise InputError("this fit has no smoother: it was not made by fit_prior [HM-IDENTIFY-045]")
+            raise InputError("fit: it has no smoother. Use a fit made by fit_prior [HM-IDENTIFY-045]")
         return Smoother(prior, dt, self.sigma, self.walk, self.sizes, self.fading, self.substeps)
 
     @property

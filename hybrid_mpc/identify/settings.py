@@ -93,13 +93,13 @@ class TrainingSettings:
         own = Fields(self, "training settings")
         own.need(
             "objectives", lambda: self.objectives,
-            "objectives is empty; a training needs at least one, e.g. ('error',) [HM-IDENTIFY-046]",
+            "objectives: empty; give at least one, e.g. ('error',) [HM-IDENTIFY-046]",
         )  # fmt: skip
         own.need(
             "kind prior_parameters", lambda: self.use_prior or self.prior_parameters == "fixed",
-            "an rnn has no prior to train along; leave prior_parameters 'fixed' [HM-IDENTIFY-047]",
+            "prior_parameters: an rnn has no prior to train; set 'fixed' [HM-IDENTIFY-047]",
         )  # fmt: skip
-        own.need("parts", lambda: self.parts != 1, "parts must be 0, or 2 and more, got 1 [HM-IDENTIFY-048]")
+        own.need("parts", lambda: self.parts != 1, "parts: give 0, or at least 2; got 1 [HM-IDENTIFY-048]")
         own.refuse()
 
     @property

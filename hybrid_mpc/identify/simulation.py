@@ -321,9 +321,9 @@ def _substeps(rate: float, dt: float, name: str, where: str) -> int:
     substeps = max(1, math.ceil(rate * dt)) if math.isfinite(rate) else MAX_SUBSTEPS + 1
     if substeps > MAX_SUBSTEPS:
         raise InputError(
-            f"{name}'s fastest mode {where} is {rate:.3g} 1/s; a period of {dt} s "
-            f"would need {rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope "
-            f"at zero speed) or take a smaller dt. [HM-IDENTIFY-049]"
+            f"{name}: too stiff. Its fastest mode {where} is {rate:.3g} 1/s, so a period of {dt} s would need "
+            f"{rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope at zero speed), "
+            f"or use a smaller dt [HM-IDENTIFY-049]"
         )
     return substeps
 

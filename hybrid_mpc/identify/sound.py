@@ -1,4 +1,4 @@
-"""Whether a fitted prior is sound: what stops a run, and what puts the prior's structure in doubt. No torch in here."""
+"""Checks of a fitted prior: reasons to stop a run, and reasons to doubt the prior's structure. No torch here."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 STUCK = 0.05
-"""Share of the samples that may lie at the bounds of the smoothed states: more are no outliers."""
+"""Largest share of samples at the bounds of the smoothed states that can be outliers."""
 NEAR = 1e-3
 """Distance from a bound, over the range, that counts as at the bound."""
 CLEARLY = 0.75
-"""Error of a linear model over the fitted prior's below which the prior lacks something: two models of the same
+"""Error of a linear model over the fitted prior's below which the prior lacks an effect: two models of the same
 structure, fitted to the same recordings, differ by less."""
 BOUNDED = 0.5
-"""Share of the fitted parameters at bounds from which on the prior lacks something that they stand for."""
+"""Share of the fitted parameters at bounds from which on they compensate a missing effect."""
 NEGATIVE = -25.0
-"""FIT [%] of an output below which the prior says less of it than its mean would."""
+"""FIT [%] of an output below which the prior is worse than the mean of the output."""
 COSTLY = 0.95
-"""Error without a bound over the error with it below which the bound costs something."""
+"""Error without a bound over the error with it below which the bound is relevant."""
 ITERATIONS = 12
-"""Gauss-Newton steps of a trial fit at most; it shows the size of an error, no more."""
+"""Largest number of Gauss-Newton steps of a trial fit, enough for the size of the error."""
 
 
 @dataclass(frozen=True)
 class BoundCost:
-    """A parameter that the fit leaves at a bound, and what the bound costs.
+    """A fitted parameter at a bound, and the error due to the bound.
 
     Args:
-        parameter: Its name.
-        value: The bound [its unit].
-        free: Value that it would have without this bound [its unit].
-        ratio: Error of free runs without the bound over the error with it [-]; 1 where nothing is gained.
+        parameter: Name of the parameter.
+        value: The bound [unit of the parameter].
+        free: Fitted value without this bound [unit of the parameter].
+        ratio: Free-run error without the bound over the error with it [-]; 1 if the bound is irrelevant.
 
     Example:
         >>> print(BoundCost("k", 2.0, 2.6, 0.8))
@@ -63,7 +63,7 @@ class BoundCost:
 
     @property
     def costs(self) -> bool:
-        """Whether the bound costs something."""
+        """Whether the bound increases the error."""
         return self.ratio < COSTLY
 
     def __str__(self) -> str:
@@ -76,12 +76,12 @@ class BoundCost:
 
 
 def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) -> tuple[str, ...]:
-    """What no later stage may be given: numbers that are not finite, and states that have run away.
+    """Errors of a fit that later stages must not use: non-finite numbers, and states far out of range.
 
     Args:
-        smoother: Of the fitted prior (:meth:`~hybrid_mpc.identify.prior_result.PriorFit.smoother`).
-        fit: What the fit gave.
-        smoothed: All trajectories with the states that it smooths.
+        smoother: Smoother of the fitted prior (:meth:`~hybrid_mpc.identify.prior_result.PriorFit.smoother`).
+        fit: The fit.
+        smoothed: All trajectories with smoothed states.
     """
     prior, found = smoother.prior, []
     numbers = {
@@ -107,15 +107,15 @@ def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) 
         away = float(np.mean((x <= low + near) | (x >= high - near)))
         if away > STUCK:
             found.append(
-                f"{state.label} lies at three times its range [{state.lower:g}, {state.upper:g}] or beyond in "
-                f"{away:.0%} of the smoothed samples ({x.min():.4g} to {x.max():.4g}): no sensor determines it, its "
-                "range is wrong, or an equation that contains it is [HM-IDENTIFY-077]"
+                f"{state.label}: at or beyond three times its range [{state.lower:g}, {state.upper:g}] in {away:.0%} "
+                f"of the smoothed samples ({x.min():.4g} to {x.max():.4g}). Either no sensor determines it, or its "
+                "range or an equation with it is wrong [HM-IDENTIFY-077]"
             )
     return tuple(found)
 
 
 def correlation_of_errors(errors: Sequence[Array]) -> Array:
-    """Correlation of one-step prediction errors with those of the sample before, by output ``(n_y,)``; zero is white.
+    """Correlation of successive one-step prediction errors, by output ``(n_y,)``; zero is white.
 
     Args:
         errors: Errors of each trajectory ``(n, n_y)``, NaN where nothing was measured.
@@ -136,7 +136,7 @@ def correlation_of_errors(errors: Sequence[Array]) -> Array:
 def growth_time(
     make: Callable[..., Prior], fit: PriorFit, smoothed: Sequence[Trajectory], dt: float
 ) -> float:
-    """Time [s] over which small errors grow tenfold where the recordings go; infinite where they do not grow."""
+    """Time [s] in which small errors grow tenfold along the recordings; infinite if they do not grow."""
     own = OutputFit(make, dt)
     own.points = visited(smoothed)
     return own.reach(own.scaled(fit.values)) * math.log(GROWN[0]) / math.log(GROWN[-1])
@@ -150,9 +150,8 @@ def trial_length(
     longest: float | None,
     time_unit: float,
 ) -> float:
-    """Length [s] of the free runs of trial fits: two of the machine's seconds, less where small errors grow faster.
-
-    There it is twice the time in which they grow tenfold: first states are free in a fit.
+    """Length [s] of the free runs of trial fits: two time constants of the machine, but at most twice the time in which
+    small errors grow tenfold (initial states are free in a fit).
     """
     nominal = replace(fit, values=make().values)
     reach = min(growth_time(make, one, smoothed, dt) for one in (fit, nominal))
@@ -162,15 +161,15 @@ def trial_length(
 def bound_costs(
     make: Callable[..., Prior], fit: PriorFit, smoothed: Sequence[Trajectory], dt: float, length: float
 ) -> tuple[BoundCost, ...]:
-    """What each bound costs at which the fit leaves a parameter.
+    """Error due to each bound at which a fitted parameter lies.
 
-    The parameter's bound is moved by its whole range, all are fitted anew to windows of ``length`` [s], and errors of
-    free runs over these windows are compared.
+    The bound is moved by the parameter's whole range, all parameters are fitted again to windows of ``length`` [s], and
+    the free-run errors over these windows are compared.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
-        fit: What the fit gave.
-        smoothed: Training trajectories with smoothed states and the inputs that act.
+        fit: The fit.
+        smoothed: Training trajectories with smoothed states and delayed inputs.
         dt: Model period [s].
         length: Length [s] of the windows.
     """
@@ -193,7 +192,7 @@ def bound_costs(
         try:
             solved = problem.solve(bounded, ITERATIONS).theta
             (after,) = problem.explained([solved])
-        except InputError:  # the equations hold no values beyond this bound, or are too stiff there
+        except InputError:  # the equations are invalid or too stiff beyond this bound
             solved, after = bounded, before
         outside = solved[i] < own.lower[i] or solved[i] > own.upper[i]
         name, unit = own.names[i], own.unit[i]
@@ -205,25 +204,25 @@ def bound_costs(
 def shooting(
     fit: OutputFit, known: Sequence[Trajectory], sizes: Array, length: float, most: int = FEW
 ) -> Shooting:
-    """At most so many windows of ``length`` [s], or as long as the recordings hold."""
+    """A shooting problem with at most ``most`` windows of ``length`` [s], or of the length of the recordings."""
     longest = max(len(t.t) for t in known) - 1
     periods = min(scales.periods(length, fit.dt, 2), longest)
     return Shooting(fit, cut_outputs(known, periods, 0, most, fit.prior.states), sizes)
 
 
 def constant_runs(train: Sequence[Trajectory], test: Sequence[Trajectory], warm: int) -> list[Array]:
-    """Outputs of the poorest model: the training outputs' means, in each test trajectory after its warm-up."""
+    """Outputs of the constant model: the mean of the training outputs, in each test trajectory after its warm-up."""
     mean = np.nanmean(np.concatenate([t.y for t in train]), axis=0)
     return [np.tile(mean, (len(t.t) - warm, 1)) for t in test]
 
 
 def structure_doubt(error: float, baselines: Mapping[str, float]) -> str:
-    """Why the structure of the fitted prior is in doubt; empty where nothing says so.
+    """Why a simpler model puts the structure of the fitted prior in doubt; empty if none does.
 
     Args:
-        error: Its error of free runs on unseen recordings, over the outputs' spread.
-        baselines: That of simpler models on the same runs, by name: ``"constant"`` for the training mean, and linear
-            models of inputs and outputs.
+        error: Free-run error of the prior on test recordings, over the outputs' spread.
+        baselines: Errors of simpler models on the same runs, by name: ``"constant"`` for the training mean, and linear
+            input-output models.
 
     Example:
         >>> structure_doubt(0.35, {"constant": 1.1, "ARX": 0.3, "N4SID": 0.22})
@@ -243,10 +242,10 @@ def structure_doubt(error: float, baselines: Mapping[str, float]) -> str:
 
 
 def bounds_doubt(bounds: Sequence[BoundCost], fitted: int) -> str:
-    """Why parameters at bounds put the structure of the fitted prior in doubt; empty where they do not.
+    """Why parameters at bounds put the structure of the fitted prior in doubt; empty if they do not.
 
     Args:
-        bounds: What each bound costs (:func:`bound_costs`).
+        bounds: Error due to each bound (:func:`bound_costs`).
         fitted: Number of fitted parameters.
 
     Example:
@@ -265,12 +264,12 @@ def bounds_doubt(bounds: Sequence[BoundCost], fitted: int) -> str:
 
 
 def fit_doubt(fit_percent: Mapping[str, float], share: Mapping[str, float]) -> str:
-    """Which outputs the fitted prior predicts worse than their means would; empty where there is none.
+    """Which outputs the fitted prior predicts worse than their means; empty if there are none.
 
     Args:
-        fit_percent: FIT [%] of each output, ``"phi [rad]"``, in free runs on unseen recordings.
-        share: Error over the spread of each output in all recordings [-]: one that hardly moves in a run may have a
-            poor FIT and little error.
+        fit_percent: FIT [%] of each output, ``"phi [rad]"``, in free runs on test recordings.
+        share: Error over the spread of each output in all recordings [-]: an output that hardly moves in a run can have
+            a poor FIT and a small error.
 
     Example:
         >>> fit_doubt({"phi [rad]": -60.0, "level [m]": -40.0}, {"phi [rad]": 1.4, "level [m]": 0.1})
@@ -285,14 +284,14 @@ def fit_doubt(fit_percent: Mapping[str, float], share: Mapping[str, float]) -> s
 
 
 def no_gain(unseen: Mapping[str, float], training: Mapping[str, float]) -> str:
-    """Why nothing may be built on a fitted prior: a constant or the nominal parameters are better; empty otherwise.
+    """Why later stages must not use a fitted prior: a constant or the nominal parameters are better; empty otherwise.
 
-    A constant must be better on both kinds of recordings: a machine that is held still in one of them says little.
+    A constant must be better on test and training recordings, since one of them may contain a machine at rest.
 
     Args:
-        unseen: Errors of free runs on unseen recordings, over the outputs' spread, of the fitted prior (``"phy"``), of
-            the prior with nominal parameters (``"phy_nominal"``) and of the training mean (``"constant"``).
-        training: Those of ``"phy"`` and ``"constant"`` on the training recordings.
+        unseen: Free-run errors on test recordings, over the outputs' spread, of the fitted prior (``"phy"``), of the
+            prior with nominal parameters (``"phy_nominal"``) and of the training mean (``"constant"``).
+        training: Errors of ``"phy"`` and ``"constant"`` on the training recordings.
 
     Example:
         >>> no_gain({"phy": 1.2, "phy_nominal": 2.0, "constant": 0.8}, {"phy": 1.1, "constant": 1.0})

@@ -508,8 +508,8 @@ class TrainedParameters(nn.Module):
         free = [spec for spec in prior.parameters if not spec.fixed]
         if not free:
             raise InputError(
-                f"{type(prior).__name__} has no free parameter to train along (all have lower == upper); "
-                "leave prior_parameters 'fixed' or give one of them bounds [HM-IDENTIFY-050]"
+                f"{type(prior).__name__}: no free parameter to train (all have lower == upper). "
+                "Set prior_parameters to 'fixed', or give a parameter bounds [HM-IDENTIFY-050]"
             )
         self.networks, start, n_p = networks, prior.values, len(prior.parameters)
         self._spec = {p.name: (start[p.name], p.lower, p.upper) for p in free}
@@ -558,8 +558,8 @@ def shift_to(prior: Prior, values: Mapping[str, float]) -> Tensor:
     unknown = set(values) - set(own)
     if unknown:
         raise InputError(
-            f"{type(prior).__name__} has no parameter {', '.join(sorted(unknown))}, which was trained along; "
-            "give the prior of the training [HM-IDENTIFY-051]"
+            f"{type(prior).__name__}: no parameter {', '.join(sorted(unknown))}, which was trained. "
+            "Give the prior of the training [HM-IDENTIFY-051]"
         )
     return torch.tensor(
         [values.get(name, fitted) - fitted for name, fitted in own.items()], dtype=torch.float64

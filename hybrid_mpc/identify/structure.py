@@ -1,7 +1,7 @@
-"""Which part of a prior is wrong: terms and signals get a factor that is fitted to the recordings. No torch in here.
+"""Find the wrong part of a prior: factors on its terms and signals are fitted to the recordings. No torch in here.
 
-A parameter cannot mend a wrong sign, a wrong unit or a term that does not exist. A factor on the term can: at -1 the
-sign is wrong, at 57.3 degrees stand for radians, at zero there is no such term.
+A parameter cannot correct a wrong sign, a wrong unit or a superfluous term. A factor on the term can: a factor of -1
+means a wrong sign, 57.3 means degrees in place of radians, 0 means that the term does not exist.
 """
 
 from __future__ import annotations
@@ -95,19 +95,19 @@ SUMS = (ca.OP_ADD, ca.OP_SUB)
 
 @dataclass(frozen=True)
 class Cause:
-    """A mistake that explains why a prior does not follow the recordings.
+    """A mistake in a prior that explains its errors on the recordings.
 
     Args:
-        what: The term or signal that is wrong.
-        why: What is wrong with it.
-        ratio: Error of free runs with the mistake mended over the error without [-].
-        factor: Factor that the recordings give the term; NaN where there is none.
-        before: Whether there is an error without the mistake mended; where the prior cannot be fitted with it, the
-            ratio is over the outputs' spread.
+        what: The wrong term or signal.
+        why: Description of the mistake.
+        ratio: Free-run error after the correction over the error before it [-].
+        factor: Fitted factor of the term; NaN without a factor. Default: NaN.
+        before: Whether there is an error before the correction; if the prior cannot be fitted with the mistake, the
+            ratio is over the outputs' spread. Default: True.
 
     Example:
         >>> print(Cause("k * u in the rate of v", "its sign seems wrong", 0.1, -1.02))
-        k * u in the rate of v: its sign seems wrong (factor -1.02); mended, the error of free runs falls to 10 %
+        k * u in the rate of v: its sign seems wrong (factor -1.02); corrected, the error of free runs falls to 10 %
     """
 
     what: str
@@ -118,14 +118,14 @@ class Cause:
 
     @property
     def exact(self) -> bool:
-        """Whether the factor says what the mistake is."""
+        """Whether the factor identifies the mistake."""
         return self.why not in VAGUE and not COMMON[0] < self.factor < COMMON[1]
 
     def __str__(self) -> str:
         factor = "" if math.isnan(self.factor) else f" (factor {self.factor:.3g})"
         left = f"{100 * self.ratio:.0f} %"
         told = f"falls to {left}" if self.before else f"is {left} of the outputs' spread"
-        return f"{self.what}: {self.why}{factor}; mended, the error of free runs {told}"
+        return f"{self.what}: {self.why}{factor}; corrected, the error of free runs {told}"
 
 
 def reading_of(factor: float, needed: bool = True) -> str:

@@ -92,7 +92,7 @@ class SearchSpace:
                 object.__setattr__(self, field.name, _checked(field.name, bounds))
         if not self.names:
             raise InputError(
-                f"the search has nothing to vary; give bounds to one of: {', '.join(USUAL)} [HM-IDENTIFY-056]"
+                f"search space: empty; give bounds for at least one of: {', '.join(USUAL)} [HM-IDENTIFY-056]"
             )
 
     @property
@@ -147,9 +147,11 @@ def parsed_space(texts: Sequence[str]) -> SearchSpace:
     for text in texts:
         name, _, given = text.partition("=")
         if name not in USUAL:
-            raise InputError(f"no setting {name!r} to vary; there are: {', '.join(USUAL)} [HM-IDENTIFY-057]")
+            raise InputError(
+                f"{name!r}: this setting cannot be varied; choose from: {', '.join(USUAL)} [HM-IDENTIFY-057]"
+            )
         if name in found:
-            raise InputError(f"{name} is varied twice; give it once [HM-IDENTIFY-058]")
+            raise InputError(f"{name}: given twice; give it once [HM-IDENTIFY-058]")
         found[name] = _parsed_bounds(text, given) if given else USUAL[name]
     return SearchSpace(**(dict.fromkeys(USUAL) | found))
 
@@ -160,23 +162,20 @@ def _parsed_bounds(text: str, given: str) -> tuple[float, float]:
         return float(low), float(high)
     except ValueError as error:
         raise InputError(
-            f"{text!r}: the form is NAME=LOW:HIGH, e.g. hidden=8:32 [HM-IDENTIFY-059]"
+            f"{text!r}: wrong form; write NAME=LOW:HIGH, e.g. hidden=8:32 [HM-IDENTIFY-059]"
         ) from error
 
 
 def _checked(name: str, bounds: Sequence[float]) -> tuple[float, float]:
     if len(bounds) != 2 or not 0 < bounds[0] < bounds[1] < float("inf"):
         raise InputError(
-            f"{name} is to be varied between {list(bounds)}; needed are two positive numbers, the lower one first"
+            f"{name}: the bounds are {list(bounds)}; give two positive numbers, the lower one first"
             " [HM-IDENTIFY-060]"
         )
     if name not in WHOLE:
         return float(bounds[0]), float(bounds[1])
     if any(b != int(b) for b in bounds):
-        raise InputError(
-            f"{name} is to be varied between {list(bounds)}; its bounds must be whole numbers"
-            " [HM-IDENTIFY-061]"
-        )
+        raise InputError(f"{name}: the bounds are {list(bounds)}; give whole numbers [HM-IDENTIFY-061]")
     return int(bounds[0]), int(bounds[1])
 
 
@@ -286,7 +285,7 @@ def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
     """Refuse numbers that no search can be made with."""
     if trials < 1 or seed < 0 or (timeout is not None and not timeout > 0):
         raise InputError(
-            f"a search needs trials of 1 or more, a seed of 0 or more and a timeout above 0 s, got "
+            f"search: give trials of at least 1, a seed of at least 0 and a timeout above 0 s; got "
             f"{trials}, {seed}, {timeout} [HM-IDENTIFY-062]"
         )
 
@@ -356,8 +355,8 @@ def _result(study: optuna.Study, base: TrainingSettings, space: SearchSpace) -> 
     complete = [row for row in rows if row.state == "complete"]
     if not complete:
         raise InputError(
-            f"all {len(rows)} trainings of the search diverged: no network had a finite validation error; look at "
-            "the data and the fitted prior, or lower the learning rates' bounds [HM-IDENTIFY-063]"
+            f"search: all {len(rows)} trainings diverged, so no network has a finite validation error. Check the data "
+            "and the fitted prior, or reduce the bounds of the learning rates [HM-IDENTIFY-063]"
         )
     best = min(complete, key=lambda row: row.value)
     importance: dict[str, float] = {}
@@ -400,8 +399,8 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
         found = study.user_attrs.get("identity", {})
     except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
         raise InputError(
-            f"{storage} is no journal of a search or is damaged ({type(error).__name__}: {error}); choose another "
-            "file or delete it to search anew [HM-IDENTIFY-064]"
+            f"{storage}: not the journal of a search, or damaged ({type(error).__name__}: {error}). Choose another "
+            "file, or delete it to start a new search [HM-IDENTIFY-064]"
         ) from error
     finally:
         optuna.logging.set_verbosity(verbosity)
@@ -409,8 +408,8 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
         study.set_user_attr("identity", dict(identity))
     elif differ := [name for name in identity if found.get(name) != identity[name]]:
         raise InputError(
-            f"{storage} holds another search ({', '.join(differ)} differ); go on with the same ones or choose "
-            "another file [HM-IDENTIFY-065]"
+            f"{storage}: belongs to another search ({', '.join(differ)} differ). Continue with the same settings, or "
+            "choose another file [HM-IDENTIFY-065]"
         )
     for _ in study.get_trials(states=(TrialState.WAITING,)):  # drawn, not begun, when the search was ended
         study.ask()

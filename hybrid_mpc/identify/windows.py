@@ -65,14 +65,14 @@ class FirstStates:
             )
         if (self.kind == "known") != bool(self.values):
             problems.append(
-                f"first states: values by name belong to kind 'known' and to it alone, got {self.values}"
+                f"first states: give values by name with kind 'known', and only then; got {self.values}"
                 " [HM-IDENTIFY-067]"
             )
         if not all(math.isfinite(value) for value in self.values.values()):
             problems.append(f"first states: values must be finite, got {self.values} [HM-IDENTIFY-068]")
         if (self.kind == "warm_up") != (0 < self.seconds < math.inf):
             problems.append(
-                f"first states: a positive length [s] belongs to kind 'warm_up' and to it alone, got {self.seconds}"
+                f"first states: give a positive length [s] with kind 'warm_up', and only then; got {self.seconds}"
                 " [HM-IDENTIFY-069]"
             )
         refuse(problems)
@@ -89,19 +89,20 @@ class FirstStates:
         """
         names, outputs = ([s.name for s in signals] for signals in (prior.states, prior.outputs))
         problems = [
-            f"first states: {name!r} is no state of {type(prior).__name__} ({', '.join(names)}) [HM-IDENTIFY-070]"
+            f"first states: {type(prior).__name__} has no state {name!r}; choose from: {', '.join(names)} "
+            "[HM-IDENTIFY-070]"
             for name in self.values
             if name not in names
         ]
         if self.kind == "measured" and not set(names) & set(outputs):
             problems.append(
                 f"first states: no output of {type(prior).__name__} ({', '.join(outputs)}) is a state "
-                f"({', '.join(names)}); leave them free [HM-IDENTIFY-071]"
+                f"({', '.join(names)}). Use kind 'free' [HM-IDENTIFY-071]"
             )
         if self.kind in ("known", "shared") and largest_delay:
             problems.append(
-                f"first states: a delay costs the first samples of a trajectory, whose state is {self.kind}; leave "
-                "largest_delay 0, or the first states free [HM-IDENTIFY-072]"
+                f"first states: with a delay, the first samples of a trajectory are lost, but their state is "
+                f"{self.kind}. Set largest_delay to 0, or use kind 'free' [HM-IDENTIFY-072]"
             )
         refuse(problems)
 
@@ -171,8 +172,8 @@ def cut_outputs(
         if not starts:
             longest = most_samples(trajectories)
             raise InputError(
-                f"no recording is long enough: the longest has {longest} samples, a free run of {periods} periods with "
-                f"{lead} samples before it needs {periods + lead + 1} [HM-IDENTIFY-073]"
+                f"recordings: too short. The longest has {longest} samples, but a free run of {periods} periods with "
+                f"{lead} samples before it needs {periods + lead + 1}. Give longer recordings [HM-IDENTIFY-073]"
             )
         chosen = [starts[i] for i in evenly(len(starts), most)]
         if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample

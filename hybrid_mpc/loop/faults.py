@@ -1,4 +1,4 @@
-"""Faults of sensors and actuators, which need no knowledge of the plant, and of plants that know their own."""
+"""Simulated faults of sensors and actuators, for any plant, and faults that a plant implements itself."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ class Fault:
     """A fault that acts for ``start <= t < end``.
 
     Args:
-        start: First instant [s].
-        end: Instant from which it is gone [s]; ``inf`` for never.
+        start: Begin [s].
+        end: End [s]; ``inf`` for never.
         target: ``"measurement_offset"`` adds ``value`` to the measurement; ``"measurement_scale"`` multiplies
             it; ``"measurement_freeze"`` repeats the last one before the fault; ``"measurement_dropout"`` gives
             NaN; ``"input_gain"`` multiplies the input that reaches the plant by ``value``;
-            ``"input_offset"`` adds ``value`` to it. ``"plant_..."`` is one of the plant's own, which says what
-            it means; see :func:`install`.
-        value: Size, in the units of the output or input, [-] for a factor. Freeze and dropout use none.
-        channel: Name of the output or input concerned. Default: the only one; where there are several it is needed.
-        ramp: Time [s] over which the size grows, in proportion, from nothing to ``value``. Default 0: at once.
+            ``"input_offset"`` adds ``value`` to it. ``"plant_..."`` is a fault that the plant implements; see
+            :func:`install`.
+        value: Size, in the unit of the output or input, [-] for a factor. Freeze and dropout use none. Default: 0.
+        channel: Name of the output or input; needed if there are several. Default: the only one.
+        ramp: Time [s] over which the size grows linearly to ``value``. Default: 0, at once.
 
     Raises:
-        InputError: If the interval is empty, the target unknown, the value not finite, the channel no name, or the ramp
-            negative.
+        InputError: If the interval is empty, the target unknown, the value not finite, the channel not a name, or the
+            ramp negative.
 
     Example:
         >>> corrupt_input([Fault(1.0, 2.0, "input_gain", 0.5)], 1.5, np.array([0.4]))
@@ -61,7 +61,7 @@ class Fault:
         own.need(
             "start end",
             lambda: self.start < self.end,
-            f"the interval [{self.start}, {self.end}) s is empty [HM-LOOP-001]",
+            f"the interval [{self.start}, {self.end}) s is empty; give start < end [HM-LOOP-001]",
         )
         own.refuse()
 
@@ -72,17 +72,17 @@ class Fault:
 
     @property
     def on_plant(self) -> bool:
-        """True for a fault inside the machine, which only the plant can show."""
+        """True for a fault inside the machine, which the plant implements."""
         return self.target.startswith("plant_")
 
     def active(self, t: float) -> bool:
-        """True at ``t`` [s]; instants within a nanosecond of ``start`` and ``end`` count as these."""
+        """Whether the fault acts at ``t`` [s], with a tolerance of a nanosecond."""
         return self.start - 1e-9 <= t < self.end - 1e-9
 
     def value_at(self, t: float, neutral: float) -> float:
-        """Size at ``t`` [s]: on its ramp from ``neutral`` (1 for a factor, 0 for a sum) to ``value``.
+        """Size at ``t`` [s] on the ramp from ``neutral`` (1 for a factor, 0 for a sum) to ``value``.
 
-        Where ``neutral`` is infinite (a limit that is not there) the ramp is at its end from the start.
+        With an infinite ``neutral`` (no limit) there is no ramp.
         """
         if self.ramp == 0 or not math.isfinite(neutral):
             return self.value
@@ -98,7 +98,7 @@ EFFECTS: Mapping[str, Callable[[Fault, float, float, float], float]] = {
     "input_gain": lambda fault, t, value, before: value * fault.value_at(t, 1.0),
     "input_offset": lambda fault, t, value, before: value + fault.value_at(t, 0.0),
 }
-"""What a fault makes at ``t`` of a measured or commanded value; ``before`` is the measurement before it."""
+"""Faulty value at ``t``, from the measured or commanded value and the measurement before it, by target."""
 SIGNAL_TARGETS = tuple(EFFECTS)
 
 
@@ -106,11 +106,13 @@ def _unknown(target: object) -> str:
     near = difflib.get_close_matches(str(target), SIGNAL_TARGETS, 1)
     meant = f"; did you mean {near[0]!r}? There are" if near else "; known"
     targets = ", ".join(SIGNAL_TARGETS)
-    return f"fault target {target!r} is unknown{meant}: {targets}, and what a plant knows as plant_... [HM-LOOP-052]"
+    return (
+        f"fault target {target!r} is unknown{meant}: {targets}, and the plant's own plant_... [HM-LOOP-052]"
+    )
 
 
 def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequence[str]) -> None:
-    """Refuse faults of channels that do not exist or are not named, and faults that only a plant can show.
+    """Refuse faults of unknown or missing channels, and faults that only a plant can simulate.
 
     Args:
         faults: The faults.
@@ -118,7 +120,7 @@ def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequ
         inputs: Names of the inputs.
 
     Raises:
-        InputError: With the names that there are.
+        InputError: The message lists the valid names.
 
     Example:
         >>> check_channels([Fault(0.0, 1.0, "input_gain", 0.5, "power3")], ["level"], ["power1", "power2"])
@@ -128,14 +130,14 @@ def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequ
     for fault in faults:
         if fault.on_plant:
             raise InputError(
-                f"fault {fault.target} lies in the plant: build it in with "
-                "plant, faults = install(plant, faults) before simulating [HM-LOOP-002]"
+                f"fault {fault.target}: only the plant can simulate it. Call plant, faults = install(plant, faults) "
+                "before the simulation [HM-LOOP-002]"
             )
         kind, names = ("input", inputs) if fault.on_input else ("output", outputs)
         if not fault.channel and len(names) > 1:
             raise InputError(
-                f"fault {fault.target}: which {kind}? Name one of {', '.join(names)}: "
-                f'channel="{names[0]}", in a text {fault.target}:{names[0]} [HM-LOOP-003]'
+                f"fault {fault.target}: the {kind} is missing. Give one of {', '.join(names)}: "
+                f'channel="{names[0]}", or {fault.target}:{names[0]} in a text [HM-LOOP-003]'
             )
         if fault.channel and fault.channel not in names:
             raise InputError(
@@ -144,28 +146,28 @@ def check_channels(faults: Sequence[Fault], outputs: Sequence[str], inputs: Sequ
 
 
 def check_plant_faults(faults: Sequence[Fault], known: Sequence[str]) -> None:
-    """Refuse, on a plant's behalf, faults that are not among those it ``known``.
+    """Refuse faults that are not among the ``known`` faults of a plant.
 
     Raises:
-        InputError: With the fault and what the plant knows.
+        InputError: The message names the fault and the plant's faults.
     """
     for fault in faults:
         if fault.target not in known:
             raise InputError(
-                f"this plant has no fault {fault.target!r}; it knows: {', '.join(known)} [HM-LOOP-005]"
+                f"fault {fault.target!r}: this plant does not have it; choose from: {', '.join(known)} [HM-LOOP-005]"
             )
 
 
 def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]]:
-    """Build the faults of the machine into a plant; what is left are those of sensors and actuators.
+    """Build faults of the machine into a plant; faults of sensors and actuators remain.
 
-    If any fault is the plant's own, it has a method ``with_faults(faults) -> plant``.
+    A plant with faults of its own has a method ``with_faults(faults) -> plant``.
 
     Returns:
-        The plant to simulate, and the faults to hand to ``simulate``.
+        The faulty plant, and the remaining faults for ``simulate``.
 
     Raises:
-        InputError: If the plant takes no faults, or not one of these.
+        InputError: If the plant does not support one of these faults.
     """
     inside = tuple(fault for fault in faults if fault.on_plant)
     outside = tuple(fault for fault in faults if not fault.on_plant)
@@ -173,8 +175,8 @@ def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]
         return plant, outside
     if not hasattr(plant, "with_faults"):
         raise InputError(
-            f"fault {inside[0].target}: the plant {type(plant).__name__} takes no faults; it needs a method "
-            "with_faults(faults) that returns the faulty plant [HM-LOOP-006]"
+            f"fault {inside[0].target}: plant {type(plant).__name__} does not support faults. Write its method "
+            "with_faults(faults), which returns the faulty plant [HM-LOOP-006]"
         )
     return plant.with_faults(inside), outside
 
@@ -182,17 +184,17 @@ def install(plant: Any, faults: Sequence[Fault]) -> tuple[Any, tuple[Fault, ...]
 def corrupt_measurement(
     faults: Sequence[Fault], t: float, y: Array, y_before: Array, outputs: Sequence[str] = ()
 ) -> Array:
-    """Measurement ``(n_y,)`` that arrives at ``t``; ``y_before`` is the one that arrived before it.
+    """Faulty measurement ``(n_y,)`` at ``t``; ``y_before`` is the measurement before it.
 
-    ``outputs`` are their names; needed where faults name one.
+    ``outputs`` are the names of the outputs, needed if a fault names one.
     """
     return _corrupted(faults, t, y, y_before, outputs, "measurement_")
 
 
 def corrupt_input(faults: Sequence[Fault], t: float, u: Array, inputs: Sequence[str] = ()) -> Array:
-    """Input ``(n_u,)`` that reaches the plant at ``t`` when ``u`` was commanded.
+    """Faulty input ``(n_u,)`` that reaches the plant at ``t`` for the commanded input ``u``.
 
-    ``inputs`` are their names; needed where faults name one.
+    ``inputs`` are the names of the inputs, needed if a fault names one.
     """
     return _corrupted(faults, t, u, u, inputs, "input_")
 
@@ -209,7 +211,7 @@ def _corrupted(
 
 
 def fault_text(faults: Sequence[Fault], late: Sequence[tuple[float, float]] = ()) -> str:
-    """Faults in the form in which the command line takes them; ``"none"`` for none.
+    """Faults in the form of the command line; ``"none"`` for none.
 
     Example:
         >>> fault_text([Fault(1.5, np.inf, "plant_friction", 2.0)], late=((1.0, 1.2),))
@@ -229,12 +231,12 @@ def parsed_fault(text: str) -> Fault:
     """A fault from ``TARGET[:CHANNEL][=VALUE][@START[:END]]``, times in seconds.
 
     Args:
-        text: e.g. ``"input_gain=0.8@1.0"`` or ``"measurement_offset:level=0.1@5:9"``; start 0 by default, end never.
-            The channel is the name of an output or input, needed where there are several. A sensor that freezes or
-            drops out has no value, every other fault needs one.
+        text: e.g. ``"input_gain=0.8@1.0"`` or ``"measurement_offset:level=0.1@5:9"``. Default of start: 0; of end:
+            never. The channel is the name of an output or input, needed if there are several. Freeze and dropout have
+            no value, all other faults need one.
 
     Raises:
-        InputError: If it has another form, or there is no such fault.
+        InputError: If the text has another form, or the fault is unknown.
 
     Example:
         >>> fault = parsed_fault("plant_friction=2@1:2.5")
@@ -251,7 +253,7 @@ def parsed_fault(text: str) -> Fault:
         numbers = [float(v) if v else d for v, d in ((start, 0.0), (end, math.inf), (value, 0.0))]
     except ValueError as error:
         raise InputError(
-            f"fault {text!r}: {error}; the form is TARGET:CHANNEL=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
+            f"fault {text!r}: {error}. Write TARGET:CHANNEL=VALUE@START:END, e.g. input_gain=0.8@1.0:2.5"
             " [HM-LOOP-007]"
         ) from error
     if math.isnan(numbers[0]) or math.isnan(numbers[1]):
@@ -259,6 +261,6 @@ def parsed_fault(text: str) -> Fault:
     fault = Fault(numbers[0], numbers[1], target, numbers[2], channel)
     if not value and target not in ("measurement_freeze", "measurement_dropout"):
         raise InputError(
-            f"fault {text!r} has no value; write how large it is, e.g. {target}=1.5@1.0 [HM-LOOP-009]"
+            f"fault {text!r}: the value is missing; write its size, e.g. {target}=1.5@1.0 [HM-LOOP-009]"
         )
     return fault

@@ -1,4 +1,4 @@
-"""The guard: on an alarm the loop goes over to tighter limits, another controller or rest, and back without a bump."""
+"""The guard: on an alarm, the loop switches to tighter limits, a backup or the safe input, and back without a bump."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from hybrid_mpc.estimate.kalman import Estimate, Estimator
 
 Array = NDArray[np.float64]
 TINY = 1e-9
-"""Tolerance [s] of comparisons between times; far below any period, above rounding."""
+"""Tolerance [s] of comparisons between times: far below any period, above rounding."""
 USED_UP = 10**6
-"""Age of a plan that no :class:`SafeController` follows any more, so that its fallback takes over."""
+"""Age of a plan that no :class:`SafeController` uses any more, so that its fallback gives the input."""
 
 
 class Mode(IntEnum):
-    """How the loop is run, the more careful the larger."""
+    """Mode of the loop; a larger number is more cautious."""
 
     NORMAL = 0
-    """The controller as it is."""
+    """The normal controller."""
     LIMITED = 1
-    """The same controller within the guard's limits."""
+    """The normal controller within the guard's limits."""
     BACKUP = 2
-    """Another controller with an estimator of its own: usually the MPC of the fitted prior with observer."""
+    """Another controller with its own estimator, usually the MPC of the fitted prior with observer."""
     FALLBACK = 3
-    """The stabilising feedback of the safeguards."""
+    """The stabilizing feedback of the safeguards."""
     REST = 4
-    """The safe input: what is left where the sensor cannot be believed. The machine must be safe with it."""
+    """The safe input, if a sensor cannot be trusted. The machine must be safe with this input."""
 
 
 @dataclass(frozen=True)
 class Switch:
-    """A change of mode, in words why; ``t`` [s] is the first instant at which the new mode decides."""
+    """A change of mode with its reason ``why``; ``t`` [s] is the first period of the new mode."""
 
     t: float
     before: Mode
@@ -50,32 +50,31 @@ class Switch:
 
 @dataclass(frozen=True)
 class Guard:
-    """What a loop does on alarms of its monitor.
+    """Reaction of a loop to alarms of its monitor.
 
-    A reading acts in the next period. The guard goes to a more careful mode at once, and back when the alarm that asked
-    for it has been off for ``quiet`` and the mode has lasted for ``dwell``. Between two controllers nothing jumps: the
-    input stays within ``du_max`` of the last one, the new controller begins from the old one's plan, and both
-    estimators run all the time. Without an alarm the loop is the same as without a guard.
+    A reading takes effect in the next period. The guard switches to a more cautious mode at once, and back when the
+    alarm has been off for ``quiet`` and the mode has lasted for ``dwell``. Switching is bumpless: the input stays
+    within ``du_max`` of the last one, the new controller starts from the plan of the old one, and both estimators
+    always run. Without an alarm, the loop is the same as without a guard.
 
-    A frozen sensor and a machine at rest look alike: the guard stays in ``REST`` until the sensor moves. A monitor that
-    is blind for longer than its windows (``reading.blind``: samples are missing, or model or estimator gives no number)
-    asks for ``on_model`` as a doubt of the model does.
+    A frozen sensor cannot be distinguished from a machine at rest: the guard stays in ``REST`` until the sensor
+    changes. A blind monitor (``reading.blind``: no valid reading for longer than its windows) causes ``on_model``, too.
 
     Args:
-        on_model: Mode where the model does not describe the machine, or nobody can say whether it does. Default:
-            ``BACKUP`` if there is one, else ``LIMITED`` if there are limits, else ``FALLBACK``.
-        on_sensor: Mode where the sensor is frozen (``reading.frozen``). Default ``REST``.
-        limits: Bounds of the inputs in every mode but ``NORMAL``. Default: the problem's own.
-        backup: Controller of ``BACKUP``; a bare one is guarded without fallback.
-        backup_estimator: Its estimator.
-        dwell: Shortest time [s] in a mode before going back. Default 0.5.
-        quiet: Time [s] without alarm before going back. Default 1.
-        patience: Time [s] for which the model must have been in doubt before ``on_model``; alarms less than ``quiet``
-            apart count as one. A push is over by then, and the normal controller's observer handles it better than a
-            backup that takes it for a fault. A frozen sensor acts at once, always. Default 0.
+        on_model: Mode if the model does not describe the machine, or the monitor is blind. Default: ``BACKUP`` if there
+            is a backup, else ``LIMITED`` if there are limits, else ``FALLBACK``.
+        on_sensor: Mode if a sensor is frozen (``reading.frozen``). Default: ``REST``.
+        limits: Bounds of the inputs in every mode except ``NORMAL``. Default: those of the problem.
+        backup: Controller of ``BACKUP``; a bare controller has no fallback. Default: none.
+        backup_estimator: Estimator of the backup. Default: none.
+        dwell: Shortest time [s] in a mode before switching back. Default: 0.5.
+        quiet: Time [s] without alarm before switching back. Default: 1.
+        patience: Time [s] that an alarm of the model must last before ``on_model``; alarms less than ``quiet`` apart
+            count as one alarm. The normal controller's observer handles a short push better than a backup. A frozen
+            sensor always takes effect at once. Default: 0.
 
     Raises:
-        InputError: If a mode lacks what it needs, a time is negative, or there is patience without quiet.
+        InputError: If a mode lacks its parts, a time is negative, or ``patience`` is given with ``quiet=0``.
 
     Example:
         >>> Guard(limits=Limits([-0.2], [0.2])).on_model.name, Guard().on_model.name
@@ -105,17 +104,20 @@ class Guard:
     ) -> None:
         if (backup is None) != (backup_estimator is None):
             raise InputError(
-                "guard: backup and backup_estimator belong together; give both or neither [HM-LOOP-010]"
+                "guard: backup needs backup_estimator and vice versa; give both or neither [HM-LOOP-010]"
             )
         guarded = backup if backup is None or isinstance(backup, SafeController) else SafeController(backup)
         if on_model is None:
             on_model = Mode.BACKUP if guarded else Mode.LIMITED if limits else Mode.FALLBACK
         if Mode.BACKUP in (on_model, on_sensor) and guarded is None:
             raise InputError(
-                "guard: mode BACKUP needs a controller and its estimator: backup, backup_estimator [HM-LOOP-011]"
+                "guard: mode BACKUP needs a controller and its estimator; give backup and backup_estimator "
+                "[HM-LOOP-011]"
             )
         if Mode.LIMITED in (on_model, on_sensor) and limits is None:
-            raise InputError("guard: mode LIMITED needs limits, e.g. Limits([-0.2], [0.2]) [HM-LOOP-012]")
+            raise InputError(
+                "guard: mode LIMITED needs limits; give e.g. Limits([-0.2], [0.2]) [HM-LOOP-012]"
+            )
         times = float(dwell), float(quiet), float(patience)
         if not all(0 <= value < math.inf for value in times):
             raise InputError(
@@ -124,7 +126,7 @@ class Guard:
             )
         if patience > 0 and quiet == 0:
             raise InputError(
-                f"guard: patience of {patience} s needs a quiet above 0 s, to tell one alarm from the next"
+                f"guard: patience of {patience} s needs quiet above 0 s, to separate one alarm from the next"
                 " [HM-LOOP-014]"
             )
         values = on_model, on_sensor, limits, guarded, backup_estimator, *times
@@ -134,16 +136,16 @@ class Guard:
 
 @dataclass(frozen=True)
 class GuardState:
-    """What a guard remembers from one period to the next; times are in seconds.
+    """State of a guard between two periods; times are in seconds.
 
     Args:
-        mode: The mode that decides now, ``since`` when.
-        wanted: The mode of the next period, and ``why``, in words.
-        alarm: Time of the last alarm; ``doubt``: of the first of the present row.
-        frozen: Time at which the sensor was last seen frozen.
-        backup: Estimate of the backup's estimator; None without one, and before the first sample.
-        planner: Whose plan the last one is: ``"controller"``, ``"backup"`` or nobody's (at rest).
-        switches: Changes of the mode until now.
+        mode: The present mode, and the time ``since`` it has been active.
+        wanted: The mode of the next period, and the reason ``why``.
+        alarm: Time of the last alarm; ``doubt``: begin of the present sequence of alarms.
+        frozen: Time of the last reading with a frozen sensor.
+        backup: Estimate of the backup's estimator; None without a backup, and before the first sample.
+        planner: Origin of the last plan: ``"controller"``, ``"backup"``, or ``"nobody"`` (at rest).
+        switches: All changes of the mode.
     """
 
     mode: Mode = Mode.NORMAL
@@ -159,14 +161,14 @@ class GuardState:
 
 
 class GuardedController:
-    """A controller that changes with the guard's mode. Pure: what it remembers is a :class:`GuardState`."""
+    """A controller that changes with the guard's mode; its state is a :class:`GuardState`."""
 
     def __init__(self, safe: SafeController, guard: Guard | None = None) -> None:
         self.safe, self.guard = safe, guard
         if guard is not None and Mode.REST in (guard.on_model, guard.on_sensor) and safe.safe_input is None:
             raise InputError(
-                "guard: mode REST applies the safe input, and none is declared; give Scenario(safe_input=...) or "
-                "SafeController(safe_input=...): the input with which the machine may be left alone [HM-LOOP-015]"
+                "guard: mode REST needs a safe input, with which the machine may be left alone. Give "
+                "Scenario(safe_input=...) or SafeController(safe_input=...) [HM-LOOP-015]"
             )
         self._backup = safe if guard is None or guard.backup is None else guard.backup
         if guard is not None and guard.backup is not None and guard.backup_estimator is not None:
@@ -175,9 +177,9 @@ class GuardedController:
     def measured(
         self, state: GuardState, t: float, y: Array, u_prev: Array, w: Array | None = None
     ) -> GuardState:
-        """State with a sample ``y`` ``(n_y,)`` at ``t``, ``u_prev`` held before it; the mode wanted begins now.
+        """State after a sample ``y`` ``(n_y,)`` at ``t``, with ``u_prev`` held before it; the wanted mode begins now.
 
-        ``w`` ``(n_w,)`` are the disturbances measured with it; None: there are none.
+        ``w`` ``(n_w,)`` are the measured disturbances at ``t``; None without any.
         """
         if state.wanted is not state.mode:
             switch = Switch(t, state.mode, state.wanted, state.why)
@@ -195,9 +197,9 @@ class GuardedController:
         self, state: GuardState, previous: Decision, estimate: Estimate, reference: Array,
         weight: Array | None = None, *, prepared: Any = None, late: bool = False, w: Array | None = None,
     ) -> tuple[Decision, GuardState]:  # fmt: skip
-        """The input to hold from now on, by the mode's controller; see :meth:`SafeController.decide`.
+        """The input to hold from now on, from the mode's controller; see :meth:`SafeController.decide`.
 
-        ``late``: the solve has not come in time; see :meth:`SafeController.late`.
+        ``late``: the solve missed its deadline; see :meth:`SafeController.late`.
         """
         bounds = None if state.mode is Mode.NORMAL or self.guard is None else self.guard.limits
         if state.mode is Mode.REST:
@@ -214,14 +216,14 @@ class GuardedController:
         return safe.decide(before, known, reference, weight, limits=bounds, prepared=prepared, w=w), state
 
     def prepare(self, state: GuardState, decision: Decision, weight: Array | None) -> Any:
-        """What of the next solve can be done now; None where there is no such part, or another's plan is taken over."""
+        """Part of the next solve that can be computed now; None without such a part, or if another plan is used."""
         if state.wanted in (Mode.FALLBACK, Mode.REST):
             return None
         safe = self._backup if state.wanted is Mode.BACKUP and state.backup is not None else self.safe
         return safe.prepare(decision, weight) if self._planner(safe) == state.planner else None
 
     def watched(self, state: GuardState, t: float, reading: Any) -> GuardState:
-        """State with what the monitor said of the period at ``t``; it decides on the next period's mode."""
+        """State after the monitor's reading of the period at ``t``, which determines the next period's mode."""
         guard = self.guard
         if guard is None:
             return state
@@ -255,7 +257,7 @@ class GuardedController:
     def _handed(
         self, state: GuardState, previous: Decision, safe: SafeController, estimate: Estimate
     ) -> tuple[Decision, GuardState]:
-        """The decision before as one of ``safe``'s: its plan's inputs, run through the model of ``safe``."""
+        """The previous decision as one of ``safe``: the inputs of its plan, simulated with the model of ``safe``."""
         planner = self._planner(safe)
         if planner == state.planner:
             return previous, state
@@ -267,7 +269,7 @@ class GuardedController:
         return decision, replace(state, planner=planner)
 
     def _rest(self, previous: Decision, limits: Limits | None) -> Decision:
-        """The safe input, as soon as ``du_max`` lets it be."""
+        """The safe input, approached within ``du_max``."""
         ocp, safe = self.safe.controller.ocp, self.safe.safe_input
         assert safe is not None  # checked when the guard was made
         u = ocp.saturate(safe, previous.u, limits)
@@ -279,12 +281,14 @@ def _check_alike(main: Controller, backup: Controller, estimator: Estimator) -> 
     shapes = [(c.model.n_x, c.ocp.n_u, c.ocp.horizon, c.model.dt) for c in (main, backup)]
     if shapes[0] != shapes[1]:
         raise InputError(
-            f"guard: the backup has (n_x, n_u, N, dt) = {shapes[1]}, the controller {shapes[0]}; give both one problem"
+            f"guard: the backup has (n_x, n_u, N, dt) = {shapes[1]}, but the controller has {shapes[0]}. Give both the "
+            "same problem"
             " [HM-LOOP-016]"
         )
     sizes = [(m.n_x, m.n_h, m.n_u) for m in (backup.model, estimator.model)]
     if sizes[0] != sizes[1]:
         raise InputError(
-            f"guard: the backup's model has (n_x, n_h, n_u) = {sizes[0]}, that of its estimator {sizes[1]}"
+            f"guard: the backup's model has (n_x, n_h, n_u) = {sizes[0]}, but its estimator's model has {sizes[1]}. "
+            "Give both the same model"
             " [HM-LOOP-017]"
         )

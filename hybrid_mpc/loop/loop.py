@@ -1,13 +1,13 @@
-"""The loop: the one place that knows what happens in a period, in which order, and what is remembered.
+"""The loop: order of the computations in a period, and the state between periods.
 
 A period of :class:`Loop` is::
 
-    step(y, w) estimate  from the sample, and the input that acted since the one before
-              guard      the mode that the last period asked for begins; its estimator takes the sample too
-              decide     the controller of that mode solves; the safeguards make an admissible input of it
-    (the driver hands the input over)
-    finish()  monitor    compares the model with the sample, the estimate and the input that acted
-              guard      asks for the mode of the next period
+    step(y, w) estimate  from the sample and the input applied since the previous sample
+              guard      the mode wanted by the last period begins; its estimator gets the sample, too
+              decide     the controller of that mode solves; the safeguards return an admissible input
+    (the driver applies the input)
+    finish()  monitor    compares the model with the sample, the estimate and the applied input
+              guard      determines the mode of the next period
               prepare    the part of the next solve that needs no sample
 """
 
@@ -37,19 +37,19 @@ from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 TIMED = ("estimate", "solve", "monitor", "prepare")
-"""What of a period is timed: between the sample and the input, and after it."""
+"""Timed parts of a period: the first two before the input, the others after it."""
 MOST_SKIPPED = 10**12
-"""Most periods that are skipped at a time: the time [s] must stay a number."""
+"""Largest number of periods that can be skipped at once, so that the time [s] stays finite."""
 LONG = 250
-"""Skipped periods after which the estimate starts anew: a filter knows little after as many without a sample."""
+"""Skipped periods after which the estimator restarts, since its prediction has become useless."""
 
 
 class Reading(Protocol):
-    """What a monitor says of one period."""
+    """Reading of a monitor in one period."""
 
     @property
     def violation_w(self) -> float:
-        """Violation of the energy balance [W]; NaN where the energy is not read."""
+        """Violation of the energy balance [W]; NaN if the energy is not read."""
 
     @property
     def share(self) -> float:
@@ -61,7 +61,7 @@ class Reading(Protocol):
 
 
 class Monitor(Protocol):
-    """Watches a loop; pure, its memory is the state it returns."""
+    """Interface of a monitor; a pure function of its state."""
 
     def initial(self) -> Any:
         """State before the first period."""
@@ -72,18 +72,18 @@ class Monitor(Protocol):
 
 @dataclass(frozen=True)
 class LoopState:
-    """All that a loop remembers; :meth:`Loop.restore` goes on from it.
+    """Complete state of a loop; :meth:`Loop.restore` continues from it.
 
     Args:
         k: Number of the period that the last step began.
-        y: Its measurement ``(n_y,)``; NaN where there was none.
-        estimate: None after a long break, until the next sample.
-        decision: The input that is held, and the plan to go on from.
-        guard: Modes and the backup's estimate.
-        monitor: The monitor's memory; None without one.
-        inputs: Inputs ``(n_u,)`` from the one that acted before the sample to the last one, the oldest first.
-        mode: Who gives the input.
-        finished: Whether the monitor has seen the period.
+        y: Measurement of that period ``(n_y,)``; NaN if missing.
+        estimate: The estimate; None after a long break, until the next sample.
+        decision: The held input, and the plan for the next solve.
+        guard: Modes, and the backup's estimate.
+        monitor: The monitor's state; None without a monitor.
+        inputs: Inputs ``(n_u,)`` from the one applied before the sample to the last one, the oldest first.
+        mode: Source of the input: the controller (automatic) or an operator (manual).
+        finished: Whether :meth:`Loop.finish` has run for this period.
     """
 
     k: int
@@ -99,7 +99,7 @@ class LoopState:
 
 @dataclass(frozen=True)
 class _Ahead:
-    """What was made ready for the step of period k: its previews, and the solver's part that needs no sample."""
+    """Prepared data of period k: its previews, and the part of its solve that needs no sample."""
 
     k: int
     decision: Decision
@@ -108,10 +108,10 @@ class _Ahead:
 
 
 class Loop:
-    """Estimator, controller and monitor, a period at a time.
+    """Runs estimator, controller and monitor, one period at a time.
 
-    Its driver has the clock: :func:`~hybrid_mpc.loop.simulate` a virtual one,
-    :class:`~hybrid_mpc.loop.realtime.Runner` a real one, or a loop of your own::
+    A driver provides the clock: :func:`~hybrid_mpc.loop.simulate` a virtual clock,
+    :class:`~hybrid_mpc.loop.realtime.Runner` a real clock, or your own code::
 
         loop = Loop(estimator, controller, monitor=monitor, reference=reference)
         u = loop.start(read())
@@ -121,28 +121,28 @@ class Loop:
             wait()
             u = loop.step(read())
 
-    The inputs are the same whether ``finish`` is called or left to the next step. Numbers never raise: an input is
-    within the limits whatever sample, model or solver say.
+    ``finish`` may be omitted; the next step then calls it, with the same inputs. No sensor, model or reference value
+    can raise an exception, and an input is always within the limits.
 
     Args:
-        estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which each step has to be given the truth.
-        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
-            fallback.
-        monitor: Default: none.
-        reference: ``t (n,) [s] -> (n, n_x)``, or ``(n, n_y)`` where the problem weighs outputs, previewed over the
-            horizon if the problem says so, with ``n_p`` more columns where the economic stage cost has parameters; or a
+        estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which needs the truth in each step.
+        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller has no fallback.
+        monitor: The monitor. Default: none.
+        reference: ``t (n,) [s] -> (n, n_x)``, or ``(n, n_y)`` if the problem weights outputs, previewed over the
+            horizon if the problem does so, with ``n_p`` more columns if the economic stage cost has parameters; or a
             set-point ``(n_x,)`` or ``(n_y,)``. Default: the operating point.
         weight: Factors on ``q``, ``t (n,) -> (n, n_x)``. Default: 1.
-        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
+        guard: Reaction to alarms of the monitor, which it needs. Default: none.
         w: Forecast of the measured disturbances, ``t (n,) [s] -> (n, n_w)``, for a problem that previews them. Default:
-            none; those measured last are held.
-        end: Time [s] beyond which previews that are not finite hold their last value. Default: never.
-        input_delay: Periods after which an input acts, as the estimator knows it; shifts the preview.
-        sensor_delay: Periods after which a measurement arrives; pairs it with its input for the monitor.
-        now: Clock [s] of the durations. Default: the computer's.
+            none; the last measured values are held.
+        end: Time [s] beyond which non-finite previews hold their last value. Default: never.
+        input_delay: Periods after which an input acts, as in the estimator; shifts the preview. Default: 0.
+        sensor_delay: Periods after which a measurement arrives; the monitor uses it to pair measurement and input.
+            Default: 0.
+        now: Clock [s] of the durations. Default: the computer's clock.
 
     Raises:
-        InputError: If sizes, periods or delays do not fit, or a guard has no monitor.
+        InputError: If sizes, periods or delays do not match, or a guard has no monitor.
 
     Example:
         >>> import casadi as ca
@@ -184,13 +184,13 @@ class Loop:
         if monitor is not None:
             check_part(monitor, "monitor", "a monitor", "initial", "update")
         if not isinstance(guard, Guard | None):
-            raise InputError(f"guard: a Guard is needed, got {type(guard).__name__} [HM-LOOP-018]")
+            raise InputError(f"guard: give a Guard, got {type(guard).__name__} [HM-LOOP-018]")
         safe = controller if isinstance(controller, SafeController) else SafeController(controller)
         self.model, self.ocp = estimator.model, safe.controller.ocp
         _check_models(self.model, safe.controller.model)
         _check_monitor(monitor, self.model)
         if guard is not None and monitor is None:
-            raise InputError("a guard acts on a monitor's alarms; give monitor= as well [HM-LOOP-019]")
+            raise InputError("guard: it reacts to alarms of a monitor; give monitor=, too [HM-LOOP-019]")
         self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self._control = GuardedController(safe, guard)
         self._delay = whole_periods(input_delay, "input_delay")
@@ -202,7 +202,7 @@ class Loop:
         self._decide_late: Callable[[], tuple[Decision, GuardState]] | None = None
         self._ahead: _Ahead | None = None
         self.reading: Reading | None = None
-        """What the monitor said last; None without one."""
+        """The monitor's last reading; None without a monitor."""
         self.previewed: tuple[Array, Array | None] = np.zeros((0, self.ocp.n_x)), None
         """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) of this period's decision."""
         self.spent = dict.fromkeys(TIMED, 0.0)
@@ -218,10 +218,10 @@ class Loop:
         reference: ArrayLike | None = None,
         in_time: Callable[[], bool] | None = None,
     ) -> Array:
-        """Begin, while the machine rests: the first estimate, the first plan, which may take its time, the first input.
+        """Start while the machine is at rest: first estimate, first plan (which may take longer), first input.
 
-        Arguments are those of :meth:`step`; ``applied`` is the input that has acted until now, by default that of the
-        operating point. Returned is the input ``(n_u,)`` to hold from now on.
+        The arguments are those of :meth:`step`; ``applied`` is the input applied until now, by default that of the
+        operating point. Returns the input ``(n_u,)`` to hold from now on.
         """
         if in_time is not None:
             check_function(in_time, "in_time")
@@ -245,24 +245,25 @@ class Loop:
         truth: ArrayLike | None = None,
         in_time: Callable[[], bool] | None = None,
     ) -> Array:
-        """One period: estimate and decide.
+        """Run one period: estimate and decide.
 
         Args:
-            y: Sample ``(n_y,)``; None or NaN: missing, also single ones.
-            w: Measured disturbances ``(n_w,)`` from now on; NaN or None: the last ones stay. ``(m, n_w)`` with a row
-                each for now and the periods ahead is a forecast in place of the loop's own.
-            applied: Input ``(n_u,)`` that really acted since the last step, where the actuator says so; an operator's,
-                in manual mode. Default: the one that the last step returned.
-            reference: A set-point or ``(m, columns)`` from now on in steps of ``dt``, in place of the loop's own.
-            truth: The true ``(x, h)``, for an estimator that needs it.
-            in_time: Asked before the solve: may it begin? If not, the last plan is followed, as :meth:`late` does.
-                Default: it may.
+            y: Sample ``(n_y,)``; None or NaN for missing values.
+            w: Present measured disturbances ``(n_w,)``; NaN or None: the last values are held. ``(m, n_w)``, with a row
+                for the present and each following period, is a forecast that replaces the loop's own. Default: None.
+            applied: Input ``(n_u,)`` that was really applied since the last step, if the actuator reports it; in manual
+                mode that of the operator. Default: the input that the last step returned.
+            reference: A set-point or ``(m, columns)`` from now on in steps of ``dt``, which replaces the loop's own.
+                Default: the loop's own.
+            truth: The true ``(x, h)``, for an estimator that needs it. Default: none.
+            in_time: Called before the solve: whether there is enough time for it. If not, the last plan is followed, as
+                in :meth:`late`. Default: there is.
 
         Returns:
             The input ``(n_u,)`` to hold from now on, within the limits.
 
         Raises:
-            InputError: If a shape does not fit. No number raises.
+            InputError: If a shape is wrong. Values of numbers never raise.
         """
         if in_time is not None:
             check_function(in_time, "in_time")
@@ -309,9 +310,9 @@ class Loop:
         return decision.u
 
     def late(self) -> Array:
-        """The input of this period where the solve has missed its deadline: the last plan, shifted.
+        """The input of this period if the solve missed its deadline: that of the last plan, shifted by one period.
 
-        To be called after :meth:`step`, in place of the input that it returned.
+        Call it after :meth:`step`; it replaces the returned input.
         """
         if self._decide_late is not None and self.state.mode == "automatic":
             decision, guard = self._decide_late()
@@ -319,9 +320,9 @@ class Loop:
         return self.state.decision.u
 
     def finish(self) -> None:
-        """What can wait until the input is out: the monitor, the guard's next mode, the next solve's preparation.
+        """Computations after the input is applied: monitor, next mode of the guard, preparation of the next solve.
 
-        The next :meth:`step` calls it if nobody did; a second call does nothing.
+        The next :meth:`step` calls it if it was not called; a second call does nothing.
         """
         state = self.state
         if state.finished:
@@ -343,9 +344,9 @@ class Loop:
         self.spent |= {"monitor": middle - begin, "prepare": self._now() - middle}
 
     def skip(self, n: int = 1) -> None:
-        """Periods that passed without a step, e.g. since one before them took too long; the input was held.
+        """Account for ``n`` periods without a step, e.g. because a step took too long; the input was held.
 
-        The estimator is led through them without a sample; after 250 it starts anew at the next one.
+        The estimator predicts through them without samples; after more than 250 it restarts at the next sample.
         """
         n = whole(n, "skip [periods]", 0, MOST_SKIPPED)
         self.finish()
@@ -361,7 +362,7 @@ class Loop:
         self._state = replace(state, k=state.k + n, estimate=estimate, guard=guard, inputs=inputs)
 
     def warm_up(self) -> None:
-        """Call every part once, at the operating point, and forget it: first calls are slow."""
+        """Call every part once at the operating point and discard the results, since first calls are slow."""
         m = self.model
         trial, y = copy(self), m.output(m.x0, m.u0, m.w, m.p).full().ravel()
         truth = np.concatenate([m.x0, np.zeros(m.n_h)])
@@ -376,10 +377,10 @@ class Loop:
         trial.finish()
 
     def restore(self, state: LoopState) -> Array:
-        """Go on from ``state``, what :attr:`state` of a loop of the same parts was; returns the input that is held.
+        """Continue from ``state``, the :attr:`state` of a loop with the same parts; returns the held input.
 
         Raises:
-            InputError: If it is no state, or that of a loop of another model or horizon.
+            InputError: If it is not a state, or that of a loop with another model or horizon.
         """
         _check_state(state, self.model, self.ocp, self._monitor)
         self._state, self._decide_late, self._ahead, self.reading = state, None, None, None
@@ -387,25 +388,24 @@ class Loop:
 
     @property
     def mode(self) -> Literal["automatic", "manual"]:
-        """Who gives the input: the controller, or in ``"manual"`` an operator, whose inputs are ``applied``.
+        """Source of the input: the controller in ``"automatic"``; in ``"manual"`` an operator, who gives ``applied``.
 
-        While manual, the estimator goes on with the inputs that really act, so that nothing winds up, and the input
-        that a step returns is the operator's last one. Back in automatic the controller begins from it, within
-        ``du_max``.
+        In manual mode the estimator uses the applied inputs, so there is no wind-up, and a step returns the operator's
+        last input. Back in automatic mode, the controller starts from this input, within ``du_max``.
         """
         return self.state.mode
 
     @mode.setter
     def mode(self, mode: Literal["automatic", "manual"]) -> None:
         if not isinstance(mode, str) or mode not in ("automatic", "manual"):
-            raise InputError(f"mode: 'automatic' or 'manual' needed, got {mode!r:.80} [HM-LOOP-020]")
+            raise InputError(f"mode: give 'automatic' or 'manual', got {mode!r:.80} [HM-LOOP-020]")
         self._state = replace(self.state, mode=mode)
 
     @property
     def state(self) -> LoopState:
-        """All that the loop remembers, from :meth:`start` on."""
+        """Complete state of the loop, after :meth:`start`."""
         if self._state is None:
-            raise InputError("the loop has not begun; call start() with the first sample [HM-LOOP-021]")
+            raise InputError("loop: not started; call start() with the first sample first [HM-LOOP-021]")
         return self._state
 
     @property
@@ -422,22 +422,22 @@ class Loop:
 
     @property
     def decision(self) -> Decision:
-        """The input that is held, and where it came from."""
+        """The held input, and its source."""
         return self.state.decision
 
     @property
     def switches(self) -> tuple[Switch, ...]:
-        """Changes of the guard's mode until now."""
+        """All changes of the guard's mode."""
         return self.state.guard.switches
 
     @property
     def standing(self) -> Array:
-        """The reference ``(columns,)`` that is the operating point: that of a loop to which none is given."""
+        """The operating point as reference ``(columns,)``: the default reference."""
         return self._safe.controller.problem.standing()[0]
 
     @property
     def safe_input(self) -> Array | None:
-        """Input ``(n_u,)`` that the machine is left with where nothing is known; None: none is declared."""
+        """Input ``(n_u,)`` with which the machine may be left alone; None if not declared."""
         return None if self._safe.safe_input is None else self._safe.safe_input.copy()
 
     def _first_state(self, sample: Array, estimate: Estimate, first: Decision) -> LoopState:
@@ -450,24 +450,24 @@ class Loop:
         )
 
     def _disturbed(self, w: ArrayLike | None) -> Array | None:
-        """Measured disturbances ``(m, n_w)``, a row for now and each known ahead; None: nothing was measured."""
+        """Measured disturbances ``(m, n_w)``, a row for the present and each known period; None if not measured."""
         if w is None:
             return None
         rows = sampled(w, (None, self.model.n_w), "w, the measured disturbances and their forecast,")
         if not len(rows):
             raise InputError(
-                "w has no rows; give the measured disturbances, or a row for each period ahead [HM-LOOP-022]"
+                "w: no rows; give the measured disturbances, or a row for each period ahead [HM-LOOP-022]"
             )
         return rows
 
     def _now_measured(self, measured: Array | None) -> dict[str, Array]:
-        """What an estimator is told of them; nothing where the model has none."""
+        """Keyword argument ``w`` of the estimator; empty if the model has no measured disturbances."""
         if not self.model.n_w:
             return {}
         return {"w": np.full(self.model.n_w, np.nan) if measured is None else measured[0]}
 
     def _w_ahead(self, k: int, measured: Array | None, estimate: Estimate) -> Array | None:
-        """Measured disturbances ``(m, n_w)`` that the solve of period k counts on; None: those of the estimate."""
+        """Measured disturbances ``(m, n_w)`` in the solve of period k; None: those of the estimate."""
         if measured is not None and len(measured) > 1:
             return held(measured[self._delay :] if len(measured) > self._delay else measured[-1:], estimate.w)
         ahead = self._forecast((k + self._delay) * self.model.dt)
@@ -478,17 +478,17 @@ class Loop:
         return held(ahead, estimate.w)
 
     def _seen(self, sample: Array, truth: ArrayLike | None) -> Array:
-        """What the estimator takes: the sample, or the truth."""
+        """Input of the estimator: the sample, or the truth."""
         if not self._truth:
             return sample
         if truth is None:
             raise InputError(
-                "this estimator takes the true state; give truth=, or take a filter [HM-LOOP-023]"
+                "truth: this estimator needs the true state; give truth=, or use a filter [HM-LOOP-023]"
             )
         return sampled(truth, (None,), "the truth")
 
     def _preview(self, k: int, reference: ArrayLike | None) -> tuple[Array, Array | None]:
-        """Reference and factors of period k, at the instants at which its input acts."""
+        """Reference and factors of period k, at the times at which its inputs act."""
         if self._ahead is not None and self._ahead.k == k:
             x_ref, factors = self._ahead.previews
         else:
@@ -497,12 +497,12 @@ class Loop:
             x_ref = sampled(reference, (None, x_ref.shape[1]), "the reference")
             if not len(x_ref):
                 raise InputError(
-                    "the reference has no rows; give a set-point, or a row for each period ahead [HM-LOOP-024]"
+                    "reference: no rows; give a set-point, or a row for each period ahead [HM-LOOP-024]"
                 )
         return x_ref, factors
 
     def _prepared(self, previous: Decision, weight: Array | None) -> Any:
-        """What :meth:`finish` has prepared, if it is for this solve."""
+        """The preparation of :meth:`finish`, if it belongs to this solve."""
         ahead = self._ahead
         if ahead is None or ahead.decision is not previous:
             return None
@@ -511,7 +511,7 @@ class Loop:
         return ahead.prepared if same else None
 
     def _operated(self, previous: Decision, estimate: Estimate) -> Decision:
-        """The operator's input goes on, and so does the plan that automatic would begin from."""
+        """Decision in manual mode: the operator's input, and a plan from which automatic mode can start."""
         u, plan = previous.u, previous.solution
         if estimate.finite and np.all(np.isfinite(u)):
             plan = self._safe.controller.initial(estimate, np.tile(u, (self.ocp.horizon, 1)))
@@ -520,7 +520,7 @@ class Loop:
 
 
 def _with_input(decision: Decision, u: Array) -> Decision:
-    """The decision as if ``u`` had been decided; where a part of it is not known, that of the decision."""
+    """The decision with the applied input ``u``; non-finite entries are those of the decision."""
     u = np.where(np.isfinite(u), u, decision.u)
     if np.array_equal(u, decision.u):
         return decision
@@ -531,12 +531,13 @@ def _check_models(estimated: HybridModel, controlled: HybridModel) -> None:
     sizes = [(m.n_x, m.n_h, m.n_u) for m in (estimated, controlled)]
     if sizes[0] != sizes[1]:
         raise InputError(
-            f"the estimator's model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, "
-            f"the controller's model {controlled.name} {sizes[1]}; give both the same model [HM-LOOP-025]"
+            f"estimator: its model {estimated.name} has (n_x, n_h, n_u) = {sizes[0]}, but the controller's model "
+            f"{controlled.name} has {sizes[1]}. Give both the same model [HM-LOOP-025]"
         )
     if abs(controlled.dt - estimated.dt) > 1e-9 * estimated.dt:
         raise InputError(
-            f"the estimator's period is {estimated.dt} s, the controller's {controlled.dt} s; they must agree"
+            f"estimator: its period is {estimated.dt} s, but the controller's is {controlled.dt} s. Give both the same "
+            "model"
             " [HM-LOOP-026]"
         )
 
@@ -548,14 +549,14 @@ def _check_monitor(monitor: Monitor | None, model: HybridModel) -> None:
     sizes = [(m.n_x, m.n_h, m.n_u, m.n_y) for m in (own, model)]
     if sizes[0] != sizes[1]:
         raise InputError(
-            f"the monitor's model {own.name} has (n_x, n_h, n_u, n_y) = {sizes[0]}, the estimator's model {model.name} "
-            f"{sizes[1]}; give both the same model, e.g. kit.monitor({model.name!r}) [HM-LOOP-027]"
+            f"monitor: its model {own.name} has (n_x, n_h, n_u, n_y) = {sizes[0]}, but the estimator's model "
+            f"{model.name} has {sizes[1]}. Give both the same model, e.g. kit.monitor({model.name!r}) [HM-LOOP-027]"
         )
 
 
 def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monitor | None) -> None:
     if not isinstance(state, LoopState):
-        raise InputError(f"restore: what Loop.state was is needed, got {type(state).__name__} [HM-LOOP-028]")
+        raise InputError(f"restore: give a value of Loop.state, got {type(state).__name__} [HM-LOOP-028]")
     plan, estimate = state.decision.solution, state.estimate
     sizes = [
         ("y", state.y, model.n_y),
@@ -567,7 +568,7 @@ def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monito
     if estimate is not None:
         sizes += [("estimate", estimate.x, model.n_x), ("hidden state", estimate.h, model.n_h)]
     wrong = [
-        f"{name} has {np.size(value)} numbers, needed are {n}"
+        f"{name} has {np.size(value)} numbers instead of {n}"
         for name, value, n in sizes
         if np.size(value) != n
     ]
@@ -577,4 +578,7 @@ def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monito
             " [HM-LOOP-029]"
         )
     if wrong:
-        raise InputError(f"restore: the state is of a loop of other parts: {'; '.join(wrong)} [HM-LOOP-030]")
+        raise InputError(
+            f"restore: the state belongs to a loop with other parts: {'; '.join(wrong)}. Build the loop with the same "
+            "parts [HM-LOOP-030]"
+        )

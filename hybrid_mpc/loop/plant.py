@@ -1,4 +1,4 @@
-"""The simulated machine: the plant, and the plant behind its delays and faults."""
+"""The simulated machine: the plant, its delays and its faults."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Array = NDArray[np.float64]
 
 
 class Plant(Protocol):
-    """The machine in simulation. Its state is its own affair; ``truth`` gives the model's states.
+    """Interface of a simulated machine. Its state may be anything; ``truth`` gives the model's states.
 
-    It uses numpy, scipy and casadi only, and its own integrator with its own tolerance. A machine with measured
-    disturbances gets them as a fourth argument, ``step(state, u, dt, w)`` with ``w`` ``(n_w,)`` held over the period.
+    It uses numpy, scipy and casadi only, with its own integrator and tolerance. A machine with measured disturbances
+    gets them as a fourth argument, ``step(state, u, dt, w)`` with ``w`` ``(n_w,)`` held over the period.
     """
 
     def reset(self, x0: Array, seed: int) -> Any:
-        """Plant state at rest within itself at the model state ``x0`` ``(n_x,)`` [SI]."""
+        """Plant state at the model state ``x0`` ``(n_x,)`` [SI], with its internal states in equilibrium."""
 
     def step(self, state: Any, u: Array, dt: float) -> Any:
         """Plant state after ``dt`` [s] with the input ``u`` ``(n_u,)`` held.
 
-        Where the prior has disturbances the plant gets them too: ``step(state, u, dt, w)``, ``w`` ``(n_w,)``.
+        If the prior has measured disturbances, the call is ``step(state, u, dt, w)`` with ``w`` ``(n_w,)``.
         """
 
     def measure(self, state: Any, rng: np.random.Generator) -> Array:
@@ -54,8 +54,8 @@ class ModelState(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelPlant:
-    """A model in place of the machine, for a controller of another model. It tells whether two models agree, and
-    nothing of the machine.
+    """A model in place of the machine, for a controller of another model. A loop with it shows whether two models
+    agree, and nothing about the machine.
 
     Args:
         model: The model.
@@ -76,12 +76,12 @@ class ModelPlant:
     sigma: tuple[float, ...]
 
     def reset(self, x0: Array, seed: int) -> ModelState:
-        """At ``x0`` ``(n_x,)``, its memory as after a long rest there under the operating point's input."""
+        """State at ``x0`` ``(n_x,)``, with the hidden state in equilibrium for the operating point's input."""
         m = self.model
         return ModelState(np.asarray(x0, dtype=float), hidden_fixed_point(m, x0, m.u0), m.u0, m.w)
 
     def step(self, state: ModelState, u: Array, dt: float, w: Array | None = None) -> ModelState:
-        """A period on."""
+        """The state after one period."""
         m, now = self.model, self.model.w if w is None else w
         x, h = (part.full().ravel() for part in m.step(state.x, state.h, u, now, m.p))
         return ModelState(x, h, np.asarray(u, dtype=float), now)
@@ -98,7 +98,7 @@ class ModelPlant:
         return state.x
 
     def hidden(self, state: ModelState) -> Array:
-        """None: no oracle has a network's memory."""
+        """Empty: a model as plant has no internal states of an oracle."""
         return np.zeros(0)
 
 

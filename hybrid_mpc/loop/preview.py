@@ -1,4 +1,4 @@
-"""What the loop looks ahead at: reference, weight factors and measured disturbances over the horizon."""
+"""Preview of reference, weight factors and measured disturbances over the horizon."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Preview = Callable[[Array], Array]
 
 
 class Previews:
-    """Reference and weight factors over the horizon, in their shapes; arguments are those of a ``Loop``.
+    """Reference and weight factors over the horizon; the arguments are those of a ``Loop``.
 
-    Without ``ocp.preview`` they are those of the instant alone. Where values beyond the ``end`` of the run [s] are not
-    finite, the last before them is held. ``standing`` ``(columns,)`` is the reference where none is given.
+    Without ``ocp.preview`` they are those of the present time only. Non-finite values beyond the ``end`` of the run [s]
+    are replaced by the last value before them. ``standing`` ``(columns,)`` is the default reference.
     """
 
     def __init__(
@@ -44,7 +44,9 @@ class Previews:
     def _over(self, preview: Preview, times: Array, name: str, columns: int) -> Array:
         values = floats(preview(times), f"what {name} returns")
         if values.shape != (times.size, columns):
-            raise InputError(f"{name} returns {values.shape}, needed: {(times.size, columns)} [HM-LOOP-031]")
+            raise InputError(
+                f"{name}: it returns the shape {values.shape}, but must return {(times.size, columns)} [HM-LOOP-031]"
+            )
         beyond = (times > self._end + 1e-9) & ~np.all(np.isfinite(values), axis=1)
         if beyond.any():
             last = int(np.argmax(beyond)) - 1
@@ -58,35 +60,35 @@ class Previews:
 
 
 class Forecast:
-    """Measured disturbances ``(N, n_w)`` from an instant on, where the problem previews them and a forecast is given.
+    """Forecast of the measured disturbances ``(N, n_w)``, if the problem previews them.
 
     Args:
-        w: ``t (n,) [s] -> (n, n_w)``; None: there is no forecast.
+        w: ``t (n,) [s] -> (n, n_w)``; None without a forecast.
         ocp: The problem.
         n_w: Number of measured disturbances.
         dt: Period [s].
 
     Raises:
-        InputError: If there is a forecast but nothing to forecast.
+        InputError: If there is a forecast, but no measured disturbance.
     """
 
     def __init__(self, w: Preview | None, ocp: OCP, n_w: int, dt: float) -> None:
         if w is not None and not n_w:
-            raise InputError("w: a forecast of measured disturbances given, the model has none [HM-LOOP-032]")
+            raise InputError("w: the model has no measured disturbances to forecast; remove w [HM-LOOP-032]")
         if w is not None:
             check_function(w, "w")
         self._w = w if ocp.preview_w else None
         self._n_w, self._ahead = n_w, np.arange(ocp.horizon, dtype=np.float64) * dt
 
     def __call__(self, t: float) -> Array | None:
-        """Disturbances from ``t`` on; None: those measured last are held."""
+        """Disturbances from ``t`` on; None: the last measured values are held."""
         if self._w is None:
             return None
         return sampled(self._w(t + self._ahead), (self._ahead.size, self._n_w), "what w returns")
 
 
 def held(values: Array, first: Array) -> Array:
-    """Rows ``(m, n)`` in which what is not finite is the value before it, at the beginning ``first`` ``(n,)``."""
+    """Rows ``(m, n)`` in which non-finite values are replaced by the value before, initially ``first`` ``(n,)``."""
     rows, last = values.copy(), first
     for row in rows:
         last = np.where(np.isfinite(row), row, last)
@@ -95,7 +97,7 @@ def held(values: Array, first: Array) -> Array:
 
 
 def _function_of(reference: Preview | ArrayLike | None, standing: Array) -> Preview:
-    """The reference as a function of time, also where a set-point or nothing was given."""
+    """The reference as a function of time, from a function, a set-point, or None."""
     if callable(reference):
         check_function(reference, "reference")
         return reference

@@ -1,4 +1,4 @@
-"""The loop in real time: against a machine's callbacks, in step with a clock, and with a safe end."""
+"""The loop in real time: it runs on a machine's callbacks and a clock, and always ends with the safe input."""
 
 from __future__ import annotations
 
@@ -30,75 +30,77 @@ from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
 
 Array = NDArray[np.float64]
 TIMED = ("measure", "estimate", "solve", "actuate", "monitor", "prepare")
-"""What of a period is timed, in this order: the input is out after ``actuate``."""
+"""Timed parts of a period, in this order: the input is applied after ``actuate``."""
 RECENT = 25
-"""Solves whose fastest tells whether another one still fits before a deadline."""
+"""Number of recent solves; the fastest of them decides whether a solve can meet its deadline."""
 QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
 ENDING = tuple(
     getattr(signal, name)
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGXCPU", "SIGTSTP")
     if hasattr(signal, name)
 )
-"""Signals that ask a program to end or to stand still, as far as the operating system has them: Ctrl-C, ``kill``, a
-terminal that closes, Ctrl-\\, Ctrl-Break, a used-up limit of computing time, Ctrl-Z."""
+"""Signals that ask a program to end or to stop, if the operating system has them: Ctrl-C, ``kill``, closed terminal,
+Ctrl-\\, Ctrl-Break, limit of computing time, Ctrl-Z."""
 PAUSES_S = (0.0, 0.01, 0.1, 1.0)
-"""Pauses [s] before each further try to hand the safe input over: none after a message that a signal has cut off, then
-what a bus or its driver may need to recover. No more, since a process that is to end must end."""
+"""Pauses [s] before each further attempt to apply the safe input: none after a message that a signal interrupted, then
+the time that a bus or its driver may need to recover. There are no more attempts, since the process must end."""
 EARLY = 1e-3
-"""Share of a period by which a wait may end early: rounding, and what no controller notices."""
+"""Share of a period by which a wait may end early: rounding, irrelevant for a controller."""
 WAKES = 10
-"""Waits for one instant that may end early, one after the other: a sleep that something woke is slept again."""
+"""Largest number of successive waits that end early: an interrupted sleep is continued."""
 
 
 MOST_KEPT = 10**9
-"""Most periods whose rows a report keeps."""
+"""Largest number of periods with rows in a report."""
 
 
 class Runner:
-    """Steps estimator, controller and monitor against a machine's sensors and actuators, in real time.
+    """Runs estimator, controller and monitor on a machine's sensors and actuators, in real time.
 
-    It drives a :class:`~hybrid_mpc.loop.loop.Loop`. Before the clock starts, while the machine rests: the first sample,
-    and plan and input from it. Each period: wait for its instant, measure, estimate, decide, actuate, then what the
-    loop leaves until after the input. A missing sample leaves the prediction. A solve is never interrupted: one that
-    comes back after the deadline is dropped, one that cannot be in time any more is not begun, and the shifted plan is
-    applied (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). After a long delay the run goes on at the
-    grid's nearest instant; the estimator is led through the periods in between without a measurement.
+    It drives a :class:`~hybrid_mpc.loop.loop.Loop`. Before the clock starts, while the machine is at rest, it takes the
+    first sample and computes the first plan. In each period it waits for the period's time, measures, estimates,
+    decides and actuates; then it runs the rest of the period. With a missing sample the estimator predicts. A solve is
+    never interrupted: if it ends after the deadline, its result is discarded; if it cannot meet the deadline, it does
+    not begin. In both cases the shifted plan is applied
+    (:meth:`~hybrid_mpc.control.safeguard.SafeController.late`). After a long delay the run continues at the nearest
+    time of the grid; the estimator predicts through the skipped periods.
 
-    Numbers never raise. Whatever ends the run, exceptions in callbacks and signals (Ctrl-C, SIGTERM, SIGHUP, ...)
-    included, the safe input is handed to the actuator before anything else (:class:`SafeEnd`); then the exception is
-    raised on, or the signal has its effect. Signals reach Python's main thread alone: in another thread ``stop`` ends
-    a run. What no program can catch (SIGKILL, a hang in a driver, a power cut) takes a watchdog in the actuator;
-    ``docs/watchdog.md`` has one. ``actuate`` may be broken off by a signal, and is then called with the safe input.
+    No sensor, model or reference value can raise an exception. However the run ends, also by an exception in a callback
+    or by a signal (Ctrl-C, SIGTERM, SIGHUP, ...), the safe input is applied first (:class:`SafeEnd`); then the
+    exception is raised, or the signal takes effect. Only Python's main thread receives signals: in another thread,
+    end a run by ``stop``. Events that no program can catch (SIGKILL, a hanging driver, a power failure) need a
+    watchdog in the actuator; ``docs/watchdog.md`` shows one. A signal may interrupt ``actuate``, which is then called
+    with the safe input.
 
-    Without a delay the input is assumed to act from the grid's instant on: keep steps short against the period, or
-    declare the delay (:class:`~hybrid_mpc.estimate.delay.DelayCompensation`).
+    Without a delay, an input is assumed to act from the grid's time on: steps must be short compared with the period,
+    or the delay must be declared (:class:`~hybrid_mpc.estimate.delay.DelayCompensation`).
 
     Args:
-        measure: ``() -> y (n_y,)``, or None where no sample has come.
-        actuate: Takes the input ``u (n_u,)``, to be held until the next.
+        measure: ``() -> y (n_y,)``, or None without a new sample.
+        actuate: Applies the input ``u (n_u,)``, which is held until the next call.
         estimator: Filter on the controller's model.
-        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
-            fallback.
-        reference: ``t (n,) [s] -> x_ref (n, n_x)``, or ``y_ref (n, n_y)`` where the problem weighs outputs; ``t``
-            counts from the start.
-        weight: Factors on ``q``, alike. Default: 1.
-        measure_w: ``() -> w (n_w,)``, measured disturbances, or None where no sample has come. Default: nobody measures
-            them, and they are those of the operating point.
-        w: Forecast of them, as in :class:`~hybrid_mpc.loop.loop.Loop`.
-        monitor: One that has limits to alarm by. Default: none.
-        deadline: Time [s] after a period's instant by which its input must be decided. Default: one period.
-        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's; one of the two
+        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller has no fallback.
+        reference: ``t (n,) [s] -> x_ref (n, n_x)``, or ``y_ref (n, n_y)`` if the problem weights outputs; ``t`` is the
+            time since the start.
+        weight: Factors on ``q``, as a function of ``t``. Default: 1.
+        measure_w: ``() -> w (n_w,)``, measured disturbances, or None without a new sample. Default: those of the
+            operating point.
+        w: Forecast of the measured disturbances, as in :class:`~hybrid_mpc.loop.loop.Loop`. Default: none.
+        monitor: A monitor with limits. Default: none.
+        deadline: Time [s] after the begin of a period at which its input must be decided. Default: one period.
+        safe_input: Input ``(n_u,)`` within the limits for the end of the run. Default: the controller's; one of both
             must be declared.
-        input_delay: As in :class:`~hybrid_mpc.loop.loop.Loop`.
-        sensor_delay: As there.
-        clock: Default: the computer's. One that does not wait, stands still, goes back or gives NaN ends the run.
-        on_step: Called at the end of every period with a :class:`RunnerStep`; must be short.
-        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
-        keep: Periods whose rows the report keeps, the last ones. Default 100 000.
+        input_delay: As in :class:`~hybrid_mpc.loop.loop.Loop`. Default: 0.
+        sensor_delay: As in :class:`~hybrid_mpc.loop.loop.Loop`. Default: 0.
+        clock: The clock. Default: the computer's. A clock that does not wait, stops, goes back or gives NaN ends the
+            run.
+        on_step: Called at the end of every period with a :class:`RunnerStep`; it must be short. Default: nothing.
+        guard: Reaction to alarms of the monitor, which it needs. Default: none.
+        keep: Number of the last periods with rows in the report. Default: 100 000.
 
     Raises:
-        InputError: If models, deadline, safe input, delays or ``keep`` do not fit, no safe input is declared, the
-            monitor has no limits, or the estimator wants the truth.
+        InputError: If models, deadline, safe input, delays or ``keep`` are invalid, no safe input is declared, the
+            monitor has no limits, or the estimator needs the truth.
 
     Example: see ``docs/hardware.md``; in short::
 
@@ -136,17 +138,17 @@ class Runner:
             check_part(clock, "Runner: clock", "a clock", "now", "sleep_until")
         if sees_truth(estimator):
             raise InputError(
-                "Runner: a machine does not give its true state; give a filter, not TrueState [HM-LOOP-033]"
+                "Runner: estimator TrueState needs the true state, which a machine does not give. Give a filter "
+                "[HM-LOOP-033]"
             )
         if why := getattr(monitor, "cannot_alarm", ""):
-            raise InputError(
-                f"Runner: monitor: {why}; or leave monitor out, then nothing is watched [HM-LOOP-034]"
-            )
+            raise InputError(f"Runner: monitor: {why}, or omit monitor to run without one [HM-LOOP-034]")
         dt = estimator.model.dt
         due = dt if deadline is None else float(sampled(deadline, (), "Runner: deadline"))
         if not 0 < due <= dt * (1 + 1e-9):
             raise InputError(
-                f"Runner: deadline must lie within the period of {dt} s, got {deadline} s [HM-LOOP-035]"
+                f"Runner: deadline: give at most the period of {dt} s, and more than 0 s; got {deadline} s "
+                "[HM-LOOP-035]"
             )
         keep = whole(keep, "Runner: keep [periods]", 1, MOST_KEPT)
         self._clock, self._dt, self._deadline, self._keep = (
@@ -165,27 +167,28 @@ class Runner:
         declared = loop.safe_input if safe_input is None else safe_input
         if declared is None:
             raise InputError(
-                "Runner: no safe input is declared; give safe_input=[...], or Scenario(safe_input=...): the input that "
-                "the machine may be left with. Zero is not safe for every machine, so it is never guessed [HM-LOOP-036]"
+                "Runner: safe_input is missing: the input with which the machine may be left alone. Give "
+                "safe_input=[...], or Scenario(safe_input=...). There is no default, since zero is not safe for every "
+                "machine [HM-LOOP-036]"
             )
         self._safe_input = check_safe_input(declared, loop.ocp)
 
     @property
     def safe_input(self) -> Array:
-        """The input handed over at the end of every run ``(n_u,)``."""
+        """The input applied at the end of every run ``(n_u,)``."""
         return self._safe_input.copy()
 
     def run(self, duration: float | None = None, stop: Callable[[], bool] | None = None) -> RunReport:
         """Run until the duration has passed or ``stop()`` is true, whichever is first.
 
         Args:
-            duration: Length [s], rounded to whole periods. Default: none.
-            stop: Asked before every period. Default: never.
+            duration: Length [s], rounded to whole periods. Default: unlimited.
+            stop: Called before every period. Default: never stops.
 
         Raises:
-            InputError: If neither end is given, the duration is not positive and finite, a callback returns
-                another shape, or the clock is none. What a callback raises is raised on, after the safe input.
-            SafeInputError: If the actuator did not take the safe input.
+            InputError: If both arguments are missing, the duration is not positive and finite, a callback returns a
+                wrong shape, or the clock is invalid. Exceptions of a callback are raised after the safe input.
+            SafeInputError: If the actuator did not accept the safe input.
         """
         if stop is not None:
             check_function(stop, "Runner: stop")
@@ -211,29 +214,29 @@ class Runner:
         if duration is None:
             if stop is None:
                 raise InputError(
-                    "Runner: give a duration [s], or a function stop() that ends the run [HM-LOOP-037]"
+                    "Runner: the end of the run is missing; give a duration [s], or a function stop() [HM-LOOP-037]"
                 )
             return None
         dt, duration = self._dt, float(sampled(duration, (), "Runner: duration"))
         if not (math.isfinite(duration) and round(duration / dt) >= 1):
             raise InputError(
-                f"Runner: duration {duration} s given; at least one period of {dt} s, and finite, needed [HM-LOOP-038]"
+                f"Runner: duration must be finite and at least one period of {dt} s, got {duration} s [HM-LOOP-038]"
             )
         return round(duration / dt)
 
 
 def _stops(answer: object) -> bool:
-    """What ``stop()`` has answered."""
+    """The answer of ``stop()`` as a bool."""
     try:
         return bool(answer)
     except ValueError as error:  # several numbers
         raise InputError(
-            f"Runner: stop() must return True or False, it returns {type(answer).__name__} [HM-LOOP-039]"
+            f"Runner: stop() must return True or False, but it returns {type(answer).__name__} [HM-LOOP-039]"
         ) from error
 
 
 class _Run:
-    """One run: its clock, its counts and its last rows; all that the loop remembers is in the loop."""
+    """One run: its clock, its counts and its last rows; the control state is in the loop."""
 
     def __init__(self, runner: Runner, loop: Loop, clock: CheckedClock) -> None:
         self._runner, self._loop, self._clock = runner, loop, clock
@@ -245,21 +248,21 @@ class _Run:
         self._start = 0.0
 
     def begin(self) -> None:
-        """Measure, plan and decide while the machine still rests; the first period is then now."""
+        """Measure, plan and decide while the machine is at rest; the first period begins afterwards."""
         self._loop.start(self._sample(), self._disturbances())
         self._start = self._clock.now()
 
     def wait(self) -> None:
-        """Until the next period's instant, to hold the last input for a whole one."""
+        """Wait for the begin of the next period."""
         self._clock.sleep_until(self._start + self.k * self._dt)
 
     def period(self) -> None:
-        """Wait for the period's instant, and do all of it."""
+        """Wait for the begin of a period, and run it."""
         self.wait()
         loop, clock = self._loop, self._clock
         due = self._start + self.k * self._dt
         begin = measured = clock.now()
-        if self._periods:  # the first input was decided before the clock began
+        if self._periods:  # the first input was decided before the clock started
             y = self._sample()
             measured = clock.now()
             self._decide(y, due + self._deadline)
@@ -285,7 +288,7 @@ class _Run:
         self._go_on()
 
     def report(self, stopped: str) -> RunReport:
-        """What happened."""
+        """The report of the run."""
         rows, model = list(self._rows), self._loop.model
         return RunReport(
             periods=self._periods, sources=dict(self._sources), missing=self._missing, late=self._late,
@@ -312,8 +315,8 @@ class _Run:
         return None if self._runner._measure_w is None else self._runner._measure_w()
 
     def _decide(self, y: Array | None, deadline: float) -> None:
-        """A step whose solve is begun where it can be in time, and dropped where it was not."""
-        # Half of the time left is always tried: else a slow spell would end all solving.
+        """Run a step; a solve only begins if it can meet the deadline, and its result is discarded if it is late."""
+        # with half of the deadline left, always solve: otherwise a slow period could prevent all further solves
         needed = min(min(self._solves, default=0.0), 0.5 * self._deadline)
         begun = False
 
@@ -337,7 +340,7 @@ class _Run:
         self._overruns += step.applied > self._deadline
 
     def _go_on(self) -> None:
-        """To the next instant on the grid, or the nearest to now if that has long passed."""
+        """Advance to the next period, or after a long delay to the period nearest to the present time."""
         following = max(self.k + 1, round((self._clock.now() - self._start) / self._dt))
         skipped = following - self.k - 1
         if skipped:
@@ -348,17 +351,17 @@ class _Run:
 
 @dataclass(frozen=True)
 class RunnerStep:
-    """One period as ``on_step`` sees it; times are in seconds.
+    """One period, as passed to ``on_step``; times are in seconds.
 
     Args:
-        k: Its number on the grid; skipped periods have none.
-        t: Its time on the grid, since the start.
-        y: Measurement ``(n_y,)``; NaN where there was none.
+        k: Number of the period on the grid.
+        t: Time on the grid since the start.
+        y: Measurement ``(n_y,)``; NaN if missing.
         estimate: The estimate.
-        decision: The input and where it came from.
-        reading: What the monitor says, or None.
-        lateness: Begin of the period after its instant on the grid.
-        applied: Instant after the grid's at which the input had been handed over.
+        decision: The input and its source.
+        reading: The monitor's reading; None without a monitor.
+        lateness: Delay of the period's begin behind the grid.
+        applied: Time from the grid until the input has been applied.
         spent: Durations by the names of ``TIMED``.
     """
 
@@ -375,29 +378,29 @@ class RunnerStep:
 
 @dataclass(frozen=True)
 class RunReport:
-    """How a real-time run went; counts are of all periods, rows of the last ``keep``.
+    """Report of a real-time run; counts include all periods, rows the last ``keep`` periods.
 
     Args:
         periods: Periods that ran.
         sources: Number of inputs by the name of their :class:`~hybrid_mpc.control.safeguard.Source`.
-        missing: Periods without a measurement (None, or nothing finite in it).
-        late: Periods in which the shifted plan was applied because the solve was, or would have been, late.
-        overruns: Periods whose input was applied after their deadline.
-        skipped: Periods that did not run at all, since one before them took too long.
-        stopped: What ended the run: ``"duration"``, ``"stop"``, the name of a signal that the program survives
+        missing: Periods without a measurement (None, or no finite value).
+        late: Periods in which the shifted plan was applied because the solve was late, or would have been.
+        overruns: Periods whose input was applied after the deadline.
+        skipped: Periods that did not run because an earlier period took too long.
+        stopped: Cause of the end: ``"duration"``, ``"stop"``, the name of a signal that the program survives
             (``"SIGTERM"``), or ``"exit"`` of the interpreter.
-        t: Times ``(n,)`` [s] on the grid, since the start, of the last ``keep`` periods.
-        y: Measurements ``(n, n_y)``; NaN where there was none.
+        t: Times ``(n,)`` [s] on the grid since the start, of the last ``keep`` periods.
+        y: Measurements ``(n, n_y)``; NaN if missing.
         u: Inputs ``(n, n_u)``.
         x_hat: Estimated states ``(n, n_x)``.
         source: Name of the source of each input.
         status: Name of the :class:`~hybrid_mpc.control.problem.Status` of each solve.
-        lateness_ms: Begin of each period after its instant on the grid ``(n,)`` [ms].
-        applied_ms: Instant after the grid's at which each input had been handed over ``(n,)`` [ms].
+        lateness_ms: Delay of each period's begin behind the grid ``(n,)`` [ms].
+        applied_ms: Time from the grid until each input has been applied ``(n,)`` [ms].
         timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``, ``prepare``.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode in the whole run. Default: none.
-        given_way: For each period the hard bounds that its plan exceeds, since none keeps them all, with the largest
+        given_way: For each period the relaxed hard bounds, because no plan keeps all of them, with the largest
             violation in the plan. Default: unknown.
     """
 
@@ -422,7 +425,7 @@ class RunReport:
     given_way: tuple[Mapping[str, float], ...] = ()
 
     def percentiles(self) -> dict[str, dict[str, float]]:
-        """Median, 95th and 99th percentile and maximum [ms] of lateness, applied instant and durations.
+        """Median, 95th and 99th percentile and maximum [ms] of lateness, time of application and durations.
 
         Example: ``runner.run(duration=10.0).percentiles()["lateness"]["p99"]``
         """
@@ -431,34 +434,33 @@ class RunReport:
 
 
 def percentiles(values: Array) -> dict[str, float]:
-    """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN where there are none."""
+    """Median, 95th and 99th percentile and maximum of ``values`` ``(n,)``; NaN for no values."""
     if len(values) == 0:
         return dict.fromkeys(QUANTILES, float("nan"))
     return {name: float(np.quantile(values, q)) for name, q in QUANTILES.items()}
 
 
 class Ended(BaseException):
-    """Leads out of the block of a :class:`SafeEnd`, and never leaves it."""
+    """Internal exception that ends the block of a :class:`SafeEnd`; it never leaves the block."""
 
 
 class SafeEnd:
-    """A block at whose end the safe input is handed over, however the block ends.
+    """Context manager that applies the safe input at the end of its block, however the block ends.
 
-    When it ends by itself, or by any exception: ``hand_over()`` comes first, the exception is raised on. In the main
-    thread also when a signal ends it (``ENDING``): the signal breaks off what the block is doing, the safe input is
-    handed over, and only then the signal has the effect that it would have had without this block: the process ends by
-    it, or ``KeyboardInterrupt`` is raised, or the program's own handler is called. If the program lives on, it goes on
-    behind the block. Signals that are ignored, as under ``nohup``, stay so. While the safe input is handed over no
-    signal interrupts; it waits.
+    At the normal end, or after any exception, ``hand_over()`` is called first; then the exception is raised. In the
+    main thread this also holds for signals (``ENDING``): a signal interrupts the block, the safe input is applied,
+    and only then the signal takes its usual effect: it ends the process, raises ``KeyboardInterrupt``, or calls the
+    program's own handler. If the program continues, it continues after the block. Ignored signals, as under
+    ``nohup``, stay ignored. A signal during ``hand_over()`` is delayed.
 
-    Another thread gets no signals. There the block ends when the interpreter does, which waits for it.
+    Other threads receive no signals. There, the end of the interpreter ends the block, and waits for it.
 
     Args:
-        hand_over: Hands the safe input to the actuator. Where it raises it is called again after ``PAUSES_S``.
+        hand_over: Applies the safe input at the actuator. If it raises, it is called again after ``PAUSES_S``.
 
     Raises:
-        SafeInputError: At the end of the block, if the safe input could not be handed over, from the first failure of
-            ``hand_over``. If a signal then ends the process, the error is printed.
+        SafeInputError: At the end of the block, if the safe input could not be applied; its cause is the first failure
+            of ``hand_over``. If a signal then ends the process, the error is printed.
 
     Example:
         >>> held = [0.7]
@@ -481,15 +483,15 @@ class SafeEnd:
 
     @property
     def cause(self) -> str:
-        """What asked the block to end: the name of the first signal, ``"exit"`` of the interpreter, or nothing."""
+        """Cause of the block's end: the name of the first signal, ``"exit"`` of the interpreter, or empty."""
         if self._signals:
             return signal.Signals(self._signals[0]).name
         return "exit" if self._exiting else ""
 
     def check(self) -> None:
-        """End the block if that has been asked for.
+        """End the block if a signal or the interpreter's exit has requested it.
 
-        Call it often: a callback may have swallowed what a signal raised.
+        Call it often: a callback may have caught the exception of a signal.
         """
         if self.cause:
             raise Ended(self.cause)
@@ -499,7 +501,10 @@ class SafeEnd:
         if self._thread is threading.main_thread():
             for number in ENDING:
                 before = signal.getsignal(number)
-                if before not in (signal.SIG_IGN, None):  # None: not Python's, so it could not be put back
+                if before not in (
+                    signal.SIG_IGN,
+                    None,
+                ):  # None: not a Python handler, so it could not be restored
                     self._previous[number] = before
                     signal.signal(number, self._handler)
         else:
@@ -518,7 +523,7 @@ class SafeEnd:
         self._over.set()
         if not self._exiting:
             atexit.unregister(self._at_exit)
-        if failure is not None and self._signals:  # the signal may leave no time to say so
+        if failure is not None and self._signals:  # the signal may end the process: print now
             traceback.print_exception(failure)
         _deliver(list(dict.fromkeys(self._signals)))
         if failure is not None:
@@ -536,7 +541,7 @@ class SafeEnd:
             else:
                 return None
         error = SafeInputError(
-            f"the safe input could not be handed over: the actuator failed {len(failures)} times, at last with "
+            f"actuator: the safe input could not be applied. It failed {len(failures)} times, the last time with "
             f"{failures[-1]!r}. The machine may still follow the last input: cut its power [HM-LOOP-053]"
         )
         error.__cause__ = failures[0]
@@ -549,18 +554,18 @@ class SafeEnd:
             raise Ended(self.cause)
 
     def _at_exit(self) -> None:
-        """The interpreter ends: wait for the block's end, unless its thread is one of a parent process."""
+        """At the end of the interpreter, wait for the block's end, unless its thread belongs to a parent process."""
         self._exiting = True
         if self._thread.is_alive():
             self._over.wait()
 
 
 _OWN = (SafeEnd.__enter__.__code__, SafeEnd.__exit__.__code__)
-"""A signal that arrives between the block and the first or last statement of these would else get past them."""
+"""Code of the two methods: a signal within them must not raise, or the safe input could be skipped."""
 
 
 def _deliver(signals: Sequence[int]) -> None:
-    """Let signals have their effect, each whatever those before it raise."""
+    """Raise the signals again, each of them even if an earlier one raises an exception."""
     if signals:
         try:
             signal.raise_signal(signals[0])
@@ -569,10 +574,10 @@ def _deliver(signals: Sequence[int]) -> None:
 
 
 class Clock(Protocol):
-    """What the runner knows of time."""
+    """Interface of a clock."""
 
     def now(self) -> float:
-        """Time [s] on a scale that never goes back."""
+        """Monotonic time [s]."""
 
     def sleep_until(self, t: float) -> None:
         """Return at ``t`` [s] or as soon as possible after it; at once if it has passed."""
@@ -582,7 +587,7 @@ class RealClock:
     """The computer's monotonic clock."""
 
     def now(self) -> float:
-        """Time [s] since some fixed instant."""
+        """Time [s] since an arbitrary origin."""
         return time.perf_counter()
 
     def sleep_until(self, t: float) -> None:
@@ -592,7 +597,7 @@ class RealClock:
 
 
 class CheckedClock:
-    """A clock that is checked: a loop on one that stands still would spin for ever.
+    """A checked clock: with a clock that stops, a loop would never end.
 
     A wait may end early by a small share of the loop's period ``dt`` [s].
     """
@@ -601,13 +606,13 @@ class CheckedClock:
         self._clock, self._early, self._last = clock, EARLY * dt, -math.inf
 
     def now(self) -> float:
-        """Time [s], finite and never before the last one."""
+        """Time [s], checked to be finite and monotonic."""
         t = float(sampled(self._clock.now(), (), "clock: what now() returns"))
         if not math.isfinite(t):
-            raise InputError(f"clock: now() gives {t}; a finite time [s] needed [HM-LOOP-040]")
+            raise InputError(f"clock: now() returns {t}; it must return a finite time [s] [HM-LOOP-040]")
         if t < self._last:
             raise InputError(
-                f"clock: now() has gone back from {self._last} to {t}; give one that never does [HM-LOOP-041]"
+                f"clock: now() went back from {self._last} to {t}; give a monotonic clock [HM-LOOP-041]"
             )
         self._last = t
         return t
@@ -619,5 +624,6 @@ class CheckedClock:
             if self.now() >= t - self._early:
                 return
         raise InputError(
-            f"clock: sleep_until({t}) has come back {WAKES} times, at last at {self._last}; it must wait [HM-LOOP-042]"
+            f"clock: sleep_until({t}) returned {WAKES} times too early, the last time at {self._last}; it must wait "
+            "[HM-LOOP-042]"
         )

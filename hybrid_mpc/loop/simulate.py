@@ -1,4 +1,4 @@
-"""The loop in simulation: a plant in place of the machine, a virtual clock, and the record of what happened."""
+"""The loop in simulation: a plant in place of the machine, a virtual clock, and a record of all periods."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ UNITS = {"stage_cost": "1/s", "violation": "W", "share": "-"}
 
 @dataclass(frozen=True)
 class Step:
-    """One period as ``on_step`` sees it: number, time [s], truth, measurement, estimate, decision."""
+    """One period, as passed to ``on_step``: number, time [s], true state, measurement, estimate, decision, reading."""
 
     k: int
     t: float
@@ -48,7 +48,7 @@ class Step:
 
 
 MOST_PERIODS = 10**9
-"""Most periods of one simulation: each has a row in the result."""
+"""Largest number of periods of a simulation; each has a row in the result."""
 
 
 def simulate(
@@ -73,49 +73,47 @@ def simulate(
     guard: Guard | None = None,
     now: Callable[[], float] = perf_counter,
 ) -> ClosedLoopResult:
-    """Run a plant under control; deterministic except for the recorded durations.
+    """Simulate a plant under control; deterministic except for the recorded durations.
 
-    It drives a :class:`~hybrid_mpc.loop.loop.Loop` on a virtual clock. No time passes between measuring and
-    holding but the delays given. Input faults act behind the controller, which does not know of them.
+    It drives a :class:`~hybrid_mpc.loop.loop.Loop` on a virtual clock. Only the given delays lie between measurement
+    and input. Input faults act after the controller, which does not know them.
 
-    The preview reaches beyond the end of the run: reference and weight are asked for those times too. Where
-    they are not finite there (a recording that ends), their last value within the run is held.
+    The preview extends beyond the end of the run, so reference and weight are evaluated at those times, too. Non-finite
+    values there (e.g. after the end of a recording) are replaced by the last value within the run.
 
-    With delays the estimate must be that of the instant at which the input will act: give
-    :class:`~hybrid_mpc.estimate.delay.DelayCompensation` as estimator. Before the start the machine has rested
-    at ``x0`` with the first held input, and the sensor has measured it there.
+    With delays, the estimate must be that of the time at which the input will act: use
+    :class:`~hybrid_mpc.estimate.delay.DelayCompensation` as estimator. Before the start, the machine is at rest at
+    ``x0`` with the first held input.
 
     Args:
         plant: The machine.
-        estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which is handed the truth, undelayed.
-        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller is guarded without
-            fallback.
-        reference: ``t (n,) -> x_ref (n, n_x)``, or ``y_ref (n, n_y)`` where the problem weighs outputs, or a set-point;
+        estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which gets the truth without delay.
+        controller: A :class:`~hybrid_mpc.control.safeguard.SafeController`; a bare controller has no fallback.
+        reference: ``t (n,) -> x_ref (n, n_x)``, or ``y_ref (n, n_y)`` if the problem weights outputs, or a set-point;
             see :class:`~hybrid_mpc.loop.loop.Loop`.
-        dt: Period [s]; must be the models' own.
+        dt: Period [s]; it must be that of the models.
         duration: Length [s], rounded to whole periods.
         x0: Initial state ``(n_x,)``.
         seed: Seed of the plant and of the measurement noise.
-        weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, previewed alike; they count in the recorded cost.
-            Default: 1.
+        weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, also previewed and part of the recorded cost. Default: 1.
         w: Measured disturbances of the machine, ``t (n,) -> (n, n_w)`` or constant ones ``(n_w,)``: they act on the
-            plant, the loop measures them, and knows them ahead if the problem previews them. Default: those of the
-            model's operating point.
-        monitor: Default: none.
-        faults: Default: none.
+            plant, the loop measures them, and previews them if the problem does. Default: those of the model's
+            operating point.
+        monitor: The monitor. Default: none.
+        faults: Faults of sensors, actuators and plant. Default: none.
         stage_cost: Problem whose stage cost is recorded. Default: the controller's.
-        on_step: Called after every period, e.g. to show progress.
-        sensor_delay: Periods after which a measurement arrives; faults of a sensor act on arrival.
-        input_delay: Periods after which an input reaches the plant: computing and transport.
-        late: ``t [s] -> True`` where the solve misses its deadline. Default: never.
-        guard: What to do on alarms of the monitor, which it needs. Default: nothing.
-        now: Clock [s] of the recorded durations, e.g. ``time.thread_time``. Default: the computer's.
+        on_step: Called after every period, e.g. to show progress. Default: nothing.
+        sensor_delay: Periods after which a measurement arrives; faults of a sensor act on arrival. Default: 0.
+        input_delay: Periods after which an input reaches the plant: computing and transport. Default: 0.
+        late: ``t [s] -> True`` if the solve misses its deadline. Default: never.
+        guard: Reaction to alarms of the monitor, which it needs. Default: none.
+        now: Clock [s] of the recorded durations, e.g. ``time.thread_time``. Default: the computer's clock.
 
     Returns:
         The record of ``round(duration / dt)`` periods.
 
     Raises:
-        InputError: If a period, shape or channel does not fit.
+        InputError: If a period, shape or channel is wrong.
 
     Example: see ``tests/loop``; with a scenario::
 
@@ -129,9 +127,9 @@ def simulate(
         if function is not None:
             check_function(function, name)
     if not isinstance(stage_cost, OCP | None):
-        raise InputError(f"stage_cost: an OCP is needed, got {type(stage_cost).__name__} [HM-LOOP-043]")
+        raise InputError(f"stage_cost: give an OCP, got {type(stage_cost).__name__} [HM-LOOP-043]")
     if isinstance(faults, str | bytes) or not all(isinstance(fault, Fault) for fault in _listed(faults)):
-        raise InputError(f"faults: a list of Faults is needed, got {type(faults).__name__} [HM-LOOP-044]")
+        raise InputError(f"faults: give a list of Fault, got {type(faults).__name__} [HM-LOOP-044]")
     seed = whole(seed, "seed", 0, 2**63 - 1)
     sensor_delay, input_delay = (
         whole_periods(sensor_delay, "sensor_delay"),
@@ -148,7 +146,7 @@ def simulate(
     outputs, inputs = (tuple(s.name for s in signals) for signals in (model.outputs, model.inputs))
     check_channels(faults, outputs, inputs)
     cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
-    # what the loop previews is for the instant at which its input will act; the cost counts now
+    # the loop's preview begins when its input will act, but the cost needs the present reference
     standing = loop.standing
     acting = Previews(reference, weight, ocp, dt, periods * dt, standing) if input_delay else None
     rest = vector(x0, ocp.n_x, "x0")
@@ -180,7 +178,7 @@ def simulate(
         loop.finish()
         reference_now, factors = loop.previewed if acting is None else acting(t)
         goal = _goal(ocp, model, reference_now[0], loop.decision.solution.steady)
-        with np.errstate(over="ignore", invalid="ignore"):  # an absurd reference costs infinitely much
+        with np.errstate(over="ignore", invalid="ignore"):  # a huge reference has an infinite cost
             weights = 1.0 if factors is None else factors[0]
             error = model.output(x, u, now_w, model.p).full().ravel() - goal.y if cost.n_y else None
             stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, weights, u_ref=goal.u, y_error=error))
@@ -193,18 +191,18 @@ def simulate(
 
 
 def _listed(faults: object) -> Sequence[object]:
-    """What stands in a list; itself alone where it is none."""
+    """The items of a list or tuple; otherwise the object itself as single item."""
     return faults if isinstance(faults, list | tuple) else (faults,)
 
 
 def _disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview | None:
-    """Measured disturbances as a function of time; None where the model has none.
+    """Measured disturbances as a function of time; None if the model has none.
 
     Raises:
-        InputError: If constant ones are of another number, or the model has none.
+        InputError: If the number of constant disturbances is wrong, or the model has none.
     """
     if not model.n_w and w is not None:
-        raise InputError(f"w: measured disturbances given, model {model.name} has none [HM-LOOP-045]")
+        raise InputError(f"w: model {model.name} has no measured disturbances; remove w [HM-LOOP-045]")
     if not model.n_w:
         return None
     if callable(w):
@@ -219,7 +217,7 @@ def _row_at(w: Preview, t: float, n_w: int) -> Array:
 
 
 class _Goal(NamedTuple):
-    """What a period was to reach: states, inputs and outputs, and whether it can be reached."""
+    """Goal of a period: states, inputs and outputs, and whether they can be reached."""
 
     x: Array
     u: Array
@@ -228,7 +226,7 @@ class _Goal(NamedTuple):
 
 
 def _goal(ocp: OCP, model: HybridModel, reference: Array, steady: Steady | None) -> _Goal:
-    """What a period's row of the reference asks for; of outputs with its steady state."""
+    """The goal of a period from its row of the reference; for outputs with the steady state."""
     if not ocp.n_y:
         return _Goal(reference[: model.n_x].copy(), model.u0, np.full(model.n_y, np.nan), True)
     y = np.where(ocp.q_y > 0, reference[: model.n_y], 0.0)
@@ -263,7 +261,7 @@ def _result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> Cl
 
 
 class _Row(NamedTuple):
-    """A period in the record; without plans and covariances, for which a long run has no room."""
+    """A period in the record, without plans and covariances, which would need too much memory."""
 
     t: float
     x: Array
@@ -287,7 +285,7 @@ class _Row(NamedTuple):
 
 
 COLUMNS = _Row._fields[:11]
-"""Those that are numbers."""
+"""Numeric fields of a row."""
 
 
 def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, float]) -> _Row:
@@ -318,7 +316,8 @@ def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, fl
 def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
     if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
         raise InputError(
-            f"stage_cost has {cost.n_x} states and {cost.n_u} inputs, needed: {ocp.n_x} and {ocp.n_u} [HM-LOOP-046]"
+            f"stage_cost: it has {cost.n_x} states and {cost.n_u} inputs, but the controller has {ocp.n_x} and "
+            f"{ocp.n_u}. Give a problem of the same sizes [HM-LOOP-046]"
         )
     return cost
 
@@ -327,20 +326,24 @@ def _end(dt: float, duration: float, period: float) -> float:
     """End of the run [s].
 
     Raises:
-        InputError: If a time is not finite, the period another than the models', or the run shorter than one.
+        InputError: If a time is not finite, the period is not that of the models, or the run is shorter than a period.
     """
     if not (math.isfinite(duration) and math.isfinite(dt) and dt > 0):
         raise InputError(
-            f"dt and duration must be finite and dt positive; got {dt} s and {duration} s [HM-LOOP-047]"
+            f"dt and duration must be finite, and dt positive; got {dt} s and {duration} s [HM-LOOP-047]"
         )
     if not abs(dt - period) <= 1e-9 * period:
-        raise InputError(f"dt = {dt} s given, a model's period is {period} s; they must agree [HM-LOOP-048]")
+        raise InputError(
+            f"dt: got {dt} s, but the models' period is {period} s; give this period [HM-LOOP-048]"
+        )
     if duration / dt > MOST_PERIODS:
         raise InputError(
-            f"duration {duration:g} s: at most {MOST_PERIODS:g} periods of {dt} s are simulated [HM-LOOP-049]"
+            f"duration: {duration:g} s is too long; give at most {MOST_PERIODS:g} periods of {dt} s [HM-LOOP-049]"
         )
     if round(duration / dt) < 1:
-        raise InputError(f"duration {duration} s is shorter than one period of {dt} s [HM-LOOP-050]")
+        raise InputError(
+            f"duration: {duration} s is too short; give at least one period of {dt} s [HM-LOOP-050]"
+        )
     return round(duration / dt) * dt
 
 
@@ -353,30 +356,31 @@ class ClosedLoopResult:
         t: ``(n,)`` [s].
         x: True states ``(n, n_x)`` at ``t_k``.
         y: Measurements ``(n, n_y)`` as they arrived, faults and noise included; NaN for a dropout.
-        u: Commanded inputs ``(n, n_u)``, held from ``t_k`` on (with an input delay: from that much later).
-        x_hat: Estimated states ``(n, n_x)``; with an input delay of the instant at which ``u`` will act.
+        u: Commanded inputs ``(n, n_u)``, held from ``t_k`` on; with an input delay, they act later by this delay.
+        x_hat: Estimated states ``(n, n_x)``; with an input delay those of the time at which ``u`` will act.
         h: Estimated hidden states ``(n, n_h)``.
         d: Estimated unmeasured disturbances ``(n, n_d)``.
-        reference: Reference of the states ``(n, n_x)`` at ``t_k``; where the problem weighs outputs, the steady state
-            of the set-point.
+        reference: Reference of the states ``(n, n_x)`` at ``t_k``; if the problem weights outputs, the steady state of
+            the set-point.
         source: Name of the :class:`~hybrid_mpc.control.safeguard.Source` of each input.
         status: Name of the :class:`~hybrid_mpc.control.problem.Status` of each solve.
-        stage_cost: Stage cost ``(n,)`` per second on the true state and the input that acts on it, with the
-            weight factors of that instant and without penalties of soft bounds.
+        stage_cost: Stage cost ``(n,)`` per second of the true state and the applied input, with the weight factors at
+            ``t_k`` and without penalties of soft bounds.
         timing_ms: Durations ``(n,)`` [ms] of ``estimate``, ``solve``, ``monitor``, ``prepare`` and ``total``. The only
             field in which two runs may differ.
-        violation: Violation of the energy balance ``(n,)`` [W]; NaN where a monitor does not read it.
+        violation: Violation of the energy balance ``(n,)`` [W]; NaN if the monitor does not read it.
         share: Largest level of the monitor over its threshold ``(n,)`` [-]; NaN without limits.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode, in their order. Default: none.
-        valid: ``(n,)``, True where the monitor's reading was valid. Default: unknown.
-        innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN where it had none. Default: unknown.
-        nis: Normalised innovations squared ``(n,)`` [-]; NaN where there was none. Default: unknown.
-        w: Measured disturbances ``(n, n_w)`` that acted from ``t_k`` on. Default: none.
-        y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN where references are the states'. Default: unknown.
-        reached: ``(n,)``, False where the set-point cannot be reached. Default: unknown.
-        given_way: For each period the hard bounds that its plan exceeds, since none keeps them all: largest violation
-            in the plan by name, as in :class:`~hybrid_mpc.control.problem.Solution`. Default: unknown.
+        valid: ``(n,)``, True if the monitor's reading was valid. Default: unknown.
+        innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN without a measurement. Default:
+            unknown.
+        nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. Default: unknown.
+        w: Measured disturbances ``(n, n_w)`` that act from ``t_k`` on. Default: none.
+        y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN if the reference is one of states. Default:
+        unknown. reached: ``(n,)``, False if the set-point cannot be reached. Default: unknown.
+        given_way: For each period the relaxed hard bounds, because no plan keeps all of them: largest violation in the
+            plan by name, as in :class:`~hybrid_mpc.control.problem.Solution`. Default: unknown.
 
     Example:
         >>> one = np.ones((2, 1))
@@ -414,7 +418,7 @@ class ClosedLoopResult:
 
     @property
     def tracks_outputs(self) -> bool:
-        """Whether references were the outputs'."""
+        """Whether the reference is one of outputs."""
         return bool(self.y_ref.size) and bool(np.all(np.isfinite(self.y_ref)))
 
     @property
@@ -433,21 +437,21 @@ class ClosedLoopResult:
 
     @property
     def tracking_rmse(self) -> Array:
-        """Root mean squares of the deviations from the reference [their units]: of the true states ``(n_x,)``, or of
-        the measured outputs ``(n_y,)`` where references were the outputs'.
+        """Root mean square deviations from the reference [units of the signals]: of the true states ``(n_x,)``, or of
+        the measured outputs ``(n_y,)`` if the reference is one of outputs.
         """
         error = self.y - self.y_ref if self.tracks_outputs else self.x - self.reference
         return np.asarray(np.sqrt(np.nanmean(error**2, axis=0)))
 
     def to_pandas(self, model: HybridModel | None = None) -> pd.DataFrame:
-        """One row a period. Needs pandas.
+        """Table with one row for each period. Needs pandas.
 
         Args:
             model: Names and units of the columns: ``"x phi [rad]"``, ``"y phi [rad]"``, ``"t [s]"``. Default: numbers
                 without units, ``x_0``, ``x_1``, ``t``.
 
         Raises:
-            InputError: If the model has other numbers of states, inputs or outputs.
+            InputError: If the numbers of the model's states, inputs or outputs are different.
 
         Example: ``result.to_pandas(model)["u torque [N m]"]``
         """
@@ -486,6 +490,7 @@ def _labels(name: str, n: int, model: HybridModel | None) -> list[str]:
     signals = groups.get(name, model.states)
     if len(signals) != n:
         raise InputError(
-            f"to_pandas: the loop has {n} columns of {name}, the model {model.name} {len(signals)} [HM-LOOP-051]"
+            f"to_pandas: the loop has {n} columns of {name}, but model {model.name} has {len(signals)}. Give the "
+            "model of the loop [HM-LOOP-051]"
         )
     return [f"{name} {s.name} [{s.unit}]" for s in signals]

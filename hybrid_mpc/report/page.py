@@ -229,7 +229,7 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
             kind, (width, height) = str(image.format).lower(), image.size
     except UnidentifiedImageError:
         raise InputError(
-            f"report, section {section.title!r}: figure {path} is no PNG or GIF file [HM-REPORT-003]"
+            f"report, section {section.title!r}: figure {path} is not a PNG or GIF file; give one [HM-REPORT-003]"
         ) from None
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     live = path.with_suffix(".json")

@@ -119,8 +119,8 @@ class DoublePendulumPlant:
         steps, before = round(dt / TIMESTEP), round(self.late / TIMESTEP)
         if abs(steps * TIMESTEP - dt) > 1e-9 or steps <= before:
             raise InputError(
-                f"the double pendulum's plant was given a period of {dt:g} s; needed: a multiple of {TIMESTEP:g} s, "
-                f"longer than the {self.late:g} s after which a command acts [HM-SCENARIOS-002]"
+                f"double pendulum: a period of {dt:g} s is not possible. Give a multiple of {TIMESTEP:g} s, longer "
+                f"than the delay of {self.late:g} s of a command [HM-SCENARIOS-002]"
             )
         mujoco, model, data = simulation(self)
         mujoco.mj_setState(model, data, state.z, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -156,7 +156,7 @@ def simulation(plant: DoublePendulumPlant) -> tuple[Any, Any, Any]:
         import mujoco
     except ImportError as missing:
         raise InputError(
-            f"the double pendulum's closed loops run in MuJoCo ({missing}); install it with: pip install "
+            f"double pendulum: its closed loops need MuJoCo ({missing}); install it with: pip install "
             "'hybrid-mpc[mujoco]' [HM-SCENARIOS-003]"
         ) from None
     model = mujoco.MjModel.from_xml_string(MODEL.format(TIMESTEP=TIMESTEP, **vars(plant)))

@@ -367,11 +367,13 @@ def read_results(path: Path) -> dict[str, Any]:
     """Results of a reproduction."""
     results = read_json(path)
     if not isinstance(results, dict) or results.get("schema") != SCHEMA:
-        raise InputError(f"{path} holds no results of 'hybrid-mpc reproduce' [HM-SCENARIOS-022]")
+        raise InputError(
+            f"{path}: no results of 'hybrid-mpc reproduce'; give its results.json [HM-SCENARIOS-022]"
+        )
     if results.get("schema_version") != SCHEMA_VERSION:
         raise InputError(
-            f"{path} has schema version {results.get('schema_version')}, this program reads {SCHEMA_VERSION}; "
-            "use the program that wrote it, or run 'hybrid-mpc reproduce' anew [HM-SCENARIOS-023]"
+            f"{path}: schema version {results.get('schema_version')}, but this version reads {SCHEMA_VERSION}. "
+            "Use the version that wrote it, or run 'hybrid-mpc reproduce' again [HM-SCENARIOS-023]"
         )
     return results
 

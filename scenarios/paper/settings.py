@@ -41,17 +41,18 @@ class ReproductionSettings:
         """The budget's effort with these networks and sequences."""
         if self.budget not in experiment.efforts:
             raise InputError(
-                f"no budget {self.budget!r} to reproduce with; there are: {', '.join(experiment.efforts)}"
+                f"budget: no budget {self.budget!r} for this experiment; choose one of: {', '.join(experiment.efforts)}"
                 " [HM-SCENARIOS-024]"
             )
         if self.form not in FORMS:
-            raise InputError(f"no form {self.form!r}; there are: {', '.join(FORMS)} [HM-SCENARIOS-025]")
+            raise InputError(
+                f"form: unknown form {self.form!r}; choose one of: {', '.join(FORMS)} [HM-SCENARIOS-025]"
+            )
         effort = experiment.efforts[self.budget]
         networks = effort.networks if self.networks is None else self.networks
         if networks < 1:
             raise InputError(
-                f"{networks} networks cannot be evaluated; give --networks at least 1 (the paper has 16)"
-                " [HM-SCENARIOS-026]"
+                f"--networks: got {networks}; give at least 1 (the paper has 16) [HM-SCENARIOS-026]"
             )
         return replace(effort, networks=networks, sequences=self._sequences(experiment, effort))
 
@@ -80,7 +81,8 @@ def parsed_sequences(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
         raise InputError(
-            f"--sequences {text!r} is no list of whole numbers; write e.g. --sequences 3,6,9,12,15 [HM-SCENARIOS-028]"
+            f"--sequences: {text!r} is not a list of whole numbers; write e.g. --sequences 3,6,9,12,15 "
+            "[HM-SCENARIOS-028]"
         ) from None
 
 
@@ -89,7 +91,7 @@ def experiment_of(scenario: Scenario) -> Experiment:
     if not isinstance(scenario, PaperScenario):
         names = [name for name in registered_scenarios() if isinstance(load_scenario(name), PaperScenario)]
         raise InputError(
-            f"scenario {scenario.name} has no experiment to reproduce; there is one for: {', '.join(names)}"
+            f"scenario {scenario.name}: no experiment to reproduce; choose one of: {', '.join(names)}"
             " [HM-SCENARIOS-029]"
         )
     return scenario.experiment

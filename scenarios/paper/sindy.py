@@ -434,7 +434,7 @@ def _check(
 ) -> None:
     if not training or not validation:
         raise InputError(
-            "SINDy needs training and validation trajectories, at least one of each [HM-SCENARIOS-037]"
+            "SINDy: give at least one training trajectory and one validation trajectory [HM-SCENARIOS-037]"
         )
     sizes = {"x": len(prior.states), "u": len(prior.inputs)}
     for trajectory in (*training, *validation):
@@ -454,8 +454,8 @@ def _check(
         u = np.concatenate([t.u[:, j] for t in training])
         if np.ptp(u) == 0.0:
             raise InputError(
-                f"input {signal.name} is {u[0]:g} {signal.unit} in all training runs: nothing tells what it does. "
-                "Record runs that excite it. [HM-SCENARIOS-040]"
+                f"input {signal.name}: constant ({u[0]:g} {signal.unit}) in all training runs, so its effect is "
+                "unknown. Record runs that excite it [HM-SCENARIOS-040]"
             )
 
 

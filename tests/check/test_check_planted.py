@@ -125,7 +125,7 @@ PLANTED = {
     # what is measured
     "a state that no output sees": (
         lambda: replace(kettle(outputs=Kettle.outputs[:1])(), data=replace(KETTLE.data, outputs=("level",))),
-        ["no output tells of warmth (outputs: level)", "Measure it, leave it out of the states"],
+        ["warmth is not observable: no output (level)", "Measure it, remove it from the states"],
     ),
     "outputs of another number": (
         kettle(output=lambda self, x, u, w, p: (x.level,)),
@@ -188,7 +188,7 @@ PLANTED = {
     ),
     "a mode that is too fast": (
         rates(level=lambda x, u, w, p: u.inflow - 1e3 * x.level),
-        ["fastest mode at rest is 1e+03 1/s", "take a smaller dt"],
+        ["fastest mode at rest is 1e+03 1/s", "use a smaller dt"],
     ),
     # what is not supported: algebraic variables, whole numbers, time, jumps
     "declared algebraic variables": (
@@ -372,7 +372,7 @@ def test_numbers_are_looked_at_whatever_else_is_wrong():
     problems = told(replace(scenario, data=replace(KETTLE.data, outputs=("level",))))
     for word in (
         "balance one [m^3]: dS/dt", "balance one: the rate of", "balance other [W]: dS/dt",
-        "no output tells of warmth", "did you mean 'disturbances'?",
+        "warmth is not observable", "did you mean 'disturbances'?",
     ):  # fmt: skip
         assert sum(word in problem for problem in problems) == 1, (word, problems)
 

@@ -326,7 +326,7 @@ WRONG = {
     "fault of a channel": (
         task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), ["no input 'third'; known names"],
     ),
-    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["takes no faults"]),
+    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["HM-LOOP-006"]),
     "tasks without control": (field(control=None), ["no control problem"]),
     # plant and oracle
     "plant that raises": (plant(step=raises), ["plant raised KeyError"]),
@@ -371,7 +371,9 @@ def changed(base, members):
 @pytest.mark.parametrize("base", [Tank, TorchTank])
 @pytest.mark.parametrize(("members", "states"), [(BLIND, "warmth"), (TOGETHER, "up, down")])
 def test_states_that_no_output_sees_are_named(base, members, states):
-    with pytest.raises(InputError, match=rf"no output tells of {states} \(outputs: level\).*Measure it"):
+    with pytest.raises(
+        InputError, match=rf"{states} (is|are) not observable: no output \(level\).*Measure (it|them)"
+    ):
         check_scenario(changed(base, members))
 
 

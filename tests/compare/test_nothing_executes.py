@@ -57,7 +57,7 @@ def test_what_the_user_types_is_run(call, model, trap, tmp_path):
 def test_control_takes_the_scenario_from_the_command_line_alone(call, model, trap, tmp_path):
     code, _, message = call("control", "golf_robot", "--model", model, "--out", tmp_path / "out")
     assert code == 2
-    assert "was made for scenario" in message
+    assert "HM-COMPARE-017" in message
     assert not trap[1].exists()
 
 

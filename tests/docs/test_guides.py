@@ -188,7 +188,7 @@ def test_what_does_not_fit_is_refused_as_the_page_says(what_fits):
             check_scenario(what_fits.machine(prior))
     check_scenario(what_fits.machine(what_fits.Base))  # it is what each case adds that is refused
     check_scenario(what_fits.machine(what_fits.rod(5), 2.0))
-    with pytest.raises(InputError, match="no output tells of"):
+    with pytest.raises(InputError, match="HM-IDENTIFY-019"):
         check_scenario(what_fits.machine(what_fits.rod(20), 2.0))
 
 

@@ -90,7 +90,7 @@ def test_the_user_overrules():
     errors = {"phy": prior, "pgrnn": [2.0 * r for r in prior], "mopgrnn": [0.5 * r for r in prior]}
     choice = recommend(errors, deploy="pgrnn")
     assert choice.recommended == choice.hybrid == "pgrnn"
-    assert choice.reason.startswith("pgrnn is deployed as asked for. mopgrnn is recommended")
+    assert choice.reason.startswith("pgrnn is deployed as requested. mopgrnn is recommended")
     kept = recommend(errors, deploy="phy")
     assert (kept.recommended, kept.hybrid) == ("phy", "mopgrnn")
     with pytest.raises(InputError, match=r"'rnn'.*HM-IDENTIFY-003"):

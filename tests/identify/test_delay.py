@@ -41,7 +41,7 @@ def test_a_prior_is_fitted_to_delayed_recordings():
     assert abs(wrong.values["d"] / TRUTH["d"] - 1) > 0.05
     errors = [min(row["validation_error"] for row in fit.stages) for fit in (right, wrong)]
     assert errors[0] < 0.1 * errors[1]
-    (told,) = (w for w in wrong.warnings if "later than they are recorded" in w)
+    (told,) = (w for w in wrong.warnings if "later than recorded" in w)
     assert 1.2 * DT < float(told.split()[4]) < 1.4 * DT
     assert not any("later than" in w for w in right.warnings)
 

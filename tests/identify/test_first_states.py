@@ -163,10 +163,10 @@ def test_only_a_recordings_own_first_sample_is_known(runs):
 @pytest.mark.parametrize(("options", "words"), [
     ({"kind": "guessed"}, r"free, known.*HM-IDENTIFY-066"),
     ({"kind": "known"}, "HM-IDENTIFY-067"),
-    ({"kind": "free", "values": {"phi": 0.0}}, "to it alone"),
+    ({"kind": "free", "values": {"phi": 0.0}}, "HM-IDENTIFY-067"),
     ({"kind": "known", "values": {"phi": np.nan}}, "finite"),
     ({"kind": "warm_up"}, "HM-IDENTIFY-069"),
-    ({"kind": "shared", "seconds": 1.0}, "to it alone"),
+    ({"kind": "shared", "seconds": 1.0}, "HM-IDENTIFY-069"),
 ])  # fmt: skip
 def test_what_does_not_belong_to_a_kind_is_refused(options, words):
     with pytest.raises(InputError, match=words):

@@ -260,7 +260,7 @@ def test_equal_explanations_are_named_together():
         [Cause("a", "its sign seems wrong", 0.1, -1.0), Cause("b", "they seem to be exchanged", 0.1)]
     )
     assert both.startswith("a: its sign seems wrong (factor -1)")
-    assert "b: they seem to be exchanged; mended" in both
+    assert "b: they seem to be exchanged; corrected" in both
     assert named([]) == ""
 
 

@@ -137,7 +137,7 @@ def test_every_consumer_takes_the_stored_value():
     )
     model = FIVE_CM.model()
     assert make_monitor(replace(model, time_unit=2.0), limits).readings.rest_speed == (0.003,)
-    with pytest.raises(InputError, match=r"a machine's second.*HM-WATCH-008"):
+    with pytest.raises(InputError, match=r"time.*HM-WATCH-008"):
         make_monitor(model, limits)
     assert record(WatchLimits, json.loads(json.dumps(plain(limits))), "") == limits
     # nobody gave one: no number of any unit stands for it, and nothing is taken to stick

@@ -192,7 +192,7 @@ def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(s
     found = short.read(WATCH)
     assert found.limits is None
     window = 2 * round(0.1 * short.time_unit / QUICK.dt) + 1
-    assert f"no recording has the {window} samples ({window * QUICK.dt:g} s)" in found.reason
+    assert f"window of {window} samples ({window * QUICK.dt:g} s)" in found.reason
     assert "HM-WATCH-018" in found.reason
     said = watch_results(short)
     assert said.alarms is None

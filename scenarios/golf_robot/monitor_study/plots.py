@@ -30,7 +30,7 @@ def method_name(method: str) -> str:
 
 
 def delays(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Share of faults found up to a delay, one panel a fault; what is missed never comes."""
+    """Share of faults detected within a delay, one panel for each fault; missed faults never count."""
     if not any(len(values) for row in cases.values() for values in row.values()):
         raise InputError("plot of delays: there is none [HM-SCENARIOS-014]")
     figure, panels = _panels(len(cases))

@@ -126,7 +126,7 @@ def _learn(study: MonitorStudy, out: Path, jobs: list[MonitorJob], artifact: Kit
     paths = [out / LEARNING / f"{job.id}.npz" for job in jobs]
     if failed and not all(path.is_file() for path in paths):
         raise InputError(
-            f"{out}: a nominal loop to learn from has failed: {failed[-1].error.strip().splitlines()[-1]}; "
-            "--resume --retry-failed runs it again [HM-SCENARIOS-016]"
+            f"{out}: a nominal loop for learning failed: {failed[-1].error.strip().splitlines()[-1]}. Repeat it with "
+            "--resume --retry-failed [HM-SCENARIOS-016]"
         )
     write_json(out / DETECTORS, learn(study, paths, artifact))
