@@ -150,7 +150,7 @@ def no_exit(what: str = "") -> Iterator[None]:
 
 
 def _ending(stop: BaseException) -> str:
-    """What ends Python, as raised."""
+    """The exception that would end Python, as text."""
     return f"SystemExit({stop.code!r})" if isinstance(stop, SystemExit) else type(stop).__name__
 
 

@@ -13,7 +13,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.kit.artifact import save_artifact
 from hybrid_mpc.kit.assembly import make_controller, make_estimator
-from hybrid_mpc.kit.disturbances import _slow_gain, default_disturbances, gain_left, needed
+from hybrid_mpc.kit.disturbances import default_disturbances, needed
 from hybrid_mpc.kit.parts import loop_settings
 from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.loop.simulate import simulate
@@ -109,61 +109,6 @@ def test_an_input_without_effect_at_rest_carries_no_load(gain, expected):
     assert places(model, problem) == expected
     at_rest = 0.2 / gain / 2.0
     assert needed(model, problem) == pytest.approx(at_rest * (1.0 + 0.5 * gain), rel=1e-4)
-
-
-CULTURE = (Parameter("mu", 0.374, "1/h", 0.1, 1.5), Parameter("K", 0.137, "g/l", 0.05, 8.0),
-           Parameter("Y", 0.416, "-", 0.1, 0.9))  # fmt: skip
-DILUTION = 0.26
-TITRE = OCP(45, [0.0] * 2, [0.0], [1700.0], [0.07], [0.31], q_y=[115.0], preview=False)
-
-
-def culture(growth=0.374, decay=0.0):
-    """Biomass, measured, and substrate; hours. At rest mu S / (K + S) = D and X = Y (20 - S)."""
-    x, u, p = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("p", 3)
-    mu = p[0] * x[1] / (p[1] + ca.fmax(x[1], 0.0))
-    xdot = ca.vertcat((mu - u - decay) * x[0], u * (20.0 - x[1]) - mu * x[0] / p[2])
-    signals = (Signal("X", "g/l", 0.0, 20.0), Signal("S", "g/l", 0.0, 30.0))
-    substrate = 0.137 * DILUTION / (0.374 - DILUTION)
-    model = HybridModel.of(
-        "culture", 1 / 6, signals, (Signal("D", "1/h"),), signals[:1], x=x, u=u, p=p, x_next=x + xdot / 6,
-        xdot=xdot, y=x[0], parameters=CULTURE, nominal_x=(0.416 * (20.0 - substrate), substrate),
-        nominal_u=(DILUTION,),
-    )  # fmt: skip
-    parameters = (replace(CULTURE[0], value=growth), *CULTURE[1:])
-    return replace(model, parameters=parameters, state_spread=(0.2, 0.3), output_spread=(0.2,))
-
-
-def test_a_disturbance_does_not_turn_the_effect_of_an_input_round():
-    """An output's disturbance leaves the model's own gain, dX/dD = -Y K mu / (mu - D)^2; a rate's moves S and with it
-    the gain, to the other sign where a parameter is 20 % off."""
-    model = culture()
-    gain = _slow_gain(model, model.x0, np.zeros(0), model.u0, 10**6)
-    assert gain == pytest.approx(np.array([[-0.416 * 0.137 * 0.374 / (0.374 - DILUTION) ** 2]]), rel=1e-3)
-    (found,) = default_disturbances(model, TITRE) or ()
-    assert (found.at, found.signal) == ("output", "X")
-    # largest at D = 0.2: dX/dY = 20 - S, dX/dmu = Y S / (mu - D), dX/dK = -Y S / K
-    by = [0.416 * 0.15747 / 0.174, -0.416 * 0.15747 / 0.137, 20.0 - 0.15747]
-    errors = 0.2 * np.array([0.374, 0.137, 0.416])
-    assert found.size == pytest.approx(np.linalg.norm(by * errors), rel=1e-3)
-    at_rate, at_output = (
-        replace(model, disturbance_model=(Disturbance(at, "X", 0.1),)) for at in ("rate", "output")
-    )
-    assert gain_left(at_rate, TITRE) < 0.0
-    assert gain_left(at_output, TITRE) == pytest.approx(1.0)
-
-
-def test_a_culture_that_decays_is_held_without_offset():
-    model = culture()
-    model = replace(model, disturbance_model=default_disturbances(model, TITRE))
-    assumed = type("Assumed", (Assumed,), {"sensor_sigma": (0.05,)})()
-    observer = make_estimator(model, assumed, np.array([0.02, 0.05]), TITRE)
-    plant = culture(growth=0.36, decay=0.005)
-    goal = 7.9  # of the model at D = 0.33, beyond the limit; of the plant at 0.29
-    result = simulate(
-        ModelPlant(plant, (0.05,)), observer, make_controller(model, model, TITRE), [goal],
-        dt=1 / 6, duration=80.0, x0=[7.7, 0.4], seed=0,
-    )  # fmt: skip
-    assert abs(np.mean(result.x[-150:, 0]) - goal) < 0.05
 
 
 def test_references_of_states_have_one_at_each_input():

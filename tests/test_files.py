@@ -163,10 +163,10 @@ def test_a_document_tells_any_change(tmp_path):
         read_document(path, "train anew")
     path.write_text(whole)
     write_arrays(path.with_suffix(".npz"), {"x": np.arange(4.0)})
-    with pytest.raises(InputError, match=r"a\.npz .*a\.json.*HM-FILES-003.*again"):
+    with pytest.raises(InputError, match=r"a\.npz.*a\.json.*HM-FILES-003.*again"):
         read_document_arrays(path, "again")
     path.with_suffix(".npz").unlink()
-    with pytest.raises(InputError, match=r"a\.npz .*HM-FILES-010.*again"):
+    with pytest.raises(InputError, match=r"a\.npz.*HM-FILES-010.*again"):
         read_document_arrays(path, "again")
 
 
@@ -202,7 +202,7 @@ def test_a_folder_for_results_is_checked_and_not_made(tmp_path):
     with pytest.raises(InputError, match="HM-FILES-013"):
         check_folder(tmp_path)
     for bad in (tmp_path / "file" / "below", tmp_path / ("x" * 300), "/proc/nowhere", "/dev/null/x", "a\0b"):
-        with pytest.raises(InputError, match=r"cannot (write|look) into"):
+        with pytest.raises(InputError, match=r"HM-FILES-01[2345]"):
             check_folder(type(tmp_path)(bad))
     with pytest.raises(InputError, match="HM-FILES-015"):
         check_writable(type(tmp_path)("/proc"))

@@ -1,1 +1,1 @@
-"""What is checked and proposed before a run: scenario, prior, recordings, default tasks, the installation."""
+"""Checks and proposals before a run: scenario, prior, recordings, default tasks, the installation."""

@@ -378,7 +378,7 @@ def _sampling_time(source: Source, full: str, said: Said) -> Clock | None:
 
 
 def no_signal(column: Column) -> str:
-    """Why a column whose numbers move is no signal; empty if it may be one."""
+    """Reason why a column with changing numbers is not a signal; empty if it may be one."""
     said = said_by(column.full)
     even = _mostly_even(column.values)
     if said.kind == "time" and (even or not said.perhaps):

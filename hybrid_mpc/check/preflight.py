@@ -363,7 +363,7 @@ def _check_control(
 
 
 def _structure(control: OCP) -> tuple[Any, ...]:
-    """What distinguishes controllers that are built differently."""
+    """Key that is equal only for controllers that are built alike."""
     bounded = tuple(np.isfinite([control.x_min, control.x_max]).ravel())
     expressions = control.soft, control.hard, id(control.economic)
     return control.horizon, control.blocks, control.du_max is None, bounded, expressions

@@ -219,7 +219,7 @@ def _line(x: Array, y: Array) -> tuple[float, float, float]:
 
 
 def copy_of(one: Trait, other: Trait) -> str:
-    """How the second column is a copy of the first: ``scaled``, ``cut off`` at limits, or empty if it is not."""
+    """Kind of copy of the first column that the second one is: ``scaled``, ``cut off`` at limits, or empty if none."""
     x, y = (np.concatenate(trait.pieces) for trait in (one, other))
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
@@ -261,7 +261,7 @@ def _digit(values: Array) -> float:
 
 
 def follows(goal: Trait, reached: Trait) -> float:
-    """How well a column follows a set-point: explained share of its variance at the best lag, with gain one.
+    """Measure of how well a column follows a set-point: explained share of its variance at the best lag, with gain one.
 
     Zero if gain or mean differ.
     """

@@ -40,7 +40,7 @@ def data(
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
     plot: Annotated[bool, typer.Option("--plot", help="Open a figure of the recording.")] = False,
 ) -> None:
-    """Show a recording: columns, units, ranges, time, gaps and doubtful values. Nothing is written.
+    """Show a recording: columns, units, ranges, time, gaps and warnings. Nothing is written.
 
     With --out: write a simulated machine's recordings as CSV or npz files, with a README on units, sampling and roles.
     """
@@ -75,7 +75,7 @@ def tell(path: Path, plot: bool) -> None:
         words = (one.name, one.unit, str(one.count), one.low, one.high, one.note)
         table.add_row(*(Text(printable(word)) for word in words))
     console.print(table)
-    for title, texts in (("as it was read", found.notes), ("doubtful", found.findings)):
+    for title, texts in (("as it was read", found.notes), ("warnings", found.findings)):
         if texts:
             console.print(f"\n{title}")
         for text in texts:

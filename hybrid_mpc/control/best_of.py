@@ -1,4 +1,4 @@
-"""The best of several solves: an oracle's defence against local optima."""
+"""The best of several solves, against local optima; not for real time."""
 
 from __future__ import annotations
 

@@ -330,7 +330,7 @@ class CondensedController(SplitController):
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
         w: Array | None = None,
     ) -> Solution:  # fmt: skip
-        """:meth:`feedback`, then linearized anew until there have been ``iterations``; arguments as there."""
+        """:meth:`feedback`, then further iterations up to ``iterations``; same arguments."""
         solution = self.feedback(prepared, estimate, reference, limits, w)
         for i in range(1, self.iterations):
             if not solution.status.ok:

@@ -123,7 +123,7 @@ class Sizes:
 
     @cached_property
     def _moved(self) -> Array:
-        """How far the model's own runs move the states from the operating point ``(n_x,)``; NaN for no motion."""
+        """Largest deviations ``(n_x,)`` of the states from the operating point in its runs; NaN for no motion."""
         m, ocp, rng = self._model, self._ocp, np.random.default_rng(0)
         n, u0, scale = min(ocp.horizon, PERIODS), self._held, ocp.input_scale
         run = free_run(m, n)
@@ -160,7 +160,7 @@ def _known(spread: tuple[float, ...], ranges: list[float]) -> Array:
 
 
 def _tolerated(weight: Array) -> Array:
-    """What weights tolerate, ``1 / sqrt(weight)``; NaN where there is none."""
+    """Deviations that weights tolerate, ``1 / sqrt(weight)``; NaN for a weight of zero."""
     with np.errstate(divide="ignore"):
         return np.where(weight > 0, 1.0 / np.sqrt(weight), np.nan)
 

@@ -71,13 +71,13 @@ class OffsetFree:
 
     @property
     def why_undetectable(self) -> str:
-        """Why a filter cannot detect the disturbances; empty if it can."""
+        """Reason why a filter cannot detect the disturbances; empty if it can."""
         ranks = f"(rank {self.rank}, needed {self.needed})"
         return f"the outputs cannot distinguish disturbances and states {ranks}" * (not self.detectable)
 
     @property
     def why_unreachable(self) -> str:
-        """Why the inputs cannot hold the outputs at their set-points; empty if they can."""
+        """Reason why the inputs cannot hold the outputs at their set-points; empty if they can."""
         if self.reachable:
             return ""
         ranks = f"(rank of the targets {self.target_rank}, needed {self.target_needed})"

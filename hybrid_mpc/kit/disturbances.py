@@ -27,10 +27,6 @@ EXPLAINED = 0.01
 QUARTER, RUN, STILL = 0.25, 5000, 1e-6
 """Step of an input as a share of its range; longest run to steady state [periods]; change a period, over a state's
 size, that counts as steady."""
-SLOW = 0.01
-"""Growth within a horizon of the inputs by which their effect in the long run is told."""
-KEPT = 0.5
-"""Least share of the inputs' effect that disturbances at rates may leave."""
 REACH = 0.5
 """Share of the horizon within which a disturbance of a rate moves the state by the state's size."""
 
@@ -39,11 +35,10 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     """Default disturbance model; None: one disturbance at each input.
 
     Disturbances of controlled outputs act at the inputs. If errors of the parameters require disturbances larger than
-    the inputs' ranges, they act on the rates of the states that the controlled outputs measure; if those would change
-    the effect of the inputs (:func:`gain_left`), they act on the outputs. An output without weight has a disturbance of
-    its own if errors of the parameters move it in a way that no load at an input explains; otherwise the controlled
-    outputs would have an offset. There are never more disturbances than outputs, since more are not observable. A
-    problem with references of states has one disturbance at each input.
+    the inputs' ranges, they act on the rates of the states that the controlled outputs measure. An output
+    without weight has a disturbance of its own if errors of the parameters move it in a way that no load at an input
+    explains; otherwise the controlled outputs would have an offset. There are never more disturbances than outputs,
+    since more are not observable. A problem with references of states has one disturbance at each input.
 
     Args:
         model: The fitted prior.
@@ -80,10 +75,10 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     best = min(found, key=lambda one: needed(one, control), default=None)
     if best is not None and needed(best, control) <= CARRIES:
         return _plain(best)
-    others = [_with_rates(model, control, held, sizes), _with_outputs(model, control, sizes)]
-    told = [one for one in others if one is not None and offset_free(one).detectable]
-    chosen = next((one for one in told if gain_left(one, control) >= KEPT), told[0] if told else best)
-    return None if chosen is None else _plain(chosen)
+    others = _with_rates(model, control, held, sizes)
+    if others is not None and offset_free(others).detectable:
+        return others.disturbance_model
+    return None if best is None else _plain(best)
 
 
 def _plain(model: HybridModel) -> tuple[Disturbance, ...] | None:
@@ -118,57 +113,6 @@ def _with_rates(model: HybridModel, control: OCP, held: list[int], sizes: Sizes)
     return replace(model, disturbance_model=tuple(chosen))
 
 
-def _with_outputs(model: HybridModel, control: OCP, sizes: Sizes) -> HybridModel:
-    """Every output, of the size by which errors of the parameters move it at rest."""
-    plain = replace(model, disturbance_model=None)
-    moved = [np.sqrt(np.sum(_shown(model, *one) ** 2, axis=1)) for _, *one in _errors(plain, control)]
-    size = np.max([sizes.outputs, *moved], axis=0)
-    each = zip(model.outputs, size, strict=True)
-    return replace(model, disturbance_model=tuple(Disturbance("output", s.name, float(v)) for s, v in each))
-
-
-def _shown(model: HybridModel, matrix: Array, off: Array) -> Array:
-    """How far errors of the parameters move the outputs at rest ``(n_y, n_free)``, of what :func:`_errors` gives."""
-    n_z = model.n_x + model.n_h
-    return off[n_z:] - matrix[n_z:, :n_z] @ np.linalg.lstsq(matrix[:n_z, :n_z], off[:n_z], rcond=RANK)[0]
-
-
-def gain_left(model: HybridModel, control: OCP) -> float:
-    """Least share of the held outputs' long-run answer to the inputs that is left where the disturbances explain an
-    error of :data:`OFF` of a parameter; to first order, at the points of :func:`needed`.
-
-    With several outputs it is the least eigenvalue of the answers over those without disturbances. It is 1 where
-    disturbances leave the answer as it is. A negative one says that the model answers the other way round: at the turn
-    its steady states of the set-point end.
-
-    Source: Grosdidier, Morari and Holt, *Closed-loop properties from steady-state gain information*, Ind. Eng. Chem.
-    Fundam. 24 (1985).
-    """
-    held, (on_u, _, _), found = np.flatnonzero(control.q_y > 0), model.disturbed, [1.0]
-    n_z = model.n_x + model.n_h
-    for point, matrix, off in _errors(model, control):
-        before = _slow_gain(model, *point, control.horizon)[held]
-        # where the model rests that shows what a machine with other parameters shows
-        asked = np.vstack([np.zeros((n_z, off.shape[1])), _shown(model, matrix, off)])
-        for column in np.linalg.lstsq(matrix, asked, rcond=RANK)[0].T:
-            x, h, d = np.split(column, [model.n_x, n_z])
-            for sign in (1.0, -1.0):
-                x_1, h_1, u_1 = (v + sign * by for v, by in zip(point, (x, h, on_u @ d), strict=True))
-                after = _slow_gain(model, x_1, h_1, u_1, control.horizon)[held]
-                if np.all(np.isfinite(after)) and np.all(np.isfinite(before)):
-                    found.append(float(np.linalg.eigvals(after @ np.linalg.pinv(before)).real.min()))
-    return min(found)
-
-
-def _slow_gain(model: HybridModel, x: Array, h: Array, u: Array, horizon: int) -> Array:
-    """How outputs answer to inputs ``(n_y, n_u)`` that grow slowly: integrators have an answer, too."""
-    assert model.with_jacobian is not None
-    a, b = (m.full() for m in model.with_jacobian(x, h, u, model.w, model.p)[2:])
-    _, by_x, by_u = (m.full() for m in output_with_jacobian(model)(x, u, model.w))
-    growth = (1.0 + SLOW / horizon) * np.eye(len(a))
-    return by_x @ np.linalg.solve(growth - a, b)[: model.n_x] + by_u
-
-
 def needed(model: HybridModel, control: OCP) -> float:
     """Largest disturbance at an input, over its size, that compensates parameter errors of :data:`OFF` at the outputs.
 
@@ -177,7 +121,7 @@ def needed(model: HybridModel, control: OCP) -> float:
     """
     at_inputs = np.any(model.disturbed[0] != 0, axis=0)
     sizes, found = disturbance_sizes(model, control), [0.0]
-    for _, matrix, off in _errors(model, control) if at_inputs.any() else ():
+    for matrix, off in _errors(model, control) if at_inputs.any() else ():
         d = np.linalg.lstsq(matrix, off, rcond=None)[0][model.n_x + model.n_h :]
         found.append(float(np.max((np.sqrt(np.sum(d**2, axis=1)) / sizes)[at_inputs])))
     return max(found)
@@ -188,7 +132,7 @@ def unexplained(model: HybridModel, control: OCP) -> float:
     errors of :data:`OFF` as far as possible; over the same points.
     """
     sizes, n_z, found = Sizes(model, control).outputs, model.n_x + model.n_h, [0.0]
-    for _, matrix, off in _errors(model, control):
+    for matrix, off in _errors(model, control):
         # eliminate the steady-state equations (first n_z rows) exactly, then fit the outputs
         _, values, rows = np.linalg.svd(matrix[:n_z])
         rank = int(np.sum(values > RANK * values[0]))
@@ -200,8 +144,8 @@ def unexplained(model: HybridModel, control: OCP) -> float:
     return max(found)
 
 
-def _errors(model: HybridModel, control: OCP) -> list[tuple[tuple[Array, Array, Array], Array, Array]]:
-    """Points of :func:`_rests`, ``[[A - I, B_d], [C, C_d]]`` there, and what errors of the parameters add to states
+def _errors(model: HybridModel, control: OCP) -> list[tuple[Array, Array]]:
+    """At each point of :func:`_rests`: ``[[A - I, B_d], [C, C_d]]``, and what errors of the parameters add to states
     and outputs ``(n_z + n_y, n_free)``; none of a model without free parameters.
     """
     free = [i for i, one in enumerate(model.parameters) if not one.fixed]
@@ -216,7 +160,7 @@ def _errors(model: HybridModel, control: OCP) -> list[tuple[tuple[Array, Array, 
         off = np.vstack([m.full()[:, free] for m in slopes(*point, model.p)]) * (OFF * np.abs(model.p[free]))
         matrix = _at_rest(model, *point)
         if np.all(np.isfinite(matrix)) and np.all(np.isfinite(off)):
-            found.append((point, matrix, off))
+            found.append((matrix, off))
     return found
 
 

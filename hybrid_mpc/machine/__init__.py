@@ -1,1 +1,1 @@
-"""What a machine is written with: signals, the prior, friction, and what its recordings mean."""
+"""The description of a machine: signals, the prior, friction, and the meaning of its recordings."""

@@ -230,7 +230,7 @@ def test_ranges_are_the_tighter_of_soft_and_hard_bounds():
     [
         (lambda: HardBound("z", [0.0], [1.0]), "HM-CONTROL-045"),
         (lambda: HardBound(ca.Function("f", [X], [X]), [0.0] * 2, [1.0] * 2), "HM-CONTROL-045"),
-        (lambda: HardBound("x", [1.0, 1.0], [0.0, 2.0]), "cross"),
+        (lambda: HardBound("x", [1.0, 1.0], [0.0, 2.0]), "HM-CONTROL-051"),
         (lambda: HardBound("x", [1.0], [2.0, 2.0]), "HM-CONTROL-052"),
         (lambda: HardBound("x", [0.0], [1.0], 0.5), "HM-CONTROL-046"),
         (lambda: problem(HardBound("x", [0.0], [1.0])), "HM-CONTROL-015"),

@@ -1,4 +1,4 @@
-"""What is doubtful about recordings: told where it is, and nothing told where all is well."""
+"""Warnings about recordings name the place; sound recordings have none."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -266,7 +266,7 @@ def test_from_a_run_to_c_and_loops_on_it(noisy_artifact, tmp_path, call):
     """``hybrid-mpc export c``, and the solver ``native`` of a kit beside ``rti``."""
     code, _, err = call("export", "c", noisy_artifact, "--out", tmp_path / "none")
     assert code == 2
-    assert "without a control problem" in err
+    assert "HM-KIT-007" in err
     golf = hm.load_scenario("golf_robot")
     run = shutil.copytree(noisy_artifact, tmp_path / "model")
     save_loop(run, loop_settings(golf, read_parts(run).loop.process_noise))

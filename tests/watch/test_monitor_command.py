@@ -87,19 +87,19 @@ def test_the_kit_s_own_limits_need_no_option(folder, noisy_artifact, tmp_path):
     # as with the same limits from a file
     assert 8.0 <= found["recordings"][1]["alarms"][0]["start_s"] < 9.0
     without = command(folder, noisy_artifact, tmp_path / "without")
-    assert "holds no limits of energy" in without.output
+    assert "no limits of energy" in without.output
 
 
 def test_too_little_nominal_data_says_how_much_is_needed(folder, noisy_artifact, tmp_path):
     done = command(folder, noisy_artifact, tmp_path / "out", "--learn", "1")
-    assert "HM-WATCH-025" in str(done.exception)
+    assert "HM-WATCH-024" in str(done.exception)
     assert not (tmp_path / "out" / "calibration.json").exists()
 
 
 def test_bad_input_speaks(folder, noisy_artifact, tmp_path):
     (tmp_path / "empty.json").write_text("{}")
     done = command(folder, noisy_artifact, tmp_path / "out", "--calibration", str(tmp_path / "empty.json"))
-    assert "holds no limits of energy" in str(done.exception)
+    assert "HM-WORKFLOW-026" in str(done.exception)
     files, scenario = [folder / "pushed.csv"], load_scenario("golf_robot")
     with pytest.raises(InputError, match="HM-WORKFLOW-022"):
         prepared(replace(scenario, control=None), noisy_artifact, files)

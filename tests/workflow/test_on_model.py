@@ -84,7 +84,7 @@ def test_a_study_which_compares_wants_a_plant(call, bare_tanks, tmp_path):
     )
     code, _, error = call(*words)
     assert code == 2
-    assert "has no plant" in error
+    assert "HM-COMPARE-015" in error
 
 
 def test_check_names_the_default_tasks(call, bare_tanks):
