@@ -130,7 +130,7 @@ def test_models_and_artifacts_that_cannot_predict(call, bare_tanks, model, tmp_p
         predict(kit, replace(trajectory, dt=10.0))
     quiet = replace(kit, loop=replace(kit.loop, control={}))
     assert predict(quiet, trajectory).one_step is None
-    assert "without a control problem" in predict(quiet, trajectory).reason
+    assert "HM-KIT-007" in predict(quiet, trajectory).reason
 
 
 def test_missing_samples_are_predicted_in_the_free_run(bare_tanks, model):
