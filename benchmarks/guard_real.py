@@ -107,7 +107,7 @@ def leave_one_out(
     """Every recording by limits that were learned from the clean windows of all others.
 
     Each is replayed as a whole, as it would have run online: what happens between the windows is in the monitor's
-    memory when the next one begins. Nothing is learned from the first of the machine's seconds of a window.
+    memory when the next one begins. Nothing is learned from the first time units of a window.
     """
     stems = [r.file for r in recordings]
     if len(set(stems)) < 2:

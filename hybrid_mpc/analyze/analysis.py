@@ -86,10 +86,10 @@ LARGEST_ZERO = 1e6
 LEVEL = 0.5
 """Amplitude of the multisine over half the input's range."""
 PERIOD, PERIODS, BAND = 20.0, 4, (0.1, 3.0)
-"""The multisine for frequency responses: its period [the machine's seconds], periods that count, and band [1 over
+"""The multisine for frequency responses: its period [time units], periods that count, and band [1 over
 these]."""
 DRIVEN, DRIVEN_BAND = 30.0, (0.1, 1.5)
-"""A driven run: its length [the machine's seconds] and band [1 over these]."""
+"""A driven run: its length [time units] and band [1 over these]."""
 POSITIONS = 21
 """Positions of the gain schedule."""
 

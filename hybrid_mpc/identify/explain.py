@@ -98,7 +98,7 @@ ALONG = 4
 LOWERED = 0.99
 """Ratio of errors over all windows that a candidate has to reach before it is fitted in every fold."""
 MEMORY = 3.0
-"""Length of a block at least, in the machine's seconds: shorter ones are no separate evidence. ``FEWEST`` there are in
+"""Length of a block at least, in time units: shorter ones are no separate evidence. ``FEWEST`` there are in
 any case: then a term must take off much in all of them."""
 SHORTEST = 4
 """Samples of a block at least."""

@@ -50,7 +50,7 @@ from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
-"""Lengths of the windows [the machine's seconds, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
+"""Lengths of the windows [time units, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
 ones have one optimum, long ones are what counts."""
 FARTHEST = 3.0
 """Length of the longest windows at most, over the time in which small errors grow a hundredfold: first states would be
@@ -71,7 +71,7 @@ SHIFT, EXACT = 0.2, 1e-5
 BEYOND = 0.05
 """Share of a state's own span by which it may leave its range: a smoother overshoots."""
 FORGETS = 2.0
-"""Length of the windows of predictions [the machine's seconds]: an observer forgets where it began."""
+"""Length of the windows of predictions [time units]: an observer forgets where it began."""
 Progress = Callable[[int, int, str], None]
 
 
@@ -111,11 +111,11 @@ def fit_prior(
         valid: Validation trajectories (chosen by, not fitted to).
         dt: Model period [s].
         length: Length [s] of the longest windows: that of the runs that the model will be evaluated by. Default: 5 of
-            the machine's seconds, or 3 of the nominal prior's largest time constant where that is more.
+            time units, or 3 of the nominal prior's largest time constant where that is more.
         largest_delay: Longest delay [s] of the inputs. Default 0: they act at once.
         start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
             fixed parameters are left out. Default: none.
-        time_unit: The machine's second [s]. Default: that of the training trajectories.
+        time_unit: The machine's time unit [s]. Default: that of the training trajectories.
         first_states: What is known of the states that free runs start from. Default: nothing, they are free.
         on_progress: ``(done, total, text)`` after every stage.
 

@@ -55,7 +55,7 @@ QUIETEST = 1e-6
 """Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none, and what
 is not known at first is some 10 spreads, whose square holds no more digits."""
 SLACK = 0.1
-"""What the states may leave their equations by over the machine's second, as a share of what shows as the sensors'
+"""What the states may leave their equations by over the machine's time unit, as a share of what shows as the sensors'
 noise: too little to be seen, enough for the problem to be well conditioned. All else that is not explained is ``d``."""
 UNSEEN = 1e-6
 """Share of the outputs' spread below which a state's whole range shows in no output."""
@@ -390,7 +390,7 @@ def fit_smoother(
         prior: The fitted prior.
         trajectories: Recordings; at most ``SAMPLE`` of them, evenly chosen, are used.
         dt: Period [s].
-        time_unit: The machine's second [s]. Default: that of the trajectories.
+        time_unit: The machine's time unit [s]. Default: that of the trajectories.
         substeps: Runge-Kutta sub-steps a period. Default: as many as the prior needs where the trajectories go, as far
             as they hold states.
     """
@@ -461,7 +461,7 @@ def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_u
 
 
 def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
-    """How each state at a time shows in each output over the machine's second after it ``(n_y, n, n_x)``.
+    """How each state at a time shows in each output over the machine's time unit after it ``(n_y, n, n_x)``.
 
     Where the machine runs away it is the time, if that is shorter, in which what is small grows by ``GROWN``.
 

@@ -475,7 +475,7 @@ def causes(
         recorded: Training trajectories as recorded, with the inputs that act.
         dt: Model period [s].
         longest: Length [s] of the free runs by which models are judged; shorter ones are taken where small errors grow.
-        time_unit: The machine's second [s].
+        time_unit: The machine's time unit [s].
     """
     known, sizes, noise = _smoothed(make, recorded, dt, time_unit)
     fit = _FactorFit(make, dt).visiting(known)
@@ -578,7 +578,7 @@ def causes_of_refusal(
         recorded: Training trajectories as recorded.
         dt: Model period [s].
         longest: Length [s] of the free runs by which models are judged.
-        time_unit: The machine's second [s].
+        time_unit: The machine's time unit [s].
     """
     known, points = None, None
     if _fits(make, dt, time_unit):  # at rest; perhaps not where the recordings go

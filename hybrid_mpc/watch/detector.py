@@ -141,7 +141,7 @@ class WatchLimits:
     def check(
         self, kind: str, channels: Sequence[Channel], n_terms: int, dt: float, time_unit: float
     ) -> None:
-        """Refuse readings with other channels, another period or another time constant of the machine."""
+        """Refuse readings with other channels, another period or another time unit."""
         known = {(c.name, c.unit) for c in channels}
         strange = [one.channel for one in self.channels if (one.channel, one.unit) not in known]
         if kind != self.kind or strange:
@@ -155,7 +155,7 @@ class WatchLimits:
             )
         for what, own, given in (
             ("a period", self.dt, dt),
-            ("a time constant of the machine", self.time_unit, time_unit),
+            ("a time unit", self.time_unit, time_unit),
         ):
             if abs(own - given) > 1e-9 * own:
                 raise InputError(

@@ -101,7 +101,7 @@ def limits_of(
 ) -> WatchLimits:
     """The limits of :func:`learn_limits` from the ``traces`` of a monitor without limits, and the measurements ``ys``.
 
-    The first time constant of the machine in each nominal interval does not count, because the estimator settles. The
+    The first time unit in each nominal interval does not count, because the estimator settles. The
     variance of a channel with terms is fitted by weighted nonnegative least squares to its squared values. Each limit
     gets an equal share of the wanted rate. Its threshold is the level that nominal levels exceed at that rate (extreme
     values of blocks). If the data are too short, it is 1.5 times the highest nominal level, and ``method`` says so. A

@@ -71,7 +71,7 @@ class ResidualReadings:
       one-step prediction starts at an estimate that partly follows the fault; the free run does not. Of two free runs
       in turn, the older one is read.
 
-    The first time constant of the machine does not count, because the estimates settle. **Travel**: the sum of the
+    The first time unit does not count, because the estimates settle. **Travel**: the sum of the
     one-step predictions while an output repeats its reading exactly. A sensor at the end of its range is not frozen.
 
     For a mechanical model with measured positions, :class:`~hybrid_mpc.watch.energy.EnergyReadings` detect more,

@@ -107,7 +107,7 @@ def test_missing_samples_leave_the_scales(missing):
     # a sensor that is there at every other row is a slower one: its motion between counts as noise, a little
     noise = noise_of([Outputs(y)])
     assert noise == pytest.approx(1e-3, rel=0.6 if missing in ("half", "every other") else 0.15)
-    # straight lines over the holes bend the motion at their ends: a tenth of the scale, and a machine's second stays
+    # straight lines over the holes bend the motion at their ends: a tenth of the scale, and a time unit stays
     assert time_scale([Outputs(y)], 0.02) == pytest.approx(2.0, rel=0.2)
     assert time_unit([Outputs(y)], 0.02) == 1.0
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 RATES = (1.0, 2.0, 5.0, 10.0)
-"""False alarm rates [per hour, scaled with the time constant of the machine by :func:`rates`]; limits are learned for
+"""False alarm rates [per hour, scaled with the time unit by :func:`rates`]; limits are learned for
 the first rate that the nominal data are long enough for."""
 NOMINAL = ("train", "valid", "nominal")
 """Roles of undisturbed parts of recordings."""
