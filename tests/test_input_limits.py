@@ -193,8 +193,8 @@ def test_figures_draw_the_limits_that_there_are(limits):
     [
         ({"u_min": (np.nan,)}, "u_min"),
         ({"u_max": ("full",)}, r"u_max.*HM-MODEL-015"),
-        ({"u_min": (2.0,)}, "cross"),  # equal to u_max
-        ({"u_min": (3.0,)}, "cross"),
+        ({"u_min": (2.0,)}, "HM-MODEL-013"),  # equal to u_max
+        ({"u_min": (3.0,)}, "HM-MODEL-013"),
         ({"u_min": (-1.0, -1.0)}, "HM-MODEL-012"),
     ],
 )

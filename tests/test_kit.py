@@ -213,7 +213,7 @@ def test_expressions_go_along(run, tmp_path):
         (
             {},
             lambda kit: kit.problem("track_sin"),
-            r"task.*'track_sin'.*did you mean 'track_sine'\? There are.*HM-RECORDS-011",
+            r"task.*'track_sin'.*'track_sine'.*HM-RECORDS-011",
         ),
         ({}, lambda kit: kit.controller(task="mistyped"), r"task.*'mistyped'.*HM-RECORDS-011"),
         (
@@ -256,7 +256,7 @@ def test_a_state_of_other_parts_is_refused(run):
     mine, prior = (hm.Loop(kit.observer(name), kit.controller(name)) for name in ("hybrid", "prior"))
     mine.start([0.0])
     prior.start([0.0])
-    with pytest.raises(hm.InputError, match=r"hidden state has 0 numbers, needed are 8.*HM-LOOP-030"):
+    with pytest.raises(hm.InputError, match=r"hidden state has 0 numbers.* 8.*HM-LOOP-030"):
         mine.restore(prior.state)
     with pytest.raises(hm.InputError, match=r"no.*HM-LOOP-029"):
         hm.Loop(kit.observer(), kit.controller(), monitor=kit.monitor()).restore(mine.state)

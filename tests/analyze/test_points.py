@@ -227,7 +227,7 @@ def test_bad_input_speaks():
         (lambda: friction_slopes(model, [0.0], [0.0]), "positive"),
         (lambda: linearize_secant(model, [0.0, 0.0], [0.0], [1.0], kind="chord"), "kind"),
         (lambda: gain_schedule(model, [], [1.0, 1.0], [1.0]), "HM-ANALYZE-025"),
-        (lambda: linearize_along(model, [0.0], np.zeros((5, 1))), "needed"),
+        (lambda: linearize_along(model, [0.0], np.zeros((5, 1))), "HM-ANALYZE-018"),
     ]:
         with pytest.raises(InputError, match=text):
             call()

@@ -245,5 +245,5 @@ def test_parameters_that_a_run_does_not_tell_apart_are_named(golf_artifact):
     apart = found.apart(sigma)
     assert not {"r", "mu"} <= set(apart.names)
     assert np.allclose(np.diag(apart.correlation(sigma)), 1.0)
-    with pytest.raises(InputError, match=r"\['nothing'\].*prior.*m, g,.*HM-ANALYZE-056"):
+    with pytest.raises(InputError, match=r"model prior.*\['nothing'\].*m, g,.*HM-ANALYZE-056"):
         parameter_sensitivities(model, [0.0, 0.0], u, names=["nothing"])

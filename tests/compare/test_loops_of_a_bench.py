@@ -69,7 +69,7 @@ def test_what_is_not_there_is_named(bench):
 def test_another_machine_s_model_is_refused(kit):
     with pytest.raises(InputError, match=r"model mine.*emps.*golf_robot.*HM-COMPARE-017"):
         Bench(GOLF, {"mine": replace(kit, provenance=Provenance("emps"))})
-    with pytest.raises(InputError, match=r"model mine.*hybrid.*prior.*HM-COMPARE-016"):
+    with pytest.raises(InputError, match=r"model mine.*prior.*hybrid.*HM-COMPARE-016"):
         Bench(GOLF, {"mine": replace(kit, models={"hybrid": kit.models["hybrid"]})})
     with pytest.raises(InputError, match=r"control problem.*HM-COMPARE-015"):
         Bench(replace(GOLF, control=None), {})

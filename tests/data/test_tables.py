@@ -9,7 +9,7 @@ import pytest
 from machine_signals import machine
 
 from hybrid_mpc import DataSpec, InputError, Signal, load_trajectories
-from hybrid_mpc.check.new import drafted
+from hybrid_mpc.check.new import draft_scenario
 from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.recording import read_recording
 
@@ -356,7 +356,7 @@ def test_a_logger_that_was_started_again_is_cut_there(wrote):
     )
     whole = load_trajectories([path], LOOSE, SPEC, needed=()).whole
     assert [len(one.t) for one in whole] == [39, 29]
-    assert drafted([opened(path)], ("u",), ("y",), "t").period == pytest.approx(0.01)
+    assert draft_scenario([opened(path)], ("u",), ("y",), "t").period == pytest.approx(0.01)
 
 
 def test_rows_that_stand_twice_are_left_out(wrote):

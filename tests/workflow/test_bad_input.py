@@ -43,7 +43,7 @@ DAMAGE = {
     "degrees": (made(2000, 0.01, constant, lambda t: 40 * np.sin(t)),
                 ["bad.csv", "phi", "In deg it would be plausible", "units={'phi_rad': 'deg'}"]),
     "empty": (lambda lines: [], ["bad.csv", "empty"]),
-    "idle": (made(2000, 0.01, constant, lambda t: 0.3 * np.sin(t)), ["bad", "tau", "0.1 throughout"]),
+    "idle": (made(2000, 0.01, constant, lambda t: 0.3 * np.sin(t)), ["bad", "tau", "0.1", "HM-DATA-021"]),
     "still": (made(2000, 0.01, lambda t: 0.1 * np.sin(t), lambda t: 0.3), ["bad", "phi", "never moved"]),
 }  # fmt: skip
 

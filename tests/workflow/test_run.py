@@ -137,7 +137,7 @@ def test_folder_of_another_run_or_of_something_else(call, arguments, finished, t
     (tmp_path / "letter.txt").write_text("mine")
     code, _, message = call(*arguments, "--out", tmp_path)
     assert code == 2
-    assert "something else" in message
+    assert "HM-FOLDER-002" in message
     code, _, message = call(*arguments, "--out", tmp_path / "fresh", "--resume")
     assert code == 2
     assert "no run to resume" in message

@@ -192,7 +192,7 @@ def test_only_the_first_stages_of_a_new_run(own, call, tmp_path):
     assert not (tmp_path / "new").exists()
     code, told, message = call(*words, "--only", "data", "--only", "prior")
     assert code == 0, message
-    assert "the run ends here: later stages have not run" in told
+    assert "the run stops here" in told
     assert "The run is not finished" in (tmp_path / "new" / "report.html").read_text()
     assert not (tmp_path / "new" / "results.json").exists()
 

@@ -120,7 +120,7 @@ def test_plants_are_varied():
         ({"faults": ["input_gain=much"]}, "TARGET:CHANNEL=VALUE@START:END"),
         ({"faults": [3]}, "texts"),
         ({"controllers": []}, r"controllers.*HM-COMPARE-026"),
-        ({"controllers": ["prior", "prior"]}, "twice"),
+        ({"controllers": ["prior", "prior"]}, "HM-COMPARE-027"),
         ({"controllers": "prior"}, r"'prior'.*HM-COMPARE-038"),
         ({"seeds": 0}, "HM-COMPARE-037"),
         ({"seeds": [-1]}, r"seeds.*HM-COMPARE-028"),

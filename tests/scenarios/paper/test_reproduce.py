@@ -139,7 +139,7 @@ def call(call):
         (["pendulum", "--sequences", "3,16"], ["3,16", "15"]),
         (["pendulum", "--sequences", "0"], ["between 1 and 15"]),
         (["pendulum", "--sequences", "three"], ["three", "whole numbers"]),
-        (["pendulum", "--networks", "0"], ["0 networks", "--networks"]),
+        (["pendulum", "--networks", "0"], ["HM-SCENARIOS-026", "--networks"]),
         (["pendulum", "--budget", "huge"], ["huge", "quick, full"]),
         (["pendulum", "--form", "other"], ["other", "paper"]),
     ],
@@ -166,7 +166,7 @@ def test_folder_of_another_reproduction_or_of_something_else(call, exact, finish
     (tmp_path / "letter.txt").write_text("mine")
     code, _, message = call(exact, "--out", tmp_path)
     assert code == 2
-    assert "something else" in message
+    assert "HM-FOLDER-002" in message
 
 
 def test_results_of_another_schema_are_refused(finished, tmp_path):
