@@ -218,7 +218,7 @@ def test_a_full_disk_ends_a_command_with_a_line_and_no_damage(tmp_path):
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert "File too large" in done.stderr
-    assert "the same command with another --out" in done.stderr
+    assert "repeat the command with another --out" in done.stderr
     assert not [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
 
 

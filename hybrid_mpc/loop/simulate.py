@@ -378,7 +378,8 @@ class ClosedLoopResult:
         nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. Default: unknown.
         w: Measured disturbances ``(n, n_w)`` that act from ``t_k`` on. Default: none.
         y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN if the reference is one of states. Default:
-        unknown. reached: ``(n,)``, False if the set-point cannot be reached. Default: unknown.
+            unknown.
+        reached: ``(n,)``, False if the set-point cannot be reached. Default: unknown.
         given_way: For each period the relaxed hard bounds, because no plan keeps all of them: largest violation in the
             plan by name, as in :class:`~hybrid_mpc.control.problem.Solution`. Default: unknown.
 

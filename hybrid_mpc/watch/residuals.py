@@ -34,7 +34,8 @@ class ResidualState:
 
     Args:
         x: State of the latest estimate ``(n_x,)``; ``h`` its hidden state, ``w`` its disturbances; NaN before the
-        first. y: The latest measurement ``(n_y,)``.
+            first.
+        y: The latest measurement ``(n_y,)``.
         travel: Predicted motion of each output since its reading last changed ``(n_y,)``.
         repeats: Number of samples since that change ``(n_y,)``.
         runs: States, hidden states and unmeasured disturbances of the free runs ``(2, n_x + n_h + n_d)``.

@@ -205,7 +205,7 @@ IN_BOTH = {
                                                           "HM-CHECK-057"]),
     "balance without a term": (balance(warmth, nothing), ["HM-CHECK-057"]),
     "negative loss": (balance(warmth, lambda x, u, m: -0.2 * x.warmth, lambda x, u, m: -0.1 * x.warmth),
-                      ["balance heat [W]: the loss is -", "at x = ", "must not be negative", "HM-CHECK-058"]),
+                      ["balance heat [W]: the loss is -", "at x = ", "HM-CHECK-058"]),
     "balance of NaN": (balance(lambda x, u, m: m.log(x.warmth), lambda x, u, m: -0.1 + 0 * x.warmth, unit="1"),
                        ["balance heat [W]: not finite", *AT]),
     "storage of the input": (balance(lambda x, u, m: x.warmth * u.inflow, nothing, lost),
@@ -264,7 +264,7 @@ WRONG = {
     "inertia without return": (prior(mass_matrix=lambda self, q, p: None), ["HM-MACHINE-003"]),
     "inertia of two": (prior(mass_matrix=lambda self, q, p: ((p.J, 0), (0, p.J))), ["1 rows of 1 values", "got 4"]),
     "friction that drives": (prior(friction=lambda self, q, v, p: -0.1 * v.phi_dot),
-                             ["balance energy [W]: the loss is -", "must not be negative"]),
+                             ["balance energy [W]: the loss is -", "HM-CHECK-058"]),
     "friction of two": (prior(friction=lambda self, q, v, p: (v.phi_dot, v.phi_dot)),
                         ["Changed.friction(q, v, p) must give 1 values, got 2: one for each of phi_dot"]),
     "potential without return": (prior(potential=lambda self, q, p: None), ["Changed.potential(q, p)", "'return'"]),
@@ -277,14 +277,14 @@ WRONG = {
     "too many columns": (field(data=dataclasses.replace(DATA, outputs=("phi", "x"))), ["2 columns of outputs"]),
     "unknown cause": (field(causes={"mass": ("m",)}), ["no parameter m", "J, mgl"]),
     # control
-    "horizon 0": (control(horizon=0), ["horizon must be a whole number of periods"]),
-    "horizon half": (control(horizon=2.5), ["horizon must be a whole number of periods"]),
+    "horizon 0": (control(horizon=0), ["HM-CONTROL-011"]),
+    "horizon half": (control(horizon=2.5), ["HM-CONTROL-011"]),
     "crossed bounds": (control(u_min=(1,), u_max=(-1,)), ["HM-MODEL-013", "u_min"]),
     "NaN weight": (control(q=(math.nan, 1)), ["q: weights must be finite and not negative"]),
     "negative weight": (control(r=(-1,)), ["r: weights must be finite and not negative"]),
     "no weight at all": (control(r=(0,), r_delta=(0,)), ["every input needs a positive weight"]),
     "weights of too few": (
-        field(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["control: q needs 2 numbers, got 1"]
+        field(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["HM-CHECK-023"]
     ),
     "inputs of too many": (
         field(control=OCP(10, (25, 1), (1, 1), (1, 1), (-1, -1), (1, 1))), ["control: r must have 1 numbers, got 2"]
@@ -293,28 +293,28 @@ WRONG = {
     "a problem that is none": (field(control={"horizon": 10}), ["control: must be OCP(...)"]),
     "a field there is not": (control(horizn=9), ["'horizn'; did you mean 'horizon'?"]),
     "no sensor_sigma": (field(sensor_sigma=()), ["sensor_sigma: must have 1 numbers, got 0"]),
-    "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["sensor_sigma must be positive"]),
+    "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["HM-CHECK-020"]),
     "NaN sensor_sigma": (field(sensor_sigma=(math.nan,)), ["sensor_sigma[0]"]),
     "absurd sensor_sigma": (field(sensor_sigma=(1e300,)), ["sensor_sigma[0]"]),
-    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["first_sigma needs 1 standard deviations", "(phi_dot)"]),
+    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["HM-KIT-015", "(phi_dot)"]),
     "noise of no state": (field(state_noise={"phi_dott": 0.1}), ["state_noise: no state 'phi_dott'", "phi_dot"]),
-    "zero state_noise": (field(state_noise={"phi": 0.0}), ["state_noise of phi must be positive"]),
+    "zero state_noise": (field(state_noise={"phi": 0.0}), ["HM-CHECK-022"]),
     "zero du_max": (control(du_max=(0,)), ["du_max"]),
-    "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["state bounds cross"]),
+    "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["HM-CONTROL-051"]),
     "hard bounds of too many outputs": (
-        control(hard=[HardBound("y", (-1.0,) * 3, (1.0,) * 3)]), ["controller: hard bound on y: 3 values given"]
+        control(hard=[HardBound("y", (-1.0,) * 3, (1.0,) * 3)]), ["HM-CONTROL-037"]
     ),
     "hard bound out of reach": (
         control(hard=[HardBound(ca.Function("one", [ca.SX.sym("x", 2), ca.SX.sym("u")], [ca.SX(1)]), [0.0], [2.0])]),
         ["hard bound on one", "HM-CONTROL-030"],
     ),
-    "working point of one": (control(working_point=((0.0,), (0.0,))), ["working_point x: 1 values given, 2 needed"]),
-    "starts of another shape": (control(starts=(((0.0,),),)), ["starts[0]: shape (1, 1) given", "(10, 1)"]),
+    "working point of one": (control(working_point=((0.0,), (0.0,))), ["HM-MODEL-017"]),
+    "starts of another shape": (control(starts=(((0.0,),),)), ["HM-CONTROL-024", "(10, 1)"]),
     # tasks
     "no reference for all": (task(reference=lambda t: np.zeros((len(t), 1))), ["task hold: reference", "(50, 2)"]),
     "reference that raises": (task(reference=raises), ["task hold raised KeyError"]),
-    "reference of NaN": (task(reference=lambda t: np.full((len(t), 2), np.nan)), ["reference is", "finite"]),
-    "negative factors": (task(weight=lambda t: -np.ones((len(t), 2))), ["not be negative"]),
+    "reference of NaN": (task(reference=lambda t: np.full((len(t), 2), np.nan)), ["HM-CHECK-029", "finite"]),
+    "negative factors": (task(weight=lambda t: -np.ones((len(t), 2))), ["HM-CHECK-030"]),
     "no duration": (task(duration=0.0), ["task 'hold': duration"]),
     "endless": (task(duration=math.inf), ["task 'hold': duration"]),
     "x0 of one": (task(x0=(0.0,)), ["x0 must have 2"]),
@@ -324,7 +324,7 @@ WRONG = {
     ),
     "same tasks": (field(tasks=(TASK, TASK)), ["'hold' appears twice"]),
     "fault of a channel": (
-        task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), ["no input 'third'; known names"],
+        task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), ["HM-LOOP-004"],
     ),
     "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["HM-LOOP-006"]),
     "tasks without control": (field(control=None), ["no control problem"]),

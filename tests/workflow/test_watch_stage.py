@@ -182,7 +182,7 @@ def test_the_faulted_loops_are_reported(context, resumed):
     assert len(loops.rows) == 4
     words = " ".join(_watch_words(resumed))
     assert "6 loops of the simulated machine" in words
-    assert "for 2 false alarms an hour" in words
+    assert "2 false alarms an hour" in words
     assert "too short for 1 an hour" in words
     drawn = {name: caption for _, name, _, caption in watch_figures(context)}
     assert set(drawn) == {"monitor_swing", *(f"fault_{name}" for name in by_name)}
