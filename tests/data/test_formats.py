@@ -208,7 +208,7 @@ def test_version_7_3(tmp_path):
     assert source.unread == ("run",)
     assert "timetable2table(run" in source.note
     path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(InputError, match="HM-DATA-082"):
+    with pytest.raises(InputError, match="HM-DATA-034"):
         opened(path)
 
 

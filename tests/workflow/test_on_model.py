@@ -68,7 +68,7 @@ def test_control_does_the_same_from_the_artifact(call, bare_tanks, tmp_path):
     assert names == {"hold_prior_observer.png", "hold_hybrid_observer.png"}
     first, second = told.index("prior_observer on the model hybrid,"), told.index("on the model hybrid_1,")
     block = told[first:second]
-    assert "hybrid_observer " not in block.partition("machine:")[2].partition("a step of")[0]
+    assert "hybrid_observer " not in block.partition("machine:")[2].partition("step time of")[0]
 
 
 def test_a_study_which_compares_wants_a_plant(call, bare_tanks, tmp_path):
