@@ -174,7 +174,7 @@ def test_the_command_fails_where_no_reading_is_valid(recordings, tmp_path):
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())["recordings"][0]
     assert found["valid_s"] == 0.0
     assert found["not_finite_s"] > 9.0
-    assert "no finite number" in found["alarms"][0]["diagnosis"]
+    assert "non-finite value" in found["alarms"][0]["diagnosis"]
 
 
 @pytest.mark.full
