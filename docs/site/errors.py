@@ -65,7 +65,7 @@ def page() -> str:
     parts = [HEAD]
     for room, rows in groupby(sorted(codes()), lambda row: row[0].rpartition("-")[0]):
         parts.append(f"\n## {room}\n\n| code | message |\n| --- | --- |\n")
-        parts += [f"| {code} | {_cell(text)} |\n" for code, text in rows]
+        parts += [f'| <span class="nowrap">{code}</span> | {_cell(text)} |\n' for code, text in rows]
     return "".join(parts)
 
 

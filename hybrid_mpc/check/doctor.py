@@ -64,15 +64,15 @@ def _packages() -> Iterator[Finding]:
             extras.setdefault(marker[1] if marker else "", []).append(named[0])
     for extra, names in extras.items():
         there = {name: _version(name) for name in dict.fromkeys(names)}
-        told = ", ".join(f"{name} {found or 'missing'}" for name, found in there.items())
-        if not told:
+        text = ", ".join(f"{name} {found or 'missing'}" for name, found in there.items())
+        if not text:
             continue
         complete = all(there.values())
         state: State = "ok" if complete else "absent" if extra else "wrong"
         remedy = (
             "" if complete else f"pip install 'hybrid-mpc[{extra}]'" if extra else "pip install hybrid-mpc"
         )
-        yield Finding(f"extra {extra}" if extra else "needed", told, state, remedy)
+        yield Finding(f"extra {extra}" if extra else "needed", text, state, remedy)
 
 
 def _version(name: str) -> str:
@@ -89,8 +89,8 @@ def _compiler() -> Finding:
         words = shlex.split(command)
         if words and shutil.which(words[0]):
             lines = _told([*words, "--version"]).splitlines()
-            told = f"{command}: {lines[0]}" if lines else f"{command}, version unknown"
-            return Finding("C compiler", told)
+            text = f"{command}: {lines[0]}" if lines else f"{command}, version unknown"
+            return Finding("C compiler", text)
     what = f"CC = {named} is not a command" if named else "none found (cc, gcc, clang)"
     remedy = "install a compiler to compile models; without one they run slower, in CasADi's virtual machine"
     return Finding("C compiler", what, "absent", remedy)
@@ -113,11 +113,11 @@ def _gpu() -> Finding:
     )
     if not names:
         return Finding("GPU", "none found (nvidia-smi); networks train on the CPU")
-    told = ", ".join(name.strip() for name in names)
+    text = ", ".join(name.strip() for name in names)
     if torch.endswith("+cpu"):
         remedy = "install torch with CUDA, then use --device cuda"
-        return Finding("GPU", f"{told}, but torch {torch} cannot use it", "absent", remedy)
-    return Finding("GPU", f"{told}; train on it with --device cuda" if torch else told)
+        return Finding("GPU", f"{text}, but torch {torch} cannot use it", "absent", remedy)
+    return Finding("GPU", f"{text}; train on it with --device cuda" if torch else text)
 
 
 def _told(command: list[str]) -> str:

@@ -71,8 +71,8 @@ def check(
     problems, warnings = found.problems, (*found.warnings, *found.doubts)
     in_doubt: tuple[str, ...] = ()
     if fit and not problems:
-        problems, told, in_doubt = _fit(console, context)
-        warnings += told
+        problems, found_warnings, in_doubt = _fit(console, context)
+        warnings += found_warnings
     left = left_to_decide(Path(scenario)) if scenario.endswith(".py") else []
     for texts, style, title in (
         (left, "cyan", "left to decide"), (warnings, "yellow", "warnings"),
@@ -169,11 +169,11 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
     console.print(_signals(found, prior, spec))
     if prior.parameters:
         console.print(_parameters(prior))
-    told = "none, so there is no MOPGRNN"
+    text = "none, so there is no MOPGRNN"
     if not found.problems and prior.equations.balances:
-        told = ", ".join(f"{b.name} ({b.unit}, {b.rate_unit})" for b in prior.equations.balances)
+        text = ", ".join(f"{b.name} ({b.unit}, {b.rate_unit})" for b in prior.equations.balances)
     if not found.problems:
-        _line(console, "balances", told)
+        _line(console, "balances", text)
     corrects = [prior.states[i].name for i in prior.corrected] if not found.problems else []
     if corrects:
         _line(console, "networks may correct the rates of", ", ".join(corrects))
@@ -275,13 +275,13 @@ def _times(modes: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> str:
 
     size = float(np.abs(modes).max(initial=0.0))
     rates = np.sort(-modes.real[modes.real < -1e-9 * size])
-    told = [f"{1 / rates[0]:.3g} s"] if len(rates) else []
-    told += [f"down to {1 / rates[-1]:.3g} s"] if len(rates) > 1 and rates[-1] > 1.001 * rates[0] else []
+    parts = [f"{1 / rates[0]:.3g} s"] if len(rates) else []
+    parts += [f"down to {1 / rates[-1]:.3g} s"] if len(rates) > 1 and rates[-1] > 1.001 * rates[0] else []
     integrators = int((np.abs(modes.real) <= 1e-9 * size).sum())
     unstable = int((modes.real > 1e-9 * size).sum())
-    told += [f"{integrators} undamped or integrating"] if integrators else []
-    told += [f"{unstable} unstable"] if unstable else []
-    return ", ".join(told) if told else "none"
+    parts += [f"{integrators} undamped or integrating"] if integrators else []
+    parts += [f"{unstable} unstable"] if unstable else []
+    return ", ".join(parts) if parts else "none"
 
 
 def _recordings(found: Preflight) -> Table:

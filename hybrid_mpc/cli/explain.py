@@ -66,25 +66,29 @@ def explain(
 
 def summary(found: ExplainResult, folder: Path) -> list[str]:
     """The result in a few lines."""
-    told = found.explanation
-    lines = [f"evaluated on {told.evidence.text}, in free runs of {told.evidence.length:.3g} s"]
-    if not told.found:
-        return [*lines, f"no term was added: {told.reason}"]
-    lines += [f"found: {term.name}: {term.formula}" for term in told.found]
-    return [*lines, f"end of the search: {told.reason}", f"scenario: {(folder / found.file).resolve()}"]
+    explanation = found.explanation
+    lines = [f"evaluated on {explanation.evidence.text}, in free runs of {explanation.evidence.length:.3g} s"]
+    if not explanation.found:
+        return [*lines, f"no term was added: {explanation.reason}"]
+    lines += [f"found: {term.name}: {term.formula}" for term in explanation.found]
+    return [
+        *lines,
+        f"end of the search: {explanation.reason}",
+        f"scenario: {(folder / found.file).resolve()}",
+    ]
 
 
 def _steps(found: ExplainResult) -> Table:
     """One row per step."""
     from hybrid_mpc.workflow.explain_page import alternatives_of, interval, signed, values_of
 
-    told = found.explanation
+    explanation = found.explanation
     table = _table(
         "steps", "step", "held-out error [-]", "ratio to the previous step", "fitted values", "alternatives"
     )
-    table.add_row("prior, nominal", f"{told.nominal:.3g}", "", "", "")
-    table.add_row("prior, fitted", f"{told.before:.3g}", "", "", "")
-    for step in told.steps:
+    table.add_row("prior, nominal", f"{explanation.nominal:.3g}", "", "", "")
+    table.add_row("prior, fitted", f"{explanation.before:.3g}", "", "", "")
+    for step in explanation.steps:
         table.add_row(
             signed(step), f"{step.held_out.error:.3g}", interval(step), values_of(step), alternatives_of(step)
         )  # fmt: skip

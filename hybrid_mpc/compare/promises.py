@@ -588,7 +588,7 @@ def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
     """Row "step time": whether steps end within the period, in processor time, which other processes hardly change."""
     ms = np.sort(np.concatenate([one.result.timing_ms["total"] for one in trials]))
     p99, worst = float(np.quantile(ms, 0.99)), float(ms[-1])
-    told = (
+    evidence = (
         f"99 % of {ms.size} steps take less than {p99:.3g} ms of processor time, the longest {worst:.3g} ms; the "
         f"period is {period_ms:.4g} ms"
     )
@@ -596,11 +596,11 @@ def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
         "Use solver native (compiled C), a shorter horizon, move blocks or a longer dt (docs/choosing.md)."
     )
     if p99 > period_ms:
-        return Promise("step time", "not promised", told, remedy)
+        return Promise("step time", "not promised", evidence, remedy)
     # ignore a single long step: it may be caused by the operating system
     if p99 > HALF * period_ms or ms[-2] > period_ms:
-        return Promise("step time", "doubted", told, remedy)
-    return Promise("step time", "shown", f"{told}; on this computer")
+        return Promise("step time", "doubted", evidence, remedy)
+    return Promise("step time", "shown", f"{evidence}; on this computer")
 
 
 # Horizon and margins.
@@ -619,21 +619,23 @@ def horizon(points: Sequence[SetPoint]) -> Promise:
     )
     dt, n = point.model.dt, point.problem.horizon
     share = 1.0 - float(cost[n])
-    told = f"the {n} periods ({n * dt:.3g} s) contain {100 * share:.3g} % of the cost of a deviation"
+    evidence = f"the {n} periods ({n * dt:.3g} s) contain {100 * share:.3g} % of the cost of a deviation"
     tail = [int(np.argmax(cost < left)) for left in TAIL]
     if all(tail):
         # cost ~ exp(-2 t / tau), since it is quadratic in the state
         slow = 2.0 * dt * max(tail[1] - tail[0], 1) / math.log(TAIL[0] / TAIL[1])
-        told += f"; the time constant of its slowest mode is {slow:.2g} s"
+        evidence += f"; the time constant of its slowest mode is {slow:.2g} s"
     if share >= CARRIES:
-        return Promise(name, "shown", told)
+        return Promise(name, "shown", evidence)
     enough = int(np.argmax(cost <= 1.0 - CARRIES))
     want = (
         f"A horizon of {enough} periods contains {100 * CARRIES:.0f} %"
         if enough
         else "Weight drifting states"
     )
-    return Promise(name, "doubted", told, f"{want}; a longer dt or move blocks reduce its computing time.")
+    return Promise(
+        name, "doubted", evidence, f"{want}; a longer dt or move blocks reduce its computing time."
+    )
 
 
 def _left_costs(point: SetPoint) -> Array:
@@ -675,18 +677,18 @@ def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Pr
         return Promise(name, "not promised", "; ".join(lacks), SOFTER)
     point, signal, own = worst
     late = f"{own.delay_periods} period" + "s" * (own.delay_periods != 1)
-    told = (
+    evidence = (
         f"at {signal.name} in {point.title}: gain {own.gain_down:.2g} to {own.gain_up:.3g} times, phase "
         f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay"
     )
     if good:
-        return Promise(name, "shown", told)
-    told += f". Beyond these margins the linearized loop is unstable (recommended distance: {MODULUS:g})"
+        return Promise(name, "shown", evidence)
+    evidence += f". Beyond these margins the linearized loop is unstable (recommended distance: {MODULUS:g})"
     other = _distance(of_prior, signal)
     if other is None:
-        return Promise(name, "doubted", told, SOFTER)
-    told += f"; with the fitted prior as model and controller the distance is {other:.2g}"
-    return Promise(name, "doubted", told, BY_NETWORK if other > 2 * own.modulus else SOFTER)
+        return Promise(name, "doubted", evidence, SOFTER)
+    evidence += f"; with the fitted prior as model and controller the distance is {other:.2g}"
+    return Promise(name, "doubted", evidence, BY_NETWORK if other > 2 * own.modulus else SOFTER)
 
 
 def _margins_at(point: SetPoint) -> list[tuple[Signal, Margins]]:
@@ -749,15 +751,17 @@ def limits(
     ends = [bound for point in hard for bound in point.problem.hard if bound.at_end]
     if not hard:
         soft = any(_is_soft(point.problem) for point in points)
-        told = "the bounds of states and outputs are soft" if soft else "only inputs are bounded"
+        evidence = "the bounds of states and outputs are soft" if soft else "only inputs are bounded"
         return Promise(
             name,
             "shown",
-            f"{told}; every period has a plan within the inputs' limits ({len(sources)} periods tested)",
+            f"{evidence}; every period has a plan within the inputs' limits ({len(sources)} periods tested)",
         )
-    told = f"no hard bound is relaxed from {len(starts)} starts within {100 * NEAR:.0f} % of a bound"
+    evidence = f"no hard bound is relaxed from {len(starts)} starts within {100 * NEAR:.0f} % of a bound"
     return Promise(
-        name, "shown", told + (", and the plan has a terminal set" if ends else " (simulation, not a proof)")
+        name,
+        "shown",
+        evidence + (", and the plan has a terminal set" if ends else " (simulation, not a proof)"),
     )
 
 
@@ -810,14 +814,14 @@ def process_noise(kit: Kit) -> Promise:
     shares = np.where(spread > 0, sigma / np.where(spread > 0, spread, 1.0), 0.0)
     i = int(shares.argmax())
     signal = model.states[i]
-    told = (
+    evidence = (
         f"the largest is that of {signal.name}: {sigma[i]:.2g} {signal.unit} a period, {100 * shares[i]:.2g} % of its "
         f"spread ({spread[i]:.2g} {signal.unit})"
     )
     if shares[i] <= 1.0:
-        return Promise(name, "shown", told)
+        return Promise(name, "shown", evidence)
     return Promise(
-        name, "doubted", told,
+        name, "doubted", evidence,
         "The prior does not describe this state. Correct the prior, or set Scenario(state_noise=...).",
     )  # fmt: skip
 
@@ -827,14 +831,14 @@ def innovations(found: Tested | str) -> Promise:
     name = "innovations"
     if isinstance(found, str):
         return Promise(name, "not promised", found, "Give longer test recordings.")
-    told = (
+    evidence = (
         f"largest autocorrelation {found.correlation:.2g} (at most {WHITE:g}), variance {found.nis:.3g} times the "
         f"assumed one (from {1 / SURE:g} to {SURE:g}), on {found.samples} samples"
     )
     if found.correlation <= WHITE and 1.0 / SURE <= found.nis <= SURE:
-        return Promise(name, "shown", told)
+        return Promise(name, "shown", evidence)
     return Promise(
-        name, "doubted", told,
+        name, "doubted", evidence,
         "The observer's model lacks a state, friction or a delay, or the sensor noise (sensor_sigma) is wrong; see "
         "section Estimation of the report.",
     )  # fmt: skip
@@ -858,8 +862,8 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
         periods = periods_to_find(quiet(point.estimator), SEARCHED * n)
         dead = [_disturbance(model, j) for j, v in enumerate(periods) if not math.isfinite(v)]
         if dead:
-            told = f"the load at {dead[0]} is not estimated: the observer's gain on it is zero"
-            return Promise(name, "not promised", told, remedy)
+            evidence = f"the load at {dead[0]} is not estimated: the observer's gain on it is zero"
+            return Promise(name, "not promised", evidence, remedy)
         goal, d = loads(point, 0), one.result.d
         # a load may be as small as the noise of its estimate: then allow a tenth of an ordinary load
         near = np.maximum(np.abs(goal) / 3.0, 0.1 * LOAD * disturbance_sizes(model, point.problem))
@@ -867,11 +871,11 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
         found = (
             "two thirds of a load are estimated after" if late < len(d) else "a load is not estimated within"
         )
-        told = (
+        evidence = (
             f"{found} {late * dt:.3g} s ({late / n:.2g} horizons) in a loop on the model itself, {point.title}; the "
             f"quiet filter alone takes {float(periods.max()) * dt:.3g} s"
         )
-        worst = max(worst, (late / n, told))
+        worst = max(worst, (late / n, evidence))
     if worst[0] <= LASTS / CONSTANTS:  # then exp(-CONSTANTS) = 5 % is left at the end of a trial
         return Promise(name, "shown", worst[1])
     return Promise(name, "doubted", worst[1], remedy)
