@@ -19,8 +19,9 @@ GROUPS: dict[str, Mapping[str, Any]] = {
 }
 HEAD = """# Operators
 
-A torch module exports if `torch.export` reduces it to the operators below. Each computes the same as in torch. Other
-operators and other arguments are refused by name. *Same* means the shape of the first argument.
+A torch module exports if `torch.export` reduces it to the operators below. Each computes the same as in torch, except as
+noted. Other operators and other arguments are refused by name. *Further arguments* follow the first argument; *same*
+means the shape of the first argument.
 
 This page is generated: `python -m nn_export.operators.table > docs/operators.md`.
 """
@@ -65,7 +66,7 @@ NOTES: dict[str, str] = {
     "atan2": "not finite at (0, 0)",
     "detach": "derivatives pass",
     "maximum minimum": "do not pass NaN on",
-    "where.self": "the other branch never makes it NaN",
+    "where.self": "NaN of the other branch is not passed on",
     "arange.start_step": "as float32 only numbers that it holds exactly",
     "constant_pad_nd": "no negative `pad`",
     "embedding gather index.Tensor index_select": "constant positions",
@@ -87,7 +88,7 @@ def document() -> str:
     """The table as Markdown: operators of the same arguments, shape and limits share a row."""
     parts = [HEAD]
     for title, group in GROUPS.items():
-        parts.append(f"## {title}\n\n| operator | arguments | shape; limits |\n| --- | --- | --- |")
+        parts.append(f"## {title}\n\n| operator | further arguments | shape; limits |\n| --- | --- | --- |")
         rows: dict[tuple[str, ...], list[str]] = {}
         for name in sorted(group):
             rows.setdefault(_cells(name), []).append(f"`{short(name)}`")
@@ -110,7 +111,7 @@ def _cells(name: str) -> tuple[str, str]:
     parameters = list(inspect.signature(OPERATORS[name]).parameters)
     both = {"other", "min", "condition"} & set(parameters)
     size = _of(SHAPES, name) or ("broadcast" if both else SAME)
-    return ", ".join(parameters), "; ".join(filter(None, (size, _of(NOTES, name))))
+    return ", ".join(parameters[1:]), "; ".join(filter(None, (size, _of(NOTES, name))))
 
 
 def _of(table: Mapping[str, str], name: str) -> str:
