@@ -19,9 +19,9 @@ GROUPS: dict[str, Mapping[str, Any]] = {
 }
 HEAD = """# Operators
 
-A torch module exports if `torch.export` reduces it to the operators below. Each computes the same as in torch, except as
-noted. Other operators and other arguments are refused by name. *Further arguments* follow the first argument; *same*
-means the shape of the first argument.
+A torch module exports if `torch.export` reduces it to the operators below. Each computes the same as in torch, except
+as noted. Other operators and other arguments are refused by name. *Further arguments* follow the first argument;
+*same* means the shape of the first argument.
 
 This page is generated: `python -m nn_export.operators.table > docs/operators.md`.
 """
