@@ -1,4 +1,4 @@
-"""Result of a fit of the prior: values, standard errors, unidentifiable parameters. This module never imports torch."""
+"""Result of a fit of the prior: values, standard errors, unidentifiable parameters. No torch in here."""
 
 from __future__ import annotations
 
