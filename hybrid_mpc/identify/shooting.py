@@ -33,7 +33,7 @@ LOOSELY = 1e-2
 """Weight of an initial state's distance from its guess, over its size, with errors in spreads. It is small: a wrong
 nominal prior gives poor guesses, and errors are far below the spread if the initial states fit."""
 ROUNDING = 1e-12
-"""Relative increase of the diagonal of the normal equations, so that initial states with equal effects stay solvable."""
+"""Relative increase of the diagonal of the normal equations: initial states with equal effects stay solvable."""
 STEEP = 1e8
 """Limit of a derivative, in spreads of the output per size of an initial state or parameter. Larger derivatives belong
 to a diverging run and are ignored."""
