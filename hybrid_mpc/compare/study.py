@@ -215,8 +215,8 @@ class Study:
         (24, 24)
         >>> Study("golf_robot", "m", controllers=["hybird"])
         Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: no controller 'hybird'; did you mean 'hybrid'? There are: prior, prior_observer, \
-hybrid, hybrid_observer, oracle, oracle_state
+        hybrid_mpc.errors.InputError: no controller 'hybird'; did you mean 'hybrid'? Known names: prior, \
+prior_observer, hybrid, hybrid_observer, oracle, oracle_state
     """
 
     scenario: str
