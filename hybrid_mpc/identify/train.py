@@ -110,10 +110,13 @@ def train(
 
 @dataclass(frozen=True)
 class TrainingFailure:
-    """Updates of network ``network`` that were skipped because a number was not finite; ``step`` is the last of them.
+    """Updates of a network that were skipped because a number was not finite.
 
-    ``objective`` is the one whose loss was not finite, ``"gradient"`` where all losses were. ``stopped``: it rests at
-    its best weights from there on.
+    Args:
+        network: Number of the network.
+        objective: The objective whose loss was not finite; ``"gradient"`` if all losses were finite.
+        step: The last skipped update.
+        stopped: Whether the network keeps its best weights from there on.
     """
 
     network: int

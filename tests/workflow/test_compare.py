@@ -26,8 +26,15 @@ from hybrid_mpc.compare.summary import by_task, interval, summaries
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stages import compare as stage
-from hybrid_mpc.workflow.stages.compare import TIMED, _seeds, compare, control_stage, parts_of, run_specs
-from hybrid_mpc.workflow.stages.results import gap_closed
+from hybrid_mpc.workflow.stages.compare import (
+    TIMED,
+    _seeds,
+    compare,
+    control_stage,
+    gap_closed,
+    parts_of,
+    run_specs,
+)
 
 GOLF = load_scenario("golf_robot")
 SIGNALS = SimpleNamespace(
