@@ -251,7 +251,7 @@ def test_loops_leave_the_limits_in_the_artifact_and_do_not_depend_on_them(run_fo
     out = shutil.copytree(run_folder, tmp_path / "run")
     context = Context(RunSettings("golf_robot", budget="quick"), GOLF, out)
     learned = load(out).limits("hybrid")
-    spec = LoopSpec("golf_robot", MODEL, "track_sine", "hybrid_observer", duration=0.5)
+    spec = LoopSpec("golf_robot", MODEL, "track_sine", "hybrid_observer", duration=0.5, keep=("step_ms",))
     monkeypatch.setattr(type(context), "read", lambda self, stage: None)
     monkeypatch.setattr(stage, "compare", lambda context: run_specs("golf_robot", out / "model", [spec]))
     found = []
