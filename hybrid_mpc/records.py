@@ -32,12 +32,12 @@ LONGEST_WHAT = 100
 """Most characters of a record's description in a message."""
 MOST_NAMED = 20
 """Most problems of one file that are listed; a damaged file may have thousands."""
-BESIDE = "beside"
-"""Key in the metadata of a field that :func:`beside` made."""
+BESIDE = {"beside": True}
+"""Metadata of a dataclass field that :func:`plain` leaves out: its arrays lie in a file beside the JSON."""
 
 
 def beside() -> Any:
-    """A dataclass field for arrays by name: :func:`plain` leaves it out, since arrays lie in a file beside the JSON.
+    """A dataclass field for arrays by name, which :func:`plain` leaves out; they lie in a file beside the JSON.
 
     Example:
         >>> @dataclasses.dataclass(frozen=True)
@@ -47,22 +47,22 @@ def beside() -> Any:
         >>> plain(Row(1.5, {"x": np.zeros(3)})), record(Row, {"cost": 1.5}, "a row").arrays
         ({'cost': 1.5}, {})
     """
-    return dataclasses.field(default_factory=dict, compare=False, metadata={BESIDE: True})
+    return dataclasses.field(default_factory=dict, compare=False, metadata=BESIDE)
 
 
 def plain(value: Any) -> Any:
     """``value`` in JSON's own types.
 
-    Dataclasses (without fields made by :func:`beside`) and mappings become objects, sequences and arrays lists, paths
-    texts, non-finite numbers ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program (InputError if it
-    has no program).
+    Dataclasses (without the fields marked :data:`BESIDE`) and mappings become objects, sequences and arrays lists,
+    paths texts, non-finite numbers ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program (InputError
+    if it has no program).
 
     Example:
         >>> plain({"x": np.array([1.0, np.inf]), "where": Path("a")})
         {'x': [1.0, 'inf'], 'where': 'a'}
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        kept = [f.name for f in dataclasses.fields(value) if BESIDE not in f.metadata]
+        kept = [f.name for f in dataclasses.fields(value) if f.metadata != BESIDE]
         return {name: plain(getattr(value, name)) for name in kept}
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}

@@ -60,7 +60,7 @@ VERSIONS = """## Versions
 
 def fields_of(kind: Any) -> list[str]:
     """Names of the fields that the file holds."""
-    return [f.name for f in dataclasses.fields(kind) if BESIDE not in f.metadata]
+    return [f.name for f in dataclasses.fields(kind) if f.metadata != BESIDE]
 
 
 def meanings(kind: Any) -> dict[str, str]:
