@@ -116,7 +116,7 @@ class _Panels:
         panel = figure(
             title=plain(title) or None, x_axis_label=plain(ax.get_xlabel()), y_axis_label=plain(ax.get_ylabel()),
             x_axis_type=SCALES.get(ax.get_xscale(), "linear"), y_axis_type=SCALES.get(ax.get_yscale(), "linear"),
-            tools="xpan,xwheel_zoom,box_zoom,reset,save", active_drag="box_zoom", active_scroll=None,
+            tools="xpan,xwheel_zoom,xbox_zoom,reset,save", active_drag="xbox_zoom", active_scroll=None,
             x_range=shared[0] if shared else ax.get_xlim(), height=round(PIXELS * height) + AROUND,
         )  # fmt: skip
         self.ranges.append((ax, panel.x_range))
