@@ -17,26 +17,10 @@ from scipy.stats import t as student
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.specification import ChoiceRule
 
 Array = NDArray[np.float64]
-BLOCKS = 8
-"""Blocks at least that runs of few recordings are cut into: the scatter between fewer says little."""
-RECORDINGS = 2
-"""Recordings from which on each of them is a block: errors within one hang together, and the next may be of another
-day."""
-FEWEST = 3
-"""Recordings that give a bound, where each of them is a block: of two a single difference would tell their scatter, and
-on the temperature lab two that agreed by chance made a hybrid recommended that was 1.3 to 1.4 times worse."""
-CONFIDENCE = 0.95
-"""Probability, one-sided, with which a bound holds; each share of each kind has its own. With one kind of which half is
-exactly as good as the prior, and all else is worse, 6 % of choices take it (``tests/identify/test_choose.py``)."""
-SHARES = (0.75, 0.5)
-"""Shares of a correction that are tried, the largest first, where the whole of it does not surely beat the prior. The
-errors of prior and hybrid are alike only in part: a model between them may err less than either, and scatters less, so
-half a correction may be sure where the whole is not. A quarter is not tried: it alone was sure in 3 of 45 cells
-on real machines, and had 0.99, 1.05, 1.01 of the prior's error there (docs/results/no_harm.md)."""
-CONFIDENT = 1.0
-"""Ratio to the prior's error that the upper bound of the hybrid's has to stay below."""
+RULE = ChoiceRule()
 
 
 @dataclass(frozen=True)
@@ -46,7 +30,7 @@ class CandidateFigures:
     Args:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
         ratio: That over the prior's [-]; of several recordings the geometric mean of each one's.
-        upper: Upper bound of the ratio with a probability of ``CONFIDENCE`` [-].
+        upper: Upper bound of the ratio with the probability of the :class:`~hybrid_mpc.ChoiceRule` [-].
         share: Share of the networks' correction that it has. Default: the whole.
     """
 
@@ -90,11 +74,12 @@ def recommend(
     recordings: Sequence[str] = (),
     evidence: str = "recordings",
     shrunk: Callable[[str, float], Sequence[Array]] | None = None,
+    rule: ChoiceRule = RULE,
 ) -> Choice:
     """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
 
     The ratio of a hybrid's error to the prior's is the geometric mean of each recording's where there are
-    ``RECORDINGS`` or more, and its bound is that of the mean of the logarithms: another recording may be like any of
+    two or more, and its bound is that of the mean of the logarithms: another recording may be like any of
     these, so a single one in which the prior is far off does not outweigh the others. Over all runs together the hybrid
     must be better as well. Of several hybrids that surely beat the prior the one with the lowest ratio is recommended.
     Within a single recording the ratio is that of the root mean squares; its scatter is found by leaving out one block
@@ -109,8 +94,9 @@ def recommend(
         recordings: Which recording each run is from, or which part of a single one. Default: all are from one.
         evidence: What these are called in the reason.
         shrunk: ``(name, share) -> errors`` of a hybrid of which a share of its networks' correction counts. It is asked
-            where the whole does not surely beat the prior; the largest of ``SHARES`` that surely does is taken, else
-            the whole. Default: the whole alone.
+            where the whole does not surely beat the prior; the largest of the rule's ``shares`` that surely does is
+            taken, else the whole. Default: the whole alone.
+        rule: How sure the comparison must be. Default: 95 %.
 
     Raises:
         InputError: If ``deploy`` is no candidate, or there is no validation run.
@@ -132,12 +118,12 @@ def recommend(
         raise InputError(
             "choice: no validation run to compare the models on; give longer recordings [HM-IDENTIFY-004]"
         )
-    compared = _Compared(errors[prior], samples, recordings)
+    compared = _Compared(errors[prior], samples, recordings, rule)
     figures = {name: compared.figures(runs) for name, runs in errors.items()}
     for name in errors if shrunk is not None else ():
         if name == prior or compared.sure(figures[name]):
             continue
-        for share in SHARES:
+        for share in rule.shares:
             less = compared.figures(shrunk(name, share), share)  # type: ignore[misc]
             if compared.sure(less):
                 figures[name] = less
@@ -160,10 +146,14 @@ def recommend(
 class _Compared:
     """Figures of candidates over the pieces of evidence that the prior's runs are cut into."""
 
-    def __init__(self, prior: Sequence[Array], samples: int, recordings: Sequence[str]) -> None:
+    def __init__(
+        self, prior: Sequence[Array], samples: int, recordings: Sequence[str], rule: ChoiceRule
+    ) -> None:
+        self._rule = rule
         self._cuts = _cuts([len(run) for run in prior], samples)
         self._sizes = np.array([b - a for run in self._cuts for a, b in run])
-        self.whole = len(set(recordings)) >= RECORDINGS
+        # errors within a recording hang together, and the next recording may be of another day
+        self.whole = len(set(recordings)) > 1
         self._of = np.zeros(0, dtype=np.int64)
         if self.whole:
             blocks = [name for name, run in zip(recordings, self._cuts, strict=True) for _ in run]
@@ -180,15 +170,15 @@ class _Compared:
         own = _sums(runs, self._cuts)
         if np.array_equal(own, self._prior) and np.isfinite(own).all():
             return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share)
-        found = _by_blocks(own, self._prior, self._sizes)
+        found = _by_blocks(own, self._prior, self._sizes, self._rule)
         if self.whole:
             of_own, of_prior = (np.bincount(self._of, v).astype(np.float64) for v in (own, self._prior))
-            found = _by_recordings(of_own, of_prior, found)
+            found = _by_recordings(of_own, of_prior, found, self._rule)
         return replace(found, share=share)
 
     def sure(self, figures: CandidateFigures) -> bool:
         """Whether they are surely better than the prior's, and better over all runs together."""
-        return figures.upper < CONFIDENT and figures.error < _root_mean(self._prior, self._sizes)
+        return figures.upper < 1.0 and figures.error < _root_mean(self._prior, self._sizes)
 
 
 def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tuple[list[str], str]:
@@ -216,7 +206,7 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
     bound = f"at most {own.upper:.2f}" if math.isfinite(own.upper) else "without a bound: record more"
     of_it = "its error" if own.share == 1 else f"with {own.share:g} of its correction, its error"
     said = f"{of_it} on held-out data is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
-    if chosen == prior and own.upper < CONFIDENT:
+    if chosen == prior and own.upper < 1.0:
         said += ", but over all of them together the prior's is no larger"
     if chosen == prior:
         return f"The fitted prior is recommended: {best} does not surely beat it; {said}."
@@ -225,7 +215,8 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
 
 def _cuts(lengths: Sequence[int], samples: int) -> list[list[tuple[int, int]]]:
     """Blocks of each run as first and last sample: whole runs, or parts of runs if there are few runs."""
-    parts = math.ceil(BLOCKS / max(1, len(lengths)))
+    # eight blocks at least: the scatter between fewer says little
+    parts = math.ceil(8 / max(1, len(lengths)))
     cuts = []
     for n in lengths:
         count = max(1, min(parts, n // max(1, samples)))
@@ -243,7 +234,7 @@ def _root_mean(sums: Array, sizes: Array) -> float:
     return math.sqrt(float(sums.sum()) / float(sizes.sum())) if np.isfinite(sums).all() else math.inf
 
 
-def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
+def _by_blocks(own: Array, prior: Array, sizes: Array, rule: ChoiceRule) -> CandidateFigures:
     """Figures from the sums of squares of blocks; the scatter is the jackknife's."""
     n = len(sizes)
     error = _root_mean(own, sizes)
@@ -256,18 +247,18 @@ def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
         return CandidateFigures(error, ratio, math.inf)
     without = 0.5 * np.log(np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300))
     scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
-    bound = math.log(max(ratio, 1e-300)) + float(student.ppf(CONFIDENCE, n - 1)) * scatter
+    bound = math.log(max(ratio, 1e-300)) + float(student.ppf(rule.confidence, n - 1)) * scatter
     return CandidateFigures(error, ratio, math.exp(min(bound, 700.0)))
 
 
-def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures) -> CandidateFigures:
+def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures, rule: ChoiceRule) -> CandidateFigures:
     """Figures from the sums of squares of recordings: the mean of the logarithms of their ratios."""
     if not np.isfinite(own).all() or not np.isfinite(prior).all():
         return blocks
     n, each = len(own), 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
     most = math.inf  # two may agree by chance
-    if n >= FEWEST:
-        most = float(each.mean() + student.ppf(CONFIDENCE, n - 1) * each.std(ddof=1) / math.sqrt(n))
+    if n >= rule.fewest:
+        most = float(each.mean() + student.ppf(rule.confidence, n - 1) * each.std(ddof=1) / math.sqrt(n))
     return CandidateFigures(
         blocks.error, math.exp(float(each.mean())), math.exp(most) if most < 700 else math.inf
     )
