@@ -153,8 +153,8 @@ def test_limits_of_an_axis_of_millimetres_a_second_are_learned_kept_and_put_back
     assert found.clean.alarms == 0  # thresholds are above the highest level of these very recordings
     assert found.clean.seconds > 0
     covered = found.recordings[0]
-    assert covered["valid_s"] > 500
-    assert covered["not_finite_s"] == covered["missing_s"] == 0.0
+    assert covered.valid_s > 500
+    assert covered.not_finite_s == covered.missing_s == 0.0
     kit = load(slow.out / "model")
     assert kit.models["hybrid"].time_unit == slow.time_unit > 5.0
     assert kit.rest_speed == (rest,)

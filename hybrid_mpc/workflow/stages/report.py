@@ -41,7 +41,7 @@ from hybrid_mpc.workflow.stages.identify import (
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
 from hybrid_mpc.workflow.stages.promises import PromisesResult
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect, write_results
-from hybrid_mpc.workflow.stages.watch import RATES, WatchResult
+from hybrid_mpc.workflow.stages.watch import RATES, WatchedRecording, WatchResult
 from hybrid_mpc.workflow.stages.watching import watching_table
 
 TITLES: Mapping[str, str] = {
@@ -297,19 +297,18 @@ def _prior_replay_text(weight: float) -> tuple[str, ...]:
     return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
 
 
-def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+def coverage_words(recordings: Sequence[WatchedRecording]) -> tuple[str, ...]:
     """A sentence on parts of the recordings that were not monitored, warm-up apart; empty without such a part.
 
     Example:
-        >>> coverage_words([{"valid_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
+        >>> coverage_words([WatchedRecording("monday", valid_s=4.0, warm_up_s=0.3, missing_s=0.0, not_finite_s=2.0)])
         ('Not monitored: 2 s with a non-finite value of model or estimator.',)
     """
-    why = {
-        "missing_s": "with missing samples",
-        "not_finite_s": "with a non-finite value of model or estimator",
+    sums = {
+        "with missing samples": sum(row.missing_s for row in recordings),
+        "with a non-finite value of model or estimator": sum(row.not_finite_s for row in recordings),
     }
-    sums = {key: sum(float(row[key]) for row in recordings) for key in why}
-    parts = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
+    parts = [f"{seconds:.3g} s {words}" for words, seconds in sums.items() if seconds > 0]
     return (f"Not monitored: {', '.join(parts)}.",) if parts else ()
 
 

@@ -141,6 +141,25 @@ class CleanAlarms:
 
 
 @dataclass(frozen=True)
+class WatchedRecording:
+    """How long a recording was monitored.
+
+    Args:
+        file: Name of the recording.
+        valid_s: Time with a valid reading [s].
+        warm_up_s: Time until all windows were full [s].
+        missing_s: Time with missing samples [s].
+        not_finite_s: Time with a non-finite value of model or estimator [s].
+    """
+
+    file: str
+    valid_s: float
+    warm_up_s: float
+    missing_s: float
+    not_finite_s: float
+
+
+@dataclass(frozen=True)
 class NominalLoop:
     """A loop that limits were learned from.
 
@@ -197,7 +216,7 @@ class WatchResult:
         reason: Why there are no limits. Default: limits were learned.
         loops: Loops that limits were learned from. Default: none, limits were learned from recordings.
         channels: The channels. Default: none.
-        recordings: Monitored and unmonitored seconds, by recording and reason.
+        recordings: How long each recording was monitored.
         alarms: Alarms on whole recordings.
         clean: False alarms.
         by_channel: False alarms of each channel and of each frozen-sensor check.
@@ -213,7 +232,7 @@ class WatchResult:
     reason: str = ""
     loops: tuple[NominalLoop, ...] = ()
     channels: tuple[Channel, ...] = ()
-    recordings: tuple[Mapping[str, float | str], ...] = ()
+    recordings: tuple[WatchedRecording, ...] = ()
     alarms: tuple[RecordedAlarm, ...] = ()
     clean: CleanAlarms | None = None
     by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
@@ -391,7 +410,7 @@ def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResul
     return replace(
         found, channels=monitor.readings.channels, alarms=tuple(alarms), by_channel=each, arrays=arrays,
         recordings=tuple(
-            {"file": r.name, **t.coverage(monitor.model.dt)} for r, t in zip(whole, traces, strict=True)
+            WatchedRecording(r.name, **t.coverage(monitor.model.dt)) for r, t in zip(whole, traces, strict=True)
         ),
         clean=clean_alarms(context, whole, [t.alarm for t in traces]), shown=tuple(r.name for r, _ in ranked),
     )  # fmt: skip
