@@ -1,7 +1,7 @@
-"""Do no harm: which of the candidates is recommended, by free runs over data that were left out.
+"""Choice of the recommended model among fitted prior and hybrids, by free runs over held-out data.
 
-A hybrid is recommended only if it beats the fitted prior there by more than the uncertainty of the comparison. Where
-the whole correction does not, a share of it may.
+A hybrid is recommended only if its error is significantly smaller than the fitted prior's. If the full correction of
+the networks is not significantly better, a share of it is tried.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ RULE = ChoiceRule()
 
 @dataclass(frozen=True)
 class CandidateFigures:
-    """A candidate on the runs that it is judged by: over data that were left out.
+    """Errors of a candidate in free runs over held-out data.
 
     Args:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
-        ratio: That over the prior's [-]; of several recordings the geometric mean of each one's.
-        upper: Upper bound of the ratio with the probability of the :class:`~hybrid_mpc.ChoiceRule` [-].
-        share: Share of the networks' correction that it has. Default: the whole.
+        ratio: Error over the prior's [-]; for several recordings the geometric mean of their ratios.
+        upper: Upper bound of the ratio at the confidence level of the :class:`~hybrid_mpc.ChoiceRule` [-].
+        share: Share of the networks' correction in the candidate. Default: the full correction.
     """
 
     error: float
@@ -42,15 +42,15 @@ class CandidateFigures:
 
 @dataclass(frozen=True)
 class Choice:
-    """Which model is recommended and why.
+    """The recommended model and the reason.
 
     Args:
-        recommended: Name of the candidate.
-        hybrid: The hybrid that is exported: the recommended one, else that with the least error.
+        recommended: Name of the recommended candidate.
+        hybrid: The hybrid that is exported: the recommended one, else the one with the least error.
         candidates: Figures by candidate.
         reason: One sentence for the report.
-        blocks: Blocks of these runs that were compared.
-        sure: The hybrids that surely beat the prior.
+        blocks: Number of recordings or blocks that were compared.
+        sure: The hybrids that are significantly better than the prior.
     """
 
     recommended: str
@@ -61,7 +61,7 @@ class Choice:
     sure: tuple[str, ...] = ()
 
     def share(self, name: str) -> float:
-        """Share of the networks' correction that a kind has in the model; of what is no candidate the whole."""
+        """Share of the networks' correction in a model; 1 for a model that is not a candidate."""
         return self.candidates[name].share if name in self.candidates else 1.0
 
 
@@ -76,30 +76,32 @@ def recommend(
     shrunk: Callable[[str, float], Sequence[Array]] | None = None,
     rule: ChoiceRule = RULE,
 ) -> Choice:
-    """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
+    """Choose among the prior and hybrids by their squared errors over the same held-out runs.
 
-    The ratio of a hybrid's error to the prior's is the geometric mean of each recording's where there are
-    two or more, and its bound is that of the mean of the logarithms: another recording may be like any of
-    these, so a single one in which the prior is far off does not outweigh the others. Over all runs together the hybrid
-    must be better as well. Of several hybrids that surely beat the prior the one with the lowest ratio is recommended.
-    Within a single recording the ratio is that of the root mean squares; its scatter is found by leaving out one block
-    after the other (jackknife); a block is a contiguous part of a run.
+    A hybrid is significantly better than the prior if the upper bound of its ratio is below 1 and its error over all
+    runs together is smaller too. Of several such hybrids, the one with the lowest ratio is recommended.
+
+    - Two or more recordings: the ratio is the geometric mean over the recordings of the hybrid's error over the
+      prior's. Its bound is that of the mean of the logarithms (Student's t). So a single recording with a large error
+      of the prior does not dominate.
+    - A single recording: the ratio is that of the root mean squares. Its standard error is the jackknife's: one block
+      (a contiguous part of a run) after the other is left out.
 
     Args:
-        errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
-            over its spread, squared.
-        prior: Name of the prior among them.
-        deploy: Candidate that the user wants whatever the figures say. Default: none.
-        samples: Samples of a block at least, within which errors hang together. Default: 1.
-        recordings: Which recording each run is from, or which part of a single one. Default: all are from one.
-        evidence: What these are called in the reason.
-        shrunk: ``(name, share) -> errors`` of a hybrid of which a share of its networks' correction counts. It is asked
-            where the whole does not surely beat the prior; the largest of the rule's ``shares`` that surely does is
-            taken, else the whole. Default: the whole alone.
-        rule: How sure the comparison must be. Default: 95 %.
+        errors: Squared errors of each run ``(n,)`` [-], by candidate: the mean over the outputs of the squared error
+            over the squared spread.
+        prior: Name of the prior in ``errors``.
+        deploy: Candidate to recommend whatever the figures are. Default: none.
+        samples: Minimum samples of a block; errors within a block are correlated. Default: 1.
+        recordings: Recording of each run, or part of a single recording. Default: all runs are of one recording.
+        evidence: Name of the recordings or parts in the reason.
+        shrunk: ``(name, share) -> errors`` of a hybrid with a share of its networks' correction. It is called if the
+            full correction is not significantly better than the prior. The largest share of the rule that is
+            significantly better is used, else the full correction. Default: only the full correction.
+        rule: Confidence level, shares, and fewest recordings. Default: 95 %.
 
     Raises:
-        InputError: If ``deploy`` is no candidate, or there is no validation run.
+        InputError: If ``deploy`` is not a candidate, or there is no validation run.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -131,7 +133,7 @@ def recommend(
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)
     safe = [name for name in hybrids if compared.sure(figures[name])]
-    # the lowest mean of the logarithms: what the next recording is expected to have; two that are alike by their error
+    # the lowest mean logarithm is the best expectation for the next recording; equal ratios are ordered by the error
     chosen = min(safe, key=lambda name: (figures[name].ratio, figures[name].error), default=prior)
     pieces = compared.pieces
     of_what = f"{evidence}, their geometric mean" if compared.whole else "block" if pieces == 1 else "blocks"
@@ -144,7 +146,7 @@ def recommend(
 
 
 class _Compared:
-    """Figures of candidates over the pieces of evidence that the prior's runs are cut into."""
+    """Comparison of candidates with the prior, over the recordings or blocks that the prior's runs are cut into."""
 
     def __init__(
         self, prior: Sequence[Array], samples: int, recordings: Sequence[str], rule: ChoiceRule
@@ -152,7 +154,7 @@ class _Compared:
         self._rule = rule
         self._cuts = _cuts([len(run) for run in prior], samples)
         self._sizes = np.array([b - a for run in self._cuts for a, b in run])
-        # errors within a recording hang together, and the next recording may be of another day
+        # errors within a recording are correlated, and recordings can differ from day to day
         self.whole = len(set(recordings)) > 1
         self._of = np.zeros(0, dtype=np.int64)
         if self.whole:
@@ -162,11 +164,11 @@ class _Compared:
 
     @property
     def pieces(self) -> int:
-        """How many there are."""
+        """Number of recordings or blocks."""
         return len(set(self._of.tolist())) if self.whole else len(self._sizes)
 
     def figures(self, runs: Sequence[Array], share: float = 1.0) -> CandidateFigures:
-        """Of a candidate's squared errors by run."""
+        """Figures of a candidate from its squared errors by run."""
         own = _sums(runs, self._cuts)
         if np.array_equal(own, self._prior) and np.isfinite(own).all():
             return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share)
@@ -177,7 +179,7 @@ class _Compared:
         return replace(found, share=share)
 
     def sure(self, figures: CandidateFigures) -> bool:
-        """Whether they are surely better than the prior's, and better over all runs together."""
+        """Whether a candidate is significantly better than the prior, and also better over all runs together."""
         return figures.upper < 1.0 and figures.error < _root_mean(self._prior, self._sizes)
 
 
@@ -230,12 +232,15 @@ def _sums(runs: Sequence[Array], cuts: Sequence[Sequence[tuple[int, int]]]) -> A
 
 
 def _root_mean(sums: Array, sizes: Array) -> float:
-    """Root mean square of what the sums of squares of blocks are of; infinite where a run diverged."""
+    """Root mean square from the sums of squares and the sizes of blocks; infinite if a run diverged."""
     return math.sqrt(float(sums.sum()) / float(sizes.sum())) if np.isfinite(sums).all() else math.inf
 
 
 def _by_blocks(own: Array, prior: Array, sizes: Array, rule: ChoiceRule) -> CandidateFigures:
-    """Figures from the sums of squares of blocks; the scatter is the jackknife's."""
+    """Figures from the sums of squares of blocks, with the jackknife's standard error.
+
+    With l_i the logarithm of the ratio without block i: s^2 = (n - 1) / n sum (l_i - mean(l))^2 (Efron, 1982).
+    """
     n = len(sizes)
     error = _root_mean(own, sizes)
     if not math.isfinite(error):
@@ -252,11 +257,14 @@ def _by_blocks(own: Array, prior: Array, sizes: Array, rule: ChoiceRule) -> Cand
 
 
 def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures, rule: ChoiceRule) -> CandidateFigures:
-    """Figures from the sums of squares of recordings: the mean of the logarithms of their ratios."""
+    """Figures from the sums of squares of recordings.
+
+    With l_i = log(ratio of recording i): upper = exp(mean(l) + t_{n-1, confidence} std(l) / sqrt(n)).
+    """
     if not np.isfinite(own).all() or not np.isfinite(prior).all():
         return blocks
     n, each = len(own), 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
-    most = math.inf  # two may agree by chance
+    most = math.inf  # no bound from two recordings: they may agree by chance
     if n >= rule.fewest:
         most = float(each.mean() + student.ppf(rule.confidence, n - 1) * each.std(ddof=1) / math.sqrt(n))
     return CandidateFigures(

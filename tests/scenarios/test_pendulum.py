@@ -232,5 +232,5 @@ def test_the_whole_job(tmp_path):
     assert results.export.parity_max_abs_error <= 1e-12
     error = {name: scores.model.error for name, scores in results.evaluation.scores.items()}
     assert error["phy"] == error["phy_nominal"]  # the prior is not fitted
-    assert error["mopgrnn"] < 0.1 * error["phy"]  # docs/machines/pendulum.md: 0.01 of the prior's
+    assert error["mopgrnn"] < 0.1 * error["phy"]  # docs/results/simulated_machines.md: 0.01 of the prior's
     assert results.control.cost("hybrid_observer") < 0.5 * results.control.cost("prior_observer")
