@@ -130,8 +130,8 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.machine.prior import Balance as Balance, OperatingPoint as OperatingPoint, Prior as Prior
     from hybrid_mpc.machine.signals import Parameter as Parameter, Signal as Signal
     from hybrid_mpc.machine.specification import (
-        BenchmarkBudget as BenchmarkBudget, BenchmarkSpec as BenchmarkSpec, DataSpec as DataSpec,
-        Role as Role, Window as Window,
+        BenchmarkBudget as BenchmarkBudget, BenchmarkSpec as BenchmarkSpec, ChoiceRule as ChoiceRule,
+        DataSpec as DataSpec, Role as Role, Window as Window,
     )
     from hybrid_mpc.machine.terms import Term as Term, extended as extended, with_nominal as with_nominal
     from hybrid_mpc.machine.torch_prior import TorchPrior as TorchPrior
@@ -237,7 +237,7 @@ _ROOMS = {
     "machine.mechanical": ("MechanicalPrior",),
     "machine.prior": ("Balance", "OperatingPoint", "Prior"),
     "machine.signals": ("Parameter", "Signal"),
-    "machine.specification": ("BenchmarkBudget", "BenchmarkSpec", "DataSpec", "Role", "Window"),
+    "machine.specification": ("BenchmarkBudget", "BenchmarkSpec", "ChoiceRule", "DataSpec", "Role", "Window"),
     "machine.terms": ("Term", "extended", "with_nominal"),
     "machine.torch_prior": ("TorchPrior",),
     "model.buffered": ("BufferedFunction",),

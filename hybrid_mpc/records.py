@@ -32,20 +32,38 @@ LONGEST_WHAT = 100
 """Most characters of a record's description in a message."""
 MOST_NAMED = 20
 """Most problems of one file that are listed; a damaged file may have thousands."""
+BESIDE = {"beside": True}
+"""Metadata of a dataclass field that :func:`plain` leaves out: its arrays lie in a file beside the JSON."""
+
+
+def beside() -> Any:
+    """A dataclass field for arrays by name, which :func:`plain` leaves out; they lie in a file beside the JSON.
+
+    Example:
+        >>> @dataclasses.dataclass(frozen=True)
+        ... class Row:
+        ...     cost: float
+        ...     arrays: Mapping[str, Any] = beside()
+        >>> plain(Row(1.5, {"x": np.zeros(3)})), record(Row, {"cost": 1.5}, "a row").arrays
+        ({'cost': 1.5}, {})
+    """
+    return dataclasses.field(default_factory=dict, compare=False, metadata=BESIDE)
 
 
 def plain(value: Any) -> Any:
     """``value`` in JSON's own types.
 
-    Dataclasses and mappings become objects, sequences and arrays lists, paths texts, non-finite numbers ``"inf"``,
-    ``"-inf"`` and ``"nan"``, and a CasADi function its program (InputError if it has no program).
+    Dataclasses (without the fields marked :data:`BESIDE`) and mappings become objects, sequences and arrays lists,
+    paths texts, non-finite numbers ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program (InputError
+    if it has no program).
 
     Example:
         >>> plain({"x": np.array([1.0, np.inf]), "where": Path("a")})
         {'x': [1.0, 'inf'], 'where': 'a'}
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        kept = [f.name for f in dataclasses.fields(value) if f.metadata != BESIDE]
+        return {name: plain(getattr(value, name)) for name in kept}
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError, no_exit, said_by
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.signals import Parameter, Signal
-from hybrid_mpc.machine.specification import BenchmarkSpec, Count, CountOrNone, DataSpec
+from hybrid_mpc.machine.specification import BenchmarkSpec, ChoiceRule, Count, CountOrNone, DataSpec
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Line, Name, NotNegative, Number, Seconds, Text
@@ -192,6 +192,7 @@ class Scenario:
         terms: Candidates of ``hybrid-mpc explain``: names of laws of :mod:`hybrid_mpc.machine.terms`, e.g.
             ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Default, if no law is named: all
             laws, besides the own terms.
+        choice: How sure held-out data must show that a hybrid is better than the fitted prior. Default: 95 %.
 
     Raises:
         InputError: With all fields of a wrong kind, and equal names of tasks.
@@ -224,6 +225,7 @@ class Scenario:
     beyond_recordings: bool = False
     disturbance_model: tuple[Disturbance, ...] | None = None
     terms: tuple[Term | Name, ...] = ()
+    choice: ChoiceRule = field(default_factory=ChoiceRule)
 
     def __post_init__(self) -> None:
         own = Fields(self, f"scenario {self.name!r}")

@@ -174,7 +174,7 @@ def patched(monkeypatch, sources):
     monkeypatch.setattr(job, "STAGES", fake_stages(sources))
     monkeypatch.setattr(job, "load_scenario", scenario)
     monkeypatch.setattr(job, "check_scenario", lambda *given: SimpleNamespace(warnings=()))
-    for name in ("check_data", "check_device", "read_object", "report_so_far"):
+    for name in ("check_data", "check_device", "report_so_far"):
         monkeypatch.setattr(job, name, lambda *given: None)
     monkeypatch.setattr(job, "read_results", lambda *given: None)
     monkeypatch.setattr(Context, "kit", property(light_kit))

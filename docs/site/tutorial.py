@@ -56,45 +56,43 @@ def kept(value: Any) -> Any:
 
 def numbers(run: Path) -> dict[str, Any]:
     """What the page says of a run, from its results.json and its recordings."""
-    found = json.loads((run / "results.json").read_text())
     from hybrid_mpc import load_scenario
+    from hybrid_mpc.workflow.stages.results import read_results
 
-    prior = load_scenario(found["scenario"]).prior()
-    fit, models = found["identification"]["details"], found["identification"]
-    values, choice = fit["prior_parameters"], fit["choice"]
-    chosen = choice["candidates"][choice["recommended"]]
-    roles = [name.partition("_")[0] for name in found["data"]["files"]]
-    tasks, ratios = found["control"]["details"]["tasks"], found["control"]["details"]["comparisons"]
-    (angle,) = models["rmse"]["phy"]
+    found = read_results(run / "results.json")
+    prior = load_scenario(found.scenario).prior()
+    fit, choice = found.prior.fit, found.choice.choice
+    chosen = choice.candidates[choice.recommended]
+    roles = [name.partition("_")[0] for name in found.data.files]
+    loops, ms, watch = found.control, found.control.step_ms, found.watch
     shown = {
         "recordings": {role: roles.count(role) for role in ("train", "valid", "test")},
         "head": "\n".join((run / "data" / "train_01_sine.csv").read_text().splitlines()[:3]),
         "parameters": [
-            {"name": p.name, "unit": p.unit, "nominal": values["nominal"][p.name],
-             "fitted": values["values"][p.name], "standard_error": values["standard_errors"][p.name]}
+            {"name": p.name, "unit": p.unit, "nominal": found.prior.nominal[p.name], "fitted": fit.values[p.name],
+             "standard_error": fit.standard_errors[p.name]}
             for p in prior.parameters if not p.fixed
         ],
-        "warnings": values["warnings"],
-        "rmse": {name: by[angle] for name, by in models["rmse"].items()},
-        "choice": {"name": choice["recommended"].upper(), "share": round(100 * chosen["share"]),
-                   "ratio": chosen["ratio"], "upper": chosen["upper"]},
+        "warnings": list(fit.warnings),
+        "rmse": {name: own.model.rmse[prior.outputs[0].label] for name, own in found.evaluation.scores.items()},
+        "choice": {"name": choice.recommended.upper(), "share": round(100 * chosen.share), "ratio": chosen.ratio,
+                   "upper": chosen.upper},
         "loops": {
-            "seeds": found["control"]["details"]["most_seeds"],
+            "seeds": loops.most_seeds,
             "tasks": [
-                {"name": name, "prior": by["prior_observer"]["cost"]["mean"],
-                 "hybrid": by["hybrid_observer"]["cost"]["mean"], "oracle": by["oracle"]["cost"]["mean"],
-                 **{key: ratios[name]["prior_observer"][key] for key in ("ratio", "low", "high")}}
-                for name, by in tasks.items()
+                {"name": name, "prior": by["prior_observer"].cost.mean, "hybrid": by["hybrid_observer"].cost.mean,
+                 "oracle": by["oracle"].cost.mean,
+                 **{key: getattr(loops.comparisons[name]["prior_observer"], key) for key in ("ratio", "low", "high")}}
+                for name, by in loops.means.items()
             ],
         },
-        "step": {**{key: found["timing"]["controller_step_ms"][key] for key in ("median", "p99")},
-                 "period": found["timing"]["period_ms"]},
+        "step": {"median": ms.median, "p99": ms.p99, "period": ms.period},
         "watch": {
-            "clean": found["watch"]["details"]["clean"]["seconds"],
-            "clean_alarms": found["watch"]["details"]["clean"]["alarms"],
+            "clean": watch.clean.seconds,
+            "clean_alarms": watch.clean.alarms,
             "faults": [
-                {"title": f["title"], "delay": f["delay_s"], "diagnosis": f["diagnosis"].partition(", which")[0]}
-                for f in found["watch"]["faults"]
+                {"title": f.title, "delay": f.delay_s, "diagnosis": f.diagnosis.partition(", which")[0]}
+                for f in watch.faults
             ],
         },
     }  # fmt: skip

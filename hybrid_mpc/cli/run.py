@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,7 +21,12 @@ from hybrid_mpc.cli.options import (
 from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.workflow.stages.results import Control, Identification, OnModel, Results, Watch
+    from hybrid_mpc.compare.sequential import Comparison
+    from hybrid_mpc.workflow.stage import Absent
+    from hybrid_mpc.workflow.stages.compare import ControlResult
+    from hybrid_mpc.workflow.stages.on_model import OnModelResult
+    from hybrid_mpc.workflow.stages.results import Results
+    from hybrid_mpc.workflow.stages.watch import WatchResult
 
 INCOMPLETE = 1
 """Exit code of a run whose report is incomplete."""
@@ -118,58 +124,69 @@ def run(
 def summary(results: Results) -> list[str]:
     """The most important results of a run, one line each."""
     from hybrid_mpc.kit.promises import promise_lines
+    from hybrid_mpc.workflow.stage import Absent
     from hybrid_mpc.workflow.stages.advice import doubt_of
+    from hybrid_mpc.workflow.stages.compare import closed_loops
 
-    found = results.identification
-    doubt = doubt_of(found.details.prior_parameters.in_doubt)
-    lines = [*([doubt] if doubt else []), *errors_table(found)]
-    lines.append(found.details.choice.reason)
-    for name in ("prior", "hybrid", "oracle"):
-        loop = getattr(results.control, name)
-        if loop.cost is not None:
-            lines.append(
-                f"closed loop, {name:8} cost {loop.cost:.4g}, tracking {tracking(loop.tracking_rmse)}"
-            )
-    lines += comparison_lines(results.control)
-    lines += on_model_lines(results.on_model)
+    doubt = doubt_of(results.prior.in_doubt)
+    lines = [*([doubt] if doubt else []), *errors_table(results), results.choice.choice.reason]
+    if (loops := closed_loops(results.control)) is not None:
+        lines += loop_lines(loops)
+    if not isinstance(results.on_model, Absent):
+        lines += on_model_lines(results.on_model)
     lines += watch_lines(results.watch)
-    if results.promises.rows is None:
+    if isinstance(results.promises, Absent):
         return [*lines, f"promises of the kit: not tested: {results.promises.reason}"]
     return lines + promise_lines(results.promises.rows)
 
 
-def comparison_lines(found: Control) -> list[str]:
+def loop_lines(found: ControlResult) -> list[str]:
+    """Costs and tracking errors, then the comparison with the baselines."""
+    from hybrid_mpc.workflow.stages.compare import REPORTED
+
+    lines = []
+    for short, name in REPORTED.items():
+        if (cost := found.cost(name)) is not None:
+            lines.append(f"closed loop, {short:8} cost {cost:.4g}, tracking {tracking(found.tracking(name))}")
+    return lines + comparison_lines(found.comparisons)
+
+
+def comparison_lines(comparisons: Mapping[str, Mapping[str, Comparison]]) -> list[str]:
     """By task, the hybrid's cost over that of its strongest baseline, on equal seeds."""
     from hybrid_mpc.compare.sequential import hardest
 
     lines = []
-    for task, own in (found.details.comparisons if found.details is not None else {}).items():
+    for task, own in comparisons.items():
         least = own[base := hardest(own)]
         lines.append(f"{task}: hybrid_observer / {base} {least.words}, {least.n} seeds: {least.finding}")
     return lines
 
 
-def on_model_lines(found: OnModel) -> list[str]:
+def on_model_lines(found: OnModelResult) -> list[str]:
     """Closed-loop costs on models, one line per controller."""
     lines = []
-    for name, cells in (found.details.controllers if found.details is not None else {}).items():
+    for name, cells in found.means.items():
         words = ", ".join(f"{task} {_cell(cell.cost.mean)}" for task, cell in cells.items())
         lines.append(f"{name} on the model {found.plants[name]}, not the machine: cost of {words}")
     return lines
 
 
-def errors_table(found: Identification) -> list[str]:
+def errors_table(results: Results) -> list[str]:
     """Errors of free runs on held-out data: one row per model, one column per output and balance."""
-    outputs, balances = _labels(found.rmse), _labels(found.balance_violation)
+    scores = {name: own.model for name, own in results.evaluation.scores.items()}
+    outputs, balances = (list(errors) for errors in (scores["phy"].rmse, scores["phy"].violation))
     heads = ["error [-]", "E_sim [-]", *(f"RMSE {s}" for s in outputs), *(f"violation {b}" for b in balances)]
     rows: dict[str, list[object]] = {"": list(heads)}
-    for name in found.details.scores_of_all_networks:
-        rmse = [_of(found.rmse[name], label) for label in outputs]
-        violation = [_of(found.balance_violation[name], label) for label in balances]
-        rows[name] = [found.error[name], found.e_sim[name], *rmse, *violation]
-    for name, own in found.details.baselines.items():
+    for name, one in scores.items():
+        rows[name] = [
+            one.error,
+            one.e_sim,
+            *(one.rmse[s] for s in outputs),
+            *(one.violation[b] for b in balances),
+        ]
+    for name, own in results.prior.baselines.items():
         if own.errors is not None:
-            rmse = [_of(own.errors.rmse, label) for label in outputs]
+            rmse = (own.errors.rmse.get(label) for label in outputs)
             rows[name] = [own.errors.error, "–", *rmse, *("–" for _ in balances)]
     widths = [max(10, len(head)) for head in heads]
     lines = [
@@ -177,15 +194,6 @@ def errors_table(found: Identification) -> list[str]:
         for name, cells in rows.items()
     ]
     return ["free runs on held-out data:", *lines]
-
-
-def _labels(errors: Mapping[str, object]) -> list[str]:
-    """Labels, with units, of the signals or balances in errors."""
-    return next((list(own) for own in errors.values() if isinstance(own, Mapping)), [])
-
-
-def _of(values: object, label: str) -> object:
-    return values.get(label) if isinstance(values, Mapping) else None
 
 
 def tracking(errors: Mapping[str, float]) -> str:
@@ -199,22 +207,28 @@ def tracking(errors: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g} {unit}" for name, unit, value in split)
 
 
-def watch_lines(found: Watch) -> list[str]:
+def watch_lines(found: WatchResult | Absent) -> list[str]:
     r"""Results of the fault monitor.
 
     Example:
-        >>> from hybrid_mpc.workflow.stages.results import FaultedLoop, Watch
+        >>> from hybrid_mpc.kit.parts import WatchFile
+        >>> from hybrid_mpc.watch.detector import WatchLimits
+        >>> from hybrid_mpc.workflow.stages.watch import FaultedLoop, WatchResult
+        >>> limits = WatchLimits("residuals", 1.0, (), (), (), false_alarms_per_hour=2.0, hours=0.1)
         >>> row = FaultedLoop("weak_pump", "the pump weakens", "levels", 450.0, None, (), "", 1)
-        >>> watch = Watch("residuals", 2.0, 0.1, 0.0, (), (row,))
+        >>> watch = WatchResult({"hybrid": WatchFile({"residuals": limits})}, "residuals", faults=(row,))
         >>> print(*watch_lines(watch), sep="\n")
         monitor of residuals: learned from 6.0 min for 2 false alarms per hour; 0 alarms on recordings
           weak_pump: not detected (alarms before it: 1)
     """
-    if found.alarms is None or found.hours is None:
+    from hybrid_mpc.workflow.stage import Absent
+
+    if isinstance(found, Absent) or found.limits is None:
         return [f"monitor: {found.reason}"]
+    limits = found.limits
     lines = [
-        f"monitor of {found.kind}: learned from {60 * found.hours:.1f} min for {found.wanted_per_hour:g} false alarms "
-        f"per hour; {len(found.alarms)} alarms on recordings"
+        f"monitor of {found.kind}: learned from {60 * limits.hours:.1f} min for {limits.false_alarms_per_hour:g} false "
+        f"alarms per hour; {len(found.alarms)} alarms on recordings"
     ]
     for row in found.faults or ():
         seen = "not detected" if row.delay_s is None else f"detected after {row.delay_s:.3g} s"
@@ -225,4 +239,6 @@ def watch_lines(found: Watch) -> list[str]:
 
 
 def _cell(value: object) -> str:
-    return "diverged" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "diverged"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -29,7 +29,7 @@ from hybrid_mpc.loop.simulate import ClosedLoopResult, Step, simulate
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.limits import share_used
 from hybrid_mpc.model.model import HybridModel, kinematics
-from hybrid_mpc.records import known, plain, record
+from hybrid_mpc.records import beside, known, plain, record
 from hybrid_mpc.scenario import Scenario, Task, load_scenario, registered_scenarios
 from hybrid_mpc.watch.monitor import Monitor
 from hybrid_mpc.watch.replay import alarm_intervals
@@ -181,7 +181,12 @@ class LoopSpec:
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval of time: start and end [s]."""
+    """An interval of time.
+
+    Args:
+        start_s: Start [s].
+        end_s: End [s].
+    """
 
     start_s: float
     end_s: float
@@ -189,7 +194,14 @@ class Interval:
 
 @dataclass(frozen=True)
 class ModeChange:
-    """A change of the guard's mode: time [s], names of the modes before and after it, and the reason."""
+    """A change of the guard's mode.
+
+    Args:
+        t_s: Time [s].
+        before: Name of the mode before it.
+        after: Name of the mode after it.
+        why: Its reason.
+    """
 
     t_s: float
     before: str
@@ -247,13 +259,7 @@ class LoopRow:
     timing_ms: Mapping[str, Mapping[str, float]]
     on_model: str = ""
     given_way: Mapping[str, float] = field(default_factory=dict)
-    arrays: Mapping[str, Array] = field(default_factory=dict, compare=False)
-
-    def plain(self) -> dict[str, Any]:
-        """The row in JSON's own types, without its arrays."""
-        found: dict[str, Any] = plain(replace(self, arrays={}))
-        del found["arrays"]
-        return found
+    arrays: Mapping[str, Array] = beside()
 
     def columns(self) -> dict[str, Any]:
         """The row as flat columns of a table, without its arrays; durations begin with ``timing_``."""
@@ -479,7 +485,7 @@ def write_rows(path: Path, rows: Sequence[LoopRow], of: str) -> None:
     Raises:
         StorageError: If the file cannot be written.
     """
-    write_document(path, {"of": of, "rows": [row.plain() for row in rows]}, arrays_of(rows))
+    write_document(path, {"of": of, "rows": plain(rows)}, arrays_of(rows))
 
 
 def read_rows(path: Path, of: str) -> list[LoopRow] | None:

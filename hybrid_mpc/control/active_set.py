@@ -22,8 +22,6 @@ CHANGES = 25
 PATIENCE = 3
 """Consecutive changes of the whole set that may increase the number of wrong rows. After them the row-by-row method
 continues from the best set."""
-STEPS = 10
-"""Most steps per row of the method that changes one row at a time."""
 DEPENDENT = 1e-12
 """Pivot of a row, over its size in the dual, below which it is linearly dependent on the others."""
 
@@ -194,7 +192,8 @@ class ActiveSet:
         qp, size = self._qp, np.sqrt(np.maximum(np.sum(self._reduced**2, axis=1), 1e-300))
         multipliers, active = start.multipliers.copy(), start.active.copy()
         row, sign = -1, 0.0
-        for _ in range(STEPS * qp.lower.size):
+        # ten steps per row at most
+        for _ in range(10 * qp.lower.size):
             acts = np.flatnonzero(multipliers)
             s = self._free - (multipliers[acts] @ self._reduced[acts]) @ self._inverse
             values = qp.values(s)

@@ -19,11 +19,6 @@ SHIFT = 1e-5
 """Step of the finite differences of Jacobians, in sizes of states and hidden states and scales of the inputs."""
 FLOOR = 1e-3
 """Least curvature along any direction, over that of Gauss-Newton."""
-MATTERS = 0.2
-"""Curvature of the hidden state below this share of Gauss-Newton's, along every direction, is neglected. Convergence is
-then linear, with about this rate."""
-AT_ONCE = 200
-"""Periods per call for Jacobians: more would not fit into a core's cache."""
 
 
 class StageCurvature:
@@ -42,7 +37,8 @@ class StageCurvature:
         self._soft = soft if soft is not None and soft.functions else None
         self._shift = SHIFT * np.concatenate([sizes, ocp.input_scale])
         self._stages = stages
-        self._group = min(n_h, max(1, AT_ONCE // ocp.horizon))
+        # more than 200 periods a call would not fit into a core's cache
+        self._group = min(n_h, max(1, 200 // ocp.horizon))
 
     @cached_property
     def _by_few(self) -> Slopes:
@@ -151,7 +147,8 @@ class StageCurvature:
             return curvature
         small = curvature[:, :few, :few]
         hidden = self.condensed(curvature, from_u, by_inputs) - condense_hessians(small, from_u, self._n_x)
-        return small.copy() if _share(gauss_newton, hidden) < MATTERS else curvature
+        # along every direction below 20 % of Gauss-Newton's: convergence stays linear, with about this rate
+        return small.copy() if _share(gauss_newton, hidden) < 0.2 else curvature
 
 
 def convex(gauss_newton: Array, rest: Array, held: NDArray[np.bool_] | None = None) -> Array:

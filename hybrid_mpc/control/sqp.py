@@ -155,24 +155,15 @@ class ReducedCost:
 
 
 NAN = float("nan")
-ARMIJO = 1e-4
 KKT = 1e-6
-ATTEMPTS = 15
-"""Most QPs of an iteration, each damped more than the one before."""
 MORE = 4.0
 """Factor by which damping grows between attempts, and falls after a good step."""
 POOR, GOOD = 0.25, 0.5
 """Ratios of actual to predicted decrease: below the first damping is raised, above the second it is lowered."""
 CORRECTIONS = 2
 """Most second-order corrections of a step."""
-SLOW = 0.1
-"""Relative prediction error of the residual above which second derivatives are computed again."""
 LIFTED = 14
 """Most multiple-shooting linearizations of a first plan, before all iterates are runs."""
-AGREES = 0.01
-"""Relative difference between the cost of a run and the QP's prediction at which multiple shooting ends."""
-AGAIN = (1, 4, 16, 64)
-"""Iterations at which a neglected curvature of the hidden state is checked again."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +221,8 @@ class Descent:
         left = change - found.hessian @ answer.step
         after = max(answer.kkt, self._residual(hessian, left))
         self.at, self.kkt, self._soft, self.active = new, after, answer.multipliers, answer.active
-        self._stale, self._fresh, self._plain = wrong > SLOW * before, False, False
+        # a residual mispredicted by 10 % asks for new second derivatives
+        self._stale, self._fresh, self._plain = wrong > 0.1 * before, False, False
         self.ended = after <= KKT and self._promise(hessian, left) <= self._enough
         self.status = Status.SOLVED if self.ended else Status.STOPPED
         if gained < POOR * found.promised:
@@ -241,7 +233,8 @@ class Descent:
     def _search(self, prepared: Prepared, hessian: Array) -> _Step:
         """The first step, with growing damping, that lowers the cost enough, if any."""
         first = None
-        for _ in range(ATTEMPTS):
+        # QPs of an iteration, each damped more than the one before
+        for _ in range(15):
             damped = hessian
             if self._damping:
                 damped = hessian + np.diag(self._damping * self._cost.metric)
@@ -267,7 +260,8 @@ class Descent:
     ) -> tuple[Rollout | None, Answer]:
         """The run of a step, or of the corrected step, if it lowers the cost enough."""
         start, bounds = self.at.run, self._cost.inner.ocp.bounds(self._case.u_prev, self._case.limits)
-        least, before = start.cost - ARMIJO * promised, np.inf
+        # Armijo's condition on the decrease
+        least, before = start.cost - 1e-4 * promised, np.inf
         for i in range(1 + CORRECTIONS):
             u = np.clip(start.u + answer.step.reshape(start.u.shape), *bounds)
             run = self._cost.run(start.z[0], u, self._case)
@@ -337,7 +331,8 @@ class Descent:
         """Second derivatives here; those of the hidden state, which change slowly, from the second time on."""
         cost, old = self._cost, self.curvature
         small = old is not None and old.shape[1] < cost.stages.size
-        if old is not None and (self._taken in AGAIN if small else self._taken > 0):
+        # at these iterations a neglected curvature of the hidden state is checked again
+        if old is not None and (self._taken in (1, 4, 16, 64) if small else self._taken > 0):
             old = None
         curvature = cost.curvature(self.at, self._case, multipliers, self._soft, old)
         if old is None:  # nothing was condensed since ``prepared``
@@ -473,7 +468,8 @@ class SQPController(Controller):
             run = self._cost.run(run.z[0], self._admissible(plan.u, case), case)
             if run.cost < best.cost or not np.isfinite(best.cost):
                 best, active = run, plan.active
-            if abs(run.cost - plan.cost) <= AGREES * abs(run.cost):
+            # 1 %: the QP predicts the cost of the run, so multiple shooting ends
+            if abs(run.cost - plan.cost) <= 0.01 * abs(run.cost):
                 break
             z = np.hstack([plan.x, plan.h])
             prepared = inner.linearize(

@@ -24,17 +24,6 @@ from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
-HEED = 0.2
-"""Factor on the states' scales in the steady-state equations, relative to those of hidden states: near a network that
-hardly settles, or settles anywhere (its gates are shut), the states' equations take precedence."""
-ASIDE = 0.1
-"""Distance of further starts from the operating point's input, in scales of the input. A network that has learned
-sticking friction has zero slope between the two breakaway inputs, where Newton's method stops."""
-FLAT = 0.01
-"""Share of the outputs' slopes at the operating point below which the outputs no longer respond as they do there: the
-absolute value of a speed at standstill and beyond; the top of a curve. A descent does not leave such a point."""
-NEARER = 1e-3
-"""Largest residual, in the states' scales, of an operating point that is nearly steady."""
 
 
 class Targets:
@@ -87,7 +76,8 @@ class Targets:
         sizes = Sizes(model, ocp) if sizes is None else sizes
         self.scale: Array = np.concatenate([sizes.states, sizes.hidden, ocp.input_scale])
         """Scales of the unknowns ``(x, h, u)`` ``(n_z + n_u,)``."""
-        self.heed: Array = np.concatenate([np.full(n_x, HEED), np.ones(model.n_h)])
+        # near a network that hardly settles, or settles anywhere (its gates are shut), the states' equations come first
+        self.heed: Array = np.concatenate([np.full(n_x, 0.2), np.ones(model.n_h)])
         """Factors ``(n_z,)`` on the scales of the steady-state equations."""
         ranges = [np.array([(s.lower, s.upper) for s in group]).T for group in (model.states, model.outputs)]
         x_min, x_max = ocp.state_range
@@ -209,7 +199,8 @@ class Targets:
     @cached_property
     def flat(self) -> float:
         """Product with :attr:`slopes` below which slopes count as zero."""
-        return FLAT * float(np.vdot(self.slopes, self.slopes))
+        # 1 % of the slopes at the operating point: the absolute value of a speed beyond standstill, the top of a curve
+        return 0.01 * float(np.vdot(self.slopes, self.slopes))
 
     @cached_property
     def beside(self) -> list[Array]:
@@ -218,7 +209,8 @@ class Targets:
         """
         m, ocp = self.model, self._ocp
         u0 = np.clip(m.u0, ocp.u_min, ocp.u_max)
-        moves = np.diag(ASIDE * ocp.input_scale)
+        # a network that has learned sticking friction has zero slope between its breakaway inputs: start beside it
+        moves = np.diag(0.1 * ocp.input_scale)
         inputs = [u0, *(np.clip(u0 + move, ocp.u_min, ocp.u_max) for row in moves for move in (row, -row))]
         return [np.concatenate([m.x0, hidden_fixed_point(m, m.x0, u), u]) for u in inputs]
 
@@ -231,7 +223,8 @@ class Targets:
         states out of the range that a network ever reaches, where its gates are shut and it settles anywhere.
         """
         self._undisturbed()
-        if self._search.lacks(self.beside[0]) < NEARER:
+        # the operating point is nearly steady
+        if self._search.lacks(self.beside[0]) < 0.001:
             return []
         end = run_to_rest(self._search, self.beside[0])
         return [] if end is None else [end]

@@ -28,9 +28,12 @@ not white noise, and up to half of their power would count as motion."""
 class Sizes:
     """Natural sizes of a machine's signals, estimated from its recordings; they do not depend on units.
 
-    ``y`` ``(n_y,)`` are the spreads of the outputs, ``noise`` ``(n_y,)`` the standard deviations of their noise. ``x``
-    ``(n_x,)`` is the deviation of each state that alone moves the outputs by their spread within the machine's unit of
-    time; ``rate`` ``(n_x,)`` is ``x`` over this time.
+    Args:
+        y: Spreads of the outputs ``(n_y,)``.
+        noise: Standard deviations of their noise ``(n_y,)``.
+        x: Deviation of each state that alone moves the outputs by their spread within the machine's unit of time
+            ``(n_x,)``.
+        rate: ``x`` over this time ``(n_x,)``.
     """
 
     y: tuple[float, ...]

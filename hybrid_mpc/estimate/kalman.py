@@ -20,8 +20,6 @@ START_LIMIT = 25
 More would delay a loop's first step. Closed loops with a network depend on this number (docs/results/README.md)."""
 FITS = 1e-6
 """Largest squared error of the first outputs, in the sensors' standard deviations, of a state that fits them."""
-LOST = 1e12
-"""Growth of a variance after which its covariance has few correct digits: the estimate is lost."""
 EXACT = 1e-9
 """Largest error of the first outputs, in the sensors' standard deviations, that is rounding."""
 DEPENDENT = 1e-9
@@ -178,7 +176,8 @@ class ExtendedKalmanFilter:
             shown = np.flatnonzero(row)
             if shown.size == 1 and np.isfinite(row[shown[0]]):
                 own[shown[0]] = max(own[shown[0]], variance / row[shown[0]] ** 2)
-        return np.where(own > 0, LOST * own, np.finfo(np.float64).max)
+        # a variance that grows by 1e12 leaves few correct digits of its covariance: the estimate is lost
+        return np.where(own > 0, 1e12 * own, np.finfo(np.float64).max)
 
     def lost(self, estimate: Estimate) -> bool:
         """Whether an estimate is not finite, or too uncertain to be useful."""

@@ -15,8 +15,6 @@ from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import remedy_for_unmoved, unmoved_states
 
 Array = NDArray[np.float64]
-AROUND = 5
-"""Points around the operating point that are tested if the disturbances cannot be distinguished at it."""
 RANK = 1e-9
 """Singular values below this share of the largest count as zero, after scaling of rows and columns."""
 
@@ -156,7 +154,8 @@ def distinguishable(model: HybridModel, sizes: ArrayLike | None = None) -> Offse
     around = _sizes(model) if sizes is None else 0.1 * vector(sizes, model.n_x, "sizes")
     found = offset_free(model)
     rng = np.random.default_rng(0)
-    for _ in range(AROUND):
+    # points around the operating point
+    for _ in range(5):
         if found.detectable:
             break
         other = offset_free(model, x=model.x0 + rng.uniform(-1.0, 1.0, model.n_x) * around)

@@ -27,8 +27,6 @@ from hybrid_mpc.model.model import (
 Array = NDArray[np.float64]
 LEAST = 1.0 - 1e-9
 """Largest state of a factor, as a share of its bound: at the bound itself it would be infinite."""
-FIRST = 0.02
-"""Standard deviation of the first parameter states: a fitted model's parameters are known to a few per cent."""
 
 
 def with_parameter_states(
@@ -151,10 +149,11 @@ def parameter_filter(
     own = np.zeros(model.n_h - groups)
 
     def filter_of(scale: float, size: float) -> ExtendedKalmanFilter:
+        # a fitted model's parameters are known to a few per cent
         return ExtendedKalmanFilter(
             model, sigma_y=sigma_y, sigma_x=scale * np.asarray(sigma_x, dtype=float), sigma_x0=sigma_x0,
             sigma_d=sigma_d, sigma_d0=sigma_d0,
-            sigma_h=np.append(own, np.full(groups, size)), sigma_h0=np.append(own, np.full(groups, FIRST)),
+            sigma_h=np.append(own, np.full(groups, size)), sigma_h0=np.append(own, np.full(groups, 0.02)),
         )  # fmt: skip
 
     return SwitchingFilter([filter_of(1.0, drift), filter_of(SLIP, drift), filter_of(1.0, step)], SWITCHES)

@@ -18,13 +18,9 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
-BESIDE = 0.1
-"""Share of its range by which each state is moved from the operating point to look for a load in motion."""
 FOUND = math.exp(-1.0)
 """Remaining share of a constant disturbance that a filter has found: that of a first-order lag after one time
 constant."""
-ROUNDING = 1e-9
-"""Share of a state's size below which a model's error is rounding: no filter assumes less noise."""
 
 
 class Recording(Protocol):
@@ -99,7 +95,8 @@ def process_noise(model: HybridModel, recordings: Sequence[Known], most: int = 4
             " [HM-ESTIMATE-022]"
         )
     sizes = np.sqrt(np.mean(np.square(np.concatenate([r.x for r in recordings])), axis=0))
-    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), ROUNDING * sizes)
+    # errors below 1e-9 of a state's size are rounding: no filter assumes less noise
+    return np.maximum(np.sqrt(np.mean(np.square(errors), axis=0)), 1e-9 * sizes)
 
 
 def log_likelihood(estimator: Filter, recording: Recording, skip: int = 25) -> float:
@@ -190,7 +187,8 @@ def _errors(ekf: ExtendedKalmanFilter) -> list[Array]:
     model = ekf.model
     rest = ekf.start(np.full(model.n_y, np.nan))
     ranges = np.array([s.upper - s.lower for s in model.states])
-    x = rest.x + np.where(np.isfinite(ranges), BESIDE * ranges, np.sqrt(ekf.first[: model.n_x]))
+    # a tenth of its range from the operating point: a load may be seen in motion only
+    x = rest.x + np.where(np.isfinite(ranges), 0.1 * ranges, np.sqrt(ekf.first[: model.n_x]))
     moving = replace(rest, x=x, h=hidden_fixed_point(model, x, model.u0, limit=START_LIMIT))
     return [found for at in (rest, moving) if (found := _error(ekf, at)) is not None]
 

@@ -17,29 +17,10 @@ from scipy.stats import t as student
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.specification import ChoiceRule
 
 Array = NDArray[np.float64]
-BLOCKS = 8
-"""Minimum number of blocks that runs of few recordings are cut into; fewer blocks estimate the scatter poorly."""
-RECORDINGS = 2
-"""Number of recordings from which on each recording is one block: errors within a recording are correlated, and
-recordings can differ from day to day."""
-FEWEST = 3
-"""Minimum number of recordings for an upper bound, if each recording is a block. Two recordings give one difference,
-which estimates the scatter poorly: on the temperature lab, two recordings agreed by chance, and a hybrid with 1.3 to
-1.4 times the prior's error was recommended."""
-CONFIDENCE = 0.95
-"""Confidence level, one-sided, of each upper bound; each share of each kind has its own bound. If half a correction is
-exactly as good as the prior and all others are worse, 6 % of the choices recommend a hybrid
-(``tests/identify/test_choose.py``)."""
-SHARES = (0.75, 0.5)
-"""Shares of a correction that are tried, the largest first, if the full correction is not significantly better than the
-prior. The errors of prior and hybrid are only partly correlated, so a model between them can have a smaller error and
-less scatter than both. Then half a correction can be significant although the full one is not. A quarter is not tried:
-it alone was significant in 3 of 45 cells on real machines, with 0.99, 1.05 and 1.01 times the prior's error
-(docs/results/no_harm.md)."""
-CONFIDENT = 1.0
-"""The upper bound of a hybrid's error over the prior's must be below this ratio."""
+RULE = ChoiceRule()
 
 
 @dataclass(frozen=True)
@@ -49,7 +30,7 @@ class CandidateFigures:
     Args:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
         ratio: Error over the prior's [-]; for several recordings the geometric mean of their ratios.
-        upper: Upper bound of the ratio at the confidence level ``CONFIDENCE`` [-].
+        upper: Upper bound of the ratio at the confidence level of the :class:`~hybrid_mpc.ChoiceRule` [-].
         share: Share of the networks' correction in the candidate. Default: the full correction.
     """
 
@@ -93,15 +74,16 @@ def recommend(
     recordings: Sequence[str] = (),
     evidence: str = "recordings",
     shrunk: Callable[[str, float], Sequence[Array]] | None = None,
+    rule: ChoiceRule = RULE,
 ) -> Choice:
     """Choose among the prior and hybrids by their squared errors over the same held-out runs.
 
     A hybrid is significantly better than the prior if the upper bound of its ratio is below 1 and its error over all
     runs together is smaller too. Of several such hybrids, the one with the lowest ratio is recommended.
 
-    - ``RECORDINGS`` or more recordings: the ratio is the geometric mean over the recordings of the hybrid's error over
-      the prior's. Its bound is that of the mean of the logarithms (Student's t). So a single recording with a large
-      error of the prior does not dominate.
+    - Two or more recordings: the ratio is the geometric mean over the recordings of the hybrid's error over the
+      prior's. Its bound is that of the mean of the logarithms (Student's t). So a single recording with a large error
+      of the prior does not dominate.
     - A single recording: the ratio is that of the root mean squares. Its standard error is the jackknife's: one block
       (a contiguous part of a run) after the other is left out.
 
@@ -114,8 +96,9 @@ def recommend(
         recordings: Recording of each run, or part of a single recording. Default: all runs are of one recording.
         evidence: Name of the recordings or parts in the reason.
         shrunk: ``(name, share) -> errors`` of a hybrid with a share of its networks' correction. It is called if the
-            full correction is not significantly better than the prior. The largest of ``SHARES`` that is significantly
-            better is used, else the full correction. Default: only the full correction.
+            full correction is not significantly better than the prior. The largest share of the rule that is
+            significantly better is used, else the full correction. Default: only the full correction.
+        rule: Confidence level, shares, and fewest recordings. Default: 95 %.
 
     Raises:
         InputError: If ``deploy`` is not a candidate, or there is no validation run.
@@ -137,12 +120,12 @@ def recommend(
         raise InputError(
             "choice: no validation run to compare the models on; give longer recordings [HM-IDENTIFY-004]"
         )
-    compared = _Compared(errors[prior], samples, recordings)
+    compared = _Compared(errors[prior], samples, recordings, rule)
     figures = {name: compared.figures(runs) for name, runs in errors.items()}
     for name in errors if shrunk is not None else ():
         if name == prior or compared.sure(figures[name]):
             continue
-        for share in SHARES:
+        for share in rule.shares:
             less = compared.figures(shrunk(name, share), share)  # type: ignore[misc]
             if compared.sure(less):
                 figures[name] = less
@@ -165,10 +148,14 @@ def recommend(
 class _Compared:
     """Comparison of candidates with the prior, over the recordings or blocks that the prior's runs are cut into."""
 
-    def __init__(self, prior: Sequence[Array], samples: int, recordings: Sequence[str]) -> None:
+    def __init__(
+        self, prior: Sequence[Array], samples: int, recordings: Sequence[str], rule: ChoiceRule
+    ) -> None:
+        self._rule = rule
         self._cuts = _cuts([len(run) for run in prior], samples)
         self._sizes = np.array([b - a for run in self._cuts for a, b in run])
-        self.whole = len(set(recordings)) >= RECORDINGS
+        # errors within a recording are correlated, and recordings can differ from day to day
+        self.whole = len(set(recordings)) > 1
         self._of = np.zeros(0, dtype=np.int64)
         if self.whole:
             blocks = [name for name, run in zip(recordings, self._cuts, strict=True) for _ in run]
@@ -185,15 +172,15 @@ class _Compared:
         own = _sums(runs, self._cuts)
         if np.array_equal(own, self._prior) and np.isfinite(own).all():
             return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share)
-        found = _by_blocks(own, self._prior, self._sizes)
+        found = _by_blocks(own, self._prior, self._sizes, self._rule)
         if self.whole:
             of_own, of_prior = (np.bincount(self._of, v).astype(np.float64) for v in (own, self._prior))
-            found = _by_recordings(of_own, of_prior, found)
+            found = _by_recordings(of_own, of_prior, found, self._rule)
         return replace(found, share=share)
 
     def sure(self, figures: CandidateFigures) -> bool:
         """Whether a candidate is significantly better than the prior, and also better over all runs together."""
-        return figures.upper < CONFIDENT and figures.error < _root_mean(self._prior, self._sizes)
+        return figures.upper < 1.0 and figures.error < _root_mean(self._prior, self._sizes)
 
 
 def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tuple[list[str], str]:
@@ -221,7 +208,7 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
     bound = f"at most {own.upper:.2f}" if math.isfinite(own.upper) else "without a bound: record more"
     of_it = "its error" if own.share == 1 else f"with {own.share:g} of its correction, its error"
     said = f"{of_it} on held-out data is {own.ratio:.2f} of the prior's ({bound}; {blocks})"
-    if chosen == prior and own.upper < CONFIDENT:
+    if chosen == prior and own.upper < 1.0:
         said += ", but over all of them together the prior's is no larger"
     if chosen == prior:
         return f"The fitted prior is recommended: {best} does not surely beat it; {said}."
@@ -230,7 +217,8 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
 
 def _cuts(lengths: Sequence[int], samples: int) -> list[list[tuple[int, int]]]:
     """Blocks of each run as first and last sample: whole runs, or parts of runs if there are few runs."""
-    parts = math.ceil(BLOCKS / max(1, len(lengths)))
+    # eight blocks at least: the scatter between fewer says little
+    parts = math.ceil(8 / max(1, len(lengths)))
     cuts = []
     for n in lengths:
         count = max(1, min(parts, n // max(1, samples)))
@@ -248,7 +236,7 @@ def _root_mean(sums: Array, sizes: Array) -> float:
     return math.sqrt(float(sums.sum()) / float(sizes.sum())) if np.isfinite(sums).all() else math.inf
 
 
-def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
+def _by_blocks(own: Array, prior: Array, sizes: Array, rule: ChoiceRule) -> CandidateFigures:
     """Figures from the sums of squares of blocks, with the jackknife's standard error.
 
     With l_i the logarithm of the ratio without block i: s^2 = (n - 1) / n sum (l_i - mean(l))^2 (Efron, 1982).
@@ -264,21 +252,21 @@ def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
         return CandidateFigures(error, ratio, math.inf)
     without = 0.5 * np.log(np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300))
     scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
-    bound = math.log(max(ratio, 1e-300)) + float(student.ppf(CONFIDENCE, n - 1)) * scatter
+    bound = math.log(max(ratio, 1e-300)) + float(student.ppf(rule.confidence, n - 1)) * scatter
     return CandidateFigures(error, ratio, math.exp(min(bound, 700.0)))
 
 
-def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures) -> CandidateFigures:
+def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures, rule: ChoiceRule) -> CandidateFigures:
     """Figures from the sums of squares of recordings.
 
-    With l_i = log(ratio of recording i): upper = exp(mean(l) + t_{n-1, CONFIDENCE} std(l) / sqrt(n)).
+    With l_i = log(ratio of recording i): upper = exp(mean(l) + t_{n-1, confidence} std(l) / sqrt(n)).
     """
     if not np.isfinite(own).all() or not np.isfinite(prior).all():
         return blocks
     n, each = len(own), 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
     most = math.inf  # no bound from two recordings: they may agree by chance
-    if n >= FEWEST:
-        most = float(each.mean() + student.ppf(CONFIDENCE, n - 1) * each.std(ddof=1) / math.sqrt(n))
+    if n >= rule.fewest:
+        most = float(each.mean() + student.ppf(rule.confidence, n - 1) * each.std(ddof=1) / math.sqrt(n))
     return CandidateFigures(
         blocks.error, math.exp(float(each.mean())), math.exp(most) if most < 700 else math.inf
     )

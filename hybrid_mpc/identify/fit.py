@@ -52,26 +52,12 @@ Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
 """Lengths of the windows [time units, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other. Short windows
 have a single optimum; long windows match the use of the model."""
-FARTHEST = 3.0
-"""Maximum length of the longest windows, over the time in which small errors grow by a factor of 100. In longer windows
-rounding errors would dominate the effect of the initial states."""
 APART = 4.0
 """Maximum ratio of one length to the next."""
-SLOWEST = 3.0
-"""Length of the longest windows, over the largest time constant of the nominal prior."""
-AWAY = 10.0
-"""Time in which small errors grow by a factor of 100, over the longest windows, below which the recordings are smoothed
-again after each length: the nominal prior's states are then no initial states for longer windows."""
-WHOLE = 1.2
-"""Ratio of the longest recording to the windows from which on whole recordings are fitted too."""
 QUIET = 3.0
 """Ratio of the error to the sensors' noise below which longer windows or whole recordings are fitted."""
 SHIFT, EXACT = 0.2, 1e-5
 """Tolerated change of a parameter when integration steps are halved: in standard errors, and relative to its value."""
-BEYOND = 0.05
-"""Tolerated distance of a state beyond its range, over the span of the state: a smoother overshoots."""
-FORGETS = 2.0
-"""Length of the windows of one-step predictions [time units]; the observer forgets its initial state within it."""
 Progress = Callable[[int, int, str], None]
 
 
@@ -149,7 +135,8 @@ def fit_prior(
             f"but at least {fit.lead + 3} are needed. Give longer recordings [HM-IDENTIFY-017]"
         )
     if length is None:
-        length = max(LENGTHS[-1] * unit, SLOWEST * slowest(fit.prior))
+        # three times the largest time constant of the nominal prior
+        length = max(LENGTHS[-1] * unit, 3.0 * slowest(fit.prior))
     on_progress(0, 1, "smoothing by the nominal prior")
     smoother = rough_smoother(fit.prior, shifted(train, fit.delay(fit.nominal)), dt, time_unit=unit)
     noise = np.array(smoother.sizes.noise)
@@ -201,7 +188,8 @@ def fit_prior(
             solved = [solved[k] for k in np.argsort(errors, kind="stable")]
             found.append((name, solved, problem))
             followed = [one.theta for one in solved]
-            if fit.reach(followed[0]) < AWAY * lengths[-1] * dt:
+            # errors grow within ten windows: the nominal prior's states are no start for longer windows
+            if fit.reach(followed[0]) < 10.0 * lengths[-1] * dt:
                 again = rough_smoother(
                     make(fit.values(followed[0])), shifted(train, fit.delay(followed[0])), dt, time_unit=unit
                 )
@@ -209,7 +197,8 @@ def fit_prior(
                 every = with_states([*train, *valid], again, fit.delay(followed[0]))
                 guesses = every[: len(train)], every[len(train) :]
         whole = most_samples(guesses[0]) - fit.lead - 1
-        more = whole > WHOLE * periods and 0.8 * min(whole, LONGEST) * dt < fit.reach(followed[0])
+        # whole recordings pay from 1.2 times the windows before on
+        more = whole > 1.2 * periods and 0.8 * min(whole, LONGEST) * dt < fit.reach(followed[0])
         if more and _quiet(problem, followed[0], noise):  # fewer windows have fewer unknown initial states
             on_progress(total - 1, total, "whole recordings")
             longer = problem_of(guesses[0], None)
@@ -249,7 +238,8 @@ def fit_prior(
     if fit.free and (answered > 1.0 or fit.reach(chosen.theta) < length):
         on_progress(total - 1, total, PREDICTIONS)
         known = [replace(t, x=s.x) for t, s in zip(acting, smoother.smooth(acting), strict=True)]
-        forgotten = min(scales.periods(FORGETS * unit, dt, 2), lengths[-1], most_samples(known) - 1)
+        # after two time units an observer has forgotten where it began
+        forgotten = min(scales.periods(2.0 * unit, dt, 2), lengths[-1], most_samples(known) - 1)
         windows = cut_outputs(known, forgotten, 0, FEW, fit.prior.states)
         candidates.append((PREDICTIONS, fit_by_prediction(fit, chosen.theta, windows, smoother)))
         scores += _errors_of([candidates[-1][1].theta], scoring)
@@ -325,11 +315,12 @@ def beyond_ranges(prior: Prior, smoothed: Sequence[Trajectory]) -> tuple[str, ..
         ()
     """
     x = np.concatenate([t.x for t in smoothed])
+    # 5 % of its own span: a smoother overshoots
     return tuple(
         f"{s.label} goes from {low:.4g} to {high:.4g} with the fitted values, beyond its range [{s.lower:g}, "
         f"{s.upper:g}]: the range is wrong, or the prior lacks what keeps it within"
         for s, low, high in zip(prior.states, x.min(0), x.max(0), strict=True)
-        if low < s.lower - BEYOND * (high - low) or high > s.upper + BEYOND * (high - low)
+        if low < s.lower - 0.05 * (high - low) or high > s.upper + 0.05 * (high - low)
     )
 
 
@@ -405,7 +396,8 @@ def _lengths(
         wanted.append(wanted[-1] * APART)
     wanted.append(length)
     grown = [reach * math.log(own) / math.log(GROWN[-1]) for own in GROWN]
-    slow = sorted({min(own, FARTHEST * grown[-1]) for own in wanted if own > 1.5 * grown[-1]})
+    # beyond three times that growth, first states are lost in rounding
+    slow = sorted({min(own, 3.0 * grown[-1]) for own in wanted if own > 1.5 * grown[-1]})
     if slow:
         wanted = [*grown, *slow]
     fitting = [p for p in (scales.periods(own, dt, 2) for own in wanted) if p <= longest]

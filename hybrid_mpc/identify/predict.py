@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
@@ -23,6 +23,7 @@ from hybrid_mpc.machine.prior import OperatingPoint, Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.records import BESIDE
 
 Array = NDArray[np.float64]
 
@@ -41,8 +42,8 @@ class Predicted:
         share: Nominal share of the band.
     """
 
-    y_hat: Array
-    half_width: Array
+    y_hat: Array = field(metadata=BESIDE)
+    half_width: Array = field(metadata=BESIDE)
     rmse: Mapping[str, float | None]
     fit_percent: Mapping[str, float | None]
     inside: Mapping[str, float | None]
@@ -72,6 +73,11 @@ class Prediction:
     free_run: Predicted
     one_step: Predicted | None
     reason: str = ""
+
+    @property
+    def seconds(self) -> float:
+        """Length after the warm-up [s]."""
+        return len(self.t) * float(self.t[1] - self.t[0])
 
     def columns(self) -> dict[str, Array]:
         """Columns ``(n,)`` of a table of the prediction, with units in their names."""

@@ -46,23 +46,14 @@ friction, and intermittent model errors are taken for loads. With four horizons 
 SEARCHED = 100
 """Horizons after which a load that no filter has estimated counts as never estimated: its offset would last for minutes
 with a plan of seconds."""
-JUMP_SHARE = 0.05
-"""Standard deviation of the load's random walk per period in the jump filter. A load of 5 % of the drive's range is
-ordinary; a larger load takes a few periods."""
 FIRST_LOAD = 0.001
 """Initial standard deviation of the load, as a share of the input's range. It is small, because the load of a machine
 that sticks at rest is not observable, and its estimate would be wrong when the machine moves."""
-SCALES = (1.0, 3.0)
-"""Candidate factors on the model's one-period errors; the process noise is that of largest likelihood."""
 TUNED_PERIODS, TUNED_RECORDINGS = 500, 3
 """Number of periods and of training recordings in that likelihood."""
 DWELL_S, QUIET_S = 0.5, 1.0
 """A guard's shortest time in a mode, and the time without alarm before it switches back, in time constants of the
 machine."""
-PATIENCE_S = 0.8
-"""Time that an alarm must last before the backup takes over [time constants of the machine]. A push of 0.2 s causes
-alarms for up to 0.7 s, because of the monitor's windows and the observer. A backup that interprets the push as a
-heavier machine costs more than it saves (docs/results/guard.md)."""
 GAIN = "gain of "
 
 
@@ -176,7 +167,8 @@ def tuned_noise(
     def filter_of(scale: float) -> Filter:
         return make_estimator(model, scenario, scaled(scale), observer=observer)
 
-    return scaled(choose_most_likely(filter_of, parts, SCALES))
+    # factors on the model's one-period errors; the process noise is that of largest likelihood
+    return scaled(choose_most_likely(filter_of, parts, (1.0, 3.0)))
 
 
 def make_estimator(
@@ -231,8 +223,9 @@ def make_estimator(
     periods = round(FOUND_HORIZONS * control.horizon)
     quiet, slip = (quiet_shares(partial(filter_of, scale), periods, model.n_d) for scale in (1.0, SLIP))
     # else the slip filter would explain a lasting load by repeated slips, and never estimate it
+    # jump: a load of 5 % of the drive's range is ordinary, a larger one takes a few periods
     modes = (
-        filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, JUMP_SHARE)),
+        filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, 0.05)),
     )  # fmt: skip
     _check_found(modes, SEARCHED * control.horizon, Sizes(model, control).states)
     return SwitchingFilter(modes, SWITCHES)
@@ -511,9 +504,11 @@ def make_adaptive_guard(
         adaptive, len(groups), sigma_y=scenario.sensor_sigma, sigma_x=sigma_x, sigma_x0=first,
         sigma_d=QUIET_SHARE * span, sigma_d0=FIRST_LOAD * span,
     )  # fmt: skip
+    # 0.8 time constants: a push of 0.2 s causes alarms for up to 0.7 s, and a backup that takes the push for a heavier
+    # machine costs more than it saves (docs/results/guard.md)
     return Guard(
         Mode.BACKUP, Mode.REST, backup=backup, backup_estimator=estimator, dwell=DWELL_S * unit, quiet=QUIET_S * unit,
-        patience=PATIENCE_S * unit if patience is None else patience,
+        patience=0.8 * unit if patience is None else patience,
     )  # fmt: skip
 
 

@@ -47,7 +47,13 @@ SECONDS: Mapping[Validity, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Channel:
-    """A named reading: one number per period, with its unit; ``kind`` is a description."""
+    """A reading of the monitor: one number per period.
+
+    Args:
+        name: Its name.
+        unit: Its unit.
+        kind: Description. Default: none.
+    """
 
     name: str
     unit: str

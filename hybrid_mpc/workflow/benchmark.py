@@ -399,7 +399,7 @@ def _choice(
     recordings, evidence = evidence_of(runs)
     return recommend(
         found, samples=max(1, round(time_unit(training, dt) / dt)), recordings=recordings, evidence=evidence,
-        shrunk=of_kind,
+        shrunk=of_kind, rule=scenario.choice,
     )  # fmt: skip
 
 

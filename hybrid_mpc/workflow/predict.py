@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from hybrid_mpc.data.files import write_csv
@@ -13,32 +13,9 @@ from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.delay import lost_samples
-from hybrid_mpc.identify.predict import Predicted, Prediction, predict
+from hybrid_mpc.identify.predict import Prediction, predict
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.records import known
-
-
-@dataclass(frozen=True)
-class RunFigures:
-    """RMSE and FIT [%] by output, share of measurements within the band, and nominal coverage of the band."""
-
-    rmse: Mapping[str, float | None]
-    fit_percent: Mapping[str, float | None]
-    inside: Mapping[str, float | None]
-    share: float
-
-
-@dataclass(frozen=True)
-class RecordingFigures:
-    """A recording in ``predict.json``: length after the warm-up [s], figures of free run and one-step prediction, and
-    why one-step predictions are missing.
-    """
-
-    recording: str
-    seconds: float
-    free_run: RunFigures
-    one_step: RunFigures | None
-    reason: str
 
 
 def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory], list[str]]:
@@ -115,18 +92,13 @@ def predict_recordings(
         )
         save(figure, out / f"{name}.png")
         found.append(one)
-    figures = {"model": found[0].model, "recordings": [figures_of(one) for one in found]}
-    write_json(out / "predict.json", figures)
+    figures = [
+        {
+            "recording": one.name, "seconds": one.seconds, "free_run": one.free_run, "one_step": one.one_step,
+            "reason": one.reason,
+        }
+        for one in found
+    ]  # fmt: skip
+    write_json(out / "predict.json", {"model": found[0].model, "recordings": figures})
     say.finish("")
     return found
-
-
-def figures_of(one: Prediction) -> RecordingFigures:
-    """The numbers of a prediction."""
-
-    def of(run: Predicted) -> RunFigures:
-        return RunFigures(run.rmse, run.fit_percent, run.inside, run.share)
-
-    seconds = len(one.t) * float(one.t[1] - one.t[0])
-    step = None if one.one_step is None else of(one.one_step)
-    return RecordingFigures(one.name, seconds, of(one.free_run), step, one.reason)

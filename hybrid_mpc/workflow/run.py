@@ -10,7 +10,6 @@ from typing import Any
 from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError, named_extra, no_exit
-from hybrid_mpc.files import read_object
 from hybrid_mpc.folder import open_folder
 from hybrid_mpc.records import known
 from hybrid_mpc.scenario import load_scenario
@@ -126,7 +125,7 @@ def run(
                 if not said and stage.name not in without:
                     took[stage.name] = time.monotonic() - begun
                 context.progress.finish(said)
-    return read_results(read_object(out / "results.json"), str(out / "results.json"))
+    return read_results(out / "results.json")
 
 
 def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:

@@ -41,7 +41,12 @@ CONTEXT = "hybrid_mpc.workflow.context"
 
 @dataclass(frozen=True)
 class Absent:
-    """Why a stage has no result: it failed, the scenario does not allow it, or the user left it out."""
+    """A stage without a result: it failed, the scenario does not allow it, or the user left it out.
+
+    Args:
+        reason: Why there is no result.
+        failed: Whether the stage failed. Default: False.
+    """
 
     reason: str
     failed: bool = False
@@ -54,7 +59,8 @@ class Stage(Generic[R]):
     Args:
         name: Name of the stage and of its file.
         title: Text for the terminal.
-        result: Frozen dataclass of the result. A field ``arrays`` holds arrays by name, all other fields plain data.
+        result: Frozen dataclass of the result. A field ``arrays`` (:func:`~hybrid_mpc.records.beside`) holds arrays by
+            name, all other fields plain data.
         compute: Computes the result, or says why there is none.
         reads: Inputs besides other stages, by name. ``UNKNOWN`` counts as changed.
         needs: Stages whose results it reads. Default: none.
@@ -170,8 +176,7 @@ def write_stage(path: Path, stage: Stage[R], keys: Mapping[str, str], result: R 
         write_document(path, plain(_File(keys, result, {}, content)))
         return Stored(keys, result, content)
     arrays = dict(getattr(result, "arrays", {})) if _has_arrays(stage) else None
-    values = plain(replace(result, arrays={}) if arrays else result)  # type: ignore[type-var]
-    values.pop("arrays", None)
+    values = plain(result)
     content = digest([values, {name: _digest_of_array(a) for name, a in sorted((arrays or {}).items())}])
     write_document(path, plain(_File(keys, None, values, content)), arrays)
     return Stored(keys, result, content)
@@ -191,9 +196,7 @@ def read_stage(path: Path, stage: Stage[R], remedy: str) -> Stored[R]:
     if held.absent is not None:
         return Stored(held.keys, held.absent, held.content)
     try:
-        result = record(
-            stage.result, {**held.result, **({"arrays": {}} if _has_arrays(stage) else {})}, path.name
-        )
+        result = record(stage.result, held.result, path.name)
     except InputError as error:
         return _unfit(error)
     if _has_arrays(stage):

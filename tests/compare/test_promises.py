@@ -1,6 +1,5 @@
 """What a kit promises: each promise is shown on a good loop, and broken on purpose once, and the table says so."""
 
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -31,6 +30,7 @@ from hybrid_mpc.compare import promises as p
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.control.soft import HardBound
 from hybrid_mpc.kit.promises import PROMISES, PromiseTable, read_promises, write_promises
+from hybrid_mpc.workflow.stages.results import read_results
 
 LEVEL, VALVE = Signal("level", "m", -5.0, 5.0), Signal("valve", "m/s", -1.0, 1.0)
 
@@ -334,12 +334,10 @@ def test_a_damaged_table_is_refused(artifact, change):
 
 
 def test_a_run_leaves_its_table_in_the_model_s_folder_on_the_page_and_on_the_terminal(finished):
-    kit, results = load(finished), json.loads((finished / "results.json").read_text())
+    kit, results = load(finished), read_results(finished / "results.json")
     rows = kit.promises
     assert len(rows) >= 9
-    assert results["promises"]["rows"] == [
-        {"name": r.name, "verdict": r.verdict, "evidence": r.evidence, "remedy": r.remedy} for r in rows
-    ]
+    assert results.promises.rows == rows
     assert read_promises(finished / "model").of == kit.identity
     page = (finished / "report.html").read_text()
     table, told = page.index("What this kit promises</h2>"), (finished.parent / "told.txt").read_text()

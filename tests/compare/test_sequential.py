@@ -12,7 +12,6 @@ from hybrid_mpc.cli.run import comparison_lines
 from hybrid_mpc.compare.sequential import SAME, Comparison, compare_costs, looks
 from hybrid_mpc.compare.summary import interval, summaries
 from hybrid_mpc.workflow.stages.compare import comparisons, decided
-from hybrid_mpc.workflow.stages.results import Control, ControlDetails, ControllerCosts
 
 
 @pytest.mark.parametrize("most", range(1, 40))
@@ -78,18 +77,15 @@ def test_what_is_decided():
 
 
 def test_the_terminal_names_the_baseline_that_the_hybrid_does_least_well_against():
-    none = ControllerCosts(1.0, {})
     own = {"prior": Comparison(0.5, 0.4, 0.6, 6), "prior_observer": Comparison(0.8, 0.7, 0.9, 6)}
     none_of_it = Comparison(None, None, None, 6, "a loop diverged: the baseline's")
     lost = {"prior": none_of_it, "prior_observer": own["prior"]}
     both = {"prior": none_of_it, "prior_observer": none_of_it}
-    details = ControlDetails({}, {}, {"track": own, "stroke": lost, "push": both}, most_seeds=6)
-    assert comparison_lines(Control(none, none, none, 0.5, details=details)) == [
+    assert comparison_lines({"track": own, "stroke": lost, "push": both}) == [
         "track: hybrid_observer / prior_observer 0.8 (0.7 to 0.9), 6 seeds: cheaper",
         "stroke: hybrid_observer / prior_observer 0.5 (0.4 to 0.6), 6 seeds: cheaper",
         "push: hybrid_observer / prior – (a loop diverged: the baseline's), 6 seeds: undecided",
     ]
-    assert comparison_lines(Control(none, none, none, 0.5)) == []
 
 
 def test_costs_without_a_ratio_are_told_and_decide_nothing():

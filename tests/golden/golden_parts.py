@@ -531,31 +531,6 @@ def run_real_time(m):
     return found, counts | {"sources": sources, "stopped": report.stopped}
 
 
-# ---- results.json
-
-
-def key_lines(value):
-    """The keys of results: a line ``path: types`` a path; lists by the types of their elements."""
-    found = {}
-
-    def walk(path, value):
-        kinds = found.setdefault(path, set())
-        if isinstance(value, dict):
-            kinds.add("object")
-            for name, inner in value.items():
-                walk(f"{path}.{name}" if path else name, inner)
-        elif isinstance(value, list):
-            kinds.add("list")
-            for inner in value:
-                walk(f"{path}[]", inner)
-        else:
-            names = {bool: "flag", int: "number", float: "number", str: "text", type(None): "null"}
-            kinds.add(names[type(value)])
-
-    walk("", value)
-    return sorted(f"{path}: {' or '.join(sorted(kinds))}" for path, kinds in found.items() if path)
-
-
 # ---- comparison
 
 

@@ -3,7 +3,6 @@
 make_golden.py freeze MACHINE RUN     the folder MACHINE from the folder of a finished hybrid-mpc run
 make_golden.py arrays MACHINE [FILE]  arrays.npz and loops.json: replays, kernels and closed loops
 make_golden.py costs MACHINE [FILE]   costs.json: ten seeds of every closed loop
-make_golden.py keys RUN               results_keys.txt
 make_golden.py compare FILE FILE      largest differences between two arrays.npz
 """
 
@@ -255,12 +254,6 @@ def make_costs(name, target=None):
     target.write_text(json.dumps(found, indent=1) + "\n")
 
 
-def make_keys(run):
-    """Keys of a run's results, and the schema."""
-    results = json.loads((Path(run) / "results.json").read_text())
-    (HERE / "results_keys.txt").write_text("\n".join(parts.key_lines(results)) + "\n")
-
-
 def compare(first, second):
     """Largest difference of every array, as a share of its largest value."""
     a, b = (np.load(path, allow_pickle=False) for path in (first, second))
@@ -298,7 +291,7 @@ def commit():
 
 
 COMMANDS = {
-    "freeze": freeze, "arrays": make_arrays, "costs": make_costs, "keys": make_keys,
+    "freeze": freeze, "arrays": make_arrays, "costs": make_costs,
     "compare": compare,
 }  # fmt: skip
 

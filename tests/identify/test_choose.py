@@ -1,11 +1,13 @@
 """Do no harm: a hybrid is recommended where it surely beats the prior, and nowhere else."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 
-from hybrid_mpc import InputError
+from hybrid_mpc import ChoiceRule, InputError
 from hybrid_mpc.identify.choose import CandidateFigures, evidence_of, recommend
 
 
@@ -297,3 +299,30 @@ def test_the_hybrid_that_is_exported_is_the_recommended_one():
     assert (asked.recommended, asked.hybrid) == ("phy", "pgrnn")
     none = recommend({"phy": prior, "pgrnn": [1.1 * r for r in prior], "mopgrnn": unsure}, recordings=of)
     assert (none.recommended, none.hybrid) == ("phy", "mopgrnn")
+
+
+def test_a_rule_asks_for_more_evidence_for_fewer_recordings_and_for_other_shares():
+    """Mean log ratio -0.25, standard error 0.1: beyond Student's 95 % point (2.13), not beyond that of 99 % (3.75)."""
+    rng = np.random.default_rng(0)
+    logs = rng.standard_normal(5)
+    logs = (logs - logs.mean()) / logs.std(ddof=1) * 0.1 * math.sqrt(5) - 0.25
+    prior = [np.ones(100) for _ in logs]
+    errors = {"phy": prior, "pgrnn": [np.full(100, math.exp(2 * v)) for v in logs]}
+    names = [f"file{i}" for i in range(5)]
+
+    def upper(**rule):
+        found = recommend(errors, recordings=names, rule=ChoiceRule(**rule))
+        return found.candidates["pgrnn"].upper, found.recommended
+
+    assert upper(confidence=0.95)[1] == "pgrnn"
+    assert upper(confidence=0.99)[1] == "phy"
+    assert upper(confidence=0.95)[0] == pytest.approx(math.exp(-0.25 + student.ppf(0.95, 4) * 0.1))
+    assert math.isinf(upper(fewest=6)[0])
+    asked = []
+    recommend(
+        errors, recordings=names, rule=ChoiceRule(confidence=0.99, shares=(0.3,)),
+        shrunk=lambda name, share: asked.append(share) or errors[name],
+    )  # fmt: skip
+    assert asked == [0.3]
+    with pytest.raises(InputError, match="HM-RECORDS-007"):
+        ChoiceRule(confidence=1.0)

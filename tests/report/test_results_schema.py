@@ -1,236 +1,92 @@
-"""The schema of results.json names the key that is wrong."""
+"""results.json holds the stages' dataclasses; what does not fit is refused by name, and the page lists all keys."""
 
-import copy
-import dataclasses
 import json
-import math
-import re
-import typing
+import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.workflow.stages.results import Results, read_results
+from hybrid_mpc.records import plain
+from hybrid_mpc.workflow.run import STAGES
+from hybrid_mpc.workflow.stage import Absent
+from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, read_results, write_results
 
-PAGE = Path(__file__).parents[2] / "docs" / "results-schema.md"
-
-PER_MODEL = {"phy_nominal": 1.0, "phy": 0.2, "rnn": 0.4, "pgrnn": 0.17, "mopgrnn": 0.15}
-RESULTS = {
-    "schema_version": 11,
-    "scenario": "golf_robot",
-    "seed": 0,
-    "budget": "quick",
-    "versions": {"python": "3.11.9", "numpy": "2.1.0"},
-    "data": {
-        "files": ["a.csv"],
-        "hash": "sha256:00ff",
-        "cuts": [{"file": "a.csv", "start_s": 1.0, "end_s": 1.5}],
-        "details": {"seconds": {"train": 30.0}, "why_cut": ["a gap"], "warnings": []},
-    },
-    "identification": {
-        "error": dict(PER_MODEL),
-        "rmse": {name: {"phi [rad]": value} for name, value in PER_MODEL.items()},
-        "fit_percent": {name: {"phi [rad]": 100 - value} for name, value in PER_MODEL.items()},
-        "e_sim": dict(PER_MODEL),
-        "balance_violation": {name: {"energy [W]": value} for name, value in PER_MODEL.items()},
-        "details": {
-            "prior_parameters": {
-                "values": {"m": 1.0},
-                "standard_errors": {},
-                "nominal": {"m": 1.0},
-                "warnings": [],
-                "stages": [],
-            },
-            "scores_of_all_networks": {},
-            "by_file": {},
-            "smoother": {"sigma": [0.1], "walk": [1.0]},
-            "hybrid_over_phy": {"error": 0.75, "e_sim": 0.8},
-            "choice": {
-                "recommended": "mopgrnn",
-                "hybrid": "mopgrnn",
-                "reason": "mopgrnn is recommended.",
-                "candidates": {"phy": {"error": 0.2, "ratio": 1.0, "upper": 1.0, "share": 1.0}},
-            },
-            "bands": {
-                "phy": {
-                    "share": 0.9,
-                    "coverage": 0.88,
-                    "width": {"phi [rad]": 0.1},
-                    "score": {"phi [rad]": 0.2},
-                    "score_of_constant": {"phi [rad]": 0.25},
-                }
-            },
-            "baselines": {
-                "ARX": {
-                    "errors": {
-                        "error": 0.4,
-                        "rmse": {"phi [rad]": 0.3},
-                        "fit_percent": {"phi [rad]": 60.0},
-                    },
-                    "chosen": "order 2",
-                },
-                "N4SID": {"reason": "too short"},
-            },
-        },
-    },
-    "export": {"parity_max_abs_error": 2e-16, "jacobian_max_abs_error": 1e-15},
-    "control": {
-        "prior": {"cost": 3.0, "tracking_rmse": {"phi [rad]": 0.1}},
-        "hybrid": {"cost": 2.0, "tracking_rmse": {"phi [rad]": 0.05}},
-        "oracle": {"cost": 1.5, "tracking_rmse": {"phi [rad]": 0.04}},
-        "gap_closed": 0.67,
-    },
-    "on_model": {
-        "plants": {"prior_observer": "hybrid"},
-        "left_out": {"hybrid_observer": "one network was trained"},
-        "default_tasks": True,
-    },
-    "estimation": {
-        name: {
-            "mean_nis": 1.2,
-            "nis_low": 0.9,
-            "nis_high": 1.1,
-            "nis_inside": 0.93,
-            "ljung_box": 44.0,
-            "ljung_box_limit": 31.4,
-            "samples": 900,
-        }
-        for name in ("prior_observer", "hybrid_observer")
-    },
-    "promises": {
-        "rows": [
-            {"name": "horizon", "verdict": "shown", "evidence": "it holds 99 % of the cost", "remedy": ""}
-        ]
-    },
-    "timing": {
-        "controller_step_ms": {"median": 2.0, "p95": 3.0, "p99": 4.0, "max": 9.0},
-        "period_ms": 20.0,
-        "misses": 0,
-    },
-    "watch": {
-        "kind": "energy",
-        "wanted_per_hour": 2.0,
-        "hours": 0.05,
-        "false_alarms_per_hour": 0.0,
-        "alarms": [
-            {"file": "a", "start_s": 1.0, "end_s": 2.0, "channels": ["force of phi"], "diagnosis": ""}
-        ],
-        "faults": [
-            {
-                "fault": "friction",
-                "title": "friction doubles",
-                "task": "sine",
-                "start_s": 3.0,
-                "delay_s": None,
-                "channels": [],
-                "diagnosis": "",
-                "false_alarms": 0,
-                "switches": [],
-            }
-        ],
-        "details": {"sources": {"energy": "loops"}, "limits": {}, "clean": None},
-    },
-    "analysis": {"eigenvalues": [[0.99, 0.01]], "stabilisable": True, "detectable": True},
-}
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "tests" / "golden" / "results.json"
+SCHEMA = runpy.run_path(str(ROOT / "docs" / "site" / "results_schema.py"))
 
 
-def put(path, value):
-    results = copy.deepcopy(RESULTS)
-    *groups, key = path.split(".")
-    place = results
-    for group in groups:
-        place = place[group]
-    place[key] = value
-    return results
+@pytest.fixture
+def changed(tmp_path):
+    """Reads the demo's results after a change of the document."""
 
-
-def leaves(values=RESULTS, prefix=""):
-    for key, inner in values.items():
-        if (
-            isinstance(inner, dict)
-            and not set(inner) & {"phy", "python", "phi [rad]", "energy [W]"}
-            and key != "details"
-        ):
-            yield from leaves(inner, f"{prefix}{key}.")
+    def read(path, value):
+        document = json.loads(RESULTS.read_text())
+        *groups, key = path.split(".")
+        place = document
+        for group in groups:
+            place = place[group]
+        if value is None:
+            del place[key]
         else:
-            yield prefix + key
+            place[key] = value
+        file = tmp_path / "results.json"
+        file.write_text(json.dumps(document))
+        return read_results(file)
+
+    return read
 
 
-DEFAULTS = (
-    "on_model.",
-    "estimation.",
-    "promises.",
-    "timing.controller_step_ms.",
-    "watch.",
-    "analysis.",
-)
-"""Groups whose values may be left out."""
-
-
-def test_complete_results_are_read_and_written_back():
+def test_results_are_read_and_written_back(tmp_path):
     results = read_results(RESULTS)
-    assert results == read_results(json.loads(json.dumps(results.plain())))
-    again = results.plain()
-    assert set(leaves(RESULTS)) <= set(leaves(again))
+    write_results(tmp_path / "again.json", results)
+    assert (tmp_path / "again.json").read_text() == RESULTS.read_text()
+    assert read_results(tmp_path / "again.json") == results
 
 
-@pytest.mark.parametrize("path", [path for path in leaves() if not path.startswith(DEFAULTS)])
-def test_a_missing_key_is_named(path):
-    results = copy.deepcopy(RESULTS)
-    *groups, key = path.split(".")
-    place = results
-    for group in groups:
-        place = place[group]
-    del place[key]
-    with pytest.raises(InputError, match=f"{key} is missing"):
-        read_results(results)
+def test_a_stage_s_object_is_that_of_its_checkpoint():
+    """Every stage is in it that finds something, with the fields of its result alone; arrays are not."""
+    document = json.loads(RESULTS.read_text())
+    named = {stage.name: stage for stage in SHOWN}
+    assert {stage.name for stage in STAGES} - set(named) == {"tasks", "report"}
+    for name, stage in named.items():
+        keys = set(document[name])
+        assert keys in ({"reason", "failed"}, set(SCHEMA["fields_of"](stage.result))), name
+    assert "arrays" not in RESULTS.read_text()
 
 
-@pytest.mark.parametrize("path", list(leaves()))
-def test_a_wrong_kind_is_named(path):
-    with pytest.raises(InputError, match=rf"results: (.*; )?{path}: .*needed"):
-        read_results(put(path, object()))
+def test_a_stage_without_a_result_has_its_reason(changed):
+    found = changed("watch", plain(Absent("no plant", failed=True)))
+    assert found.watch == Absent("no plant", failed=True)
+    assert replace(found, watch=read_results(RESULTS).watch) == read_results(RESULTS)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, True, -math.inf])
-def test_only_finite_numbers_are_errors_of_a_model(value):
-    with pytest.raises(InputError, match=r"identification\.e_sim\.phy"):
-        read_results(put("identification.e_sim", PER_MODEL | {"phy": value}))
+@pytest.mark.parametrize(
+    "path", ["data.hash", "prior.fit", "evaluation.scores", "control.step_ms.p99", "seed"]
+)
+def test_what_is_missing_unknown_or_of_a_wrong_kind_is_named(changed, path):
+    with pytest.raises(InputError, match=f"{path.split('.')[-1]} is missing.*HM-RECORDS-003"):
+        changed(path, None)
+    with pytest.raises(InputError, match=r"HM-RECORDS-0(06|02|12)"):
+        changed(path, [])
+    with pytest.raises(InputError, match=r"HM-RECORDS-011"):
+        changed(f"{path}_", 3)
 
 
-def test_null_needs_a_reason():
-    with pytest.raises(InputError, match=r"control.*gap_closed.*HM-WORKFLOW-041"):
-        read_results(put("control.gap_closed", None))
-    results = put("control.gap_closed", None)
-    results["control"]["gap_closed_reason"] = "no oracle"
-    assert read_results(results).control.gap_closed_reason == "no oracle"
+@pytest.mark.parametrize("version", [11, SCHEMA_VERSION + 1, "12", [1]])
+def test_another_version_is_refused_with_what_to_do(changed, version):
+    with pytest.raises(InputError, match=r"--resume.*HM-WORKFLOW-040"):
+        changed("schema_version", version)
 
 
-def test_another_version_and_unknown_keys_are_refused():
-    with pytest.raises(InputError, match=r"11.*HM-WORKFLOW-040"):
-        read_results(put("schema_version", 4))
-    with pytest.raises(InputError, match=r"field.*'programs'.*HM-RECORDS-011"):
-        read_results(put("export.programs", 3))
-
-
-def test_an_interval_that_ends_before_it_starts_is_refused():
+def test_an_alarm_that_ends_before_it_starts_is_refused(changed):
+    wrong = [{"file": "a.csv", "start_s": 2.0, "end_s": 1.0}]
     with pytest.raises(InputError, match="HM-WORKFLOW-043"):
-        read_results(put("watch.alarms", [{"file": "a.csv", "start_s": 2.0, "end_s": 1.0}]))
+        changed("watch.alarms", wrong)
 
 
-def keys_of(kind):
-    """Keys of an object and of the objects in it; lists, reasons and details are said in a sentence each."""
-    found = set()
-    for name, hint in typing.get_type_hints(kind).items():
-        if not name.endswith("reason") and name != "details":
-            inner = [t for t in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(t)]
-            found |= {name}.union(*(keys_of(t) for t in inner if typing.get_origin(hint) is not tuple))
-    return found
-
-
-def test_the_page_names_the_keys_that_the_dataclasses_have():
-    lines = [line for line in PAGE.read_text().splitlines() if line.startswith("|")]
-    page = {key for line in lines for key in re.findall(r"`([a-z_0-9]+)`", line.split("|")[1])} - {"details"}
-    assert page - keys_of(Results) == set()
-    assert keys_of(Results) - page == {"median", "p95", "p99", "max"}  # in the line of controller_step_ms
+def test_the_page_is_made_of_the_dataclasses():
+    """``python docs/site/results_schema.py > docs/results-schema.md`` writes it."""
+    assert (ROOT / "docs" / "results-schema.md").read_text() == SCHEMA["page"]()

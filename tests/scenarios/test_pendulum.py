@@ -1,4 +1,3 @@
-import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -229,10 +228,9 @@ def test_the_whole_job(tmp_path):
     command = [sys.executable, "-m", "hybrid_mpc.cli", "run", "pendulum", "--out", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1500)
     assert done.returncode == 0, done.stdout + done.stderr
-    results = json.loads((tmp_path / "run" / "results.json").read_text())
-    read_results(results)
-    assert results["export"]["parity_max_abs_error"] <= 1e-12
-    error, control = results["identification"]["error"], results["control"]
+    results = read_results(tmp_path / "run" / "results.json")
+    assert results.export.parity_max_abs_error <= 1e-12
+    error = {name: scores.model.error for name, scores in results.evaluation.scores.items()}
     assert error["phy"] == error["phy_nominal"]  # the prior is not fitted
     assert error["mopgrnn"] < 0.1 * error["phy"]  # docs/results/simulated_machines.md: 0.01 of the prior's
-    assert control["hybrid"]["cost"] < 0.5 * control["prior"]["cost"]
+    assert results.control.cost("hybrid_observer") < 0.5 * results.control.cost("prior_observer")

@@ -44,7 +44,7 @@ def model():
     from hybrid_mpc import PriorStep, model_info, trace_model
     from hybrid_mpc.kit.artifact import build_model
 
-    values = json.loads(PRIOR.read_text())["identification"]["details"]["prior_parameters"]["values"]
+    values = json.loads(PRIOR.read_text())["parameters"]
     prior = scenario.prior(values)
     step = PriorStep(prior, scenario.data.dt).requires_grad_(False)
     programs = {f"prior/{name}": program for name, program in trace_model(step).items()}

@@ -1,25 +1,49 @@
 """The first screen of a report: each answer follows from the run's figures, and turns where one of them is bad."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from hybrid_mpc import Promise
-from hybrid_mpc.files import read_object
 from hybrid_mpc.report.page import Report, render
+from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.answers import answer_all, controller_answer, model_answer, monitor_answer
 from hybrid_mpc.workflow.stages.report import oracle_words
 from hybrid_mpc.workflow.stages.results import Results, read_results
 from hybrid_mpc.workflow.stages.watch import CleanAlarms
 
-PATH = Path(__file__).parents[2] / "docs/results/golf_robot_quick.json"
+PATH = Path(__file__).parents[1] / "golden" / "results.json"
 
 
 @pytest.fixture(scope="module")
 def results() -> Results:
-    found = read_results(read_object(PATH), str(PATH))
-    return replace(found, timing=replace(found.timing, misses=0))
+    return steps(read_results(PATH), misses=0)
+
+
+def steps(results, **change):
+    return with_control(results, step_ms=replace(results.control.step_ms, **change))
+
+
+def with_control(results, **change):
+    return replace(results, control=replace(results.control, **change))
+
+
+def with_loops(results, task, name, **change):
+    """The results where all loops of a task and controller have other figures."""
+    rows = [
+        replace(row, **change) if (row.task, row.controller) == (task, name) else row
+        for row in results.control.rows
+    ]
+    return with_control(results, rows=tuple(rows))
+
+
+def with_scores(results, name, **change):
+    found = results.evaluation
+    own = found.scores[name]
+    scores = {**found.scores, name: replace(own, model=replace(own.model, **change))}
+    return replace(results, evaluation=replace(found, scores=scores))
 
 
 def lines(answer):
@@ -29,8 +53,7 @@ def lines(answer):
 def test_a_good_run_is_answered_with_its_figures(results):
     model, controller, monitor = answer_all(results)
     assert [one.verdict for one in (model, controller, monitor)] == ["good", "good", "good"]
-    name = results.identification.details.choice.recommended
-    (error,) = results.identification.rmse[name].values()
+    (error,) = results.evaluation.scores[results.choice.choice.recommended].model.rmse.values()
     assert f"{error:.3g} rad" in lines(model)
     assert "the period is 20 ms" in lines(controller)
     found = results.watch.faults
@@ -38,26 +61,26 @@ def test_a_good_run_is_answered_with_its_figures(results):
 
 
 def test_a_model_is_in_doubt_weak_or_diverged(results):
-    found = results.identification
-    name, details = found.details.choice.recommended, found.details
-    doubt = replace(details, prior_parameters=replace(details.prior_parameters, in_doubt=("a sign",)))
-    assert model_answer(replace(found, details=doubt)).verdict == "bad"
-    weak = replace(found, fit_percent={**found.fit_percent, name: {"phi [rad]": 41.0}})
-    assert (model_answer(weak).verdict, model_answer(weak).short) == ("bad", "Weak")
-    gone = replace(found, fit_percent={**found.fit_percent, name: None}, rmse={**found.rmse, name: None})
-    assert model_answer(gone).verdict == "bad"
+    name = results.choice.choice.recommended
+    doubt = replace(results, prior=replace(results.prior, in_doubt=("a sign",)))
+    assert model_answer(doubt).verdict == "bad"
+    weak = model_answer(with_scores(results, name, fit_percent={"phi [rad]": 41.0}))
+    assert (weak.verdict, weak.short) == ("bad", "Weak")
+    gone = model_answer(
+        with_scores(results, name, fit_percent={"phi [rad]": -math.inf}, rmse={"phi [rad]": math.inf})
+    )
+    assert gone.verdict == "bad"
+    assert "phi: a free run diverged; the fitted prior has 0.0154 rad." in gone.lines
 
 
 def test_a_controller_is_in_doubt_where_a_limit_is_passed_a_step_late_or_a_promise_open(results):
-    late = replace(results, timing=replace(results.timing, misses=3))
-    assert controller_answer(late).verdict == "bad"
-    control = results.control
-    task, cells = next(iter(control.details.tasks.items()))
-    for change in ({"limits": {"u": 1.04}}, {"sources": {"MPC": 0.9}}):
-        name = "hybrid_observer"
-        own = {**control.details.tasks, task: {**cells, name: replace(cells[name], **change)}}
-        wrong = replace(results, control=replace(control, details=replace(control.details, tasks=own)))
-        assert controller_answer(wrong).verdict == "bad", change
+    assert controller_answer(steps(results, misses=3)).verdict == "bad"
+    task = results.control.rows[0].task
+    sources = dict.fromkeys(results.control.rows[0].sources, 0.0) | {"MPC": 0.9}
+    for change in ({"limits": {"u": 1.04}}, {"sources": sources}):
+        assert controller_answer(with_loops(results, task, "hybrid_observer", **change)).verdict == "bad", (
+            change
+        )
     for name, verdict in (("no offset", "bad"), ("innovations", "good")):
         rows = (
             Promise(name, "not promised", "it was not examined"),
@@ -68,23 +91,31 @@ def test_a_controller_is_in_doubt_where_a_limit_is_passed_a_step_late_or_a_promi
         assert f"1 of 2 are shown. Open: {name} (not promised)" in lines(controller_answer(open_))
 
 
-def test_without_a_loop_nothing_is_said_to_be_safe(results):
-    none = replace(
-        results.control, details=None, gap_closed=None, gap_closed_reason="the scenario has no plant"
+@pytest.mark.parametrize("why", ["no loop", "no stage"])
+def test_without_a_loop_nothing_is_said_to_be_safe(results, why):
+    none = (
+        replace(results.control, rows=(), reason="the scenario has no plant")
+        if why == "no loop"
+        else Absent("the scenario has no plant")
     )
-    assert controller_answer(replace(results, control=none)).verdict == "plain"
+    answer = controller_answer(replace(results, control=none))
+    assert answer.verdict == "plain"
+    assert "Closed loops: the scenario has no plant." in answer.lines
 
 
 def test_a_monitor_is_judged_by_its_false_alarms_and_by_the_faults_that_it_finds(results):
     found = results.watch
-    noisy = replace(found, details=replace(found.details, clean=CleanAlarms(250.0, 4)))
+    noisy = replace(found, clean=CleanAlarms(250.0, 4))
     assert monitor_answer(noisy).verdict == "bad"
     blind = replace(found, faults=(replace(found.faults[0], delay_s=None), *found.faults[1:]))
     assert monitor_answer(blind).verdict == "bad"
     assert f"Not detected: {found.faults[0].title}" in lines(monitor_answer(blind))
     none = replace(found, faults=None, faults_reason="the scenario has no plant")
     assert monitor_answer(none).verdict == "plain"
-    assert monitor_answer(replace(found, alarms=None, reason="too little data")).short == "Not examined"
+    assert "No faults were simulated: the scenario has no plant." in monitor_answer(none).lines
+    for short in (replace(found, watch={}, reason="too little data"), Absent("too little data")):
+        assert monitor_answer(short).short == "Not examined"
+        assert "too little data." in monitor_answer(short).lines
 
 
 def test_the_answers_come_first_on_the_page_and_hints_after_them(results):
@@ -95,12 +126,9 @@ def test_the_answers_come_first_on_the_page_and_hints_after_them(results):
 
 
 def test_an_oracle_that_is_beaten_is_explained(results):
-    control = results.control
-    task, cells = next(iter(control.details.tasks.items()))
-    dear = replace(cells["oracle"], cost=replace(cells["oracle"].cost, mean=1e9))
-    tasks = {**control.details.tasks, task: {**cells, "oracle": dear}}
-    (said,) = oracle_words(replace(control, details=replace(control.details, tasks=tasks)))
+    task = results.control.rows[0].task
+    (said,) = oracle_words(with_loops(results, task, "oracle", cost=1e9).control)
     assert task in said
-    cheap = replace(cells["oracle"], cost=replace(cells["oracle"].cost, mean=0.0))
-    all_cheap = {name: {**own, "oracle": cheap} for name, own in control.details.tasks.items()}
-    assert oracle_words(replace(control, details=replace(control.details, tasks=all_cheap))) == ()
+    for name in results.control.means:
+        results = with_loops(results, name, "oracle", cost=0.0)
+    assert oracle_words(results.control) == ()

@@ -26,8 +26,15 @@ from hybrid_mpc.compare.summary import by_task, interval, summaries
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stages import compare as stage
-from hybrid_mpc.workflow.stages.compare import TIMED, _seeds, compare, control_stage, parts_of, run_specs
-from hybrid_mpc.workflow.stages.results import gap_closed
+from hybrid_mpc.workflow.stages.compare import (
+    TIMED,
+    _seeds,
+    compare,
+    control_stage,
+    gap_closed,
+    parts_of,
+    run_specs,
+)
 
 GOLF = load_scenario("golf_robot")
 SIGNALS = SimpleNamespace(
@@ -244,7 +251,7 @@ def test_loops_leave_the_limits_in_the_artifact_and_do_not_depend_on_them(run_fo
     out = shutil.copytree(run_folder, tmp_path / "run")
     context = Context(RunSettings("golf_robot", budget="quick"), GOLF, out)
     learned = load(out).limits("hybrid")
-    spec = LoopSpec("golf_robot", MODEL, "track_sine", "hybrid_observer", duration=0.5)
+    spec = LoopSpec("golf_robot", MODEL, "track_sine", "hybrid_observer", duration=0.5, keep=("step_ms",))
     monkeypatch.setattr(type(context), "read", lambda self, stage: None)
     monkeypatch.setattr(stage, "compare", lambda context: run_specs("golf_robot", out / "model", [spec]))
     found = []

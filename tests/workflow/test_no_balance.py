@@ -1,6 +1,5 @@
 """A machine that is no pendulum: heat in two bodies, two outputs of other units, no balance."""
 
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -78,24 +77,21 @@ def bodies(jobs_here, tmp_path_factory):
 
 def test_every_output_has_its_figures_and_there_is_no_mopgrnn(bodies):
     out, told = bodies
-    results = json.loads((out / "results.json").read_text())
-    read_results(results)
-    found = results["identification"]
-    for name in ("phy_nominal", "phy", "rnn", "pgrnn"):
-        assert set(found["rmse"][name]) == set(found["fit_percent"][name]) == {"cold [degC]", "sensor [mV]"}
-        assert found["balance_violation"][name] == {}
-    assert found["fit_percent"]["phy"]["cold [degC]"] > 90
-    for key in ("error", "rmse", "fit_percent", "e_sim", "balance_violation"):
-        assert found[key]["mopgrnn"] is None
-        assert "no balance" in found[key]["mopgrnn_reason"]
-    assert set(found["details"]["choice"]["candidates"]) == {"phy", "pgrnn"}
-    assert set(found["details"]["bands"]["phy"]["width"]) == {"cold [degC]", "sensor [mV]"}
+    results = read_results(out / "results.json")
+    found = {name: scores.model for name, scores in results.evaluation.scores.items()}
+    assert set(found) == {"phy_nominal", "phy", "rnn", "pgrnn"}
+    for scores in found.values():
+        assert set(scores.rmse) == set(scores.fit_percent) == {"cold [degC]", "sensor [mV]"}
+        assert scores.violation == {}
+    assert found["phy"].fit_percent["cold [degC]"] > 90
+    assert set(results.choice.choice.candidates) == {"phy", "pgrnn"}
+    assert set(results.evaluation.bands["phy"].width) == {"cold [degC]", "sensor [mV]"}
     for words in ("RMSE cold [degC]", "RMSE sensor [mV]", "ARX", "N4SID"):
         assert words in told
     assert "mopgrnn" not in told
     # what models are compared by is over the outputs' spreads: neither unit rules it
-    shares = [1 - fit / 100 for fit in found["fit_percent"]["phy"].values()]
-    assert found["error"]["phy"] == pytest.approx(
+    shares = [1 - fit / 100 for fit in found["phy"].fit_percent.values()]
+    assert found["phy"].error == pytest.approx(
         np.sqrt(np.mean(np.square(shares))), rel=0.5
     )  # of training data
 
@@ -132,8 +128,8 @@ def test_a_share_of_the_correction_goes_into_all_that_follows(bodies, jobs_here,
     words = ("--data", whole.parent / "run.csv", *SKIPPED, "--out", out, "--resume", "--deploy", "pgrnn")
     done = CliRunner().invoke(app, [*map(str, ("run", whole.parent / "bodies.py", *words))])
     assert done.exit_code == 0, done.output
-    before, after = (json.loads((f / "results.json").read_text())["identification"] for f in (whole, out))
-    assert after["details"]["choice"]["candidates"]["pgrnn"]["share"] == 0.5
+    before, after = (read_results(f / "results.json") for f in (whole, out))
+    assert after.choice.choice.candidates["pgrnn"].share == 0.5
     scenario = load_scenario(str(whole.parent / "bodies.py"))
     context = Context(RunSettings(scenario.name, (whole.parent / "run.csv",), 0), scenario, out)
     phy = scenario.prior(context.prior.fit.values)
@@ -143,11 +139,15 @@ def test_a_share_of_the_correction_goes_into_all_that_follows(bodies, jobs_here,
         score(runs_of(context, "pgrnn", phy, test, share=share)[0], phy, smoother.sizes.y).error
         for share in (1.0, 0.5)
     ]
-    assert [before["error"]["pgrnn"], after["error"]["pgrnn"]] == pytest.approx(of_share, rel=1e-9)
+    found, phys = (
+        [results.evaluation.scores[name].model.error for results in (before, after)]
+        for name in ("pgrnn", "phy")
+    )
+    assert found == pytest.approx(of_share, rel=1e-9)
     assert of_share[0] != pytest.approx(of_share[1], rel=1e-3)
-    bands = [found["details"]["bands"]["pgrnn"]["width"]["cold [degC]"] for found in (before, after)]
+    bands = [results.evaluation.bands["pgrnn"].width["cold [degC]"] for results in (before, after)]
     assert bands[0] != pytest.approx(bands[1], rel=1e-3)
-    assert before["error"]["phy"] == after["error"]["phy"]
+    assert phys[0] == phys[1]
     x, u, steps = np.array([70.0, 50.0]), np.array([20.0]), []
     for folder in (whole, out):
         models = load(folder / "model").models

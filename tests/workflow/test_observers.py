@@ -3,20 +3,16 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from hybrid_mpc import Trajectory
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.estimate import (
-    ESTIMATION,
     OBSERVERS,
     PERIODS,
     RECORDINGS,
-    EstimationResult,
     estimation_stage,
     parts_for_tests,
 )
-from hybrid_mpc.workflow.stages.results import _estimation
 
 
 def recording(name, n):
@@ -55,17 +51,3 @@ def test_too_short_recordings_are_a_reason():
     )  # fmt: skip
     found = estimation_stage(context)
     assert all("at least 100" in found.observers[name].reason for name in OBSERVERS)
-
-
-@pytest.mark.parametrize(
-    "found",
-    [
-        Absent("no control problem"),
-        EstimationResult((), {name: Absent("too short") for name in OBSERVERS}, {}),
-    ],
-)
-def test_results_without_observers_have_a_reason(found):
-    results = _estimation(SimpleNamespace(find=lambda stage: {ESTIMATION: found}[stage]))
-    for name in OBSERVERS:
-        observer = getattr(results, name)
-        assert (results.reason or observer.reason) in ("no control problem", "too short")

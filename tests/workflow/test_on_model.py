@@ -26,20 +26,19 @@ def kit(bare_tanks):
 
 @pytest.mark.full
 def test_every_task_runs_on_another_model_than_the_controller_s(bare_tanks):
-    found = json.loads((bare_tanks / "run" / "results.json").read_text())
-    read_results(found)
-    loops = found["on_model"]
-    assert loops["plants"] == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_1"}
-    assert loops["default_tasks"] is True
-    for cells in loops["details"]["controllers"].values():
+    found = read_results(bare_tanks / "run" / "results.json")
+    loops = found.on_model
+    assert loops.plants == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_1"}
+    assert loops.default_tasks is True
+    for cells in loops.means.values():
         assert set(cells) == {"step", "hold"}
         for cell in cells.values():
-            assert cell["sources"]["MPC"] == 1.0
+            assert cell.sources["MPC"] == 1.0
             # within the sensor's noise (1 mm) or a tenth of the step (0.1 m), which takes a while
-            assert cell["tracking_rmse"]["lower [m]"]["mean"] < 0.02
+            assert cell.tracking_rmse["lower [m]"].mean < 0.02
     # what compares prior and hybrid knows nothing of them
-    assert found["control"]["hybrid"]["cost"] is None
-    assert "no plant" in found["control"]["gap_closed_reason"]
+    assert found.control.rows == ()
+    assert "no plant" in found.control.reason
 
 
 def test_report_terminal_and_figures_say_that_it_is_no_machine(bare_tanks):

@@ -13,6 +13,7 @@ from patience import HANGS
 
 from hybrid_mpc import InputError, load, load_trajectories, predict
 from hybrid_mpc.kit.parts import read_description, write_description
+from hybrid_mpc.workflow.stages.results import read_results
 
 
 @pytest.fixture(scope="module")
@@ -30,15 +31,13 @@ def whole(kit, path):
 def test_free_run_and_band_are_those_of_the_run(bare_tanks, model):
     kit = load(model)
     arrays = np.load(bare_tanks / "run" / "checkpoints" / "evaluation.npz")
-    deployed = json.loads((bare_tanks / "run" / "results.json").read_text())["identification"]["details"][
-        "choice"
-    ]
+    choice = read_results(bare_tanks / "run" / "results.json").choice
     (name, *_) = sorted({key.split("/")[1] for key in arrays if key.startswith("phy/")})
     t = arrays[f"phy/{name}/t"]
     trajectory = whole(kit, bare_tanks / f"{name.partition('#')[0]}.csv")
     first = int(np.argmin(np.abs(trajectory.t - t[0]))) - round(kit.predicting.data.warm_up / trajectory.dt)
     part = trajectory.part(slice(first, first + round(kit.predicting.data.warm_up / trajectory.dt) + len(t)))
-    for own, key in (("prior", "phy"), ("hybrid", deployed["hybrid"])):
+    for own, key in (("prior", "phy"), ("hybrid", choice.deployed)):
         found = predict(kit, part, own)
         assert np.allclose(found.t, t)
         # the programs are those that were traced: rounding alone

@@ -28,32 +28,33 @@ from hybrid_mpc.workflow.stages.results import read_results
 
 
 def results(folder):
-    return json.loads((folder / "results.json").read_text())
+    return read_results(folder / "results.json")
 
 
 def without_timing(folder):
-    found = {key: value for key, value in results(folder).items() if key != "timing"}
-    found["promises"] = [row for row in found["promises"]["rows"] if row["name"] != "step time"]
-    return found
+    """Everything that a seed determines: all but durations, of steps and of the loops that were run."""
+    found = json.loads((folder / "results.json").read_text())
+    rows = [row for row in found["promises"]["rows"] if row["name"] != "step time"]
+    loops = [{key: v for key, v in row.items() if key != "timing_ms"} for row in found["on_model"]["rows"]]
+    return found | {"promises": rows, "on_model": found["on_model"] | {"rows": loops}, "control": None}
 
 
 def test_folder_holds_what_the_readme_says(finished):
     found = results(finished)
-    read_results(found)
-    assert found["scenario"] == "my_machine"
-    assert found["export"]["parity_max_abs_error"] <= 1e-12  # the project's bound for values
-    assert found["export"]["jacobian_max_abs_error"] <= 1e-10  # and for Jacobians
+    assert found.scenario == "my_machine"
+    assert found.export.parity_max_abs_error <= 1e-12  # the project's bound for values
+    assert found.export.jacobian_max_abs_error <= 1e-10  # and for Jacobians
     page = (finished / "report.html").read_text()
     assert not re.search(r"<(script|link|img|iframe)[^>]* (src|href)=[\"']?https?:", page)
     names = {path.name for path in (finished / "figures").glob("*.png")}
     for name in ("prior_observer", "hybrid_observer"):
-        assert found["estimation"][name]["samples"] > 100  # at least five times the 20 lags
+        assert found.estimation.observers[name].samples > 100  # at least five times the 20 lags
         assert f"innovations_{name}.png" in names
     assert {"recordings.png", "training.png", "errors.png", "step_times.png", "poles.png"} <= names
 
 
 def test_doubts_about_recordings_reach_terminal_results_and_report(finished):
-    (warning,) = results(finished)["data"]["details"]["warnings"]
+    (warning,) = results(finished).data.warnings
     assert "tuesday.csv: column 'phi_rad' repeats" in warning
     page = (finished / "report.html").read_text()
     assert "Warning: tuesday.csv: column" in page
@@ -62,19 +63,19 @@ def test_doubts_about_recordings_reach_terminal_results_and_report(finished):
 
 def test_the_fitted_prior_beats_the_nominal_one(finished):
     # the machine's parameters are 10 to 20 % off the README's nominal ones, and it has dry friction
-    rmse = results(finished)["identification"]["rmse"]
-    (signal,) = rmse["phy"]
-    assert rmse["phy"][signal] < 0.7 * rmse["phy_nominal"][signal]
-    fitted = results(finished)["identification"]["details"]["prior_parameters"]["values"]
+    scores = results(finished).evaluation.scores
+    (fitted,), (nominal,) = (scores[name].model.rmse.values() for name in ("phy", "phy_nominal"))
+    assert fitted < 0.7 * nominal
+    fitted = results(finished).prior.fit.values
     # dry friction that the prior lacks biases it a little
     assert fitted["mgl"] == pytest.approx(1.1, rel=0.05)
 
 
 def test_a_machine_without_plant_says_why_it_has_no_closed_loop(finished):
-    control = results(finished)["control"]
-    assert control["gap_closed"] is None
-    assert "no plant" in control["gap_closed_reason"]
-    assert results(finished)["timing"]["controller_step_ms"]["median"] > 0
+    control = results(finished).control
+    assert control.gap == (None, control.reason)
+    assert "no plant" in control.reason
+    assert control.step_ms.median > 0
 
 
 def test_bounds_never_rise(finished):
@@ -185,17 +186,14 @@ def test_artifact_holds_data_only(finished):
     assert set(artifact.models) == {"hybrid", "prior"}
     assert artifact.models["prior"].n_h == 0
     assert artifact.limits("hybrid").hours > 0
-    assert artifact.provenance.data_hash == results(finished)["data"]["hash"]
+    assert artifact.provenance.data_hash == results(finished).data.hash
 
 
 def test_the_artifact_holds_the_fitted_parameters_with_what_is_known_of_them(finished):
-    fit, model = (
-        results(finished)["identification"]["details"]["prior_parameters"],
-        load(finished / "model").models["hybrid"],
-    )
-    assert {p.name: p.value for p in model.parameters} == fit["values"]
+    fit, model = results(finished).prior.fit, load(finished / "model").models["hybrid"]
+    assert {p.name: p.value for p in model.parameters} == fit.values
     assert all(p.lower <= p.value <= p.upper and p.unit for p in model.parameters)
-    errors = [fit["standard_errors"].get(p.name, 0.0) for p in model.parameters]
+    errors = [fit.standard_errors.get(p.name, 0.0) for p in model.parameters]
     covariance = np.array(model.covariance)
     assert covariance.shape == (model.n_p, model.n_p)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), errors, rtol=1e-12)
@@ -204,11 +202,12 @@ def test_the_artifact_holds_the_fitted_parameters_with_what_is_known_of_them(fin
 
 
 def test_the_main_job_says_what_its_monitor_lacks(finished):
-    found = results(finished)["watch"]
+    found = results(finished).watch
     limits = load(finished / "model").limits("hybrid")
     assert not limits.rated
     assert "need 2.5 min" in limits.method
-    assert (found["kind"], found["faults"]) == ("energy", None)
+    assert (found.kind, found.faults) == ("energy", None)
+    assert "no plant" in found.faults_reason
     page = (finished / "report.html").read_text()
     assert "1.5 x the highest nominal level" in page
 

@@ -26,7 +26,6 @@ from hybrid_mpc.workflow.stages.export import NOISE, NoiseResult
 from hybrid_mpc.workflow.stages.figures import _watch as watch_figures
 from hybrid_mpc.workflow.stages.identify import PRIOR, PriorResult
 from hybrid_mpc.workflow.stages.report import _watch_tables, _watch_words
-from hybrid_mpc.workflow.stages.results import _watch as watch_results
 from hybrid_mpc.workflow.stages.watch import WATCH, put_limits, watch_stage
 
 AXIS = """
@@ -154,8 +153,8 @@ def test_limits_of_an_axis_of_millimetres_a_second_are_learned_kept_and_put_back
     assert found.clean.alarms == 0  # thresholds are above the highest level of these very recordings
     assert found.clean.seconds > 0
     covered = found.recordings[0]
-    assert covered["valid_s"] > 500
-    assert covered["not_finite_s"] == covered["missing_s"] == 0.0
+    assert covered.valid_s > 500
+    assert covered.not_finite_s == covered.missing_s == 0.0
     kit = load(slow.out / "model")
     assert kit.models["hybrid"].time_unit == slow.time_unit > 5.0
     assert kit.rest_speed == (rest,)
@@ -168,10 +167,10 @@ def test_limits_of_an_axis_of_millimetres_a_second_are_learned_kept_and_put_back
 
 
 def test_the_report_says_what_limits_were_learned_from(slow):
-    said = watch_results(slow)
-    assert (said.kind, said.alarms, said.false_alarms_per_hour) == ("energy", (), 0.0)
-    assert "1.5 x the highest nominal level" in _watch_words(slow.read(WATCH))[0]
-    table, alarms = _watch_tables(slow)
+    found = slow.read(WATCH)
+    assert (found.kind, found.alarms, found.clean.alarms) == ("energy", (), 0)
+    assert "1.5 x the highest nominal level" in _watch_words(found)[0]
+    table, alarms = _watch_tables(found)
     assert [row[0] for row in table.rows] == [
         "force of q", "power of the free run", "q frozen", "all together",
     ]  # fmt: skip
@@ -194,11 +193,9 @@ def test_recordings_shorter_than_the_windows_give_a_reason_and_the_run_goes_on(s
     window = 2 * round(0.1 * short.time_unit / QUICK.dt) + 1
     assert f"window of {window} samples ({window * QUICK.dt:g} s)" in found.reason
     assert "HM-WATCH-018" in found.reason
-    said = watch_results(short)
-    assert said.alarms is None
-    assert found.reason == said.reason
+    assert found.limits is None
     assert list(watch_figures(short)) == []
-    assert _watch_tables(short) == []
+    assert _watch_tables(found) == []
     assert _watch_words(found)[0].startswith("The monitor was not examined: no rest speeds")
     kit = load(short.out / "model")
     assert kit.rest_speed is None

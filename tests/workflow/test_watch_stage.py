@@ -30,7 +30,6 @@ from hybrid_mpc.workflow.stages.compare import identity
 from hybrid_mpc.workflow.stages.export import NOISE, NoiseResult
 from hybrid_mpc.workflow.stages.figures import _watch as watch_figures
 from hybrid_mpc.workflow.stages.report import _watch_tables, _watch_words
-from hybrid_mpc.workflow.stages.results import _watch as watch_results
 from hybrid_mpc.workflow.stages.watch import WATCH, watch_stage
 from scenarios.golf_robot.rig import Rig
 
@@ -172,10 +171,10 @@ def test_the_faulted_loops_are_reported(context, resumed):
     assert 0 <= freeze.delay_s < 0.5
     assert freeze.switches[-1].after == "REST"
     assert freeze.diagnosis == "sensor of phi frozen: its readings repeat although motion is predicted"
-    group = watch_results(context)
-    assert [row.fault for row in group.faults] == list(by_name)
-    assert (group.wanted_per_hour, group.hours) == (2.0, pytest.approx(6 * 45 / 3600))
-    table, loops, _ = _watch_tables(context)
+    assert [row.fault for row in resumed.faults] == list(by_name)
+    limits = resumed.limits
+    assert (limits.false_alarms_per_hour, limits.hours) == (2.0, pytest.approx(6 * 45 / 3600))
+    table, loops, _ = _watch_tables(resumed)
     assert [row[0] for row in table.rows] == [
         "force of phi", "power of the free run", "phi frozen", "all together",
     ]  # fmt: skip

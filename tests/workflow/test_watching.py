@@ -7,6 +7,7 @@ import numpy as np
 from hybrid_mpc import ChannelLimit, WatchLimits
 from hybrid_mpc.kit.parts import WatchFile
 from hybrid_mpc.watch.readings import Channel
+from hybrid_mpc.workflow.stages.report import _watch_tables
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 from hybrid_mpc.workflow.stages.watching import rate_words, watching_table
 
@@ -38,7 +39,7 @@ FOUND = WatchResult(
 
 
 def test_every_channel_with_a_limit_has_a_row_and_each_fault_stands_where_it_was_seen_first():
-    level, mass, frozen, all_of_them = watching_table(FOUND).rows
+    level, mass, frozen, all_of_them = watching_table(FOUND, FOUND.limits).rows
     assert level == ("level", "0.2 m, mean over 3 s; 0.1 m, mean over 30 s", "2 (0.24 to 7.2)", "", "")
     assert mass == ("mass", "9 deviations, summed", "0 (0 to 3.7)", "weak_pump 4 s", "weak_pump: pump -21 %")
     assert frozen[0] == "level frozen"
@@ -47,8 +48,8 @@ def test_every_channel_with_a_limit_has_a_row_and_each_fault_stands_where_it_was
 
 
 def test_without_limits_there_is_no_table():
-    assert watching_table(replace(FOUND, watch={})) is None
-    assert watching_table(replace(FOUND, watch={"prior": WatchFile({}, "too little")})) is None
+    assert _watch_tables(replace(FOUND, watch={})) == []
+    assert _watch_tables(replace(FOUND, watch={"prior": WatchFile({}, "too little")})) == []
 
 
 def test_the_interval_of_a_count():

@@ -1,7 +1,6 @@
 """The whole way of a prior with a wrong sign: ``check --fit`` and ``run`` name it, or the run stops."""
 
 import html
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from hybrid_mpc import InputError, RunSettings, check_fit, load, load_scenario, 
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.promises import STRUCTURE
+from hybrid_mpc.workflow.stages.results import read_results
 
 CASES = {"right": MACHINE, "wrong load": WRONG_LOAD, "wrong torque": WRONG_TORQUE}
 
@@ -117,11 +117,10 @@ def test_a_run_says_first_that_the_prior_is_in_doubt(ran, checked):
     body = page[page.index("<body>") :]
     assert f"{sentence}: {first}" in body[: body.index("</header>")]
 
-    results = json.loads((ran / "run" / "results.json").read_text())
-    details = results["identification"]["details"]
-    assert tuple(details["prior_parameters"]["in_doubt"]) == checked["wrong load"].in_doubt
-    choice = details["choice"]
-    assert choice["recommended"] == "phy" or first in choice["reason"]
+    results = read_results(ran / "run" / "results.json")
+    assert results.prior.in_doubt == checked["wrong load"].in_doubt
+    choice = results.choice.choice
+    assert choice.recommended == "phy" or first in choice.reason
 
     (row,) = (row for row in load(ran / "run" / "model").promises if row.name == STRUCTURE)
     assert row.verdict == "doubted"

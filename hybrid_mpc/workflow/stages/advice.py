@@ -9,9 +9,10 @@ from hybrid_mpc.compare.sequential import hardest
 from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
-from hybrid_mpc.workflow.stages.compare import REPORTED
+from hybrid_mpc.workflow.stage import Absent
+from hybrid_mpc.workflow.stages.compare import REPORTED, closed_loops
 from hybrid_mpc.workflow.stages.promises import STRUCTURE
-from hybrid_mpc.workflow.stages.results import Identification, Results
+from hybrid_mpc.workflow.stages.results import Results
 
 EXPLAINED = 60.0
 """FIT [%] of the fitted prior below which a network would have to learn too much."""
@@ -32,15 +33,14 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
         explained: Whether the run has searched for missing terms. Default: False; a hint may then name the command.
 
     Example:
-        ``[hint.finding for hint in advice(read_results(read_object(path), str(path))) if hint.verdict == "bad"]``
+        ``[hint.finding for hint in advice(read_results(path)) if hint.verdict == "bad"]``
     """
-    own = results.identification
     found = [
-        *_doubt(own), *_recordings(results), *_prior(own, explained), *_choice(own, explained), *_linear(own),
-        *_floor(own), *_bands(own), *_promises(results), *_loops(results), *_watching(results),
+        *_doubt(results), *_recordings(results), *_prior(results, explained), *_choice(results, explained),
+        *_linear(results), *_floor(results), *_bands(results), *_promises(results), *_loops(results),
+        *_watching(results),
     ]  # fmt: skip
-    tried = results.control.details is not None
-    if tried and not any(hint.verdict == "bad" for hint in found):
+    if closed_loops(results.control) is not None and not any(hint.verdict == "bad" for hint in found):
         found.append(
             Hint(
                 "good",
@@ -52,7 +52,7 @@ def advice(results: Results, *, explained: bool = False) -> list[Hint]:
 
 
 def _recordings(results: Results) -> Iterator[Hint]:
-    for warning in results.data.details.warnings[:MOST]:
+    for warning in results.data.warnings[:MOST]:
         yield Hint(
             "bad",
             f"Recordings: {warning}",
@@ -76,8 +76,8 @@ def doubt_of(in_doubt: Sequence[str]) -> str:
     return f"The structure of the prior is in doubt: {in_doubt[0]}{more}."
 
 
-def _doubt(found: Identification) -> Iterator[Hint]:
-    for doubt in found.details.prior_parameters.in_doubt:
+def _doubt(results: Results) -> Iterator[Hint]:
+    for doubt in results.prior.in_doubt:
         yield Hint(
             "bad", f"The structure of the prior is in doubt: {doubt}.",
             "Correct the prior first (docs/prior-wrong.md): a wrong sign or unit, or a missing state, delay or input. "
@@ -85,14 +85,13 @@ def _doubt(found: Identification) -> Iterator[Hint]:
         )  # fmt: skip
 
 
-def _prior(found: Identification, explained: bool) -> Iterator[Hint]:
-    for warning in found.details.prior_parameters.warnings[:MOST]:
+def _prior(results: Results, explained: bool) -> Iterator[Hint]:
+    fitted = results.prior.fit
+    for warning in fitted.warnings[:MOST]:
         yield Hint("plain", f"Fit of the prior: {warning}", "Look the warning up in docs/fit-trouble.md.")
-    windows = min(
-        (row["validation_error"] for row in found.details.prior_parameters.stages), default=math.inf
-    )
-    for label, fit in _by_output(found.fit_percent.get("phy")).items():
-        if fit >= EXPLAINED:
+    windows = min((row["validation_error"] for row in fitted.stages), default=math.inf)
+    for label, fit in results.evaluation.scores["phy"].model.fit_percent.items():
+        if fit >= EXPLAINED or not math.isfinite(fit):
             continue
         what = f"The fitted prior has a FIT of {fit:.0f} % on {label.partition(' [')[0]}"
         if windows <= POOR:
@@ -109,17 +108,17 @@ def _prior(found: Identification, explained: bool) -> Iterator[Hint]:
             )  # fmt: skip
 
 
-def _choice(found: Identification, explained: bool) -> Iterator[Hint]:
-    choice = found.details.choice
+def _choice(results: Results, explained: bool) -> Iterator[Hint]:
+    choice = results.choice.choice
     own = choice.candidates[choice.hybrid]
     if choice.recommended != "phy":
         if not explained:
             yield Hint("plain", "A network improves the prior, so a physical term may be missing.", SEARCH)
         return  # the page's first answer says why
     why = choice.reason
-    if own.error is None or own.ratio is None:
+    if not (math.isfinite(own.error) and math.isfinite(own.ratio)):
         yield Hint("plain", why, "Train with shorter free runs or fewer units, or use the prior alone.")
-    elif own.upper is None or not math.isfinite(own.upper):
+    elif not math.isfinite(own.upper):
         yield Hint(
             "plain", why, "Give at least three recordings: a confidence interval needs several of them."
         )
@@ -135,15 +134,15 @@ def _choice(found: Identification, explained: bool) -> Iterator[Hint]:
         )  # fmt: skip
 
 
-def _linear(found: Identification) -> Iterator[Hint]:
+def _linear(results: Results) -> Iterator[Hint]:
     """A linear or constant model with less test error than the recommended model, unless a doubt names it already."""
-    if found.details.prior_parameters.in_doubt:
+    if results.prior.in_doubt:
         return
-    chosen = found.details.choice.recommended
-    own = found.error.get(chosen)
-    errors = {name: b.errors.error for name, b in found.details.baselines.items() if b.errors is not None}
+    chosen = results.choice.choice.recommended
+    own = results.evaluation.scores[chosen].model.error
+    errors = {name: b.errors.error for name, b in results.prior.baselines.items() if b.errors is not None}
     name = min(errors, key=lambda n: errors[n], default="")
-    if name and isinstance(own, float) and errors[name] < own:
+    if name and math.isfinite(own) and errors[name] < own:
         model = "a constant" if name == "constant" else f"the linear model {name}"
         yield Hint(
             "bad", f"On test data {model} has an error of {errors[name]:.3g}, {name_of(chosen)} {own:.3g}.",
@@ -152,12 +151,10 @@ def _linear(found: Identification) -> Iterator[Hint]:
         )  # fmt: skip
 
 
-def _floor(found: Identification) -> Iterator[Hint]:
+def _floor(results: Results) -> Iterator[Hint]:
     """Outputs whose free-run error is about the sensor noise."""
-    errors = _by_output(found.rmse.get(found.details.choice.recommended))
-    if len(errors) != len(found.details.smoother.sigma):
-        return
-    for (label, error), noise in zip(errors.items(), found.details.smoother.sigma, strict=True):
+    errors = results.evaluation.scores[results.choice.choice.recommended].model.rmse
+    for (label, error), noise in zip(errors.items(), results.prior.fit.sigma, strict=True):
         name, _, unit = label.partition(" [")
         if error < FLOOR * noise:
             yield Hint(
@@ -167,9 +164,9 @@ def _floor(found: Identification) -> Iterator[Hint]:
             )  # fmt: skip
 
 
-def _bands(found: Identification) -> Iterator[Hint]:
-    name = found.details.choice.recommended
-    band = found.details.bands.get(name)
+def _bands(results: Results) -> Iterator[Hint]:
+    name = results.choice.choice.recommended
+    band = results.evaluation.bands.get(name)
     if band is None:
         return
     if band.coverage < band.share - HELD[0]:
@@ -187,7 +184,7 @@ def _bands(found: Identification) -> Iterator[Hint]:
 
 def _promises(results: Results) -> Iterator[Hint]:
     """Promises that the kit does not give, one hint for each verdict."""
-    rows = results.promises.rows or ()
+    rows = () if isinstance(results.promises, Absent) else results.promises.rows
     for verdict, say in (("doubted", "Doubted"), ("not promised", "Not promised")):
         names = [one.name for one in rows if one.verdict == verdict and one.name != STRUCTURE]  # said first
         if names:
@@ -198,17 +195,17 @@ def _promises(results: Results) -> Iterator[Hint]:
 
 
 def _loops(results: Results) -> Iterator[Hint]:
-    times, period = results.timing.controller_step_ms, results.timing.period_ms
-    if times.p99 is not None and times.p99 > period:
+    ms = None if isinstance(results.control, Absent) else results.control.step_ms
+    if ms is not None and ms.p99 > ms.period:
         yield Hint(
-            "bad", f"Controller step time: the 99th percentile is {times.p99:.3g} ms, but the period is {period:g} ms.",
+            "bad", f"Controller step time: the 99th percentile is {ms.p99:.3g} ms, but the period is {ms.period:g} ms.",
             "Measure again on an idle computer. Else use the solver native (compiled C), a shorter horizon or a "
             "longer dt.",
         )  # fmt: skip
-    details = results.control.details
-    for task, own in (details.comparisons if details is not None else {}).items():
+    control = closed_loops(results.control)
+    for task, own in control.comparisons.items() if control is not None else ():
         found = own[base := hardest(own)]
-        means = {name: details.tasks[task][name].cost.mean for name in (REPORTED["hybrid"], *own)}  # type: ignore[union-attr]
+        means = {name: control.means[task][name].cost.mean for name in (REPORTED["hybrid"], *own)}  # type: ignore[union-attr]
         lost = means.pop(REPORTED["hybrid"]) is None and any(cost is not None for cost in means.values())
         if found.finding == "dearer" or lost:
             worse = "diverges" if lost else f"has {found.words} times the cost of {base}"
@@ -217,7 +214,7 @@ def _loops(results: Results) -> Iterator[Hint]:
                 f"Control such tasks with {base}: hybrid-mpc control --controller {base}; in Python with "
                 "kit.observer('prior') and kit.controller('prior').",
             )  # fmt: skip
-    if not results.on_model.reason:
+    if not isinstance(results.on_model, Absent):
         yield Hint(
             "plain", "The scenario has no plant: its loops ran on a model and say nothing about the machine.",
             "Write a plant that differs from the prior as your machine may (Scenario(plant=...)).",
@@ -225,17 +222,13 @@ def _loops(results: Results) -> Iterator[Hint]:
 
 
 def _watching(results: Results) -> Iterator[Hint]:
-    clean, rate = results.watch.details.clean, results.watch.wanted_per_hour
-    if clean is not None and rate is not None and clean.too_many(rate):
+    found = results.watch
+    if isinstance(found, Absent) or found.limits is None or found.clean is None:
+        return
+    clean, rate = found.clean, found.limits.false_alarms_per_hour
+    if clean.too_many(rate):
         yield Hint(
             "bad", f"The monitor has too many false alarms: {clean.words(rate)}.",
             "The limits were learned from too few or too different recordings. Look at the alarms, then record more "
             "nominal data.",
         )  # fmt: skip
-
-
-def _by_output(fit: object) -> dict[str, float]:
-    """Finite values by output."""
-    if not isinstance(fit, dict):
-        return {}
-    return {label: float(v) for label, v in fit.items() if isinstance(v, int | float) and math.isfinite(v)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.kit.assembly import working_point
 from hybrid_mpc.model.equilibrium import fixed_point, hidden_fixed_point
 from hybrid_mpc.model.model import kinematics
+from hybrid_mpc.records import beside
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Stage
 from hybrid_mpc.workflow.stages.export import EXPORT
@@ -22,10 +23,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LinearPoint:
-    """A model linearized at a point: poles as (real part, imaginary part), the largest first.
+    """A model linearized at a point.
 
-    ``slow`` poles have a natural frequency below ``split_rad_s``, a tenth of the Nyquist frequency; that of a pole at
-    zero is None.
+    Args:
+        dt: Period [s].
+        poles: Eigenvalues of the one-step map as (real part, imaginary part), the largest first.
+        frequency_rad_s: Natural frequency of each pole; None for a pole at zero.
+        damping: Damping of each pole.
+        slow: Whether the natural frequency of each pole is below ``split_rad_s``.
+        split_rad_s: A tenth of the Nyquist frequency.
+        stable: Whether every mode decays.
+        stabilisable: Whether the inputs reach every mode that does not decay.
+        detectable: Whether the outputs show every mode that does not decay.
     """
 
     dt: float
@@ -41,10 +50,13 @@ class LinearPoint:
 
 @dataclass(frozen=True)
 class ModelAnalysis:
-    """A model linearized at rest and, if it is mechanical and has a control problem, at working speed.
+    """A linearized model.
 
-    ``fixed_point`` is the steady state ``(n_x,)``; None if none lies near the operating point, with the reason in
-    ``fixed_point_reason``.
+    Args:
+        rest: The model at rest.
+        moving: The model at working speed, if it is mechanical and has a control problem.
+        fixed_point: The steady state ``(n_x,)``; None if none lies near the operating point.
+        fixed_point_reason: Why there is none.
     """
 
     rest: LinearPoint
@@ -60,13 +72,18 @@ class ModelAnalysis:
 
 @dataclass(frozen=True)
 class AnalysisResult:
-    """The models by name, their working speeds, and frequency responses: ``"MODEL/POINT/omega"`` ``(n,)``, and
-    ``.../magnitude`` and ``.../phase`` ``(n_y, n_u, n)``.
+    """Linearized models.
+
+    Args:
+        models: The models by name.
+        working_speed: Speeds at which mechanical models are linearized. Default: none.
+        arrays: Frequency responses: ``"MODEL/POINT/omega"`` ``(n,)``, and ``.../magnitude`` and ``.../phase``
+            ``(n_y, n_u, n)``.
     """
 
     models: Mapping[str, ModelAnalysis]
     working_speed: tuple[float, ...] | None = None
-    arrays: Mapping[str, Array] = field(default_factory=dict)
+    arrays: Mapping[str, Array] = beside()
 
 
 def analysis_stage(context: Context) -> AnalysisResult:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterator, Sequence
 
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Answer, Verdict
+from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.advice import EXPLAINED
-from hybrid_mpc.workflow.stages.compare import REPORTED
-from hybrid_mpc.workflow.stages.results import Control, Identification, Results, Timing, Watch
+from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, closed_loops
+from hybrid_mpc.workflow.stages.results import Results
+from hybrid_mpc.workflow.stages.watch import WatchResult
 
 SAFE = ("structure of the prior", "no offset", "step time", "stability margins", "limits")
 """Promises that must not be open if the controller is to be called safe."""
@@ -24,32 +27,31 @@ def answer_all(results: Results) -> tuple[Answer, Answer, Answer]:
     """Answers about model, controller and monitor, each from the figures of ``results.json``.
 
     Example:
-        ``answer_all(read_results(read_object(path), str(path)))[0].short``
+        ``answer_all(read_results(Path("runs/mine/results.json")))[0].short``
     """
-    return model_answer(results.identification), controller_answer(results), monitor_answer(results.watch)
+    return model_answer(results), controller_answer(results), monitor_answer(results.watch)
 
 
-def model_answer(found: Identification) -> Answer:
+def model_answer(results: Results) -> Answer:
     """Whether the recommended model predicts held-out recordings."""
-    choice = found.details.choice
+    choice, doubt = results.choice.choice, results.prior.in_doubt
     name = choice.recommended
-    fits = [fit for fit in _values(found.fit_percent.get(name)).values() if fit is not None]
-    doubt = found.details.prior_parameters.in_doubt
-    short, verdict = _model_verdict(bool(doubt), fits)
+    own = results.evaluation.scores[name].model
+    short, verdict = _model_verdict(bool(doubt), list(own.fit_percent.values()))
     lines = [f"Recommended: {name_of(name)}."]
     if doubt:
         lines.append(f"The structure of the prior is in doubt: {doubt[0]}.")
-    labels = list(_values(found.rmse.get(name)))
-    lines += [_error_line(found, name, label) for label in labels[:SHOWN_OUTPUTS]]
+    labels = list(own.rmse)
+    lines += [_error_line(results, name, label) for label in labels[:SHOWN_OUTPUTS]]
     if more := len(labels) - SHOWN_OUTPUTS:
         lines += [f"{more} more outputs are in section Free runs."] if more > 0 else []
-    own = choice.candidates[choice.hybrid]
-    if name == "phy" or own.ratio is None or own.upper is None:
+    hybrid = choice.candidates[choice.hybrid]
+    if name == "phy" or not (math.isfinite(hybrid.ratio) and math.isfinite(hybrid.upper)):
         lines.append(f"{choice.reason.rstrip('.').capitalize()}.")
     else:
         lines.append(
-            f"On held-out recordings, its error is {own.ratio:.2f} times that of the fitted prior "
-            f"(95 % upper bound {own.upper:.2f})."
+            f"On held-out recordings, its error is {hybrid.ratio:.2f} times that of the fitted prior "
+            f"(95 % upper bound {hybrid.upper:.2f})."
         )
     return Answer("Is the model good?", verdict, short, lines)
 
@@ -57,29 +59,32 @@ def model_answer(found: Identification) -> Answer:
 def _model_verdict(doubt: bool, fits: Sequence[float]) -> tuple[str, Verdict]:
     if doubt:
         return "In doubt", "bad"
-    if not fits:
+    if not fits or not all(map(math.isfinite, fits)):
         return "No: a free run diverged", "bad"
     return ("Weak", "bad") if min(fits) < EXPLAINED else ("Yes", "good")
 
 
-def _error_line(found: Identification, name: str, label: str) -> str:
+def _error_line(results: Results, name: str, label: str) -> str:
     signal, _, unit = label.removesuffix("]").partition(" [")
-    own, prior = (_values(found.rmse.get(m)).get(label) for m in (name, "phy"))
-    fit = _values(found.fit_percent.get(name)).get(label)
-    beside = "" if name == "phy" or prior is None else f"; the fitted prior has {prior:.3g} {unit}"
-    size = "a free run diverged" if own is None else f"{own:.3g} {unit}"
-    return (
-        f"{signal}: free-run error {size}" + (f" (fit {fit:.0f} %)" if fit is not None else "") + f"{beside}."
-    )
+    own, prior = (results.evaluation.scores[m].model for m in (name, "phy"))
+    text = f"{signal}: "
+    if math.isfinite(own.rmse[label]):
+        text += f"free-run error {own.rmse[label]:.3g} {unit}"
+        text += f" (fit {own.fit_percent[label]:.0f} %)" if label in own.fit_percent else ""
+    else:
+        text += "a free run diverged"
+    if name != "phy" and math.isfinite(prior.rmse[label]):
+        text += f"; the fitted prior has {prior.rmse[label]:.3g} {unit}"
+    return f"{text}."
 
 
 def controller_answer(results: Results) -> Answer:
     """Whether the loops kept limits and deadlines, and which promises of the kit are shown."""
     lines, bad = [], False
-    for one, wrong in (*_loop_lines(results), *_time_lines(results.timing)):
+    for one, wrong in (*_loop_lines(results), *_time_lines(results.control)):
         lines.append(one)
         bad |= wrong
-    rows = results.promises.rows or ()
+    rows = () if isinstance(results.promises, Absent) else results.promises.rows
     lines += [
         f"Stability margins: {row.evidence}."
         for row in rows
@@ -93,9 +98,10 @@ def controller_answer(results: Results) -> Answer:
         return Answer(
             "Is the controller safe?", "bad", f"In doubt: {', '.join(doubted) or 'see below'}", lines
         )
-    if results.control.details is None and results.on_model.details is None:
+    on_plant = closed_loops(results.control) is not None
+    if not on_plant and isinstance(results.on_model, Absent):
         return Answer("Is the controller safe?", "plain", "Not shown: no closed loop was simulated", lines)
-    simulated = "Yes, in simulation" if results.control.details is not None else "Yes, on its own model"
+    simulated = "Yes, in simulation" if on_plant else "Yes, on its own model"
     return Answer("Is the controller safe?", "good", simulated, lines)
 
 
@@ -108,16 +114,12 @@ def _promise_line(rows: Sequence[Promise], open_: Sequence[Promise]) -> str:
 
 def _loop_lines(results: Results) -> Iterator[tuple[str, bool]]:
     """Lines about limits and fallback inputs of the recommended model's loops, each with whether it is a problem."""
-    control: Control = results.control
-    if control.details is None:
-        yield f"Closed loops: {control.gap_closed_reason.rstrip('.')}.", False
+    control = closed_loops(results.control)
+    if control is None:
+        yield f"Closed loops: {results.control.reason.rstrip('.')}.", False
         return
-    short = "prior" if results.identification.details.choice.recommended == "phy" else "hybrid"
-    own = {
-        task: cells[REPORTED[short]]
-        for task, cells in control.details.tasks.items()
-        if REPORTED[short] in cells
-    }
+    name = REPORTED["prior" if results.choice.choice.recommended == "phy" else "hybrid"]
+    own = {task: cells[name] for task, cells in control.means.items() if name in cells}
     used = [(share, limit, task) for task, cell in own.items() for limit, share in cell.limits.items()]
     if used:
         share, limit, task = max(used)
@@ -129,24 +131,23 @@ def _loop_lines(results: Results) -> Iterator[tuple[str, bool]]:
     yield words if fallback else "No fallback input was needed.", fallback > FEW_FALLBACKS
 
 
-def _time_lines(timing: Timing) -> Iterator[tuple[str, bool]]:
-    p99 = timing.controller_step_ms.p99
-    if timing.misses is None or p99 is None:
+def _time_lines(found: ControlResult | Absent) -> Iterator[tuple[str, bool]]:
+    if isinstance(found, Absent):
         return
-    late = f"{timing.misses} steps missed the deadline" if timing.misses else "No step missed its deadline"
+    ms = found.step_ms
+    late = f"{ms.misses} steps missed the deadline" if ms.misses else "No step missed its deadline"
     yield (
-        f"{late}: 99 % of the steps take less than {p99:.3g} ms; the period is {timing.period_ms:g} ms.",
-        timing.misses > 0,
+        f"{late}: 99 % of the steps take less than {ms.p99:.3g} ms; the period is {ms.period:g} ms.",
+        ms.misses > 0,
     )
 
 
-def monitor_answer(found: Watch) -> Answer:
+def monitor_answer(found: WatchResult | Absent) -> Answer:
     """False alarms compared with the wanted rate; number of simulated faults detected, and the largest delay."""
-    question, clean, wanted = "Is the monitor trustworthy?", found.details.clean, found.wanted_per_hour
-    if found.alarms is None or clean is None or wanted is None:
-        return Answer(
-            question, "plain", "Not examined", (f"{(found.reason or found.faults_reason).rstrip('.')}.",)
-        )
+    question = "Is the monitor trustworthy?"
+    if isinstance(found, Absent) or found.limits is None or found.clean is None:
+        return Answer(question, "plain", "Not examined", (f"{found.reason.rstrip('.')}.",))
+    clean, wanted = found.clean, found.limits.false_alarms_per_hour
     many = clean.too_many(wanted)
     lines = [f"False alarms: {clean.words(wanted)}."]
     faults = found.faults or ()
@@ -166,7 +167,3 @@ def monitor_answer(found: Watch) -> Answer:
     if not faults:
         return Answer(question, "plain", "Not tested with faults", lines)
     return Answer(question, "good", f"Yes, on {clean.seconds:.0f} s of data", lines)
-
-
-def _values(by: object) -> Mapping[str, float | None]:
-    return by if isinstance(by, Mapping) else {}

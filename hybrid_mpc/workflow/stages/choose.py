@@ -84,7 +84,7 @@ def choice_stage(context: Context) -> ChoiceResult:
     recordings, evidence = evidence_of(runs)
     found = recommend(
         {name: errors_of(name) for name in candidates}, deploy=context.settings.deploy, samples=samples,
-        recordings=recordings, evidence=evidence, shrunk=errors_of,
+        recordings=recordings, evidence=evidence, shrunk=errors_of, rule=context.scenario.choice,
     )  # fmt: skip
     if found.recommended != "phy" and prior.in_doubt:  # networks must not hide a wrong structure
         doubt = f"However, the structure of the prior is in doubt: {prior.in_doubt[0]}."
@@ -131,6 +131,9 @@ def by_parameters(phy: Prior, fit: PriorFit, runs: Sequence[FreeRun], dt: float)
 
 CHOICE = Stage(
     "choice", "choosing a model", ChoiceResult, choice_stage,
-    lambda context: {"free runs": (context.warm, context.spec.free_run), "deploy": context.settings.deploy},
+    lambda context: {
+        "free runs": (context.warm, context.spec.free_run), "deploy": context.settings.deploy,
+        "rule of the choice": context.scenario.choice,
+    },
     (DATA, PRIOR, TRAINING),
 )  # fmt: skip

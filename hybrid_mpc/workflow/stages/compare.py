@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,13 +27,15 @@ from hybrid_mpc.compare.loops import (
     write_rows,
 )
 from hybrid_mpc.compare.sequential import Comparison, compare_costs, hardest, looks
-from hybrid_mpc.compare.summary import by_task
+from hybrid_mpc.compare.summary import Summary, by_task, summaries
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.engine import WORKERS, run_jobs
 from hybrid_mpc.files import digest
 from hybrid_mpc.kit.artifact import load
 from hybrid_mpc.kit.parts import LoopSettings, artifact_digest, loop_settings, read_parts
 from hybrid_mpc.loop.loop import Loop
+from hybrid_mpc.loop.realtime import percentiles
+from hybrid_mpc.records import beside
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import UNKNOWN, Absent, Stage, source_of, sources
@@ -48,7 +51,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 BASELINES = ("prior", "prior_observer")
 REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
-"""Controllers behind the three names of ``results.json``: all with the same kind of estimator."""
+"""Controllers behind three short names: all with the same kind of estimator."""
 TIMED_PERIODS = 1000
 """Periods timed on recordings if the scenario has no plant; enough for a 99th percentile."""
 TIMED = OBSERVERS
@@ -100,23 +103,118 @@ def parts_of(scenario: Scenario, tasks: Sequence[Task], budget: Budget, seeds: r
 
 
 @dataclass(frozen=True)
+class StepTimes:
+    """Durations of the hybrid controller's whole steps, from measurement to input [ms].
+
+    Args:
+        median: Median.
+        p95: 95th percentile.
+        p99: 99th percentile.
+        max: Longest duration.
+        period: Control period.
+        misses: Number of steps that took longer than the period.
+    """
+
+    median: float
+    p95: float
+    p99: float
+    max: float
+    period: float
+    misses: int
+
+
+@dataclass(frozen=True)
 class ControlResult:
-    """The closed loops of a run.
+    """Closed loops on the scenario's plant. Without a plant, only steps are timed, on recordings.
 
     Args:
         rows: The loops by task, controller and seed.
-        reason: Why there are no loops, if only steps were timed. Default: there are loops.
+        most_seeds: Most seeds of a task; its loops stop earlier once its comparison is decided.
+        step_ms: Durations of steps.
+        reason: Why there are no loops. Default: empty, there are loops.
         arrays: Signals for the figures, ``"NUMBER/NAME"`` with the number of the row; without loops ``step_ms``.
     """
 
     rows: tuple[LoopRow, ...]
+    most_seeds: int
+    step_ms: StepTimes
     reason: str = ""
-    arrays: Mapping[str, Array] = field(default_factory=dict)
+    arrays: Mapping[str, Array] = beside()
 
     @property
     def drawn(self) -> list[LoopRow]:
         """The loops whose signals were kept, with their signals."""
         return [row for row in with_arrays(self.rows, self.arrays) if row.arrays] if self.rows else []
+
+    @cached_property
+    def means(self) -> dict[str, dict[str, Summary]]:
+        """Means of the loops by task and controller; their intervals hold with early stopping."""
+        return summaries(self.rows, self.most_seeds)
+
+    @cached_property
+    def comparisons(self) -> dict[str, dict[str, Comparison]]:
+        """By task and baseline, the cost of the hybrid with observer over the baseline's."""
+        return {task: comparisons(cells, self.most_seeds) for task, cells in by_task(self.rows).items()}
+
+    @cached_property
+    def gaps(self) -> dict[str, tuple[float | None, str]]:
+        """By task the share of the gap that the hybrid closes, see :func:`gap_closed`."""
+        return {task: gap_closed(cells) for task, cells in by_task(self.rows).items()}
+
+    @property
+    def gap(self) -> tuple[float | None, str]:
+        """Mean of the gaps closed, or None and the reasons if no task has one."""
+        known = [value for value, _ in self.gaps.values() if value is not None]
+        if known:
+            return float(np.mean(known)), ""
+        return None, "; ".join(dict.fromkeys(reason for _, reason in self.gaps.values())) or self.reason
+
+    def cost(self, controller: str) -> float | None:
+        """Sum over the tasks of a controller's mean costs; None without loops, or if one diverged."""
+        own = [cells[controller].cost.mean for cells in self.means.values() if controller in cells]
+        known = [cost for cost in own if cost is not None]
+        return sum(known) if known and len(known) == len(own) else None
+
+    def tracking(self, controller: str) -> dict[str, float]:
+        """Root mean square tracking errors of a controller by signal, over its tasks, each with the same weight."""
+        squares: dict[str, dict[str, list[float]]] = {}
+        for row in self.rows:
+            for signal, rmse in row.tracking_rmse.items() if row.controller == controller else ():
+                squares.setdefault(signal, {}).setdefault(row.task, []).append(rmse**2)
+        return {
+            signal: math.sqrt(np.mean([np.mean(own) for own in by.values()]))
+            for signal, by in squares.items()
+        }
+
+    @property
+    def steps(self) -> dict[str, Array]:
+        """Durations of whole steps [ms] of prior and hybrid, where they were timed."""
+        if "step_ms" in self.arrays:
+            return {"hybrid": self.arrays["step_ms"]}
+        return _steps(self.drawn)
+
+
+def _steps(rows: Sequence[LoopRow]) -> dict[str, Array]:
+    own = {
+        name: [r.arrays["step_ms"] for r in rows if r.controller == REPORTED[name] and "step_ms" in r.arrays]
+        for name in ("prior", "hybrid")
+    }
+    return {name: np.concatenate(times) for name, times in own.items() if times}
+
+
+def step_times(durations: Array, period: float) -> StepTimes:
+    """Statistics of the durations of steps [ms] for a control period [ms].
+
+    Example:
+        >>> step_times(np.array([1.0, 2.0, 3.0]), 2.5).misses
+        1
+    """
+    return StepTimes(**percentiles(durations), period=period, misses=int((durations > period).sum()))
+
+
+def closed_loops(found: ControlResult | Absent) -> ControlResult | None:
+    """The stage's result if it holds closed loops, else None."""
+    return None if isinstance(found, Absent) or not found.rows else found
 
 
 def control_stage(context: Context) -> ControlResult | Absent:
@@ -127,7 +225,12 @@ def control_stage(context: Context) -> ControlResult | Absent:
     if context.scenario.plant is None:
         return _only_timing(context)
     rows = compare(context)
-    return ControlResult(tuple(replace(row, arrays={}) for row in rows), "", arrays_of(rows))
+    return ControlResult(
+        tuple(rows),
+        context.budget.seeds,
+        step_times(_steps(rows)["hybrid"], 1e3 * context.spec.dt),
+        arrays=arrays_of(rows),
+    )
 
 
 def compare(context: Context) -> list[LoopRow]:
@@ -158,6 +261,33 @@ def comparisons(cells: Mapping[str, Sequence[LoopRow]], most: int) -> dict[str, 
     return {name: compare_costs(costs[REPORTED["hybrid"]], costs[name], most) for name in BASELINES}
 
 
+def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, str]:
+    """Share of the distance from the better baseline to the measuring oracle that the hybrid covers in a task.
+
+    The baselines are the fitted prior with and without disturbance observer; the hybrid has the observer. Returns None
+    and a reason if the distance is below twice its standard error; one seed has no standard error.
+
+    gap closed = (J_baseline - J_hybrid) / (J_baseline - J_oracle), with mean costs J over the seeds.
+    """
+    if "oracle" not in cells:
+        return None, "the scenario has no oracle"
+    costs = {name: np.array([row.cost for row in rows]) for name, rows in cells.items()}
+    baseline = min((costs[n] for n in BASELINES if n in costs), key=lambda c: float(c.mean()))
+    hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
+    if min(len(baseline), len(oracle)) < 2:
+        single = "the oracle ran" if len(oracle) < 2 else "the prior ran"
+        return None, f"{single} with one seed only, which gives no standard error; use --budget full"
+    if not all(np.all(np.isfinite(c)) for c in (baseline, hybrid, oracle)):
+        return None, "a loop diverged"
+    gap = float(baseline.mean() - oracle.mean())
+    error = math.sqrt(sum(float(c.var(ddof=1)) / len(c) for c in (baseline, oracle)))
+    if gap <= 2.0 * error:
+        return None, (
+            f"the costs of baseline {baseline.mean():.4g} and oracle {oracle.mean():.4g} do not differ significantly"
+        )
+    return float(baseline.mean() - hybrid.mean()) / gap, ""
+
+
 def decided(cells: Mapping[str, Sequence[LoopRow]], most: int) -> bool:
     """Whether a task needs no more seeds: the comparison of its hybrid with the better baseline is decided."""
     found = comparisons(cells, most)
@@ -172,7 +302,10 @@ def _only_timing(context: Context) -> ControlResult:
         context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")
         durations.append(time_on_recording(controller, estimator, kit.monitor(kind="own"), recording, most))
     reason = f"scenario {context.scenario.name} has no plant to close the loop with"
-    return ControlResult((), reason, {"step_ms": np.concatenate(durations)})
+    times = np.concatenate(durations)
+    return ControlResult(
+        (), context.budget.seeds, step_times(times, 1e3 * context.spec.dt), reason, {"step_ms": times}
+    )
 
 
 def time_on_recording(

@@ -13,6 +13,7 @@ from hybrid_mpc.compare.controllers import CONTROLLERS, OBSERVERS
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.consistency import consistency
+from hybrid_mpc.records import beside
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, observed
@@ -54,7 +55,12 @@ class ObserverTest:
 
 @dataclass(frozen=True)
 class ObservedRecording:
-    """A recording, or its beginning, that the observers were tested on."""
+    """A recording, or its beginning, that the observers were tested on.
+
+    Args:
+        name: Name of the recording.
+        samples: Number of its samples.
+    """
 
     name: str
     samples: int
@@ -72,7 +78,7 @@ class EstimationResult:
 
     recordings: tuple[ObservedRecording, ...]
     observers: Mapping[str, ObserverTest | Absent]
-    arrays: Mapping[str, Array]
+    arrays: Mapping[str, Array] = beside()
 
 
 def estimation_stage(context: Context) -> EstimationResult | Absent:

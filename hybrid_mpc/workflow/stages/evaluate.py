@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from hybrid_mpc.identify.evaluate import (
     score,
 )
 from hybrid_mpc.kit.prediction import Bands
+from hybrid_mpc.records import beside
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Stage
 from hybrid_mpc.workflow.stages.choose import CHOICE, run_parts
@@ -48,7 +50,12 @@ class BandScores:
 
 @dataclass(frozen=True)
 class ModelScores:
-    """Errors of a model on test data, and of each of its networks alone, if the model is the mean of several."""
+    """Errors of a model on test data.
+
+    Args:
+        model: Errors of the model.
+        networks: Errors of each of its networks alone, if the model is the mean of several.
+    """
 
     model: Scores
     networks: tuple[Scores, ...]
@@ -70,7 +77,12 @@ class EvaluationResult:
     by_file: Mapping[str, Mapping[str, Scores]]
     runs: tuple[str, ...]
     bands: Mapping[str, BandScores]
-    arrays: Mapping[str, Array]
+    arrays: Mapping[str, Array] = beside()
+
+
+def finite(value: float) -> float | None:
+    """The number, or None if it is not finite: a free run diverged."""
+    return float(value) if math.isfinite(value) else None
 
 
 def evaluation_stage(context: Context) -> EvaluationResult:

@@ -42,8 +42,12 @@ FEW = 10
 
 @dataclass(frozen=True)
 class ExportResult:
-    """The artifact: the largest differences of its models' values and Jacobians from PyTorch's, relative to the
-    outputs' scale, and the hash of its programs.
+    """The artifact: its models compared with PyTorch in float64, relative to the outputs' scale.
+
+    Args:
+        parity_max_abs_error: Largest difference of the values.
+        jacobian_max_abs_error: Largest difference of the Jacobians.
+        programs_sha256: Hash of the programs.
     """
 
     parity_max_abs_error: float
@@ -53,8 +57,12 @@ class ExportResult:
 
 @dataclass(frozen=True)
 class NoiseResult:
-    """Process noise of the estimators: standard deviations per period ``(n_x,)`` [state units] by estimator, the
-    digest of the models that it was estimated with, and the disturbance model; None: one at each input.
+    """Process noise of the estimators.
+
+    Args:
+        process_noise: Standard deviations per period ``(n_x,)`` [state units], by estimator.
+        of: Digest of the models that it was estimated with.
+        disturbance_model: Disturbances that the observer estimates. Default: one at each input.
     """
 
     process_noise: Mapping[str, tuple[float, ...]]

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 
 from hybrid_mpc.compare.loop_figures import curves_of, loop_figure
 from hybrid_mpc.compare.loops import ON_MODEL
-from hybrid_mpc.compare.summary import summaries
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.identify.evaluate import Scores, input_correlation
 from hybrid_mpc.identify.settings import kinds_of
@@ -27,11 +26,10 @@ from hybrid_mpc.workflow.stages.analyze import ANALYSIS
 from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.compare import CONTROL, REPORTED
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
-from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.evaluate import EVALUATION, finite
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.identify import PRIOR, TRAINING, trained_models
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, by_controller
-from hybrid_mpc.workflow.stages.results import finite, step_times
 from hybrid_mpc.workflow.stages.watch import WATCH, clean_windows, read_trace
 
 Figures = dict[str, list[tuple[Path, str]]]
@@ -271,7 +269,7 @@ def _overview(context: Context) -> Any:
         return
     table = {
         task: {name: (_number(cell.cost.mean), _number(cell.cost.ci95)) for name, cell in cells.items()}
-        for task, cells in summaries(list(found.rows), context.budget.seeds).items()
+        for task, cells in found.means.items()
     }
     if any("oracle" in row for row in table.values()):
         text = "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
@@ -325,12 +323,12 @@ def _estimation(context: Context) -> Any:
 
 
 def _timing(context: Context) -> Any:
-    times = step_times(context)
-    if times:
+    found = context.find(CONTROL)
+    if not isinstance(found, Absent):
         caption = (
             "Duration of controller steps: estimation, optimization and monitoring, including Python calls."
         )
-        yield "timing", "step_times", loops.solve_times(times, 1e3 * context.spec.dt), caption
+        yield "timing", "step_times", loops.solve_times(found.steps, 1e3 * context.spec.dt), caption
 
 
 def _watch(context: Context) -> Any:

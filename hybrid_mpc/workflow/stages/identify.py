@@ -53,7 +53,7 @@ from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.structure import causes, causes_of_refusal, named
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.records import plain, record
+from hybrid_mpc.records import beside, plain, record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Stage, source_of
@@ -98,24 +98,31 @@ class DataResult:
 
 
 @dataclass(frozen=True)
-class CutInterval:
-    """A part of a recording that is cut out or interpolated: its file, start and end [s]."""
+class CutPart:
+    """A part of a recording that is cut out or interpolated.
+
+    Args:
+        file: Name of the recording.
+        start_s: Start [s] in the recording's own time: the last sample before it.
+        end_s: End [s]: the first sample after it.
+        why: Its reason.
+    """
 
     file: str
     start_s: float
     end_s: float
-
-
-@dataclass(frozen=True)
-class CutPart(CutInterval):
-    """A cut interval and its reason."""
-
     why: str
 
 
 @dataclass(frozen=True)
 class BaselineScores:
-    """Free-run errors of a baseline model and its chosen orders, or why the model is missing."""
+    """A simpler model than the prior.
+
+    Args:
+        errors: Errors of its free runs; None if it is missing.
+        chosen: Its chosen orders.
+        reason: Why it is missing.
+    """
 
     errors: OutputErrors | None = None
     chosen: str = ""
@@ -153,7 +160,7 @@ class PriorResult:
     no_gain: str
     error_correlation: Mapping[str, float]
     longest_run: float | None
-    arrays: Mapping[str, Array]
+    arrays: Mapping[str, Array] = beside()
 
 
 @dataclass(frozen=True)

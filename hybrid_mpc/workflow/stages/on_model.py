@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.compare.controllers import OBSERVERS
 from hybrid_mpc.compare.loops import DRAWN, MODEL, LoopRow, LoopSpec, arrays_of, stand_in, with_arrays
+from hybrid_mpc.compare.summary import Summary, summaries
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.kit.parts import loop_settings
+from hybrid_mpc.records import beside
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage
 from hybrid_mpc.workflow.stages.compare import run_or_read, task_content
@@ -23,7 +26,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OnModelResult:
-    """Closed loops on models.
+    """Closed loops for a scenario without plant, each on another model than the controller's own.
+
+    They show whether two models agree, and nothing about the machine. Each controller has another plant, so do not
+    compare their figures.
 
     Args:
         plants: Name of the model in place of the machine, by controller.
@@ -37,12 +43,21 @@ class OnModelResult:
     left_out: Mapping[str, str]
     default_tasks: bool
     rows: tuple[LoopRow, ...]
-    arrays: Mapping[str, Array] = field(default_factory=dict)
+    arrays: Mapping[str, Array] = beside()
 
     @property
     def drawn(self) -> list[LoopRow]:
         """The loops whose signals were kept, with their signals."""
         return [row for row in with_arrays(self.rows, self.arrays) if row.arrays]
+
+    @cached_property
+    def means(self) -> dict[str, dict[str, Summary]]:
+        """Means of the loops by controller and task."""
+        return {
+            name: {task: cells[name] for task, cells in summaries(rows).items()}
+            for name, rows in by_controller(self.rows).items()
+            if rows
+        }
 
 
 def on_model_stage(context: Context) -> OnModelResult | Absent:
@@ -77,13 +92,7 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
     }  # fmt: skip
     found = run_or_read(context, parts)
     rows = [row for part in parts for row in found[part]]
-    return OnModelResult(
-        plants,
-        left_out,
-        not context.scenario.tasks,
-        tuple(replace(row, arrays={}) for row in rows),
-        arrays_of(rows),
-    )
+    return OnModelResult(plants, left_out, not context.scenario.tasks, tuple(rows), arrays_of(rows))
 
 
 def what_on_model_reads(context: Context) -> dict[str, object]:

@@ -29,7 +29,12 @@ MEND = "Correct the prior first: docs/prior-wrong.md explains each reason."
 
 @dataclass(frozen=True)
 class PromisesResult:
-    """The table "What this kit promises": its rows in their order, and the digest of what it was made of."""
+    """The table "What this kit promises".
+
+    Args:
+        rows: Its rows in their order.
+        of: Digest of the kit that was examined.
+    """
 
     rows: tuple[Promise, ...]
     of: str = ""

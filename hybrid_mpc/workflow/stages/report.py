@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from hybrid_mpc.compare.sequential import SAME, hardest
 from hybrid_mpc.compare.step_response import step_responses
 from hybrid_mpc.compare.summary import Summary
 from hybrid_mpc.compare.tasks import tasks_of
-from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
@@ -24,35 +23,25 @@ from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.advice import advice, doubt_of
-from hybrid_mpc.workflow.stages.analyze import ANALYSIS
+from hybrid_mpc.workflow.stages.analyze import AnalysisResult
 from hybrid_mpc.workflow.stages.answers import answer_all
-from hybrid_mpc.workflow.stages.choose import CHOICE
-from hybrid_mpc.workflow.stages.compare import CONTROL
-from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
-from hybrid_mpc.workflow.stages.evaluate import EVALUATION
+from hybrid_mpc.workflow.stages.choose import CHOICE, ChoiceResult
+from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, StepTimes, closed_loops
+from hybrid_mpc.workflow.stages.estimate import EstimationResult
+from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult, finite
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
-from hybrid_mpc.workflow.stages.export import EXPORT
+from hybrid_mpc.workflow.stages.export import ExportResult
 from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
-from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, models_of, training_settings
-from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
-from hybrid_mpc.workflow.stages.promises import PROMISES
-from hybrid_mpc.workflow.stages.results import (
-    REPORTED,
-    Analysis,
-    Control,
-    Data,
-    Export,
-    Identification,
-    OnModel,
-    Promises,
-    Results,
-    Timing,
-    collect,
-    finite,
-    identification,
-    recordings,
+from hybrid_mpc.workflow.stages.identify import (
+    DATA,
+    DataResult,
+    models_of,
+    training_settings,
 )
-from hybrid_mpc.workflow.stages.watch import RATES, WATCH, WatchResult
+from hybrid_mpc.workflow.stages.on_model import OnModelResult
+from hybrid_mpc.workflow.stages.promises import PromisesResult
+from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect, write_results
+from hybrid_mpc.workflow.stages.watch import RATES, WatchedRecording, WatchResult
 from hybrid_mpc.workflow.stages.watching import watching_table
 
 TITLES: Mapping[str, str] = {
@@ -86,7 +75,7 @@ def report_stage(context: Context) -> ReportResult:
     results = collect(context)
     figures = draw_all(context)
     write_report(context.out / "report.html", _report(context, results, figures))
-    write_json(context.out / "results.json", results.plain())
+    write_results(context.out / "results.json", results)
     drawn = tuple(path.name for group in figures.values() for path, _ in group)
     return ReportResult("report.html", drawn)
 
@@ -95,12 +84,12 @@ def report_so_far(context: Context) -> None:
     """Write a first report of the finished stages up to the free runs, while the run continues."""
     figures = draw_first(context)
     tables: dict[str, Sequence[Table]] = {
-        "data": [_data_table(recordings(context))],
+        "data": [_data_table(context.read(DATA))],
         **({"explain": _explain_tables(context)} if _explained(context) else {}),
         "models": [_prior_table(context)],
     }
     if "free_run" in figures:
-        tables["free_run"] = _free_run_tables(context, identification(context))
+        tables["free_run"] = _free_run_tables(context)
     texts = words("run_words.html")
     shown = [key for key in TITLES if key in figures or key in tables]
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
@@ -140,30 +129,36 @@ def command(context: Context, scenario: str = "") -> str:
 
 
 def _report(context: Context, results: Results, figures: Figures) -> Report:
-    found = results.identification
-    tables: dict[str, Sequence[Table | None]] = {
-        "promises": [_promises_table(results.promises)],
+    tables: dict[str, Sequence[Table]] = {
         "data": [_data_table(results.data)],
         "explain": _explain_tables(context),
         "models": [_prior_table(context)],
-        "free_run": _free_run_tables(context, found),
+        "free_run": _free_run_tables(context),
         "export": [_export_table(results.export)],
-        "control": [
-            _control_table(results.control),
-            _comparison_table(results.control),
-            _tracking_table(results.control, untracked(context)),
-            _response_table(context),
-        ],
-        "on_model": _on_model_tables(results.on_model),
-        "estimation": [_observer_table(results)],
-        "timing": [_timing_table(results.timing)],
-        "watch": _watch_tables(context),
-        "analysis": [_pole_table(results.analysis)],
     }
+    if not isinstance(results.promises, Absent):
+        tables["promises"] = [_promises_table(results.promises)]
+    if (loops := closed_loops(results.control)) is not None:
+        tables["control"] = [
+            _control_table(loops),
+            _comparison_table(loops),
+            _tracking_table(loops, untracked(context)),
+            _response_table(context, loops),
+        ]
+    if not isinstance(results.control, Absent):
+        tables["timing"] = [_timing_table(results.control.step_ms)]
+    if not isinstance(results.on_model, Absent):
+        tables["on_model"] = _on_model_tables(results.on_model)
+    if not isinstance(results.estimation, Absent):
+        tables["estimation"] = [_observer_table(results.estimation)]
+    if not isinstance(results.watch, Absent):
+        tables["watch"] = _watch_tables(results.watch)
+    if not isinstance(results.analysis, Absent):
+        tables["analysis"] = [_pole_table(results.analysis)]
     instead, after = _notes(context, results)
     for key in ("estimation", "timing", "watch"):
         # without pictures and tables the general text of the section has nothing to explain
-        if key in after and not figures.get(key) and not any(t is not None and t.rows for t in tables[key]):
+        if key in after and not figures.get(key) and not any(t.rows for t in tables.get(key, ())):
             instead[key] = after.pop(key)
     texts = words("run_words.html")
     sections = tuple(
@@ -171,11 +166,11 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
             TITLES[key],
             instead.get(key, texts[key]),
             figures.get(key, ()),
-            [t.filled() for t in tables.get(key, ()) if t is not None and t.rows],
+            [t.filled() for t in tables.get(key, ()) if t.rows],
             after.get(key, ()),
         )
         for key in TITLES
-        if (key != "on_model" or not results.on_model.reason) and (key != "explain" or _explained(context))
+        if not isinstance({"on_model": results.on_model, "explain": results.explain}.get(key), Absent)
     )
     versions = ", ".join(f"{name} {v}" for name, v in results.versions.items())
     return Report(
@@ -187,7 +182,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
         advice(results, explained=_explained(context)),
-        doubt_of(found.details.prior_parameters.in_doubt),
+        doubt_of(results.prior.in_doubt),
         answer_all(results),
     )
 
@@ -199,37 +194,33 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     """Paragraphs by section: those that replace the usual ones, and those after tables and pictures."""
     instead: Notes = {}
     after: Notes = {}
-    control = results.control
-    if results.promises.rows is None:
+    control, on_model, tested = results.control, results.on_model, results.estimation
+    if isinstance(results.promises, Absent):
         instead["promises"] = (
             f"The promises of the kit were not examined: {results.promises.reason.rstrip('.')}.",
         )
-    if control.gap_closed is None:
-        reason = control.gap_closed_reason.rstrip(".")
-        if control.hybrid.cost is None:
-            timed = " Instead, the controller was timed on recordings."
-            timed = "" if results.timing.misses is None else timed
-            if results.on_model.plants:
-                timed += f" Loops {ON_MODEL}, are in the next section."
-            instead["control"] = (f"No closed loop was simulated: {reason}.{timed}",)
-        else:
-            after["control"] = (f"The gap closed is not defined: {reason}.",)
-    after["control"] = (*after.get("control", ()), *oracle_words(control))
-    on_model = results.on_model
-    after["on_model"] = tuple(f"{name}: {why}." for name, why in on_model.left_out.items())
-    if DRAWN_PRIOR in on_model.plants.values():
-        after["on_model"] += (
-            f"The networks correct nothing, so no other model differs from the controller's. {DRAWN_PRIOR} is the "
-            "prior with parameters drawn from their fitted covariance.",
-        )
-    if on_model.default_tasks:
-        after["on_model"] += ("The scenario declares no tasks; the loops use default tasks.",)
-    tested = results.estimation
-    observers = (tested.prior_observer, tested.hybrid_observer)
-    without = [text for text in (tested.reason, *(o.reason for o in observers if o is not None)) if text]
-    if without:
-        after["estimation"] = (f"Observers were not tested: {'; '.join(dict.fromkeys(without))}.",)
-    after["data"] = tuple(f"Warning: {text}" for text in results.data.details.warnings)
+    if (loops := closed_loops(control)) is not None:
+        value, reason = loops.gap
+        undefined = f"The gap closed is not defined: {reason.rstrip('.')}."
+        after["control"] = (*((undefined,) if value is None else ()), *oracle_words(loops))
+    else:
+        timed = "" if isinstance(control, Absent) else " Instead, the controller was timed on recordings."
+        if not isinstance(on_model, Absent) and on_model.plants:
+            timed += f" Loops {ON_MODEL}, are in the next section."
+        instead["control"] = (f"No closed loop was simulated: {control.reason.rstrip('.')}.{timed}",)
+    if isinstance(control, Absent):
+        after["timing"] = (f"No controller step was timed: {control.reason.rstrip('.')}.",)
+    if not isinstance(on_model, Absent):
+        after["on_model"] = tuple(on_model_words(on_model))
+    absent = (
+        [tested]
+        if isinstance(tested, Absent)
+        else [one for one in tested.observers.values() if isinstance(one, Absent)]
+    )
+    if absent:
+        reasons = dict.fromkeys(one.reason for one in absent)
+        after["estimation"] = (f"Observers were not tested: {'; '.join(reasons)}.",)
+    after["data"] = tuple(f"Warning: {text}" for text in results.data.warnings)
     replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
     lacking = "mopgrnn" not in models_of(context.scenario.prior())
     after["training"] = ((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()) + _prior_replay_text(
@@ -237,25 +228,34 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     )
     if context.prior.fit.warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
-    if results.timing.misses is None:
-        after["timing"] = (f"No controller step was timed: {results.timing.misses_reason.rstrip('.')}.",)
-    watched: WatchResult | Absent = context.find(WATCH)
-    after["watch"] = (*_watch_words(watched), *coverage_words(results.watch.details.recordings))
-    if results.analysis.details is None:
-        instead["analysis"] = (f"No linear analysis: {results.analysis.reason.rstrip('.')}.",)
+    watched, analysis = results.watch, results.analysis
+    seen = () if isinstance(watched, Absent) else watched.recordings
+    after["watch"] = (*_watch_words(watched), *coverage_words(seen))
+    if isinstance(analysis, Absent):
+        instead["analysis"] = (f"No linear analysis: {analysis.reason.rstrip('.')}.",)
     else:
-        models = results.analysis.details.models
         after["analysis"] = tuple(
-            f"{name}: {m.fixed_point_reason}" for name, m in models.items() if m.fixed_point_reason
+            f"{name}: {m.fixed_point_reason}" for name, m in analysis.models.items() if m.fixed_point_reason
         )
     return instead, after
 
 
-def oracle_words(control: Control) -> tuple[str, ...]:
+def on_model_words(found: OnModelResult) -> Iterator[str]:
+    """Notes on loops on a model: controllers without loops, a drawn prior, default tasks."""
+    yield from (f"{name}: {why}." for name, why in found.left_out.items())
+    if DRAWN_PRIOR in found.plants.values():
+        yield (
+            f"The networks correct nothing, so no other model differs from the controller's. {DRAWN_PRIOR} is the "
+            "prior with parameters drawn from their fitted covariance."
+        )
+    if found.default_tasks:
+        yield "The scenario declares no tasks; the loops use default tasks."
+
+
+def oracle_words(control: ControlResult) -> tuple[str, ...]:
     """A note on tasks in which another controller costs less than the oracle; empty without such a task."""
-    tasks = control.details.tasks if control.details is not None else {}
     beaten = []
-    for task, cells in tasks.items():
+    for task, cells in control.means.items():
         costs = {name: cell.cost.mean for name, cell in cells.items() if cell.cost.mean is not None}
         if "oracle" in costs and min(costs, key=lambda name: costs[name]) != "oracle":
             beaten.append(task)
@@ -297,27 +297,26 @@ def _prior_replay_text(weight: float) -> tuple[str, ...]:
     return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
 
 
-def coverage_words(recordings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+def coverage_words(recordings: Sequence[WatchedRecording]) -> tuple[str, ...]:
     """A sentence on parts of the recordings that were not monitored, warm-up apart; empty without such a part.
 
     Example:
-        >>> coverage_words([{"valid_s": 4.0, "warm_up_s": 0.3, "missing_s": 0.0, "not_finite_s": 2.0}])
+        >>> coverage_words([WatchedRecording("monday", valid_s=4.0, warm_up_s=0.3, missing_s=0.0, not_finite_s=2.0)])
         ('Not monitored: 2 s with a non-finite value of model or estimator.',)
     """
-    why = {
-        "missing_s": "with missing samples",
-        "not_finite_s": "with a non-finite value of model or estimator",
+    sums = {
+        "with missing samples": sum(row.missing_s for row in recordings),
+        "with a non-finite value of model or estimator": sum(row.not_finite_s for row in recordings),
     }
-    sums = {key: sum(float(row[key]) for row in recordings) for key in why}
-    parts = [f"{sums[key]:.3g} s {words}" for key, words in why.items() if sums[key] > 0]
+    parts = [f"{seconds:.3g} s {words}" for words, seconds in sums.items() if seconds > 0]
     return (f"Not monitored: {', '.join(parts)}.",) if parts else ()
 
 
-def _data_table(data: Data) -> Table:
-    rows: list[tuple[Any, ...]] = list(data.details.seconds.items())
+def _data_table(data: DataResult) -> Table:
+    rows: list[tuple[Any, ...]] = list(data.seconds.items())
     rows += [
-        (f"cut: {c.file}, {c.start_s:.2f} to {c.end_s:.2f} s: {why}", c.end_s - c.start_s)
-        for c, why in zip(data.cuts, data.details.why_cut, strict=True)
+        (f"cut: {c.file}, {c.start_s:.2f} to {c.end_s:.2f} s: {c.why}", c.end_s - c.start_s)
+        for c in data.cuts
     ]
     caption = f"{len(data.files)} files; content hash {data.hash[:16]}."
     return Table(("part", "length [s]"), rows, caption)
@@ -358,33 +357,29 @@ def _prior_table(context: Context) -> Table:
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
 
-def _free_run_tables(context: Context, found: Identification) -> list[Table]:
+def _free_run_tables(context: Context) -> list[Table]:
     """Errors of every model: by output; then of its rates and by balance; the choice, and the bands."""
-    prior = context.scenario.prior()
-    models = models_of(prior)
+    prior, found = context.scenario.prior(), context.read(EVALUATION)
+    models = {name_of(m): found.scores[m].model for m in models_of(prior)}
     outputs = [s.label for s in prior.outputs]
-    base = _number(found.error["phy"])
-    rows: list[tuple[Any, ...]] = []
-    for m in models:
-        error = _number(found.error[m])
-        rmse, fit = ([_by(by[m], label) for label in outputs] for by in (found.rmse, found.fit_percent))
-        rows.append((name_of(m), error, _percent(error, base), *rmse, *fit))
-    for name, own in found.details.baselines.items():
-        errors = own.errors or OutputErrors(math.inf, {}, {})
-        error = finite(errors.error)
-        rmse, fit = ([_by(by, label) for label in outputs] for by in (errors.rmse, errors.fit_percent))
+    base = finite(found.scores["phy"].model.error)
+    errors: dict[str, OutputErrors] = {**models}
+    for name, own in context.prior.baselines.items():
         model = name if name == "constant" else f"{name} (linear)"
-        rows.append((model, error, _percent(error, base), *rmse, *fit))
+        errors[model] = own.errors or OutputErrors(math.inf, {}, {})
+    rows: list[tuple[Any, ...]] = []
+    for name, one in errors.items():
+        rmse, fit = ([_by(by, label) for label in outputs] for by in (one.rmse, one.fit_percent))
+        rows.append((name, finite(one.error), _percent(one.error, base), *rmse, *fit))
     columns = ("model", "error [spreads]", "over the prior's", *(f"RMSE of {label}" for label in outputs),
                *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
     tables = [Table(columns, rows, "Free runs on test data: outputs.")]
     balances = [f"{b.name} [{b.rate_unit}]" for b in prior.equations.balances]
-    base = _number(found.e_sim["phy"])
-    rows = []
-    for m in models:
-        e_sim = _number(found.e_sim[m])
-        violations = [_by(found.balance_violation[m], label) for label in balances]
-        rows.append((name_of(m), e_sim, _percent(e_sim, base), *violations))
+    base = finite(found.scores["phy"].model.e_sim)
+    rows = [
+        (name, finite(s.e_sim), _percent(s.e_sim, base), *(_by(s.violation, label) for label in balances))
+        for name, s in models.items()
+    ]
     columns = (
         "model",
         "E_sim [spreads]",
@@ -392,14 +387,15 @@ def _free_run_tables(context: Context, found: Identification) -> list[Table]:
         *(f"violation of {label}" for label in balances),
     )
     caption = "Free runs on test data: rates of the states" + (" and balances." if balances else ".")
-    return [*tables, Table(columns, rows, caption), _choice_table(found), _band_table(context, found)]
+    tables.append(Table(columns, rows, caption))
+    return [*tables, _choice_table(context.read(CHOICE)), _band_table(context, found)]
 
 
-def _choice_table(found: Identification) -> Table:
-    choice = found.details.choice
+def _choice_table(found: ChoiceResult) -> Table:
+    choice = found.choice
     rows = [
-        (name_of(name), None if name == "phy" else f"{100 * c.share:.0f} %", c.error, c.ratio,
-         None if name == "phy" else c.upper,
+        (name_of(name), None if name == "phy" else f"{100 * c.share:.0f} %", finite(c.error), finite(c.ratio),
+         None if name == "phy" else finite(c.upper),
          "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]  # fmt: skip
@@ -413,11 +409,11 @@ def _choice_table(found: Identification) -> Table:
     return Table(columns, rows, caption)
 
 
-def _band_table(context: Context, found: Identification) -> Table:
+def _band_table(context: Context, found: EvaluationResult) -> Table:
     rows: list[tuple[Any, ...]] = [
         (name_of(name), output.label, f"{100 * b.share:g} %", f"{100 * b.coverage:.0f} %",
          *(by[output.label] for by in (b.width, b.score, b.score_of_constant)))
-        for name, b in found.details.bands.items()
+        for name, b in found.bands.items()
         for output in context.scenario.prior().outputs
     ]  # fmt: skip
     what = ("mean width", "interval score", "of a constant band")
@@ -429,27 +425,21 @@ def _band_table(context: Context, found: Identification) -> Table:
     return Table(columns, rows, caption)
 
 
-def _by(values: Any, label: str) -> float | None:
-    """The number of a signal; None without finite numbers of all signals."""
-    return values.get(label) if isinstance(values, Mapping) else None
+def _by(values: Mapping[str, float], label: str) -> float | None:
+    """The finite number of a signal, or None."""
+    return finite(values.get(label, math.nan))
 
 
-def _number(value: Any) -> float | None:
-    return value if isinstance(value, float) else None
+def _percent(value: float, base: float | None) -> str:
+    return f"{100 * (value / base - 1):+.0f} %" if base and math.isfinite(value) else "–"
 
 
-def _percent(value: float | None, base: float | None) -> str:
-    return "–" if value is None or not base else f"{100 * (value / base - 1):+.0f} %"
-
-
-def _promises_table(found: Promises) -> Table | None:
-    if not found.rows:
-        return None
+def _promises_table(found: PromisesResult) -> Table:
     rows = [(one.name, one.verdict, one.evidence, one.remedy) for one in found.rows]
     return Table(("promise", "verdict", "evidence", "what to do"), rows)
 
 
-def _export_table(export: Export) -> Table:
+def _export_table(export: ExportResult) -> Table:
     rows = [
         ("values", f"{export.parity_max_abs_error:.1e}", "1e-12"),
         ("Jacobians", f"{export.jacobian_max_abs_error:.1e}", "1e-10"),
@@ -458,14 +448,11 @@ def _export_table(export: Export) -> Table:
     return Table(("compared", "largest difference", "allowed"), rows, caption)
 
 
-def _control_table(control: Control) -> Table | None:
-    details = control.details
-    if details is None:
-        return None
-    names = [n for n in CONTROLLERS if any(n in cells for cells in details.tasks.values())]
+def _control_table(found: ControlResult) -> Table:
+    names = [n for n in CONTROLLERS if any(n in cells for cells in found.means.values())]
     rows = []
-    for task, cells in details.tasks.items():
-        gap = details.gap_closed_by_task[task].value
+    for task, cells in found.means.items():
+        gap, _ = found.gaps[task]
         costs = (_cost(cells.get(name)) for name in names)
         rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
     caption = (
@@ -477,20 +464,17 @@ def _control_table(control: Control) -> Table | None:
     return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
 
 
-def _comparison_table(control: Control) -> Table | None:
+def _comparison_table(found: ControlResult) -> Table:
     """The hybrid's cost over that of each baseline on the same seeds, with an interval valid under early stopping."""
-    details = control.details
-    if details is None:
-        return None
     rows = [
-        (task, base.replace("_", ", ") + " *" * (base == hardest(own)), found.words, found.n, found.finding)
-        for task, own in details.comparisons.items()
-        for base, found in own.items()
+        (task, base.replace("_", ", ") + " *" * (base == hardest(own)), one.words, one.n, one.finding)
+        for task, own in found.comparisons.items()
+        for base, one in own.items()
     ]
     caption = (
         f"Cost of the hybrid with observer over a baseline's on the same seeds: geometric mean, and a 95 % interval "
         f"that holds with early stopping. The loops of a task stop once the larger ratio (*) is decided, at most after "
-        f"{details.most_seeds} seeds. Ratios within {100 * SAME:.0f} % of 1 count as the same. The 95 % hold for each "
+        f"{found.most_seeds} seeds. Ratios within {100 * SAME:.0f} % of 1 count as the same. The 95 % hold for each "
         "row alone: one of twenty rows may be wrong."
     )
     return Table(("task", "baseline", "ratio of costs", "seeds", "finding"), rows, caption)
@@ -501,13 +485,11 @@ def untracked(context: Context) -> set[str]:
     return {task.name for task in context.scenario.tasks if task.weight is not None}
 
 
-def _tracking_table(control: Control, untracked: Collection[str]) -> Table | None:
+def _tracking_table(found: ControlResult, untracked: Collection[str]) -> Table:
     """Tracking errors of every signal that has a reference, in its unit."""
-    if control.details is None:
-        return None
     cells = [
         (task, name, own[name])
-        for task, own in control.details.tasks.items()
+        for task, own in found.means.items()
         for name in CONTROLLERS
         if name in own and task not in untracked
     ]
@@ -520,12 +502,10 @@ def _tracking_table(control: Control, untracked: Collection[str]) -> Table | Non
     return Table(("task", "controller", *(f"RMSE of {s}" for s in signals)), rows, caption)
 
 
-def _response_table(context: Context) -> Table | None:
+def _response_table(context: Context, found: ControlResult) -> Table:
     """Rise, settling, overshoot and offset in tasks that end at a set-point."""
-    scenario, found = context.scenario, context.find(CONTROL)
-    if isinstance(found, Absent) or scenario.control is None:
-        return None
-    drawn, prior = found.drawn, scenario.prior()
+    scenario, drawn, prior = context.scenario, found.drawn, context.scenario.prior()
+    assert scenario.control is not None
     names = {controller: name for name, controller in REPORTED.items()}
     rows = [
         (
@@ -546,10 +526,10 @@ def _response_table(context: Context) -> Table | None:
     return Table(heads, rows, caption)
 
 
-def _on_model_tables(found: OnModel) -> list[Table | None]:
+def _on_model_tables(found: OnModelResult) -> list[Table]:
     """One table for each controller: their plants differ, so one table must not compare two controllers."""
-    tables: list[Table | None] = []
-    for name, cells in (found.details.controllers if found.details is not None else {}).items():
+    tables = []
+    for name, cells in found.means.items():
         signals, errors = _tracking(list(cells.values()))
         rows = [
             (task, _cost(cell), *own, f"{100 * max(cell.limits.values(), default=0.0):.0f} %",
@@ -582,13 +562,12 @@ def _cost(cell: Summary | None) -> str:
     return f"{mean:.3g}" + (f" ± {half:.1g}" if half is not None else "")
 
 
-def _observer_table(results: Results) -> Table:
-    found = {name: getattr(results.estimation, name) for name in OBSERVERS}
+def _observer_table(found: EstimationResult) -> Table:
     rows = [
         (OBSERVER_TITLES[name], r.mean_nis, f"{r.nis_low:.2f} to {r.nis_high:.2f}", f"{100 * r.nis_inside:.0f} %",
          f"{r.ljung_box:.0f}", f"{r.ljung_box_limit:.0f}", r.samples)
-        for name, r in found.items()
-        if r is not None and r.mean_nis is not None
+        for name, r in found.observers.items()
+        if not isinstance(r, Absent)
     ]  # fmt: skip
     columns = ("observer", "mean NIS", "consistent", "below 95 %", "Ljung-Box", "white below", "samples")
     return Table(
@@ -596,20 +575,16 @@ def _observer_table(results: Results) -> Table:
     )
 
 
-def _timing_table(timing: Timing) -> Table | None:
-    if timing.misses is None:
-        return None
-    ms = timing.controller_step_ms
-    row = (ms.median, ms.p95, ms.p99, ms.max, timing.period_ms, timing.misses)
+def _timing_table(ms: StepTimes) -> Table:
+    row = (ms.median, ms.p95, ms.p99, ms.max, ms.period, ms.misses)
     return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
 
 
-def _watch_tables(context: Context) -> list[Table | None]:
+def _watch_tables(found: WatchResult) -> list[Table]:
     """Tables of the channels, of the loops with a fault, and of the alarms on recordings."""
-    found = context.find(WATCH)
-    if isinstance(found, Absent) or found.limits is None:
+    if found.limits is None:
         return []
-    tables = [watching_table(found)]
+    tables = [watching_table(found, found.limits)]
     if found.faults:
         heads = ("fault", "at [s]", "detection delay [s]", "alarms before", "guard")
         rows = [
@@ -627,26 +602,25 @@ def _watch_tables(context: Context) -> list[Table | None]:
     return [*tables, Table(heads, alarms, "Alarms over the whole recordings.")]
 
 
-def _pole_table(analysis: Analysis) -> Table | None:
-    if analysis.details is None:
-        return None
+def _pole_table(analysis: AnalysisResult) -> Table:
     rows = []
-    for model, found in analysis.details.models.items():
+    for model, found in analysis.models.items():
         for point, a in found.points.items():
             slow = [f"{number(w)} ({z:.2f})" for w, z in
                     list(zip(a.frequency_rad_s, a.damping, strict=True))[:2] if w is not None]  # fmt: skip
             rows.append((model, point, ", ".join(slow), a.stable, a.stabilisable, a.detectable))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
     points = {"rest": "at rest", "moving": "at working speed"}
-    there = [
-        points[p] for p in points if any(p in found.points for found in analysis.details.models.values())
-    ]
+    there = [points[p] for p in points if any(p in found.points for found in analysis.models.values())]
     return Table(columns, rows, f"Poles of the models linearized {' and '.join(there)}.")
 
 
 REPORT = Stage(
-    "report", "writing the report", ReportResult, report_stage, what_report_reads,
-    (DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES, WATCH,
-     ANALYSIS),
+    "report",
+    "writing the report",
+    ReportResult,
+    report_stage,
+    what_report_reads,
+    SHOWN,
     restore=report_is_there,
-)  # fmt: skip
+)

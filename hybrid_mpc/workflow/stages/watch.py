@@ -19,6 +19,7 @@ from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import sensor_steps
 from hybrid_mpc.kit.parts import WatchFile, read_parts, write_watch
 from hybrid_mpc.model.model import HybridModel
+from hybrid_mpc.records import beside
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
 from hybrid_mpc.watch.explain import begun, explained
@@ -73,7 +74,15 @@ def rates(model: HybridModel) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class RecordedAlarm:
-    """An alarm on a recording: file, start and end [s], channels in the order of their alarms, diagnosis."""
+    """An alarm on a recording.
+
+    Args:
+        file: Name of the recording.
+        start_s: Start [s] in the recording's own time.
+        end_s: End [s].
+        channels: Channels in the order of their alarms.
+        diagnosis: Its cause; empty without a diagnosis.
+    """
 
     file: str
     start_s: float
@@ -91,7 +100,14 @@ class RecordedAlarm:
 
 @dataclass(frozen=True)
 class CleanAlarms:
-    """False alarms: undisturbed time [s] and the alarms that begin in it, of all data and of the test data alone."""
+    """False alarms in undisturbed data.
+
+    Args:
+        seconds: Undisturbed time [s].
+        alarms: Alarms that begin in it.
+        test_seconds: Undisturbed time of the test data alone [s].
+        test_alarms: Alarms that begin in it.
+    """
 
     seconds: float = 0.0
     alarms: int = 0
@@ -125,8 +141,35 @@ class CleanAlarms:
 
 
 @dataclass(frozen=True)
+class WatchedRecording:
+    """How long a recording was monitored.
+
+    Args:
+        file: Name of the recording.
+        valid_s: Time with a valid reading [s].
+        warm_up_s: Time until all windows were full [s].
+        missing_s: Time with missing samples [s].
+        not_finite_s: Time with a non-finite value of model or estimator [s].
+    """
+
+    file: str
+    valid_s: float
+    warm_up_s: float
+    missing_s: float
+    not_finite_s: float
+
+
+@dataclass(frozen=True)
 class NominalLoop:
-    """A loop that limits were learned from: task, seed, factor that friction drifts to, length [s], cost."""
+    """A loop that limits were learned from.
+
+    Args:
+        task: Name of the task.
+        seed: Seed of the loop.
+        friction: Factor that friction drifts to.
+        seconds: Length [s].
+        cost: Closed-loop cost.
+    """
 
     task: str
     seed: int
@@ -173,10 +216,12 @@ class WatchResult:
         reason: Why there are no limits. Default: limits were learned.
         loops: Loops that limits were learned from. Default: none, limits were learned from recordings.
         channels: The channels. Default: none.
-        recordings: Monitored and unmonitored seconds, by recording and reason.
+        recordings: How long each recording was monitored.
         alarms: Alarms on whole recordings.
-        clean: False alarms; ``by_channel`` those of each channel and frozen-sensor check.
-        faults: Loops with a fault; None without a plant or without a task that has no faults of its own.
+        clean: False alarms.
+        by_channel: False alarms of each channel and of each frozen-sensor check.
+        faults: Loops with a fault; None if none were run.
+        faults_reason: Why no loops with a fault were run. Default: empty, they were run.
         shown: Names of the recordings whose traces are kept.
         arrays: Traces, see :func:`read_trace`.
     """
@@ -187,13 +232,14 @@ class WatchResult:
     reason: str = ""
     loops: tuple[NominalLoop, ...] = ()
     channels: tuple[Channel, ...] = ()
-    recordings: tuple[Mapping[str, float | str], ...] = ()
+    recordings: tuple[WatchedRecording, ...] = ()
     alarms: tuple[RecordedAlarm, ...] = ()
     clean: CleanAlarms | None = None
     by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
     faults: tuple[FaultedLoop, ...] | None = None
+    faults_reason: str = ""
     shown: tuple[str, ...] = ()
-    arrays: Mapping[str, Array] = field(default_factory=dict)
+    arrays: Mapping[str, Array] = beside()
 
     @property
     def limits(self) -> WatchLimits | None:
@@ -253,10 +299,14 @@ def watch_stage(context: Context) -> WatchResult | Absent:
     if found.limits is None:
         return replace(found, reason=watch[kit.recommended].reason)
     found = _on_recordings(context, kit, found)
-    if scenario.plant is not None and _calm(context) and kind in watch["hybrid"].limits:
-        context.progress.update("faults", 0, 1, "loops with simulated faults")
-        found = _faulted(context, kit, found)
-    return found
+    if scenario.plant is None:
+        return replace(found, faults_reason=f"scenario {scenario.name} has no plant to simulate faults with")
+    if not _calm(context):
+        return replace(found, faults_reason=f"scenario {scenario.name} has no task without faults")
+    if kind not in watch["hybrid"].limits:
+        return replace(found, faults_reason=watch["hybrid"].reason)
+    context.progress.update("faults", 0, 1, "loops with simulated faults")
+    return _faulted(context, kit, found)
 
 
 def put_limits(context: Context, found: WatchResult) -> str:
@@ -360,7 +410,7 @@ def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResul
     return replace(
         found, channels=monitor.readings.channels, alarms=tuple(alarms), by_channel=each, arrays=arrays,
         recordings=tuple(
-            {"file": r.name, **t.coverage(monitor.model.dt)} for r, t in zip(whole, traces, strict=True)
+            WatchedRecording(r.name, **t.coverage(monitor.model.dt)) for r, t in zip(whole, traces, strict=True)
         ),
         clean=clean_alarms(context, whole, [t.alarm for t in traces]), shown=tuple(r.name for r, _ in ranked),
     )  # fmt: skip

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from scipy.stats import chi2
 
 from hybrid_mpc.report.page import Table
+from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 
 HEADS = (
@@ -22,11 +23,8 @@ CAPTION = (
 )
 
 
-def watching_table(found: WatchResult) -> Table | None:
-    """Table of the channels with limits, of the frozen-sensor checks, and of all together; None without limits."""
-    limits = found.limits
-    if limits is None:
-        return None
+def watching_table(found: WatchResult, limits: WatchLimits) -> Table:
+    """Table of the channels with limits, of the frozen-sensor checks, and of all together."""
     rows, faults = [], found.faults or ()
     for channel in found.channels:
         own = limits.of(channel.name)
