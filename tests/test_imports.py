@@ -42,6 +42,7 @@ ROOMS = {
     "workflow": "nn_export errors engine records files folder machine data model estimate control loop scenario watch "
     "kit identify plots report analyze check compare",
     "cli": "errors rules engine files machine data scenario kit identify analyze check compare workflow",
+    "__main__": "cli",
     "scenarios.paper": "errors rules engine records files folder machine data scenario identify plots workflow cli",
     "scenarios.golf_robot.monitor_study": "errors engine records files folder loop scenario watch kit plots report "
     "compare cli",

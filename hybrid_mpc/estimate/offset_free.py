@@ -85,7 +85,7 @@ class OffsetFree:
 
 def offset_free(
     model: HybridModel,
-    controlled: Sequence[int] | None = None,
+    controlled: Sequence[int | str] | None = None,
     *,
     x: ArrayLike | None = None,
     u: ArrayLike | None = None,
@@ -95,13 +95,13 @@ def offset_free(
 
     Args:
         model: The model, with its ``disturbance_model``.
-        controlled: Indices of the controlled outputs. Default: all.
+        controlled: Controlled outputs by name or index, e.g. those with a weight ``q_y``. Default: all.
         x: State ``(n_x,)``. Default: the operating point's.
         u: Input ``(n_u,)``. Default: likewise.
         w: Measured disturbances ``(n_w,)``. Default: likewise.
 
     Raises:
-        InputError: If a size does not fit.
+        InputError: If a size does not fit, or the model has no such output.
 
     Source: Pannocchia and Rawlings, *Disturbance models for offset-free model-predictive control*, AIChE J. 49 (2003);
     Maeder, Borrelli, Morari, *Linear offset-free model predictive control*, Automatica 45 (2009).
@@ -128,12 +128,15 @@ def offset_free(
     still, c = a - np.eye(n_z), np.hstack([by_x, np.zeros((model.n_y, model.n_h))])
     b_d = b @ on_u
     b_d[: model.n_x] += on_x
-    chosen = list(range(model.n_y)) if controlled is None else list(controlled)
-    if not all(0 <= i < model.n_y for i in chosen):
+    names = [signal.name for signal in model.outputs]
+    wanted = list(range(model.n_y)) if controlled is None else list(controlled)
+    chosen = [names.index(one) if one in names else one for one in wanted]
+    if any(isinstance(i, str) or not 0 <= i < model.n_y for i in chosen):
         raise InputError(
-            f"controlled: must be indices of the {model.n_y} outputs, got {chosen} [HM-ESTIMATE-010]"
+            f"controlled: must be names or indices of the outputs {', '.join(names)}, got {wanted} [HM-ESTIMATE-010]"
         )
-    target_rank, target_needed = _rank(np.block([[still, b], [c[chosen], by_u[chosen]]])), n_z + len(chosen)
+    rows = [int(i) for i in chosen]
+    target_rank, target_needed = _rank(np.block([[still, b], [c[rows], by_u[rows]]])), n_z + len(rows)
     return OffsetFree(
         model.n_d, model.n_y,
         _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d, target_rank, target_needed,

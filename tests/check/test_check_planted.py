@@ -505,7 +505,7 @@ def test_it_takes_seconds(tmp_path, page):
     source = text if page.endswith(".py") else re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
     (tmp_path / "machine.py").write_text(source)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, "-m", "hybrid_mpc.cli", "check", str(tmp_path / "machine.py")]
+    command = [sys.executable, "-m", "hybrid_mpc", "check", str(tmp_path / "machine.py")]
     assert "No errors" in subprocess.run(command, capture_output=True, text=True, check=True).stdout
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime) < 6.0

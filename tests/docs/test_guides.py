@@ -185,12 +185,12 @@ def test_the_way_from_a_recording_to_a_fit(tmp_path):
         "check my_tank.py --data monday.csv",
     ):
         assert command.startswith("check") or f"hybrid-mpc {command}" in page
-        subprocess.run([sys.executable, "-m", "hybrid_mpc.cli", *command.split()], **python)
+        subprocess.run([sys.executable, "-m", "hybrid_mpc", *command.split()], **python)
     fitted = "check docs/examples/tank.py --data monday.csv --data tuesday.csv --fit"
     assert f"hybrid-mpc {fitted}" in page
     command = fitted.replace("docs/examples", str(ROOT / "docs/examples")).split()
     done = subprocess.run(
-        [sys.executable, "-m", "hybrid_mpc.cli", *command], env={**os.environ, "COLUMNS": "110"}, **python
+        [sys.executable, "-m", "hybrid_mpc", *command], env={**os.environ, "COLUMNS": "110"}, **python
     )
     (line,) = (" ".join(line.split()) for line in done.stdout.splitlines() if re.match(r"k .* 5 to 40", line))
     assert line in " ".join(page.split())

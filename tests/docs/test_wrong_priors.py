@@ -20,7 +20,7 @@ COUPLING = "cos(alpha) in the mass matrix (theta, alpha): its sign seems wrong"
 
 def done(command, folder):
     """Exit code and output of a command of the page."""
-    words = {"python": sys.executable, "hybrid-mpc": f"{sys.executable} -m hybrid_mpc.cli"}
+    words = {"python": sys.executable, "hybrid-mpc": f"{sys.executable} -m hybrid_mpc"}
     for name, word in words.items():
         command = re.sub(rf"^{name} ", f"{word} ", command)
     command = command.replace("docs/examples", str(ROOT / "docs/examples"))

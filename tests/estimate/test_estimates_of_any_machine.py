@@ -151,8 +151,10 @@ def test_the_rank_test():
     assert offset_free(thermal(), [0]).promised
     integrator = sensor(lambda x: x)
     assert offset_free(integrator).promised
-    with pytest.raises(InputError, match="HM-ESTIMATE-010"):
-        offset_free(thermal(), [2])
+    assert offset_free(thermal(), [thermal().outputs[0].name]) == offset_free(thermal(), [0])
+    for unknown in ([2], ["voltage"]):
+        with pytest.raises(InputError, match="HM-ESTIMATE-010"):
+            offset_free(thermal(), unknown)
 
 
 def test_an_observer_whose_disturbances_nobody_can_tell_is_refused():

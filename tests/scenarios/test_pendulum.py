@@ -225,7 +225,7 @@ def test_simulate_holds_each_torque_for_a_sample():
 
 @pytest.mark.full
 def test_the_whole_job(tmp_path):
-    command = [sys.executable, "-m", "hybrid_mpc.cli", "run", "pendulum", "--out", str(tmp_path / "run")]
+    command = [sys.executable, "-m", "hybrid_mpc", "run", "pendulum", "--out", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1500)
     assert done.returncode == 0, done.stdout + done.stderr
     results = read_results(tmp_path / "run" / "results.json")

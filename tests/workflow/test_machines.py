@@ -14,7 +14,7 @@ FILES = ("energy_shaping_0p9Nm", "energy_shaping_1p5Nm")
 
 
 def job(out, *words):
-    command = [sys.executable, "-m", "hybrid_mpc.cli", "run", *map(str, words), "--out", str(out)]
+    command = [sys.executable, "-m", "hybrid_mpc", "run", *map(str, words), "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1500)
     assert done.returncode == 0, done.stdout + done.stderr
     results = read_results(out / "results.json")

@@ -92,7 +92,7 @@ def test_bounds_never_rise(finished):
 def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp_path):
     """Also the test of determinism: everything but timing is the same, bit for bit."""
     out = tmp_path / "run"
-    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
+    command = [sys.executable, "-m", "hybrid_mpc", *arguments, "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     deadline = time.monotonic() + HANGS
     while not list(out.glob("checkpoints/training/*/*.safetensors")):  # in the middle of the training
@@ -112,7 +112,7 @@ def test_killed_and_resumed_run_equals_the_finished_one(finished, arguments, tmp
 def test_killed_several_times(finished, arguments, tmp_path):
     """At random moments; whatever the moment, --resume finishes the run to the same results."""
     rng, out = np.random.default_rng(0), tmp_path / "run"
-    command = [sys.executable, "-m", "hybrid_mpc.cli", *arguments, "--out", str(out)]
+    command = [sys.executable, "-m", "hybrid_mpc", *arguments, "--out", str(out)]
     for _ in range(3):
         resume = ["--resume"] if (out / "run.json").is_file() else []
         process = subprocess.Popen(

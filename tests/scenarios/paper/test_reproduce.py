@@ -116,7 +116,7 @@ def test_sindy_has_a_row_where_it_is_there(exact, tmp_path, monkeypatch):
 @pytest.mark.full
 def test_on_the_command_line_with_two_processes(exact, finished, tmp_path):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "hybrid_mpc.cli", "reproduce", exact, "--out", str(out)]
+    command = [sys.executable, "-m", "hybrid_mpc", "reproduce", exact, "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=HANGS)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "MOPGRNN" in done.stdout
