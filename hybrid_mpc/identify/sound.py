@@ -37,6 +37,9 @@ NEGATIVE = -25.0
 """FIT [%] of an output below which the prior is worse than the mean of the output."""
 COSTLY = 0.95
 """Error without a bound over the error with it below which the bound is relevant."""
+WORSE = 1.5
+"""Error of an output after the fit, over the error before, from which on a warning names it: test recordings
+are few, and smaller changes come by chance."""
 ITERATIONS = 12
 """Largest number of Gauss-Newton steps of a trial fit, enough for the size of the error."""
 
@@ -261,6 +264,27 @@ def bounds_doubt(bounds: Sequence[BoundCost], fitted: int) -> str:
         ends = ", ".join(f"{one.parameter} at {one.value:.4g}" for one in bounds)
         return f"{len(bounds)} of {fitted} fitted parameters end at a bound: {ends}"
     return "; ".join(str(one) for one in bounds if one.ratio < CLEARLY)
+
+
+def warn_of_worse_outputs(nominal: Mapping[str, float], fitted: Mapping[str, float]) -> tuple[str, ...]:
+    """A warning for each output whose error on test recordings is larger with fitted than with nominal parameters.
+
+    The fit minimises the error over all outputs, each over its spread. One output may get worse for the sake of others.
+
+    Args:
+        nominal: Root mean square error by output with nominal parameters, ``"phi [rad]"``.
+        fitted: The same with fitted parameters.
+
+    Example:
+        >>> warn_of_worse_outputs({"x [mm]": 0.2, "p [bar]": 1.6}, {"x [mm]": 1.2, "p [bar]": 1.1})
+        ('x [mm]: the error on test recordings is 1.2 with fitted and 0.2 with nominal parameters',)
+    """
+    return tuple(
+        f"{name}: the error on test recordings is {fitted[name]:.3g} with fitted and {error:.3g} with nominal "
+        "parameters"
+        for name, error in nominal.items()
+        if math.isfinite(error) and fitted[name] > WORSE * error
+    )
 
 
 def fit_doubt(fit_percent: Mapping[str, float], share: Mapping[str, float]) -> str:

@@ -47,6 +47,7 @@ from hybrid_mpc.identify.sound import (
     problems,
     structure_doubt,
     trial_length,
+    warn_of_worse_outputs,
 )
 from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.identify.step import PriorStep, Scaling
@@ -334,7 +335,10 @@ def examined_prior(context: Context) -> PriorResult:
             "trained and compared by free runs of that length; free_run of the DataSpec sets another length",
         )
         context.progress.warn(growth[0])
-    fit = replace(fit, warnings=(*fit.warnings, *growth))
+    worse = warn_of_worse_outputs(errors["phy_nominal"].rmse, errors["phy"].rmse)
+    for warning in worse:
+        context.progress.warn(f"fit of the prior: {warning}")
+    fit = replace(fit, warnings=(*fit.warnings, *growth, *worse))
     own = {name: one.error for name, one in errors.items()} | {"constant": _error_of(baselines["constant"])}
     training: dict[str, float] = {}
     if own["phy"] >= own["constant"]:
