@@ -29,7 +29,7 @@ NOTHING = 1e-14
 class Mode(NamedTuple):
     """One mode of a discrete system.
 
-    Args:
+    Attributes:
         pole: Pole z.
         frequency: Natural frequency of the continuous equivalent ``s = log(z) / dt`` [rad/s]; infinite for z = 0.
         damping: Damping ratio of the continuous equivalent [-]; 1 for z = 0 and z = 1.
